@@ -1,0 +1,164 @@
+"""The paced loop: frames of an array, with the servo's position beside them, in batches.
+
+Clock and sleep are injected; a batch is handed over every 25 ms or so. A slow consumer cannot
+be waited for here: whoever iterates must be quick, and what was missed is counted and flagged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+import numpy as np
+
+from devices.array import Scan, TileArray
+from devices.clock import Clock, UtcAnchor
+from devices.frames import (
+    FRAME_COLUMNS,
+    NO_SERVO_AGE,
+    NO_SERVO_COUNTS,
+    NOT_READ,
+    FrameBatch,
+    FrameStatus,
+    TileInfo,
+    TileStatus,
+)
+from devices.mpl115a2 import (
+    PRESSURE_MAX_KPA,
+    PRESSURE_MIN_KPA,
+    Coefficients,
+    compensate_kpa,
+)
+
+BATCH_NS = 25_000_000
+"""Length of a batch: at 10 ms two fifths of a message would be header (performance.md)."""
+
+_BATCH_FRAMES_MAX = 64
+
+
+class ServoSource(Protocol):
+    """Where the newest servo position comes from; the tile loop never waits for it."""
+
+    def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
+        """Position in counts and its sample instant, newest known at `t_mono_ns`; None so far."""
+
+    @property
+    def stale_after_ns(self) -> int:
+        """Age from which a position is older than it should be."""
+
+
+class ReferenceSource(Protocol):
+    """The calibration rig's force sensor, sampled with the tiles."""
+
+    def force_n(self, t_mono_ns: int) -> float:
+        """Reference force at an instant, in newtons; NaN where nothing is pressed."""
+
+
+class Acquisition:
+    """One stream of frames: `seq` counts from 0, `t_ns` is `t_mono_ns` plus one fixed anchor."""
+
+    def __init__(
+        self,
+        array: TileArray,
+        tiles: tuple[TileInfo, ...],
+        clock: Clock,
+        anchor: UtcAnchor,
+        *,
+        rate_hz: float = 0.0,
+        servo: ServoSource | None = None,
+        reference: ReferenceSource | None = None,
+    ) -> None:
+        self.missed_slots = 0
+        """Slots in which no frame was begun, because the loop was late."""
+        self._array = array
+        self._clock = clock
+        self._anchor = anchor
+        self._period_ns = round(1e9 / rate_hz) if rate_hz else 0
+        self._servo = servo
+        self._reference = reference
+        coefficients = [Coefficients.from_words(tile.coefficient_words) for tile in tiles]
+        self._a0, self._b1, self._b2, self._c12 = (
+            np.array([getattr(c, name) for c in coefficients]) for name in ("a0", "b1", "b2", "c12")
+        )
+        self._next_seq = 0
+
+    def run(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
+        """Take frames until `stop()` is true, which is asked before every frame.
+
+        Yields:
+            Batches of at least one frame; the last one may be short.
+
+        Raises:
+            BusMisuseError, BusSetupError: as for `TileArray.scan`; other faults are flags.
+        """
+        slot_ns = self._clock.now_ns()
+        while not stop():
+            columns = self._empty_columns()
+            row = 0
+            batch_end_ns = self._clock.now_ns() + BATCH_NS
+            while row < _BATCH_FRAMES_MAX and self._clock.now_ns() < batch_end_ns and not stop():
+                frame_status = 0
+                if self._period_ns:
+                    late = max(0, self._clock.now_ns() - slot_ns) // self._period_ns
+                    if late:
+                        self.missed_slots += late
+                        slot_ns += late * self._period_ns
+                        frame_status |= FrameStatus.OVERRUN
+                    self._clock.sleep_until_ns(slot_ns)
+                    slot_ns += self._period_ns
+                self._fill(columns, row, self._array.scan(), frame_status)
+                row += 1
+            if row:
+                yield self._batch(columns, row)
+
+    def _empty_columns(self) -> dict[str, np.ndarray]:
+        n, tiles = _BATCH_FRAMES_MAX, len(self._array.tiles)
+        return {
+            name: np.zeros((n, tiles) if per_tile else n, dtype)
+            for name, (dtype, per_tile) in FRAME_COLUMNS.items()
+        }
+
+    def _fill(
+        self, columns: dict[str, np.ndarray], row: int, scan: Scan, frame_status: int
+    ) -> None:
+        first_stop_ns = scan.convert_stop_ns[0]
+        t_mono_ns = first_stop_ns + self._array.sample_delay_ns
+        if scan.bus_fault:
+            frame_status |= FrameStatus.BUS_FAULT
+        servo_counts, servo_age_us = NO_SERVO_COUNTS, NO_SERVO_AGE
+        if self._servo is not None:
+            reading = self._servo.latest(t_mono_ns)
+            if reading is not None:
+                servo_counts, age_ns = reading[0], t_mono_ns - reading[1]
+                servo_age_us = age_ns // 1000
+            if reading is None or age_ns > self._servo.stale_after_ns:
+                frame_status |= FrameStatus.SERVO_STALE
+        columns["seq"][row] = self._next_seq
+        columns["t_mono_ns"][row] = t_mono_ns
+        columns["t_ns"][row] = t_mono_ns + self._anchor.offset_ns
+        columns["padc"][row] = scan.padc
+        columns["tadc"][row] = scan.tadc
+        columns["sample_offset_us"][row] = [
+            (stop_ns - first_stop_ns) // 1000 for stop_ns in scan.convert_stop_ns
+        ]
+        columns["servo_counts"][row] = servo_counts
+        columns["servo_age_us"][row] = servo_age_us
+        columns["status"][row] = scan.status
+        columns["frame_status"][row] = frame_status
+        columns["reference_force_n"][row] = (
+            np.nan if self._reference is None else self._reference.force_n(t_mono_ns)
+        )
+        self._next_seq += 1
+
+    def _batch(self, columns: dict[str, np.ndarray], rows: int) -> FrameBatch:
+        batch = FrameBatch(**{name: column[:rows] for name, column in columns.items()})
+        self._flag_over_range(batch)
+        return batch
+
+    def _flag_over_range(self, batch: FrameBatch) -> None:
+        # Raw counts are kept as read. A part pressed past its range falls through zero and comes
+        # back near full count (hardware.md 1.3), so both ends are out of range.
+        kpa = compensate_kpa(batch.padc, batch.tadc, self._a0, self._b1, self._b2, self._c12)
+        outside = (kpa > PRESSURE_MAX_KPA) | (kpa < PRESSURE_MIN_KPA) | (batch.padc <= 1)
+        readable = (batch.padc != NOT_READ) & ((batch.status & TileStatus.UNUSABLE) == 0)
+        batch.status[outside & readable] |= np.uint8(TileStatus.OVER_RANGE)

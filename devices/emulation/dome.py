@@ -1,0 +1,247 @@
+"""The dome: contact force in, gas pressure on the chip out.
+
+Order of the chain (hardware.md 9): contact force -> creep of the rubber -> hysteresis -> volume of
+the bubble -> gas temperature -> absolute pressure. The gas is heat conduction in a sphere with an
+isothermal wall, eight modes; the rubber three Prony terms and four play operators. None of these
+equations or numbers is the estimator's.
+
+Everything is computed ahead of the bus in blocks of time on a fine grid, for all domes at once, and
+interpolated where a chip samples: the physics does not know who asks, or when.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from devices.emulation.parts import DomePart, random_of
+from devices.scene import EmulationScene
+
+Floats = npt.NDArray[np.float64]
+
+GRID_S = 0.0005
+"""Between grid points pressure is taken as linear: in a tap of 20 ms that is off by 0.01 kPa."""
+_BLOCK = 2000
+
+_KELVIN = 273.15
+_KAPPA = 0.4 / 1.4  # (gamma - 1) / gamma of air
+_MODES = np.arange(1, 9)
+_MODE_WEIGHTS = 6.0 / (np.pi * _MODES) ** 2  # of the mean temperature of a heated sphere
+_PLAY_WIDTHS_N = np.array([0.5, 1.0, 2.0, 4.0])
+_UNLOADED_N = 0.05
+_PICARD_LIMIT = 40
+_PICARD_TOLERANCE_K = 1e-6  # 3e-7 kPa
+
+
+class Load(Protocol):
+    """What presses on the domes."""
+
+    def forces_n(self, t_s: Floats) -> Floats:
+        """Force on each dome along its axis, shape (len(t_s), domes), never negative."""
+
+
+class Surroundings:
+    """Temperature and hydrostatic pressure around the domes, and how chip and gas follow.
+
+    One step of each, as the scene says; closed forms of one and two first-order lags.
+    """
+
+    def __init__(self, scene: EmulationScene) -> None:
+        self._scene = scene
+
+    @property
+    def steady(self) -> bool:
+        """Does the temperature never change?"""
+        return self._scene.temperature_step_k == 0.0
+
+    def chip_degc(self, t_s: float, lag_s: float) -> float:
+        """Temperature of a chip that follows the surroundings with one lag."""
+        scene = self._scene
+        since = max(t_s - scene.temperature_step_s, 0.0)
+        return scene.ambient_degc - scene.temperature_step_k * math.expm1(-since / lag_s)
+
+    def gas_wall_degc(self, t_s: Floats, chip_lag_s: float, gas_lag_s: float) -> Floats:
+        """Temperature of the bubble's wall, which follows the chip with a second lag."""
+        scene, a, b = self._scene, chip_lag_s, gas_lag_s
+        since = np.maximum(t_s - scene.temperature_step_s, 0.0)
+        arrived = 1 - (a * np.exp(-since / a) - b * np.exp(-since / b)) / (a - b)
+        return np.asarray(scene.ambient_degc + scene.temperature_step_k * arrived)
+
+    def head_kpa(self, t_s: Floats) -> Floats:
+        """Pressure around the dome above the atmosphere's."""
+        return np.where(t_s >= self._scene.head_s, self._scene.head_kpa, 0.0)
+
+
+class Domes:
+    """All domes of a foot under one load, integrated forward in blocks."""
+
+    def __init__(
+        self,
+        parts: Sequence[DomePart],
+        serials: Sequence[str],
+        load: Load,
+        scene: EmulationScene,
+        surroundings: Surroundings,
+        label: str,
+    ) -> None:
+        self._parts = parts
+        self._load = load
+        self._scene = scene
+        self._surroundings = surroundings
+        n = len(parts)
+        self._seal_kpa = np.array([part.seal_kpa for part in parts])
+        self._wall = np.array([part.wall_per_kpa for part in parts])
+        self._knee_n = np.array([part.knee_n for part in parts])
+        self._stiffening = np.array([part.stiffening for part in parts])
+        self._seal_k = scene.ambient_degc + _KELVIN
+        self._loading_rngs = [random_of(f"loading/{label}/{serial}") for serial in serials]
+
+        self._creep = np.zeros((n, 3))
+        self._play_n = np.zeros((n, len(_PLAY_WIDTHS_N)))
+        self._loading_gain = np.ones(n)
+        self._last_force_n = np.zeros(n)
+        self._mode_k = np.zeros((n, len(_MODES)))
+        self._last_ln_p = np.log(self._seal_kpa)
+
+        self._next = 0  # grid index of the first point that is not computed
+        self._first = 0  # grid index of the first point that is kept
+        self._kpa: list[list[float]] = []
+        self._extend()
+
+    def pressure_kpa(self, dome: int, t_s: float) -> float:
+        """Absolute gas pressure of one dome. Times may not go back by more than a block.
+
+        Raises:
+            ValueError: `t_s` lies before what is still kept.
+        """
+        position = t_s / GRID_S
+        index = int(position)
+        while index + 1 >= self._next:
+            self._extend()
+        row = index - self._first
+        if row < 0:
+            raise ValueError(f"dome pressure at {t_s} s was asked for too late")
+        low, high = self._kpa[row][dome], self._kpa[row + 1][dome]
+        return low + (position - index) * (high - low)
+
+    def _extend(self) -> None:
+        """Compute one more block; keep it and the one before."""
+        t_s: Floats = GRID_S * np.arange(self._next, self._next + _BLOCK, dtype=np.float64)
+        force_n = self._load.forces_n(t_s)
+        felt_n = self._hysteresis(self._creeping(force_n))
+        lost = self._stiffening * np.log1p(felt_n / self._knee_n) * self._loading_gains(force_n)
+        kpa = self._gas(t_s, 1.0 - lost)
+        self._last_force_n = force_n[-1]
+        kept = self._kpa[-_BLOCK:]
+        self._first = self._next - len(kept)
+        self._kpa = kept + kpa.tolist()
+        self._next += _BLOCK
+
+    def _creeping(self, force_n: Floats) -> Floats:
+        """Creep: part of the force is felt only after each term's time; statically all of it is."""
+        if not self._scene.rubber:
+            return force_n
+        felt = force_n.copy()
+        for dome, part in enumerate(self._parts):
+            f = np.concatenate([[self._last_force_n[dome]], force_n[:, dome]])
+            for term, (share, tau_s) in enumerate(zip(part.creep_parts, part.creep_s, strict=True)):
+                decay = np.exp(-GRID_S / tau_s)
+                mean = (1 - decay) * tau_s / GRID_S
+                # Exact for a force that is linear between grid points.
+                drive = (mean - decay) * f[:-1] + (1 - mean) * f[1:]
+                slow, _ = lfilter([1], [1, -decay], drive, zi=[decay * self._creep[dome, term]])
+                self._creep[dome, term] = slow[-1]
+                felt[:, dome] += share * (slow - f[1:])
+        return np.maximum(felt, 0.0)
+
+    def _hysteresis(self, force_n: Floats) -> Floats:
+        """Generalised play: each operator lags between two branches that meet at zero load."""
+        if not self._scene.hysteresis:
+            return force_n
+        f = force_n[:, :, None]
+        half_n = _PLAY_WIDTHS_N * -np.expm1(-f / (3 * _PLAY_WIDTHS_N))
+        low, high = f - half_n, f + half_n
+        played = np.empty_like(low)
+        y = self._play_n
+        for k in range(len(f)):
+            y = np.minimum(np.maximum(y, low[k]), high[k])
+            played[k] = y
+        self._play_n = y
+        loop_n = np.array([part.loop_n for part in self._parts])
+        weight = loop_n / _PLAY_WIDTHS_N.sum()
+        return np.asarray(force_n + weight * (played - f).sum(axis=2))
+
+    def _loading_gains(self, force_n: Floats) -> Floats:
+        """A gain of its own for every loading, drawn when the dome is touched."""
+        gains = np.ones_like(force_n)
+        if self._scene.repeatability == 0.0:
+            return gains
+        for dome in range(force_n.shape[1]):
+            f = np.concatenate([[self._last_force_n[dome]], force_n[:, dome]])
+            touched = np.flatnonzero((f[:-1] <= _UNLOADED_N) & (f[1:] > _UNLOADED_N))
+            start = 0
+            for index in touched.tolist():
+                gains[start:index, dome] = self._loading_gain[dome]
+                draw = self._loading_rngs[dome].standard_normal()
+                self._loading_gain[dome] = 1.0 + self._scene.repeatability * draw
+                start = index
+            gains[start:, dome] = self._loading_gain[dome]
+        return gains
+
+    def _gas(self, t_s: Floats, volume: Floats) -> Floats:
+        """Pressure of the sealed gas at a given relative volume of the unstretched bubble.
+
+        Mean gas temperature T = wall + sum of modes; mode n is driven by kappa T d(ln p) times its
+        weight and decays with conduction_s / n^2. The wall yields to the pressure difference over
+        it. Pressure and temperature depend on each other: Picard iteration over the block, which
+        contracts by less than kappa.
+        """
+        wall_k = np.stack(
+            [
+                self._surroundings.gas_wall_degc(t_s, part.chip_lag_s, part.gas_lag_s) + _KELVIN
+                for part in self._parts
+            ],
+            axis=1,
+        )
+        head_kpa = self._surroundings.head_kpa(t_s)[:, None]
+        excess_k = np.zeros_like(wall_k)
+        kpa = self._pressure(wall_k, volume, head_kpa)
+        if not self._scene.gas:
+            return kpa
+        decay = np.exp(
+            -GRID_S * _MODES**2 / np.array([part.conduction_s for part in self._parts])[:, None]
+        )
+        gain = _MODE_WEIGHTS * (1 - decay) / -np.log(decay)
+        for _ in range(_PICARD_LIMIT):
+            ln_p = np.concatenate([self._last_ln_p[None], np.log(kpa)])
+            drive = _KAPPA * (wall_k + excess_k) * np.diff(ln_p, axis=0)
+            modes_k = np.empty((*drive.shape, len(_MODES)))
+            for dome in range(drive.shape[1]):
+                for m in range(len(_MODES)):
+                    modes_k[:, dome, m], _ = lfilter(
+                        [gain[dome, m]],
+                        [1, -decay[dome, m]],
+                        drive[:, dome],
+                        zi=[decay[dome, m] * self._mode_k[dome, m]],
+                    )
+            new_k = modes_k.sum(axis=2)
+            change_k = np.abs(new_k - excess_k).max()
+            excess_k = new_k
+            kpa = self._pressure(wall_k + excess_k, volume, head_kpa)
+            if change_k < _PICARD_TOLERANCE_K:
+                break
+        self._mode_k = modes_k[-1]
+        self._last_ln_p = np.log(kpa[-1])
+        return kpa
+
+    def _pressure(self, gas_k: Floats, volume: Floats, head_kpa: Floats) -> Floats:
+        """Solve p volume (1 + c (p - seal - head)) = seal T / T_seal for p."""
+        c = self._wall
+        linear = 1.0 - c * (self._seal_kpa + head_kpa)
+        right = self._seal_kpa * gas_k / (self._seal_k * volume)
+        return np.asarray(2 * right / (linear + np.sqrt(linear**2 + 4 * c * right)))

@@ -1,0 +1,197 @@
+"""A recorded load, and how it is pressed on an array of tiles.
+
+A trace gives either a force per tile, or a total force with its centre of pressure. In the second
+case, among the non-negative tile forces with this sum and moment the one with the least sum of
+squares is pressed. Ground truth is what was pressed, so every change made here is counted.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import nnls
+
+from devices.errors import LoadTraceError, UsageError
+
+Floats = npt.NDArray[np.float64]
+
+FORCE_LIMIT_N = 60.0
+"""Twice what a tile is made for (paper III-A: 25 to 35 N); more is not pressed on it."""
+
+TOUCH_S = 0.010
+"""A trace that begins or ends under load is entered and left in this time."""
+
+_COP_NEEDED_FROM = 0.01  # of the greatest force: below it a centre of pressure may be missing
+_EXACT = 1e4  # weight of sum and moment against the squares: they hold to 1e-8
+_MOVED_M = 1e-6
+
+
+@dataclass(frozen=True)
+class LoadTrace:
+    """A recorded load; all arrays have time as the first axis.
+
+    Attributes:
+        where: name of the file, for messages.
+        time_s: strictly increasing.
+        cells_n: (n, cells), force per tile; None if the trace has a total force.
+        fz_n: (n,), total force; None if the trace has cells for the array.
+        cop_m: (n, 2), its centre of pressure in the trace's own axes; NaN where undefined.
+        angle_rad: (n,), segment angle; None if not recorded.
+    """
+
+    where: str
+    time_s: Floats
+    cells_n: Floats | None
+    fz_n: Floats | None
+    cop_m: Floats | None
+    angle_rad: Floats | None
+
+
+@dataclass(frozen=True)
+class CopTransform:
+    """COP used = `scale` * (cop - c0) + `offset_m`, c0 being the trace's force-weighted mean COP.
+
+    `axes` says which axis of the trace becomes x and which y of the foot, with sign: "xy", "-yx".
+    """
+
+    scale: float = 1.0
+    offset_m: tuple[float, float] = (0.0, 0.0)
+    axes: str = "xy"
+
+    def matrix(self) -> Floats:
+        """Rows: foot x and y; columns: trace x and y.
+
+        Raises:
+            UsageError: `axes` is not two different axes with optional signs.
+        """
+        match = re.fullmatch(r"([+-]?)([xy])([+-]?)([xy])", self.axes)
+        if match is None or match[2] == match[4]:
+            raise UsageError(
+                f"--cop-axes {self.axes!r} names no two axes",
+                expected="xy, yx, or one of these with signs such as -yx",
+            )
+        rows = np.zeros((2, 2))
+        for row, (sign, axis) in enumerate(((match[1], match[2]), (match[3], match[4]))):
+            rows[row, "xy".index(axis)] = -1.0 if sign == "-" else 1.0
+        return rows
+
+
+@dataclass(frozen=True)
+class PressedTrace:
+    """Tile forces over time as they are pressed, and what had to be changed to press them."""
+
+    time_s: Floats
+    forces_n: Floats
+    angle_rad: Floats | None
+    moved_to_edge: int
+    """Samples whose centre of pressure lay outside the tiles' hull and was moved to its edge."""
+    limited: int
+    """Samples in which a tile would have borne more than `FORCE_LIMIT_N`."""
+
+
+def press(
+    trace: LoadTrace,
+    positions_m: Floats,
+    bears: npt.NDArray[np.bool_],
+    *,
+    load_scale: float,
+    cop: CopTransform,
+    lead_s: float,
+) -> PressedTrace:
+    """Turn a trace into forces on tiles, beginning at `lead_s`.
+
+    Args:
+        trace: the recorded load.
+        positions_m: (tiles, 2), where the tiles are.
+        bears: (tiles,), False for bare reference tiles, which get no force.
+        load_scale: factor on every force.
+        cop: how the trace's centre of pressure becomes the foot's.
+        lead_s: seconds without load before it.
+
+    Raises:
+        LoadTraceError: the trace fits neither the number of tiles nor has force and COP.
+        UsageError: the COP transform is malformed.
+    """
+    if trace.cells_n is not None:
+        borne_n, moved = trace.cells_n * load_scale, 0
+        if borne_n.shape[1] != bears.sum():
+            raise LoadTraceError(
+                f"the trace has {borne_n.shape[1]} cell columns, the array has "
+                f"{bears.sum()} tiles that bear load",
+                where=trace.where,
+                remedy="Choose a scene with as many tiles, or remove the cell columns",
+            )
+    else:
+        borne_n, moved = _share(trace, positions_m[bears], load_scale, cop)
+    limited = int((borne_n > FORCE_LIMIT_N).any(axis=1).sum())
+    forces_n = np.zeros((len(borne_n), len(positions_m)))
+    forces_n[:, bears] = np.clip(borne_n, 0.0, FORCE_LIMIT_N)
+
+    begin_s = lead_s + TOUCH_S
+    time_s = trace.time_s - trace.time_s[0] + begin_s
+    rest = np.zeros((1, forces_n.shape[1]))
+    return PressedTrace(
+        time_s=np.concatenate([[lead_s], time_s, [time_s[-1] + TOUCH_S]]),
+        forces_n=np.concatenate([rest, forces_n, rest]),
+        angle_rad=None
+        if trace.angle_rad is None
+        else np.pad(trace.angle_rad, 1, mode="edge").astype(np.float64),
+        moved_to_edge=moved,
+        limited=limited,
+    )
+
+
+def _share(
+    trace: LoadTrace, positions_m: Floats, load_scale: float, cop: CopTransform
+) -> tuple[Floats, int]:
+    if trace.fz_n is None or trace.cop_m is None:
+        raise LoadTraceError(
+            "no load in the trace",
+            where=trace.where,
+            expected="fz_n with cop_x_m and cop_y_m, or one cellN_n column per tile",
+        )
+    fz_n = np.maximum(trace.fz_n, 0.0)
+    defined = ~np.isnan(trace.cop_m[:, 0] + trace.cop_m[:, 1])
+    missing = ~defined & (np.abs(trace.fz_n) > _COP_NEEDED_FROM * np.abs(trace.fz_n).max())
+    if missing.any():
+        row = int(np.flatnonzero(missing)[0])
+        raise LoadTraceError(
+            f"row {row + 1} has {trace.fz_n[row]:g} N but no centre of pressure",
+            where=trace.where,
+            expected="cop_x_m and cop_y_m wherever the load is above 1 % of its maximum",
+        )
+    weight = np.where(defined, fz_n, 0.0)
+    if weight.sum() == 0.0:
+        raise LoadTraceError("the trace never loads the foot", where=trace.where)
+    centre_m = (weight[:, None] * np.where(defined[:, None], trace.cop_m, 0.0)).sum(
+        0
+    ) / weight.sum()
+    cop_m = np.where(defined[:, None], trace.cop_m - centre_m, 0.0)
+    wanted_m = cop.scale * cop_m @ cop.matrix().T + np.array(cop.offset_m)
+
+    # A line array knows one axis only; the other one is dropped.
+    axes = np.ptp(positions_m, axis=0) > 1e-9
+    shares = np.zeros((len(fz_n), len(positions_m)))
+    moved = 0
+    for row in np.flatnonzero(fz_n > 0.0).tolist():
+        shares[row], was_moved = _least_squares_shares(positions_m[:, axes], wanted_m[row, axes])
+        moved += was_moved
+    return shares * (fz_n * load_scale)[:, None], moved
+
+
+def _least_squares_shares(positions_m: Floats, cop_m: Floats) -> tuple[Floats, bool]:
+    """Non-negative shares of sum one with their centroid at `cop_m` or nearest to it."""
+    tiles, axes = positions_m.shape
+    scale_m = np.abs(positions_m).max() if axes else 1.0
+    rows = np.vstack([np.ones(tiles), positions_m.T / scale_m])
+    nearest, _ = nnls(np.vstack([_EXACT * rows[:1], rows[1:]]), np.append(_EXACT, cop_m / scale_m))
+    reachable_m = positions_m.T @ nearest
+    moved = bool(np.any(np.abs(reachable_m - cop_m) > _MOVED_M))
+    shares, _ = nnls(
+        np.vstack([_EXACT * rows, np.eye(tiles)]),
+        np.concatenate([_EXACT * np.append(1.0, reachable_m / scale_m), np.zeros(tiles)]),
+    )
+    return shares, moved

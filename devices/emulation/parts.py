@@ -1,0 +1,97 @@
+"""What each emulated part is like, drawn once and for ever from its serial.
+
+Two tiles of one serial are the same tile in every scene and session; `parts_seed` is another shelf
+of parts. Nothing here may be read by a driver or an estimator: they learn what crosses the bus, and
+what a bench recording shows.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from devices.mpl115a2 import CONVERSION_MAX_NS, Coefficients, padc_of_kpa
+
+
+@dataclass(frozen=True)
+class ChipPart:
+    """One MPL115A2 (hardware.md 1.3, 1.4, 1.6)."""
+
+    coefficients: Coefficients
+    conversion_ns: int
+    tadc_at_25_degc: float
+
+
+@dataclass(frozen=True)
+class DomePart:
+    """One polyurethane dome with its bubble (hardware.md 9).
+
+    Static curve: the bubble loses the part `stiffening * ln(1 + F / knee_n)` of its volume under a
+    slow force F; concave, without a limit, and no polynomial.
+    """
+
+    seal_kpa: float
+    """Gas pressure unloaded at the sealing temperature."""
+    knee_n: float
+    stiffening: float
+    wall_per_kpa: float
+    """Volume change per kPa of pressure difference over the wall, relative."""
+    conduction_s: float
+    """r^2 / (pi^2 a): slowest mode of heat conduction in the bubble at constant pressure."""
+    gas_lag_s: float
+    """How long the gas follows its chip's temperature."""
+    chip_lag_s: float
+    """How long the chip follows the surroundings."""
+    creep_parts: tuple[float, float, float]
+    creep_s: tuple[float, float, float]
+    loop_n: float
+    """Half width of the hysteresis loop at full load, in newtons."""
+
+
+def draw_chip(serial: str, parts_seed: int) -> ChipPart:
+    """The chip of a serial. Ranges bracket the three parts whose coefficients are published."""
+    rng = _rng("chip", serial, parts_seed)
+    while True:
+        drawn = Coefficients(
+            a0=rng.uniform(1700, 2200),
+            b1=rng.uniform(-2.5, -1.9),
+            b2=rng.uniform(-1.0, -0.85),
+            c12=rng.uniform(0.00065, 0.00088),
+        )
+        coefficients = Coefficients.from_words(drawn.to_words())
+        if 250 <= float(padc_of_kpa(100.0, 500, coefficients)) <= 500:
+            break
+    return ChipPart(
+        coefficients=coefficients,
+        conversion_ns=min(CONVERSION_MAX_NS, round(rng.uniform(1.4e6, 2.0e6))),
+        tadc_at_25_degc=rng.uniform(472, 498),  # two published scales, 26 counts apart
+    )
+
+
+def draw_dome(serial: str, parts_seed: int) -> DomePart:
+    """The dome of a serial: an 11 mm Vytaflex 60 dome, give or take what casting does."""
+    rng = _rng("dome", serial, parts_seed)
+    return DomePart(
+        seal_kpa=rng.uniform(98.0, 102.5),
+        knee_n=rng.uniform(8.0, 13.0),
+        stiffening=rng.uniform(0.078, 0.092),
+        wall_per_kpa=rng.uniform(0.0010, 0.0015),
+        conduction_s=float(np.exp(rng.uniform(np.log(0.008), np.log(0.042)))),
+        gas_lag_s=rng.uniform(2.0, 6.0),
+        chip_lag_s=rng.uniform(0.8, 2.0),
+        creep_parts=(rng.uniform(0.02, 0.04), rng.uniform(0.02, 0.04), rng.uniform(0.02, 0.04)),
+        creep_s=(rng.uniform(0.02, 0.06), rng.uniform(0.2, 0.5), rng.uniform(1.5, 4.0)),
+        loop_n=rng.uniform(0.35, 0.55),  # 3 % of 30 N from branch to branch
+    )
+
+
+def _rng(what: str, serial: str, parts_seed: int) -> np.random.Generator:
+    return random_of(f"{what}/{parts_seed}/{serial}")
+
+
+def random_of(label: str) -> np.random.Generator:
+    """A random generator that depends on `label` alone, on every machine the same."""
+    digest = hashlib.sha256(label.encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:16], "big"))

@@ -1,0 +1,156 @@
+"""Every error FootTile raises on purpose.
+
+    FootTileError
+     +-- SceneError            (ValueError)    a scene file is wrong; exit code 2
+     +-- UsageError            (ValueError)    a command's options do not fit together; exit code 2
+     +-- LoadTraceError        (ValueError)    a load trace cannot be pressed on the tiles
+     +-- I2cError              (OSError)
+     |    +-- NoAcknowledgeError               nobody answered at an address
+     |    +-- BusFaultError                    the bus itself failed: time-out, arbitration, reset
+     |    +-- BusMisuseError                   the adapter cannot do what we asked: our bug
+     |    +-- BusSetupError                    no such bus, no permission
+     +-- TileSetupError                        a tile's coefficients are absent or implausible
+     +-- ServoError
+     |    +-- ServoSetupError                  no such serial port
+     |    +-- ServoTimeoutError (TimeoutError) a servo did not answer in time
+     |    +-- ServoPacketError  (ValueError)   bytes that are no valid packet
+     |    +-- ServoStatusError                 the servo answered with an error number
+     +-- FileFormatError       (ValueError)    a file is not what it should be
+     +-- CalibrationError      (ValueError)    a calibration is absent, unphysical or does not fit
+     +-- TareError             (ValueError)    no interval to tare on
+
+Every error keeps its facts: `what` happened, `where`, what was `expected`, and the `remedy`. Those
+that a stranger would catch by a built-in type are that type too. In a running stream a fault is a
+status bit and a NaN (see `devices.frames`); these errors stop a command, never a stream.
+"""
+
+from __future__ import annotations
+
+
+class FootTileError(Exception):
+    """Base of all errors; composes its text from the facts it keeps.
+
+    `exit_code` is what the command line returns for it (design: 1 failed, 2 usage).
+    """
+
+    exit_code = 1
+
+    def __init__(self, what: str, *, where: str = "", expected: str = "", remedy: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.where = where
+        self.expected = expected
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        text = f"{self.where}: {self.what}" if self.where else self.what
+        if self.expected:
+            text += f"; expected {self.expected}"
+        if self.remedy:
+            text += f". {self.remedy}"
+        return text
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Keyword-only facts must survive pickling between processes.
+        return (_rebuild, (type(self), self.facts()))
+
+    def facts(self) -> dict[str, object]:
+        """The facts of this error by name."""
+        return {
+            "what": self.what,
+            "where": self.where,
+            "expected": self.expected,
+            "remedy": self.remedy,
+        }
+
+
+def _rebuild(kind: type[FootTileError], facts: dict[str, str]) -> FootTileError:
+    return kind(facts.pop("what"), **facts)
+
+
+class SceneError(FootTileError, ValueError):
+    """A scene file is unreadable, has an unknown key, a wrong type or contradicts itself."""
+
+    exit_code = 2
+
+
+class UsageError(FootTileError, ValueError):
+    """Options of a command do not fit together or name something that is not there."""
+
+    exit_code = 2
+
+
+class LoadTraceError(FootTileError, ValueError):
+    """A load trace is unreadable or cannot be pressed on this array."""
+
+
+class I2cError(FootTileError, OSError):
+    """A transfer on the I2C bus failed; `errno` is the adapter's (hardware.md 3.2, 3.3)."""
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        expected: str = "",
+        remedy: str = "",
+        errno: int | None = None,
+    ) -> None:
+        super().__init__(what, where=where, expected=expected, remedy=remedy)
+        self.errno = errno
+
+    def facts(self) -> dict[str, object]:
+        """The facts of this error by name, errno among them."""
+        return super().facts() | {"errno": self.errno}
+
+
+class NoAcknowledgeError(I2cError):
+    """Address or data was not acknowledged (EREMOTEIO on a Pi, ENXIO on i2c-gpio)."""
+
+
+class BusFaultError(I2cError):
+    """The bus failed, not one device: ETIMEDOUT, EAGAIN (arbitration), EBUSY, EIO."""
+
+
+class BusMisuseError(I2cError):
+    """The adapter refused the shape of the transfer (EINVAL, EOPNOTSUPP): a bug in the driver."""
+
+
+class BusSetupError(I2cError):
+    """The bus cannot be opened: ENOENT, ENODEV, EACCES."""
+
+
+class TileSetupError(FootTileError):
+    """A tile does not answer at start-up, or its coefficients are no MPL115A2's."""
+
+
+class ServoError(FootTileError):
+    """Base of the servo's errors."""
+
+
+class ServoSetupError(ServoError):
+    """The servo's serial port cannot be opened."""
+
+
+class ServoTimeoutError(ServoError, TimeoutError):
+    """The servo did not answer in time."""
+
+
+class ServoPacketError(ServoError, ValueError):
+    """Bytes on the line are no valid packet: header, length or CRC."""
+
+
+class ServoStatusError(ServoError):
+    """The servo answered with an error number in its status packet."""
+
+
+class FileFormatError(FootTileError, ValueError):
+    """A file is absent, unreadable, or not of the kind the command needs."""
+
+
+class CalibrationError(FootTileError, ValueError):
+    """A calibration is absent, unphysical, or does not cover the tiles it is asked for."""
+
+
+class TareError(FootTileError, ValueError):
+    """No unloaded interval to tare on."""

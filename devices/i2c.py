@@ -1,0 +1,133 @@
+"""The I2C bus as the drivers see it: one call, `transfer`, and errors that say whose fault it was.
+
+A bus sits on an adapter that takes smbus2 `i2c_msg` objects and raises bare `OSError` with the
+kernel's errno: on a Raspberry Pi that is `smbus2.SMBus`, in an emulation the register-level
+model behind the same method. Classification of the errno (hardware.md 3.2 to 3.4) is this side of
+the seam, so the emulation exercises it too.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+from typing import Protocol
+
+from smbus2 import SMBus, i2c_msg
+
+from devices.errors import (
+    BusFaultError,
+    BusMisuseError,
+    BusSetupError,
+    I2cError,
+    NoAcknowledgeError,
+    UsageError,
+)
+
+__all__ = ["I2cAdapter", "I2cBus", "i2c_msg", "open_bus"]
+
+# include/uapi/linux/i2c-dev.h: adapter time-out in units of 10 ms, sticky. The core's default of
+# about 1 s would stall the loop for hundreds of frames on one wedged transfer.
+I2C_TIMEOUT = 0x0702
+TIMEOUT_10MS = 3
+
+_NACK = {errno.ENXIO, errno.EREMOTEIO}
+_BUS = {errno.EIO, errno.ETIMEDOUT, errno.EAGAIN, errno.EBUSY}
+_MISUSE = {errno.EINVAL, errno.EOPNOTSUPP}
+
+
+class I2cAdapter(Protocol):
+    """What is beneath a bus: `smbus2.SMBus`, or an emulated adapter."""
+
+    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
+        """One I2C_RDWR transaction: START, repeated STARTs between messages, one STOP."""
+
+    def close(self) -> None:
+        """Release the adapter."""
+
+
+class I2cBus:
+    """One I2C bus.
+
+    Not thread-safe: one thread owns a bus (smbus2's advice), because a mux selection and the access
+    behind it are two transactions that nothing may come between.
+    """
+
+    def __init__(self, adapter: I2cAdapter, name: str) -> None:
+        self.name = name
+        self._adapter = adapter
+        self._i2c_rdwr = adapter.i2c_rdwr
+
+    def transfer(self, *messages: i2c_msg) -> None:
+        """Run `messages` as one transaction; read messages are filled in place.
+
+        Raises:
+            NoAcknowledgeError: nobody acknowledged an address or a byte.
+            BusFaultError: time-out, lost arbitration, or an unspecified I/O error.
+            BusMisuseError: the adapter cannot do this sequence (a bug in the driver).
+            BusSetupError: the bus went away or may not be used.
+        """
+        try:
+            self._i2c_rdwr(*messages)
+        except OSError as error:
+            raise _classified(error, self.name, messages) from error
+
+    def close(self) -> None:
+        """Close the adapter."""
+        self._adapter.close()
+
+
+def _classified(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cError:
+    number = error.errno
+    where = f"{bus}, address 0x{messages[-1].addr:02x}" if messages else bus
+    name = errno.errorcode.get(number, str(number)) if number is not None else str(error)
+    if number in _NACK:
+        return NoAcknowledgeError(
+            f"no acknowledge ({name})",
+            where=where,
+            remedy="Check the plug, the supply and the mux channel",
+            errno=number,
+        )
+    if number in _BUS:
+        return BusFaultError(
+            f"the bus failed ({name})",
+            where=where,
+            remedy="Check that SDA and SCL are high when idle; if not, reset mux and tile supply",
+            errno=number,
+        )
+    if number in _MISUSE:
+        return BusMisuseError(
+            f"the adapter refused the transfer ({name})",
+            where=where,
+            expected="at most 42 messages, of which one read message, and it last",
+            errno=number,
+        )
+    return BusSetupError(
+        f"the bus cannot be used ({name})",
+        where=where,
+        remedy="Check that the device exists, that I2C is enabled (dtparam=i2c_arm=on) and that "
+        "this user is in the group i2c",
+        errno=number,
+    )
+
+
+def open_bus(name: str, emulated: I2cAdapter | None = None) -> I2cBus:
+    """Open the bus `name`: a device such as `/dev/i2c-1`, or `"emulated"`.
+
+    An emulated adapter has to be handed in: the world behind it is made by whoever runs it.
+
+    Raises:
+        BusSetupError: the device is missing or may not be opened.
+        UsageError: `"emulated"` without an emulated adapter.
+    """
+    if name == "emulated":
+        if emulated is None:
+            raise UsageError("bus 'emulated' needs an emulated world, and none was given")
+        return I2cBus(emulated, name)
+    try:
+        adapter = SMBus(name)
+    except OSError as error:
+        raise _classified(error, name, ()) from error
+    if adapter.fd is not None:
+        # smbus2 has no call of its own for it.
+        fcntl.ioctl(adapter.fd, I2C_TIMEOUT, TIMEOUT_10MS)
+    return I2cBus(adapter, name)

@@ -1,0 +1,277 @@
+"""Scene files: which tiles hang where, what the ground does, and what the estimate needs.
+
+A scene is TOML. Every key is listed here with its unit and default; an unknown key, a wrong type
+or a contradiction is a `SceneError` that names the key and the remedy. Built-in scenes are files of
+the same form in `devices/scenes/`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from devices.errors import SceneError
+from devices.tca9548a import ADDRESSES, CHANNELS
+
+ScheduleName = Literal["simultaneous", "sequential"]
+ReadDuringConversion = Literal["stale", "abort", "torn"]
+FaultKind = Literal["no_answer", "stale"]
+
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Position = Annotated[float, Field(gt=-1.0, lt=1.0)]  # a tile 50 m away was meant in millimetres
+
+
+class _Section(BaseModel):
+    # Strict: "4" is not 4, and 1 is not true. Only int to float is let through, as in TOML itself.
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class ArrayScene(_Section):
+    """`[array]`: the bus and how it is asked."""
+
+    bus: str = "emulated"
+    """A device such as /dev/i2c-1, or "emulated"."""
+    scl_hz: _Positive = 400_000.0
+    """Bus clock of the emulation; on hardware it is set in config.txt."""
+    schedule: ScheduleName = "simultaneous"
+    wait_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 3.0
+    """How long the driver waits for a conversion. The default is the data sheet's maximum; shorter
+    only where the parts are known to be faster, else results are stale."""
+    conversion_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """Emulation only: conversion time of every part. Absent: drawn for each part."""
+
+
+class TileScene(_Section):
+    """`[[tile]]`: one tile, where it is plugged in and where it sits in the foot frame."""
+
+    serial: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9._-]+$")]
+    mux: int
+    channel: int
+    x_m: _Position
+    y_m: _Position
+    z_m: _Position
+    reference: bool = False
+    """A bare tile that measures the surroundings: it bears no load and is in no sum."""
+
+    @field_validator("mux")
+    @classmethod
+    def _mux_exists(cls, mux: int) -> int:
+        if mux not in ADDRESSES:
+            raise ValueError(f"0x{mux:02x} is no TCA9548A address, which are 0x70 to 0x77")
+        return mux
+
+    @field_validator("channel")
+    @classmethod
+    def _channel_exists(cls, channel: int) -> int:
+        if channel not in CHANNELS:
+            raise ValueError(f"{channel} is no channel of a TCA9548A, which are 0 to 7")
+        return channel
+
+
+class ServoScene(_Section):
+    """`[servo]`: the Dynamixel whose position goes with the frames."""
+
+    port: str = "emulated"
+    """A device such as /dev/ttyUSB0, or "emulated"."""
+    model: Literal["MX-28", "MX-64"] = "MX-64"
+    protocol: Literal[2] = 2
+    id: Annotated[int, Field(ge=0, le=252)] = 1
+    baudrate: Annotated[int, Field(gt=0)] = 1_000_000
+    rate_hz: _Positive = 100.0
+    """How often the position is read."""
+    sign: Literal[-1, 1] = 1
+    zero_counts: int = 2048
+    ratio: _Number = 1.0
+    """Turns of the segment per turn of the servo."""
+    ankle_travel_m_per_rad: _Number | None = None
+    """Forward travel of the ankle per radian of the segment; absent: not known."""
+
+
+class _Ground(_Section):
+    pass
+
+
+class NoGround(_Ground):
+    """The foot hangs in the air."""
+
+    kind: Literal["none"]
+
+
+class PlateGround(_Ground):
+    """Somebody stands on a plate and sways."""
+
+    kind: Literal["plate"]
+    load_n: _Positive = 40.0
+    sway_m: _NotNegative = 0.006
+    """Amplitude of the centre of pressure's slow sway along the array."""
+
+
+class RollingGround(_Ground):
+    """The paper's rolling rig: a rigid plate passes under the foot's arc at constant speed."""
+
+    kind: Literal["rolling"]
+    load_n: _Positive = 8.92
+    """The paper's leg weighs 0.909 kg."""
+    radius_m: _Positive = 0.150
+    """Radius of the foot's arc (paper II-D)."""
+    speed_m_s: _Positive = 0.02
+    patch_m: _Positive = 0.012
+    """Half length of the contact patch that the domes' compliance makes of the line contact."""
+
+
+class IndentationGround(_Ground):
+    """The mill: each tile in turn is pressed by a spindle against a reference force sensor."""
+
+    kind: Literal["indentation"]
+    load_n: _Positive = 30.0
+    stroke_s: _Positive = 4.0
+    """Duration of one slow loading, and of one unloading."""
+    repeats: Annotated[int, Field(ge=2)] = 4
+    soak_k: _Number = 4.0
+    """Temperature step of the unloaded soak at the end."""
+
+
+class TraceGround(_Ground):
+    """A recorded load, given on the command line with --load."""
+
+    kind: Literal["trace"]
+
+
+GroundScene = Annotated[
+    NoGround | PlateGround | RollingGround | IndentationGround | TraceGround,
+    Field(discriminator="kind"),
+]
+
+
+class EmulationScene(_Section):
+    """`[emulation]`: which effects the emulated domes and chips show. A real node ignores it."""
+
+    noise_kpa: _NotNegative = 0.165
+    """Standard deviation of a single reading in all: core, outliers and rounding."""
+    correlated_ms: _NotNegative = 0.0
+    """Correlation time of the noise's core; 0: white."""
+    repeatability: _NotNegative = 0.0
+    """Standard deviation of the normalised output between loadings (paper III-A: 0.03)."""
+    gas: bool = True
+    """Adiabatic overshoot of fast loads."""
+    rubber: bool = True
+    """Creep of the dome."""
+    hysteresis: bool = True
+    """Rate-independent loop of the dome."""
+    ambient_degc: _Number = 21.0
+    temperature_step_k: _Number = 0.0
+    """A step of the surroundings' temperature ..."""
+    temperature_step_s: _NotNegative = 0.0
+    """... this long after power-up. Chip and gas follow with different delays."""
+    head_kpa: _NotNegative = 0.0
+    """Hydrostatic pressure on the domes ..."""
+    head_s: _NotNegative = 0.0
+    """... from this long after power-up on."""
+    clip_kpa: _NotNegative = 0.0
+    """Analogue clip of the chips; 0: none, they wrap (as real parts do)."""
+    read_during_conversion: ReadDuringConversion = "stale"
+
+
+class FaultScene(_Section):
+    """`[[fault]]`: something fails at `t_s` after power-up, for `duration_s`."""
+
+    kind: FaultKind
+    tile: str
+    t_s: _NotNegative
+    duration_s: _Positive
+
+
+class Scene(_Section):
+    """One scene. See the module's text for what a file looks like."""
+
+    name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9._-]+$")]
+    models: tuple[str, ...] = Field(default=("unwrap", "static"), strict=False)
+    """The models that an estimate of this scene needs, in any order."""
+    rate_hz: _NotNegative = 0.0
+    """Frame rate; 0: as fast as the schedule allows."""
+    calibration: str = "bench"
+    """A calibration file, a preset's name, or "bench": run the emulated bench once."""
+    array: ArrayScene = ArrayScene()
+    tile: Annotated[tuple[TileScene, ...], Field(min_length=1, strict=False)]
+    servo: ServoScene | None = None
+    ground: GroundScene = NoGround(kind="none")
+    emulation: EmulationScene = EmulationScene()
+    fault: tuple[FaultScene, ...] = Field(default=(), strict=False)
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        serials = [tile.serial for tile in self.tile]
+        if twice := _repeated(serials):
+            raise ValueError(f"tile serial {twice!r} appears twice; every tile has its own")
+        plugs = [f"mux 0x{tile.mux:02x} channel {tile.channel}" for tile in self.tile]
+        if twice := _repeated(plugs):
+            raise ValueError(f"{twice} is used by two tiles; plug each into a channel of its own")
+        for fault in self.fault:
+            if fault.tile not in serials:
+                raise ValueError(
+                    f"a fault names tile {fault.tile!r}, but there are only {', '.join(serials)}"
+                )
+        return self
+
+
+def _repeated(values: list[str]) -> str | None:
+    return next((value for value, count in Counter(values).items() if count > 1), None)
+
+
+def builtin_scenes() -> tuple[str, ...]:
+    """Names of the scenes that come with FootTile."""
+    folder = resources.files("devices") / "scenes"
+    return tuple(sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.is_file()))
+
+
+def load_scene(name_or_path: str) -> Scene:
+    """Read a built-in scene by its name, or a scene file by its path.
+
+    Raises:
+        SceneError: no such scene or file, not TOML, an unknown key, a wrong type, a contradiction.
+    """
+    if name_or_path in builtin_scenes():
+        text = (resources.files("devices") / "scenes" / f"{name_or_path}.toml").read_text("utf-8")
+        return parse_scene(text, where=f"scene {name_or_path}")
+    try:
+        text = Path(name_or_path).read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(
+            f"no scene {name_or_path!r}: {error}",
+            expected=f"one of {', '.join(builtin_scenes())}, or the path of a scene file",
+        ) from error
+    return parse_scene(text, where=name_or_path)
+
+
+def parse_scene(text: str, *, where: str) -> Scene:
+    """Build a scene from the text of a scene file; `where` names it in errors.
+
+    Raises:
+        SceneError: as for `load_scene`.
+    """
+    try:
+        return Scene.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"not TOML: {error}", where=where) from error
+    except ValidationError as error:
+        raise SceneError(_first_complaint(error), where=where) from error
+
+
+def _first_complaint(error: ValidationError) -> str:
+    complaint = error.errors()[0]
+    key = ".".join(str(part) for part in complaint["loc"]) or "scene"
+    message = complaint["msg"].removeprefix("Value error, ")
+    if complaint["type"] == "extra_forbidden":
+        return f"unknown key {key!r}. Check its spelling, or remove it"
+    if complaint["type"] == "missing":
+        return f"key {key!r} is missing"
+    if complaint["type"] == "value_error":
+        return f"{key}: {message}"
+    return f"{key} = {complaint['input']!r}: {message}"

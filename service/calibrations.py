@@ -1,0 +1,126 @@
+"""Where a calibration comes from by its name: a preset, a file, or the emulated bench.
+
+The bench presses each tile alone, as a user would on the mill, and fits what was recorded. A serial
+is for ever the same tile, so its result is kept in the user's cache; it is found again by serial,
+parts seed and version, and would come out the same if it were made anew.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from platformdirs import user_cache_path
+
+from devices.errors import CalibrationError
+from devices.scene import Scene, TileScene, load_scene
+from service.calibrate import calibrate
+from service.estimation.calibration import PRESETS, Calibration
+from service.simulate import SimulateOptions, simulate
+from service.version import SOFTWARE
+
+BENCH = "bench"
+BENCH_REFERENCE = "emulated mill, 12 bit over 100 N"
+
+Progress = Callable[[str], None]
+
+
+def find_calibration(
+    name: str,
+    serials: Sequence[str],
+    *,
+    parts_seed: int = 0,
+    cache: Path | None = None,
+    progress: Progress = lambda message: None,
+) -> Calibration:
+    """The calibration called `name`, checked to cover `serials`.
+
+    Args:
+        name: "bench", a preset's name, or the path of a file.
+        serials: tiles that it must cover.
+        parts_seed: which parts the emulated bench presses.
+        cache: where the bench's results are kept; default: the user's cache.
+        progress: told what takes time.
+
+    Raises:
+        CalibrationError: no such calibration, or it lacks a tile.
+    """
+    if name == BENCH:
+        folder = cache if cache is not None else user_cache_path("foottile") / "bench"
+        entries = [_bench_tile(serial, parts_seed, folder, progress) for serial in serials]
+        return Calibration(
+            name=BENCH,
+            reference=BENCH_REFERENCE,
+            date=entries[0].date,
+            tiles=tuple(tile for entry in entries for tile in entry.tiles),
+        )
+    calibration = PRESETS[name]() if name in PRESETS else read_calibration(Path(name))
+    return calibration.restricted_to(serials)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read a calibration file.
+
+    Raises:
+        CalibrationError: there is none, or it is not one.
+    """
+    try:
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(
+            f"no calibration {str(path)!r}: {error}",
+            expected=f"a file, {BENCH!r}, or a preset: {', '.join(PRESETS)}",
+        ) from error
+    return Calibration.from_json(text, where=str(path))
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """Write a calibration file, whole or not at all.
+
+    Raises:
+        OSError: the folder is missing or not writable.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(calibration.to_json())
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) -> Calibration:
+    kept = folder / f"{SOFTWARE.replace(' ', '-')}-parts{parts_seed}-{serial}.json"
+    if kept.exists():
+        try:
+            return read_calibration(kept)
+        except CalibrationError:
+            kept.unlink()  # a damaged cache is no calibration, and no reason to fail
+    progress(f"pressing tile {serial} on the emulated bench")
+    with tempfile.TemporaryDirectory(prefix="foottile-bench-") as work:
+        recording = Path(work) / f"bench-{serial}.parquet"
+        simulate(SimulateOptions(bench_scene(serial), parts_seed=parts_seed), recording, None)
+        calibration = calibrate([recording], name=f"{BENCH}-{serial}", reference=BENCH_REFERENCE)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_calibration(calibration, kept)
+    return calibration
+
+
+def bench_scene(serial: str) -> Scene:
+    """The mill with one tile under it."""
+    return with_tiles(load_scene("indentation"), [serial])
+
+
+def with_tiles(scene: Scene, serials: Sequence[str]) -> Scene:
+    """The same scene with these tiles, plugged in and placed one after another."""
+    tiles = tuple(
+        TileScene(
+            serial=serial, mux=0x70 + i // 8, channel=i % 8, x_m=0.014 * i, y_m=0.0, z_m=-0.15
+        )
+        for i, serial in enumerate(serials)
+    )
+    return Scene.model_validate({**scene.model_dump(), "tile": [t.model_dump() for t in tiles]})

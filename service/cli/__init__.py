@@ -1,0 +1,1 @@
+"""The command `foottile`: options to calls, results to text or JSON, errors to exit codes."""

@@ -1,0 +1,59 @@
+"""Entry point of `foottile`."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from devices.errors import FootTileError
+from service.cli.calibrate import calibrate_command
+from service.cli.estimate import estimate_command
+from service.cli.simulate import simulate_command
+from service.version import SOFTWARE
+
+app = typer.Typer(
+    name="foottile",
+    help="Data service for arrays of FootTile pressure sensors on robot feet.",
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+app.command("simulate")(simulate_command)
+app.command("estimate")(estimate_command)
+app.command("calibrate")(calibrate_command)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(SOFTWARE)
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Run the command line; every expected error becomes one line on stderr and an exit code."""
+    try:
+        app()
+    except FootTileError as error:
+        sys.stderr.write(f"foottile: {error}\n")
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.stderr.write("foottile: interrupted, nothing was written\n")
+        sys.exit(1)
+    except OSError as error:
+        sys.stderr.write(f"foottile: {error}\n")
+        sys.exit(1)

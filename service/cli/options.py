@@ -1,0 +1,74 @@
+"""What several commands share: options that are pairs, output paths, progress, and JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from devices.errors import UsageError
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+
+# Data goes to stdout; progress and remarks to stderr, progress only if somebody watches.
+stdout = Console()
+stderr = Console(stderr=True)
+
+
+def pair(text: str | None, option: str) -> tuple[float, float] | None:
+    """Two numbers with a comma between them.
+
+    Raises:
+        UsageError: anything else.
+    """
+    if text is None:
+        return None
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        first = second = math.nan
+    if not (math.isfinite(first) and math.isfinite(second)):
+        raise UsageError(f"{option} {text!r} is no pair of numbers", expected="A,B")
+    return first, second
+
+
+def output_path(path: Path) -> Path:
+    """`path`, after a look whether it can be written, before anything takes time.
+
+    Raises:
+        UsageError: its folder is missing or not writable, or it is a folder.
+    """
+    folder = path.parent
+    if not folder.is_dir():
+        raise UsageError(f"no folder {str(folder)!r} to write {path.name} in", remedy="Make it")
+    if path.is_dir() or not os.access(folder, os.W_OK):
+        raise UsageError(f"{str(path)!r} cannot be written")
+    return path
+
+
+def print_json(value: object) -> None:
+    """One JSON document on stdout; NaN has no place in it."""
+    sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+@contextmanager
+def progress(message: str) -> Iterator[None]:
+    """Say what takes time, on a terminal only."""
+    if not stderr.is_terminal:
+        yield
+        return
+    with stderr.status(message):
+        yield
+
+
+def remark(message: str) -> None:
+    """A line on stderr that a user should see, wherever it goes."""
+    stderr.print(message, style="dim", highlight=False)

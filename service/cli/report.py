@@ -1,0 +1,93 @@
+"""Results as tables for people."""
+
+from __future__ import annotations
+
+import math
+
+from rich.table import Table
+
+from service.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
+from service.estimation.calibration import Calibration
+
+EMULATED = "Errors of an emulated foot; the paper's 1 N and 4 mm are a real one's."
+
+
+def accuracy_table(a: Accuracy) -> Table:
+    """Errors against the truth of an emulated scene."""
+    table = Table(title="Error against the truth", caption=EMULATED, title_justify="left")
+    table.add_column("quantity")
+    table.add_column("value", justify="right")
+    table.add_column("over")
+    grf = f"{a.grf_frames} frames above {GRF_FROM_N} N, unsaturated"
+    cop = f"{a.cop_frames} frames above {COP_FROM_N} N"
+    stances = f"{a.stances} stances"
+    for name, value, unit, over in (
+        ("GRF mean absolute", a.grf_mae_n, "N", grf),
+        ("GRF RMS", a.grf_rms_n, "N", grf),
+        ("GRF bias", a.grf_bias_n, "N", grf),
+        ("GRF within 1.96 sigma", 100 * a.grf_coverage_95, "%", grf),
+        ("GRF sigma, median", a.grf_sigma_median_n, "N", grf),
+        ("GRF in flight, mean", a.flight_mean_n, "N", "frames without load"),
+        ("GRF peak", a.peak_error_n, "N", stances),
+        ("GRF impulse", a.impulse_error_ns, "N s", stances),
+        ("COP mean", 1e3 * a.cop_mean_m, "mm", cop),
+        ("COP 95th percentile", 1e3 * a.cop_p95_m, "mm", cop),
+        ("COP x within 1.96 sigma", 100 * a.cop_coverage_95, "%", cop),
+    ):
+        table.add_row(name, "-" if math.isnan(value) else f"{value:.3f} {unit}", over)
+    table.add_row("COP not stated", str(a.cop_masked_frames), f"frames above {COP_FROM_N} N")
+    table.add_row("saturated", str(a.saturated_frames), f"{a.frames} frames")
+    return table
+
+
+def calibration_table(calibration: Calibration) -> Table:
+    """Quality of every tile's fit."""
+    table = Table(
+        title=f"Calibration {calibration.name} ({calibration.id})",
+        caption=f"left out: error on a repeat the fit has not seen; loop: hysteresis\n"
+        f"reference: {calibration.reference}; {calibration.date}",
+        title_justify="left",
+    )
+    for heading in (
+        "tile",
+        "R2",
+        "RMSE N",
+        "left out N",
+        "loop N",
+        "range kPa",
+        "rises",
+        "repeats",
+    ):
+        table.add_column(heading, justify="left" if heading == "tile" else "right")
+    for tile in calibration.tiles:
+        table.add_row(
+            tile.serial,
+            _number(tile.r2, 5),
+            _number(tile.rmse_n, 3),
+            _number(tile.cv_rmse_n, 3),
+            _number(tile.hysteresis_n, 3),
+            f"{tile.range_kpa[0]:.0f} to {tile.range_kpa[1]:.2f}",
+            "yes" if tile.monotonic else "NO",
+            str(tile.repeats),
+        )
+    return table
+
+
+def calibration_json(calibration: Calibration) -> dict[str, object]:
+    """The contract's shape of a calibration's quality."""
+    fields = (
+        "serial",
+        "r2",
+        "rmse_n",
+        "cv_rmse_n",
+        "hysteresis_n",
+        "range_kpa",
+        "monotonic",
+        "coefficients",
+    )
+    tiles = [{name: getattr(tile, name) for name in fields} for tile in calibration.tiles]
+    return {"id": calibration.id, "tiles": tiles}
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

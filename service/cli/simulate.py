@@ -1,0 +1,167 @@
+"""`foottile simulate`: a session on emulated hardware in virtual time."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, cast, get_args
+
+import typer
+
+from devices.errors import UsageError
+from devices.scene import Scene, ScheduleName, load_scene
+from service.cli.options import (
+    JsonOption,
+    output_path,
+    pair,
+    print_json,
+    progress,
+    remark,
+    stdout,
+)
+
+OFFLINE_LAG_MS = 100.0
+
+
+def simulate_command(
+    scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Session to write; default: SCENE.parquet here.")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Length, lead included; default: that of the load or programme."),
+    ] = None,
+    load: Annotated[
+        Path | None, typer.Option(help="Recorded load to press instead of the scene's ground.")
+    ] = None,
+    load_scale: Annotated[float, typer.Option(help="Factor on every force of the load.")] = 1.0,
+    cop_scale: Annotated[
+        float, typer.Option(help="Factor on the load's COP about its mean.")
+    ] = 1.0,
+    cop_offset_m: Annotated[
+        str, typer.Option(metavar="X,Y", help="Where the load's mean COP comes to lie.")
+    ] = "0,0",
+    cop_axes: Annotated[
+        str, typer.Option(help="Axes of the load that become x and y: xy, yx, -yx, ...")
+    ] = "xy",
+    lead_s: Annotated[float, typer.Option(help="Seconds without load first: the tare.")] = 1.0,
+    schedule: Annotated[
+        str | None, typer.Option(help="sequential or simultaneous; default: the scene's.")
+    ] = None,
+    tiles: Annotated[
+        str | None, typer.Option(help="Indentation only: serials to press, T01,T02,...")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Draws noise and ground, not the parts.")] = 0,
+    parts_seed: Annotated[int, typer.Option(min=0, help="Draws other parts.")] = 0,
+    truth: Annotated[
+        bool, typer.Option("--truth", help="Add the true_* columns and print the error.")
+    ] = False,
+    no_estimates: Annotated[bool, typer.Option("--no-estimates", help="Raw frames only.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a scene on emulated hardware in virtual time and write the session.
+
+    The real driver reads emulated chips through an emulated bus; the same command and version give
+    the same bytes. Exit codes: 0 good, 1 failed, 2 wrong usage.
+    """
+    # Imported here: the physics pulls in scipy, which `--help` need not wait for.
+    from devices.emulation.load_trace import CopTransform
+    from service.calibrations import find_calibration, with_tiles
+    from service.cli.report import accuracy_table
+    from service.pipeline import EstimateOptions
+    from service.simulate import SimulateOptions, simulate
+    from storage.load_trace_file import read_load_trace
+
+    the_scene = load_scene(scene)
+    if tiles is not None:
+        if the_scene.ground.kind != "indentation":
+            raise UsageError("--tiles chooses what the mill presses", expected="an indentation")
+        the_scene = with_tiles(the_scene, tiles.split(","))
+    _check(the_scene, seconds, lead_s, load_scale, cop_scale)
+    path = output_path(out if out is not None else Path(f"{the_scene.name}.parquet"))
+    options = SimulateOptions(
+        scene=the_scene,
+        seconds=seconds,
+        schedule=_schedule(schedule),
+        seed=seed,
+        parts_seed=parts_seed,
+        lead_s=lead_s,
+        truth=truth,
+        load=read_load_trace(load) if load is not None else None,
+        load_scale=load_scale,
+        cop=CopTransform(cop_scale, pair(cop_offset_m, "--cop-offset-m") or (0.0, 0.0), cop_axes),
+    )
+    estimate = None
+    if not no_estimates and the_scene.calibration != "none":
+        with progress("calibrating on the emulated bench"):
+            calibration = find_calibration(
+                the_scene.calibration,
+                [tile.serial for tile in the_scene.tile],
+                parts_seed=parts_seed,
+                progress=remark,
+            )
+        estimate = EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS)
+    began = time.perf_counter()
+    with progress(f"simulating {the_scene.name}"):
+        result = simulate(options, path, estimate)
+    wall_s = time.perf_counter() - began
+    pressed = result.pressed
+    if as_json:
+        print_json(
+            {
+                "out": str(path),
+                "frames": result.frames,
+                "seconds": result.seconds,
+                "rate_hz": result.rate_hz,
+                "bytes": path.stat().st_size,
+                "moved_to_edge": pressed.moved_to_edge if pressed else None,
+                "limited": pressed.limited if pressed else None,
+                "accuracy": result.accuracy.as_dict() if result.accuracy else None,
+            }
+        )
+        return
+    size = path.stat().st_size
+    stdout.print(
+        f"{path}: {result.frames} frames in {result.seconds:.3f} s of virtual time, "
+        f"{result.rate_hz:.1f} frames/s, {size} bytes ({size / result.frames:.1f} a frame)",
+        highlight=False,
+        soft_wrap=True,
+    )
+    remark(f"{wall_s:.1f} s of wall time, {result.seconds / wall_s:.1f} times real time")
+    if pressed is not None:
+        stdout.print(
+            f"load: {pressed.moved_to_edge} samples had their COP moved to the hull's edge, "
+            f"{pressed.limited} had a tile's force limited",
+            highlight=False,
+            soft_wrap=True,
+        )
+    if result.accuracy is not None:
+        stdout.print(accuracy_table(result.accuracy))
+
+
+def _schedule(name: str | None) -> ScheduleName | None:
+    if name is None:
+        return None
+    names = get_args(ScheduleName)
+    if name not in names:
+        raise UsageError(f"--schedule {name!r}", expected=" or ".join(names))
+    return cast(ScheduleName, name)
+
+
+def _check(
+    scene: Scene, seconds: float | None, lead_s: float, load_scale: float, cop_scale: float
+) -> None:
+    if scene.array.bus != "emulated":
+        raise UsageError(
+            f"scene {scene.name!r} is for {scene.array.bus}, and simulate only emulates",
+            remedy='Set array.bus = "emulated"',
+        )
+    for option, value, least in (
+        ("--seconds", 1.0 if seconds is None else seconds, 0.0),
+        ("--load-scale", load_scale, 0.0),
+        ("--cop-scale", cop_scale, None),
+        ("--lead-s", lead_s, -1e-9),
+    ):
+        if not abs(value) < 1e9 or (least is not None and value <= least):
+            raise UsageError(f"{option} {value:g}", expected="a sensible positive number")

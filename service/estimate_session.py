@@ -1,0 +1,124 @@
+"""A sealed session in, the same session with new estimates out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+
+from devices.errors import CalibrationError, FileFormatError, UsageError
+from devices.frames import ArrayInfo
+from devices.scene import Scene, load_scene
+from service.accuracy import JUDGED, Accuracy, judge
+from service.calibrations import find_calibration
+from service.estimation.calibration import Calibration
+from service.estimation.plan import EstimationPlan
+from service.pipeline import EstimateOptions, EstimateStream, notes_of
+from service.simulate import joined
+from storage.schema import MILL, TRUTH
+from storage.session_file import SessionReader, SessionWriter
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """What came of it."""
+
+    frames: int
+    plan: EstimationPlan
+    accuracy: Accuracy | None
+
+
+def estimate_session(
+    source: Path,
+    out: Path,
+    *,
+    calibration: str | None,
+    models: tuple[str, ...] | None,
+    lag_ms: float,
+    scene: str | None,
+    tare_s: tuple[float, float] | None,
+    remark: Callable[[str], None],
+) -> Estimated:
+    """Estimate a session; see `foottile estimate --help` for what is taken from where.
+
+    Raises:
+        FootTileError: the session, scene, calibration or tare is not usable; `out` is untouched.
+    """
+    the_scene = load_scene(scene) if scene is not None else None
+    with SessionReader(source) as session:
+        info = _placed(session.info, the_scene)
+        options = EstimateOptions(
+            calibration=_calibration(session, the_scene, calibration, remark),
+            models=models or (the_scene.models if the_scene else info.models),
+            lag_ms=lag_ms,
+            tare_s=tare_s,
+        )
+        kept = [c.name for c in (*TRUTH, *MILL) if session.has(c.name)]
+        judging = all(c.name in kept for c in TRUTH)
+        stream = EstimateStream(info, options)
+        judged: list[Mapping[str, npt.NDArray[Any]]] = []
+        frames = 0
+        with SessionWriter(out, info, session.notes) as writer:
+            for batch, extra in stream.run(session.batches(*kept)):
+                if not frames and stream.plan is not None:
+                    writer.add_notes(notes_of(stream.plan))
+                writer.append(batch, extra)
+                frames += len(batch)
+                if judging:
+                    columns = {"t_ns": batch.t_ns, **extra}
+                    judged.append({name: columns[name] for name in JUDGED})
+    if stream.plan is None:
+        raise FileFormatError("the session has no frames", where=str(source))
+    return Estimated(frames, stream.plan, judge(joined(judged)) if judged else None)
+
+
+def _placed(info: ArrayInfo, scene: Scene | None) -> ArrayInfo:
+    """The array with its tiles where the scene says they are."""
+    if scene is None:
+        return info
+    places = {tile.serial: tile for tile in scene.tile}
+    if set(places) != set(info.serials):
+        raise UsageError(
+            f"scene {scene.name!r} has the tiles {', '.join(sorted(places))}, "
+            f"the session {', '.join(sorted(info.serials))}",
+            remedy="Name the scene it was recorded with",
+        )
+    tiles = tuple(
+        tile.model_copy(
+            update={
+                name: getattr(places[tile.serial], name)
+                for name in ("x_m", "y_m", "z_m", "reference")
+            }
+        )
+        for tile in info.tiles
+    )
+    return info.model_copy(update={"tiles": tiles})
+
+
+def _calibration(
+    session: SessionReader,
+    scene: Scene | None,
+    wanted: str | None,
+    remark: Callable[[str], None],
+) -> Calibration:
+    notes = session.notes
+    inside = Calibration.model_validate(notes["calibration"]) if "calibration" in notes else None
+    if inside is not None and wanted in (None, inside.id):
+        return inside
+    name = wanted or (scene.calibration if scene is not None else None)
+    if name is None:
+        raise CalibrationError(
+            "no calibration: the session brings none and none was named",
+            where=str(session.path),
+            remedy="Add --calibration FILE, or --scene with a scene that names one",
+        )
+    parts_seed = notes.get("parts_seed", 0)
+    return find_calibration(
+        name,
+        session.info.serials,
+        parts_seed=parts_seed if isinstance(parts_seed, int) else 0,
+        progress=remark,
+    )

@@ -1,0 +1,211 @@
+"""What is known of each tile from the bench: curve, range, quality, and where it came from.
+
+A calibration states every unit and offset; nothing is assumed (hardware.md 7). Its id is the hash
+of its content, so two calibrations of one id are the same calibration.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from devices.errors import CalibrationError
+
+ANY_SERIAL = "*"
+BASIS = 3
+"""A cubic without constant term has three coefficients to be uncertain about."""
+
+
+class TileCalibration(BaseModel):
+    """The static curve of one tile.
+
+    Force in newtons: `f_offset_n + f_scale_n * poly(u)` with `u = (gauge_kpa - p_offset_kpa) /
+    p_scale_kpa` and `poly` from `coefficients`, low to high; with `zero_mode` "subtract_f0" less
+    the same at zero gauge pressure.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    serial: str
+    p_input: Literal["gauge_kpa", "normalised"]
+    p_offset_kpa: float
+    p_scale_kpa: float = Field(gt=0)
+    f_offset_n: float
+    f_scale_n: float = Field(gt=0)
+    zero_mode: Literal["as_fitted", "subtract_f0"]
+    coefficients: tuple[float, float, float, float]
+    range_kpa: tuple[float, float]
+    """Gauge pressures that were calibrated; above them force is a lower bound."""
+    monotonic: bool
+    absolute_scale: Literal["measured", "assumed"]
+    covariance: tuple[tuple[float, ...], ...]
+    """Of coefficients 1 to 3, in units of `f_scale_n` squared."""
+    relative_misfit: float = Field(ge=0)
+    """Standard deviation of a new loading's force about the curve, as a part of the force."""
+    r2: float | None
+    rmse_n: float | None
+    cv_rmse_n: float | None
+    """Leave-one-repeat-out error."""
+    hysteresis_n: float | None
+    """Greatest distance between loading and unloading branch."""
+    repeats: int
+    baseline_kpa: float | None
+    """Absolute pressure unloaded, when it was calibrated."""
+    noise_kpa: float | None
+    """Standard deviation of a single reading, unloaded."""
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        if not self.range_kpa[0] < self.range_kpa[1]:
+            raise ValueError(f"range_kpa {self.range_kpa} is empty")
+        matrix = np.array(self.covariance)
+        if matrix.shape != (BASIS, BASIS):
+            raise ValueError(f"covariance is {matrix.shape}, expected {(BASIS, BASIS)}")
+        if self.monotonic != is_monotonic(self.coefficients, self.range_u):
+            raise ValueError(f"monotonic = {self.monotonic} is not true of the coefficients")
+        return self
+
+    @property
+    def range_u(self) -> tuple[float, float]:
+        """The calibrated range in the polynomial's variable."""
+        low, high = ((p - self.p_offset_kpa) / self.p_scale_kpa for p in self.range_kpa)
+        return low, high
+
+
+class Calibration(BaseModel):
+    """Calibrations of tiles by serial, with the reference they were made against."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    version: Literal[1] = 1
+    name: str
+    reference: str
+    """The force sensor, or the publication, that the scale comes from."""
+    date: str
+    """ISO 8601, of the recordings."""
+    tiles: tuple[TileCalibration, ...]
+
+    @property
+    def id(self) -> str:
+        """First 16 hexadecimal digits of the SHA-256 of the content."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+
+    def of(self, serial: str) -> TileCalibration:
+        """The entry for a serial.
+
+        Raises:
+            CalibrationError: there is none.
+        """
+        for tile in self.tiles:
+            if tile.serial in (serial, ANY_SERIAL):
+                return tile
+        known = ", ".join(tile.serial for tile in self.tiles)
+        raise CalibrationError(
+            f"no calibration for tile {serial}",
+            where=f"calibration {self.name} ({self.id})",
+            expected=f"one of {known}",
+            remedy="Press the tile on the bench and run `foottile calibrate`, or name another "
+            "calibration with --calibration",
+        )
+
+    def restricted_to(self, serials: Sequence[str]) -> Calibration:
+        """The same with the entries of `serials` only, which it must have.
+
+        Raises:
+            CalibrationError: a serial is not in it.
+        """
+        entries = tuple(dict.fromkeys(self.of(serial) for serial in serials))
+        return self.model_copy(update={"tiles": entries})
+
+    def to_json(self) -> str:
+        """Text of a calibration file; the id is in it for people, and checked when read."""
+        content = {"id": self.id, **self.model_dump(mode="json")}
+        return json.dumps(content, indent=2) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str, *, where: str) -> Calibration:
+        """Read a calibration file.
+
+        Raises:
+            CalibrationError: not JSON, a field is missing or unknown, or the id does not match.
+        """
+        try:
+            content = json.loads(text)
+            stated_id = content.pop("id", None)
+            calibration = cls.model_validate(content)
+        except (ValueError, AttributeError, TypeError) as error:
+            detail = error.errors()[0] if isinstance(error, ValidationError) else None
+            what = (
+                f"{'.'.join(str(part) for part in detail['loc'])}: {detail['msg']}"
+                if detail
+                else str(error)
+            )
+            raise CalibrationError(
+                f"not a calibration: {what}",
+                where=where,
+                expected="a file written by `foottile calibrate`",
+            ) from error
+        if stated_id != calibration.id:
+            raise CalibrationError(
+                f"its id says {stated_id}, its content is {calibration.id}",
+                where=where,
+                remedy="It was edited by hand or damaged: calibrate again",
+            )
+        return calibration
+
+
+def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) -> bool:
+    """Whether the cubic rises all over `range_u`: its slope is a parabola, ends and vertex tell."""
+    _, c1, c2, c3 = coefficients
+    places = list(range_u)
+    if c3 != 0.0 and range_u[0] < (vertex := -c2 / (3 * c3)) < range_u[1]:
+        places.append(vertex)
+    return all(c1 + u * (2 * c2 + u * 3 * c3) > 0.0 for u in places)
+
+
+def paper_eq2_shape() -> Calibration:
+    """The paper's eq. 2 as a shape, for any tile, with an assumed scale.
+
+    F = 0.13 p^3 + 0.02354 p^2 + 0.5702 p + 0.1309 has no stated units, and no reading in SI units
+    gives the paper's 25 to 35 N at saturation (hardware.md 7). So: p = gauge / 15 kPa, zero at zero
+    load, 30 N at full scale. The 25 to 35 N that are possible stand as 10 % uncertainty of scale.
+    """
+    coefficients = (0.1309, 0.5702, 0.02354, 0.13)
+    full_scale = sum(coefficients[1:])
+    none = tuple(tuple(0.0 for _ in range(BASIS)) for _ in range(BASIS))
+    tile = TileCalibration(
+        serial=ANY_SERIAL,
+        p_input="normalised",
+        p_offset_kpa=0.0,
+        p_scale_kpa=15.0,
+        f_offset_n=0.0,
+        f_scale_n=30.0 / full_scale,
+        zero_mode="subtract_f0",
+        coefficients=coefficients,
+        range_kpa=(0.0, 15.0),
+        monotonic=True,
+        absolute_scale="assumed",
+        covariance=none,
+        relative_misfit=0.1,
+        r2=None,
+        rmse_n=None,
+        cv_rmse_n=None,
+        hysteresis_n=None,
+        repeats=0,
+        baseline_kpa=None,
+        noise_kpa=None,
+    )
+    return Calibration(
+        name="paper-eq2-shape",
+        reference="Ruppert and Badri-Sproewitz 2020, eq. 2; scale assumed",
+        date="2020-05-19",
+        tiles=(tile,),
+    )
+
+
+PRESETS = {"paper-eq2-shape": paper_eq2_shape}

@@ -1,0 +1,76 @@
+"""Where the tiles are: hull, grid, segment angle, and the way from foot frame to ground frame.
+
+Axes as in the design: foot frame x forward, y to the left, z up the segment, origin at the ankle.
+A positive angle is a roll forward (right-handed about y).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.frames import NO_SERVO_COUNTS, ServoInfo
+
+Floats = npt.NDArray[np.float64]
+
+_SAME_PLACE_M = 1e-6
+
+
+def hull(positions_m: Floats) -> tuple[Floats, Floats]:
+    """Half-planes `normals @ p <= offsets` whose intersection is the hull of tiles (tiles, 2).
+
+    Tiles in a line, or a single one, have a hull without area: two half-planes across every
+    direction in which they do not extend would forbid any noise, so only the ends of the line
+    count; across it a force-weighted mean cannot leave the line anyway.
+
+    Returns:
+        Unit normals (k, 2) and offsets (k,).
+    """
+    centre_m = positions_m.mean(axis=0)
+    _, spread_m, directions = np.linalg.svd(positions_m - centre_m)
+    extends = np.zeros(2, dtype=bool)
+    extends[: len(spread_m)] = spread_m > _SAME_PLACE_M
+    if extends.all():
+        from scipy.spatial import ConvexHull
+
+        equations = ConvexHull(positions_m).equations
+        return equations[:, :2], -equations[:, 2]
+    normals = np.concatenate([directions[extends], -directions[extends]])
+    return normals, (positions_m @ normals.T).max(axis=0, initial=-np.inf)
+
+
+def grid_indices(
+    positions_m: Floats,
+) -> tuple[Floats, Floats] | None:
+    """Index of every tile along x and y, from 1, if the tiles fill a grid (paper eq. 4); else None.
+
+    A line of tiles is a grid of one row.
+    """
+    columns, x = np.unique(np.round(positions_m[:, 0] / _SAME_PLACE_M), return_inverse=True)
+    rows, y = np.unique(np.round(positions_m[:, 1] / _SAME_PLACE_M), return_inverse=True)
+    places = set(zip(x.tolist(), y.tolist(), strict=True))
+    if len(places) != len(positions_m) or len(places) != len(columns) * len(rows):
+        return None
+    return x.astype(np.float64) + 1.0, y.astype(np.float64) + 1.0
+
+
+def angle_rad(servo: ServoInfo, servo_counts: npt.NDArray[np.int32]) -> Floats:
+    """Segment angle from signed multi-turn servo counts; NaN where there is no reading."""
+    per_count = servo.sign * servo.ratio * 2.0 * np.pi / servo.counts_per_turn
+    known = servo_counts != NO_SERVO_COUNTS
+    return np.where(
+        known, (servo_counts.astype(np.float64) - servo.zero_counts) * per_count, np.nan
+    )
+
+
+def to_ground_x_m(
+    x_m: Floats, z_m: Floats, angle_rad: Floats, ankle_travel_m_per_rad: float | None
+) -> Floats:
+    """A point of the foot frame in the ground frame, along x (paper eq. 3 with l = -z, r = -x).
+
+    ankle travel + x cos(angle) + z sin(angle); NaN where the ankle's travel is not known.
+    """
+    if ankle_travel_m_per_rad is None:
+        return np.full_like(x_m, np.nan)
+    turned_m = x_m * np.cos(angle_rad) + z_m * np.sin(angle_rad)
+    return np.asarray(ankle_travel_m_per_rad * angle_rad + turned_m)

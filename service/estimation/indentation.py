@@ -1,0 +1,148 @@
+"""An indentation recording, reduced to what a curve is fitted to: averages along slow strokes.
+
+Readings are averaged in short blocks of a stroke, because the noise of single readings is an error
+in the variable that is fitted over, and would flatten the curve. A stroke is a `load` that goes
+straight over into an `unload`; holds, releases and taps are left to the models of fast effects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.errors import CalibrationError
+
+Floats = npt.NDArray[np.float64]
+
+BLOCKS_PER_STROKE = 60
+BASELINE_NS = 1_000_000_000
+BASELINE_READINGS_MIN = 10
+
+
+@dataclass(frozen=True)
+class Indentation:
+    """One tile's part of a bench recording; arrays of n readings in the order of time.
+
+    Attributes:
+        serial: of the tile.
+        where: file it came from, for messages.
+        t_ns: instants of the readings.
+        kpa: absolute pressure; NaN where the tile was not readable.
+        reference_n: force of the reference sensor; NaN where the spindle was elsewhere.
+        phase: what the spindle did: "rest", "load", "unload", ...
+        under_spindle: whether it was this tile.
+    """
+
+    serial: str
+    where: str
+    t_ns: npt.NDArray[np.int64]
+    kpa: Floats
+    reference_n: Floats
+    phase: npt.NDArray[np.str_]
+    under_spindle: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Strokes:
+    """Block averages of all slow strokes of a tile, m blocks.
+
+    Attributes:
+        gauge_kpa: (m,), pressure above the tile's baseline.
+        force_n: (m,), reference force above its own zero.
+        repeat: (m,), number of the stroke, from 0.
+        loading: (m,), True on the way in.
+    """
+
+    gauge_kpa: Floats
+    force_n: Floats
+    repeat: npt.NDArray[np.int64]
+    loading: npt.NDArray[np.bool_]
+
+    def rows(self, mask: npt.NDArray[np.bool_]) -> Strokes:
+        """The blocks in `mask`."""
+        return Strokes(
+            self.gauge_kpa[mask], self.force_n[mask], self.repeat[mask], self.loading[mask]
+        )
+
+
+@dataclass(frozen=True)
+class Unloaded:
+    """A tile and the reference just before the tile is first pressed."""
+
+    baseline_kpa: float
+    noise_kpa: float
+    reference_zero_n: float
+
+
+def unloaded(recording: Indentation) -> Unloaded:
+    """Baseline and noise of the tile, and zero of the reference.
+
+    Raises:
+        CalibrationError: the tile is never pressed, or there is too little before it is.
+    """
+    where = place(recording)
+    pressed = recording.under_spindle & (recording.phase != "rest")
+    if not pressed.any():
+        raise CalibrationError(
+            "the recording never presses this tile",
+            where=where,
+            expected="phases load and unload with pressed_tile naming it",
+        )
+    first = int(np.argmax(pressed))
+    before = np.arange(len(pressed)) < first
+    before &= recording.t_ns >= recording.t_ns[first] - BASELINE_NS
+    kpa = recording.kpa[before & np.isfinite(recording.kpa)]
+    if len(kpa) < BASELINE_READINGS_MIN:
+        raise CalibrationError(
+            f"only {len(kpa)} readings before the tile is first pressed",
+            where=where,
+            expected=f"at least {BASELINE_READINGS_MIN} unloaded readings for the baseline",
+        )
+    reference_n = recording.reference_n[before & recording.under_spindle]
+    reference_n = reference_n[np.isfinite(reference_n)]
+    return Unloaded(
+        baseline_kpa=float(kpa.mean()),
+        noise_kpa=float(kpa.std(ddof=1)),
+        reference_zero_n=float(reference_n.mean()) if len(reference_n) else 0.0,
+    )
+
+
+def strokes(recording: Indentation) -> Strokes:
+    """Block averages of every slow stroke of the tile.
+
+    Raises:
+        CalibrationError: as for `unloaded`, or there is no slow stroke.
+    """
+    zero = unloaded(recording)
+    label = np.where(recording.under_spindle, recording.phase, "")
+    begins = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
+    ends = np.append(begins[1:], len(label))
+    readable = np.isfinite(recording.kpa) & np.isfinite(recording.reference_n)
+    blocks: list[tuple[float, float, int, bool]] = []
+    count = 0
+    for i in range(len(begins) - 1):
+        if (label[begins[i]], label[begins[i + 1]]) != ("load", "unload"):
+            continue
+        for run, loading in ((i, True), (i + 1, False)):
+            rows = np.arange(begins[run], ends[run])
+            for block in np.array_split(rows[readable[rows]], BLOCKS_PER_STROKE):
+                if len(block):
+                    gauge_kpa = recording.kpa[block].mean() - zero.baseline_kpa
+                    force_n = recording.reference_n[block].mean() - zero.reference_zero_n
+                    blocks.append((float(gauge_kpa), float(force_n), count, loading))
+        count += 1
+    if not blocks:
+        raise CalibrationError(
+            "no slow stroke of this tile in the recording",
+            where=place(recording),
+            expected="phase load followed by phase unload, with reference_force_n",
+        )
+    gauge, force, repeat, loads = zip(*blocks, strict=True)
+    return Strokes(np.array(gauge), np.array(force), np.array(repeat), np.array(loads))
+
+
+def place(recording: Indentation) -> str:
+    """File and tile, for messages."""
+    return f"{recording.where}, tile {recording.serial}"

@@ -1,0 +1,35 @@
+"""Counts to absolute pressure for a whole array: the data sheet's compensation per tile."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.frames import ArrayInfo
+from devices.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
+
+Floats = npt.NDArray[np.float64]
+
+_ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of what rounding to one count takes away
+
+
+class Compensation:
+    """The coefficients of an array's chips, as arrays over tiles."""
+
+    def __init__(self, info: ArrayInfo) -> None:
+        chips = [Coefficients.from_words(tile.coefficient_words) for tile in info.tiles]
+        self._a0, self._b1, self._b2, self._c12 = (
+            np.array([getattr(chip, name) for chip in chips]) for name in ("a0", "b1", "b2", "c12")
+        )
+
+    def kpa(self, padc: npt.ArrayLike, tadc: npt.ArrayLike) -> Floats:
+        """Absolute pressure, (n, tiles), of raw counts of that shape."""
+        return compensate_kpa(padc, tadc, self._a0, self._b1, self._b2, self._c12)
+
+    def kpa_per_count(self, tadc: npt.ArrayLike) -> Floats:
+        """Pressure step of one count of `padc`; negative."""
+        return kpa_per_padc(tadc, self._b1, self._c12)
+
+    def rounding_kpa(self, tadc: npt.ArrayLike) -> Floats:
+        """Standard uncertainty that rounding to a count leaves."""
+        return np.asarray(np.abs(self.kpa_per_count(tadc)) * _ROUNDING)

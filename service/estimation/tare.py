@@ -1,0 +1,155 @@
+"""The tare: each tile's baseline and noise, from an interval without load.
+
+It comes from an interval the user names, else from frames marked as lead, else from the first
+interval that can be recognised as unloaded; else there is none, and that is an error, because a
+wrong baseline is a wrong force that looks right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.errors import TareError
+from devices.frames import FrameBatch, FrameStatus, TileStatus
+from service.estimation.calibration import Calibration
+from service.estimation.pressure import Compensation
+
+Floats = npt.NDArray[np.float64]
+
+FRAMES_MIN = 20
+WINDOW_NS = 500_000_000
+NEAR_BASELINE_KPA = 1.5
+"""How far an unloaded bubble may be from its baseline on the bench: 5 K, by p0 / T0."""
+QUIET = 1.5
+"""An unloaded tile's readings scatter at most so much more than on the bench."""
+
+Source = Literal["interval", "lead", "recognised"]
+
+
+@dataclass(frozen=True)
+class Tare:
+    """Baselines with their uncertainty; arrays over tiles.
+
+    Attributes:
+        baseline_kpa: absolute pressure unloaded.
+        baseline_sigma_kpa: its standard uncertainty.
+        noise_kpa: standard deviation of a single reading.
+        t_ns: instant at which the interval ended, in UTC.
+        begin_s: begin of the interval, in seconds from the first frame.
+        end_s: its end.
+        frames: number of frames it was taken from.
+        source: how the interval was found.
+    """
+
+    baseline_kpa: Floats
+    baseline_sigma_kpa: Floats
+    noise_kpa: Floats
+    t_ns: int
+    begin_s: float
+    end_s: float
+    frames: int
+    source: Source
+
+
+def take_tare(
+    frames: FrameBatch,
+    compensation: Compensation,
+    calibration: Calibration,
+    serials: tuple[str, ...],
+    *,
+    interval_s: tuple[float, float] | None = None,
+) -> Tare:
+    """The tare of a recording from its beginning `frames`.
+
+    Args:
+        frames: frames from the first of the recording on.
+        compensation: of the array's chips.
+        calibration: of its tiles, whose bench baselines tell an unloaded tile.
+        serials: of the tiles, in order.
+        interval_s: the user's interval, in seconds from the first frame.
+
+    Raises:
+        TareError: the interval holds too few readable frames, or none can be recognised.
+    """
+    t_s = (frames.t_ns - frames.t_ns[0]) * 1e-9
+    if interval_s is not None:
+        begin_s, end_s = interval_s
+        rows = (t_s >= begin_s) & (t_s <= end_s)
+        return _from_rows(frames, compensation, serials, rows, "interval")
+    lead = (frames.frame_status & FrameStatus.LEAD) != 0
+    if lead.any():
+        return _from_rows(frames, compensation, serials, lead, "lead")
+    rows = _recognise(frames, compensation, calibration, serials)
+    return _from_rows(frames, compensation, serials, rows, "recognised")
+
+
+def _from_rows(
+    frames: FrameBatch,
+    compensation: Compensation,
+    serials: tuple[str, ...],
+    rows: npt.NDArray[np.bool_],
+    source: Source,
+) -> Tare:
+    kpa = compensation.kpa(frames.padc[rows], frames.tadc[rows])
+    kpa[(frames.status[rows] & TileStatus.UNUSABLE) != 0] = np.nan
+    readable = np.isfinite(kpa).sum(axis=0)
+    for serial, count in zip(serials, readable, strict=True):
+        if count < FRAMES_MIN:
+            raise TareError(
+                f"tile {serial} has {count} readable frames in the interval",
+                expected=f"at least {FRAMES_MIN}",
+                remedy="Name another interval with --tare-s BEGIN,END",
+            )
+    # A perfectly quiet reading is still rounded to a count.
+    floor_kpa = compensation.rounding_kpa(np.nanmean(frames.tadc[rows], axis=0))
+    noise_kpa = np.maximum(np.nanstd(kpa, axis=0, ddof=1), floor_kpa)
+    t_s = (frames.t_ns[rows] - frames.t_ns[0]) * 1e-9
+    return Tare(
+        baseline_kpa=np.nanmean(kpa, axis=0),
+        baseline_sigma_kpa=noise_kpa / np.sqrt(readable),
+        noise_kpa=noise_kpa,
+        t_ns=int(frames.t_ns[rows][-1]),
+        begin_s=float(t_s[0]),
+        end_s=float(t_s[-1]),
+        frames=int(rows.sum()),
+        source=source,
+    )
+
+
+def _recognise(
+    frames: FrameBatch,
+    compensation: Compensation,
+    calibration: Calibration,
+    serials: tuple[str, ...],
+) -> npt.NDArray[np.bool_]:
+    """Rows of the first half second in which every tile is quiet and near its bench baseline."""
+    entries = [calibration.of(serial) for serial in serials]
+    if any(entry.baseline_kpa is None or entry.noise_kpa is None for entry in entries):
+        raise TareError(
+            f"calibration {calibration.name} does not say where an unloaded tile lies",
+            remedy="Name an unloaded interval with --tare-s BEGIN,END",
+        )
+    expected_kpa = np.array([entry.baseline_kpa for entry in entries], dtype=np.float64)
+    noise_kpa = np.array([entry.noise_kpa for entry in entries], dtype=np.float64)
+    kpa = compensation.kpa(frames.padc, frames.tadc)
+    kpa[(frames.status & TileStatus.UNUSABLE) != 0] = np.nan
+    since_ns = frames.t_ns - frames.t_ns[0]
+    for begin_ns in range(0, int(since_ns[-1]) + 1, WINDOW_NS // 2):
+        rows = (since_ns >= begin_ns) & (since_ns < begin_ns + WINDOW_NS)
+        window_kpa = kpa[rows]
+        if len(window_kpa) < FRAMES_MIN or not np.isfinite(window_kpa).all():
+            continue
+        near = np.abs(window_kpa.mean(axis=0) - expected_kpa) < NEAR_BASELINE_KPA
+        quiet = window_kpa.std(axis=0, ddof=1) < QUIET * noise_kpa
+        if (near & quiet).all():
+            return np.asarray(rows)
+    raise TareError(
+        "no interval can be recognised as unloaded",
+        expected=f"{WINDOW_NS / 1e9:g} s in which every tile is quiet and within "
+        f"{NEAR_BASELINE_KPA} kPa of its baseline on the bench",
+        remedy="Name an unloaded interval with --tare-s BEGIN,END",
+    )

@@ -1,0 +1,174 @@
+"""Frames to estimates for a recording that comes in pieces: finds the tare, then estimates.
+
+Used by `simulate` while frames are taken and by `estimate` from a file; frames wait until a tare is
+known, and estimates leave together with the frames they are about.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.errors import TareError, UsageError
+from devices.frames import ArrayInfo, FrameBatch, FrameStatus
+from service.estimation.calibration import Calibration
+from service.estimation.estimate import Estimates, EstimationState, finish, step
+from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.pressure import Compensation
+from service.estimation.tare import Tare, take_tare
+
+Extra = Mapping[str, npt.NDArray[Any]]
+
+CHUNK = 4096
+"""Rows per step: numpy slows down once its temporaries leave the cache (performance.md)."""
+
+RECOGNISE_WITHIN_NS = 60_000_000_000
+"""An unloaded interval is looked for in the first minute of a recording."""
+
+
+@dataclass(frozen=True)
+class EstimateOptions:
+    """What an estimate of a recording is asked to be."""
+
+    calibration: Calibration
+    models: tuple[str, ...]
+    lag_ms: float
+    tare_s: tuple[float, float] | None = None
+
+
+class EstimateStream:
+    """Estimates of one stream; `plan` is there once the tare is known."""
+
+    def __init__(self, info: ArrayInfo, options: EstimateOptions) -> None:
+        self.plan: EstimationPlan | None = None
+        self._info = info
+        self._options = options
+        # Refuse now what would fail later: unknown models, tiles without calibration.
+        serials = info.serials
+        if options.tare_s is not None and not 0 <= options.tare_s[0] < options.tare_s[1]:
+            raise UsageError(
+                f"--tare-s {options.tare_s[0]:g},{options.tare_s[1]:g} is no interval",
+                expected="BEGIN,END in seconds from the first frame, BEGIN before END",
+            )
+        options.calibration.restricted_to(serials)
+        nothing = np.zeros(len(serials))
+        make_plan(
+            info,
+            options.calibration,
+            Tare(nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"),
+            models=options.models,
+            lag_ms=options.lag_ms,
+        )
+
+    def run(
+        self, pieces: Iterable[tuple[FrameBatch, Extra]]
+    ) -> Iterator[tuple[FrameBatch, dict[str, npt.NDArray[Any]]]]:
+        """Frames with their extra columns and estimates, in order, every frame once.
+
+        Raises:
+            TareError: no tare can be found.
+        """
+        pieces = iter(pieces)
+        taken = self._until_tare(pieces)
+        plan = self.plan = self._make_plan(FrameBatch.concatenate([f for f, _ in taken]))
+        held: deque[tuple[FrameBatch, Extra]] = deque()
+        state = EstimationState()
+        for frames, extra in chain(taken, pieces):
+            for begin in range(0, len(frames), CHUNK):
+                end = min(begin + CHUNK, len(frames))
+                rows = frames.rows(begin, end)
+                held.append((rows, {name: values[begin:end] for name, values in extra.items()}))
+                estimates, state = step(plan, rows, state)
+                yield from _paired(held, estimates)
+        last = finish(plan, state)
+        if last is not None:
+            yield from _paired(held, last)
+
+    def _until_tare(
+        self, pieces: Iterator[tuple[FrameBatch, Extra]]
+    ) -> list[tuple[FrameBatch, Extra]]:
+        """Take pieces until the tare's interval has passed."""
+        taken: list[tuple[FrameBatch, Extra]] = []
+        for piece in pieces:
+            taken.append(piece)
+            if self._tare_is_in(taken):
+                break
+        if not taken:
+            raise TareError("the recording has no frames")
+        return taken
+
+    def _make_plan(self, frames: FrameBatch) -> EstimationPlan:
+        options = self._options
+        tare = take_tare(
+            frames,
+            Compensation(self._info),
+            options.calibration,
+            self._info.serials,
+            interval_s=options.tare_s,
+        )
+        return make_plan(
+            self._info, options.calibration, tare, models=options.models, lag_ms=options.lag_ms
+        )
+
+    def _tare_is_in(self, taken: list[tuple[FrameBatch, Extra]]) -> bool:
+        first, newest = taken[0][0], taken[-1][0]
+        since_ns = int(newest.t_ns[-1] - first.t_ns[0])
+        if self._options.tare_s is not None:
+            return since_ns > self._options.tare_s[1] * 1e9
+        if first.frame_status[0] & FrameStatus.LEAD:
+            return not newest.frame_status[-1] & FrameStatus.LEAD
+        return since_ns > RECOGNISE_WITHIN_NS
+
+
+def _paired(
+    held: deque[tuple[FrameBatch, Extra]], estimates: Estimates
+) -> Iterator[tuple[FrameBatch, dict[str, npt.NDArray[Any]]]]:
+    """Cut the held frames to where the estimates reach."""
+    at = 0
+    while at < len(estimates):
+        frames, extra = held.popleft()
+        n = min(len(frames), len(estimates) - at)
+        if n < len(frames):
+            rest = {name: values[n:] for name, values in extra.items()}
+            held.appendleft((frames.rows(n, len(frames)), rest))
+        columns = {name: values[:n] for name, values in extra.items()}
+        columns |= estimate_columns(estimates.rows(at, at + n))
+        yield frames.rows(0, n), columns
+        at += n
+
+
+def estimate_columns(estimates: Estimates) -> dict[str, npt.NDArray[Any]]:
+    """Columns of a sealed file; `seq` and `t_ns` are the frames' own."""
+    return {
+        f.name: getattr(estimates, f.name)
+        for f in fields(Estimates)
+        if f.name not in ("seq", "t_ns")
+    }
+
+
+def notes_of(plan: EstimationPlan) -> dict[str, object]:
+    """What a file says of how its estimates were made; enough to make them again."""
+    tare = plan.tare
+    return {
+        "calibration_id": plan.calibration.id,
+        "calibration": plan.calibration.restricted_to(plan.info.serials).model_dump(mode="json"),
+        "absolute_scale": "assumed" if plan.assumed_scale else "measured",
+        "models": list(plan.models),
+        "lag_ms": plan.lag_ns * 1e-6,
+        "tare": {
+            "source": tare.source,
+            "begin_s": tare.begin_s,
+            "end_s": tare.end_s,
+            "frames": tare.frames,
+            "t_ns": tare.t_ns,
+            "baseline_kpa": tare.baseline_kpa.tolist(),
+            "baseline_sigma_kpa": tare.baseline_sigma_kpa.tolist(),
+            "noise_kpa": tare.noise_kpa.tolist(),
+        },
+    }

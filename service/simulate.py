@@ -1,0 +1,249 @@
+"""A session on emulated silicon in virtual time: the real driver, frames, estimates, one file.
+
+The same command and version give the same bytes: time is virtual, every draw comes from the seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.acquisition import Acquisition
+from devices.array import TileArray
+from devices.clock import UtcAnchor, VirtualClock
+from devices.dynamixel import MODELS as SERVO_MODELS
+from devices.dynamixel import open_servo
+from devices.emulation.ground import tile_positions_m
+from devices.emulation.load_trace import CopTransform, LoadTrace, PressedTrace, press
+from devices.emulation.world import World
+from devices.errors import UsageError
+from devices.frames import ArrayInfo, FrameBatch, FrameStatus, ServoInfo, TileInfo
+from devices.i2c import open_bus
+from devices.scene import Scene, ScheduleName, ServoScene
+from devices.servo import PolledServo
+from service.accuracy import JUDGED, Accuracy, judge
+from service.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
+from service.version import SOFTWARE
+from storage.session_file import SessionWriter
+
+START_NS = 1_577_836_800_000_000_000
+"""2020-01-01T00:00:00Z, at which every emulated machine is switched on."""
+
+NODE = "emulated"
+
+_GATHER = 64
+
+
+@dataclass(frozen=True)
+class SimulateOptions:
+    """What to emulate; see `foottile simulate --help`."""
+
+    scene: Scene
+    seconds: float | None = None
+    schedule: ScheduleName | None = None
+    seed: int = 0
+    parts_seed: int = 0
+    lead_s: float = 1.0
+    truth: bool = False
+    load: LoadTrace | None = None
+    load_scale: float = 1.0
+    cop: CopTransform = CopTransform()  # noqa: RUF009  # frozen, so one for all is safe
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What came of it."""
+
+    frames: int
+    seconds: float
+    rate_hz: float
+    missed_slots: int
+    pressed: PressedTrace | None
+    accuracy: Accuracy | None
+
+
+class Simulation:
+    """One emulated foot, identified over its bus and ready to run."""
+
+    def __init__(self, options: SimulateOptions, stack: ExitStack) -> None:
+        scene = options.scene
+        self._options = options
+        self.pressed = _press(options)
+        self._clock = VirtualClock()
+        self._world = World(
+            scene,
+            self._clock,
+            seed=options.seed,
+            parts_seed=options.parts_seed,
+            lead_s=options.lead_s,
+            pressed=self.pressed,
+        )
+        self._end_ns = _end_ns(options, self._world.ground.duration_s)
+        schedule = options.schedule or scene.array.schedule
+        array = TileArray(
+            open_bus("emulated", self._world.i2c_adapter),
+            scene.tile,
+            self._clock,
+            schedule=schedule,
+            wait_ms=scene.array.wait_ms,
+        )
+        tiles = array.identify()
+        anchor = UtcAnchor.of(0, START_NS, clock_set=True)
+        servo = None
+        if scene.servo is not None:
+            servo = _polled_servo(self._world, scene.servo, self._clock.now_ns(), stack)
+        # One frame before the stream tells what rate this bus gives.
+        begin_ns = self._clock.now_ns()
+        array.scan()
+        self.rate_hz = scene.rate_hz or 1e9 / (self._clock.now_ns() - begin_ns)
+        self.info = _array_info(scene, schedule, tiles, anchor, self.rate_hz, options.seed)
+        self.acquisition = Acquisition(
+            array,
+            tiles,
+            self._clock,
+            anchor,
+            rate_hz=scene.rate_hz,
+            servo=servo,
+            reference=self._world.mill,
+        )
+
+    def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
+        """Frames with what the emulation adds: truth if asked for, the mill's notes."""
+        lead_ns = round(self._options.lead_s * 1e9)
+        mill = self._world.mill
+        batches = self.acquisition.run(lambda: self._clock.now_ns() >= self._end_ns)
+        # Nobody watches, so frames may gather: batching does not change a bit of the result.
+        while gathered := list(islice(batches, _GATHER)):
+            batch = FrameBatch.concatenate(gathered)
+            lead = np.where(batch.t_mono_ns < lead_ns, FrameStatus.LEAD, 0).astype(np.uint8)
+            extra: dict[str, npt.NDArray[Any]] = {}
+            if self._options.truth:
+                extra |= asdict(self._world.truth(batch.t_mono_ns))
+            if mill is not None:
+                extra |= mill.notes(batch.t_mono_ns)
+            yield replace(batch, frame_status=batch.frame_status | lead), extra
+
+
+def simulate(options: SimulateOptions, out: Path, estimate: EstimateOptions | None) -> Simulated:
+    """Run a session and seal it at `out`; without `estimate`, raw frames only.
+
+    Raises:
+        FootTileError: anything wrong with scene, load or calibration; `out` is not touched then.
+    """
+    notes: dict[str, object] = {
+        "scene": options.scene.model_dump(mode="json"),
+        "seed": options.seed,
+        "parts_seed": options.parts_seed,
+        "lead_s": options.lead_s,
+    }
+    judged: list[Mapping[str, npt.NDArray[Any]]] = []
+    frames = 0
+    first_ns = last_ns = 0
+    with ExitStack() as stack:
+        simulation = Simulation(options, stack)
+        pieces: Iterator[tuple[FrameBatch, Extra]] = simulation.pieces()
+        stream = None
+        if estimate is not None:
+            stream = EstimateStream(simulation.info, estimate)
+            pieces = iter(stream.run(pieces))
+        writer = stack.enter_context(SessionWriter(out, simulation.info, notes))
+        for batch, extra in pieces:
+            if stream is not None and stream.plan is not None and not frames:
+                writer.add_notes(notes_of(stream.plan))
+            writer.append(batch, extra)
+            first_ns = first_ns or int(batch.t_ns[0])
+            last_ns = int(batch.t_ns[-1])
+            frames += len(batch)
+            if options.truth and estimate is not None:
+                columns = {"t_ns": batch.t_ns, **extra}
+                judged.append({name: columns[name] for name in JUDGED})
+    seconds = (last_ns - first_ns) * 1e-9
+    return Simulated(
+        frames=frames,
+        seconds=seconds,
+        rate_hz=(frames - 1) / seconds if seconds else float("nan"),
+        missed_slots=simulation.acquisition.missed_slots,
+        pressed=simulation.pressed,
+        accuracy=judge(joined(judged)) if judged else None,
+    )
+
+
+def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArray[Any]]:
+    """Columns of all pieces, one after another."""
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+
+def _press(options: SimulateOptions) -> PressedTrace | None:
+    if options.load is None:
+        return None
+    return press(
+        options.load,
+        tile_positions_m(options.scene.tile)[:, :2],
+        np.array([not tile.reference for tile in options.scene.tile]),
+        load_scale=options.load_scale,
+        cop=options.cop,
+        lead_s=options.lead_s,
+    )
+
+
+def _end_ns(options: SimulateOptions, ground_s: float | None) -> int:
+    seconds = options.seconds if options.seconds is not None else ground_s
+    if seconds is None:
+        raise UsageError(
+            f"scene {options.scene.name!r} has no end of its own", remedy="Add --seconds S"
+        )
+    return round(seconds * 1e9)
+
+
+def _polled_servo(world: World, scene: ServoScene, now_ns: int, stack: ExitStack) -> PolledServo:
+    line_clock = VirtualClock(now_ns)
+    emulated = stack.enter_context(world.servo(scene, line_clock))
+    servo = open_servo(
+        emulated.port,
+        baudrate=scene.baudrate,
+        clock=line_clock,
+        servo_id=scene.id,
+        model=scene.model,
+    )
+    stack.callback(servo.close)
+    return PolledServo(servo, line_clock, rate_hz=scene.rate_hz)
+
+
+def _array_info(
+    scene: Scene,
+    schedule: ScheduleName,
+    tiles: tuple[TileInfo, ...],
+    anchor: UtcAnchor,
+    rate_hz: float,
+    seed: int,
+) -> ArrayInfo:
+    servo = None
+    if scene.servo is not None:
+        servo = ServoInfo(
+            model=scene.servo.model,
+            counts_per_turn=SERVO_MODELS[scene.servo.model].counts_per_turn,
+            zero_counts=scene.servo.zero_counts,
+            sign=scene.servo.sign,
+            ratio=scene.servo.ratio,
+            ankle_travel_m_per_rad=scene.servo.ankle_travel_m_per_rad,
+        )
+    return ArrayInfo(
+        node=NODE,
+        boot_id=f"{seed:032x}",
+        tiles=tiles,
+        servo=servo,
+        schedule=schedule,
+        nominal_rate_hz=rate_hz,
+        utc_offset_ns=anchor.offset_ns,
+        clock_set=anchor.clock_set,
+        software=SOFTWARE,
+        scene=scene.name,
+        models=scene.models,
+    )

@@ -1,0 +1,250 @@
+"""One table of columns from which the schemas of wire and disk are made.
+
+On the wire (and in a journal) a column with one value per tile is a fixed-size list, so that a
+message is read as numpy views without a copy. In a sealed file it is flat, `padc_0`, `padc_1`, ...,
+because that compresses best and any tool can read it. Units and meaning are in the field metadata
+of both, the array's description in the schema metadata.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from devices.errors import FileFormatError
+from devices.frames import (
+    FRAME_COLUMNS,
+    NO_SERVO_AGE,
+    NO_SERVO_COUNTS,
+    NOT_READ,
+    ArrayInfo,
+    FrameBatch,
+)
+
+ARRAY_INFO_KEY = b"foottile.array_info"
+
+Array = npt.NDArray[Any]
+"""A numpy column; which type it has is said by the column table, not by the checker."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One quantity: its name carries its unit, its type is that of the file."""
+
+    name: str
+    type: pa.DataType
+    unit: str
+    description: str
+    per_tile: bool = False
+    missing: int | None = None
+    """The number that stands for "not known" in memory; null in files. Floats: NaN, null too."""
+
+    def flat_names(self, tiles: int) -> list[str]:
+        """Names of its columns in a flat file."""
+        return [f"{self.name}_{i}" for i in range(tiles)] if self.per_tile else [self.name]
+
+    def field(self, name: str, type_: pa.DataType, *, nullable: bool) -> pa.Field[Any]:
+        """An Arrow field with unit and description in its metadata."""
+        metadata = {"unit": self.unit, "description": self.description}
+        return pa.field(name, type_, nullable=nullable, metadata=metadata)
+
+
+def _frame(name: str, unit: str, description: str, missing: int | None = None) -> Column:
+    dtype, per_tile = FRAME_COLUMNS[name]
+    return Column(name, pa.from_numpy_dtype(np.dtype(dtype)), unit, description, per_tile, missing)
+
+
+FRAMES = (
+    _frame("seq", "1", "number of the frame in its stream"),
+    _frame("t_mono_ns", "ns", "CLOCK_MONOTONIC of the node at the sample of the first tile"),
+    _frame("t_ns", "ns", "the same instant in UTC since 1970"),
+    _frame("padc", "counts", "raw pressure counts, falling with pressure", NOT_READ),
+    _frame("tadc", "counts", "raw temperature counts of the chip", NOT_READ),
+    _frame("sample_offset_us", "us", "sample instant of the tile minus t_ns"),
+    _frame("servo_counts", "counts", "newest servo position", NO_SERVO_COUNTS),
+    _frame("servo_age_us", "us", "age of the servo position at t_ns", NO_SERVO_AGE),
+    _frame(
+        "status",
+        "bits",
+        "1 no_answer, 2 stale, 4 retried, 8 implausible, 16 over_range, 32 not_converted",
+    ),
+    _frame(
+        "frame_status", "bits", "1 overrun, 2 servo_stale, 4 bus_fault, 8 lead, 16 new_array_info"
+    ),
+    _frame("reference_force_n", "N", "force of the calibration rig's sensor"),
+)
+"""What a node measures: `devices.frames.FrameBatch`."""
+
+_F32 = pa.float32()
+
+CONTACT_UNKNOWN = 255
+
+ESTIMATES = (
+    Column("gauge_kpa", _F32, "kPa", "gas pressure above the tile's own baseline", True),
+    Column("force_n", _F32, "N", "force on the tile along its axis", True),
+    Column("force_sigma_n", _F32, "N", "standard uncertainty of force_n", True),
+    Column("grf_n", _F32, "N", "ground reaction force: sum of the tile forces"),
+    Column("grf_sigma_n", _F32, "N", "standard uncertainty of grf_n"),
+    Column("cop_x_m", _F32, "m", "centre of pressure, foot frame, x forward"),
+    Column("cop_y_m", _F32, "m", "centre of pressure, foot frame, y to the left"),
+    Column("cop_sigma_x_m", _F32, "m", "standard uncertainty of cop_x_m"),
+    Column("cop_sigma_y_m", _F32, "m", "standard uncertainty of cop_y_m"),
+    Column("cop_index_x", _F32, "1", "paper eq. 4: pressure-weighted grid index along x, from 1"),
+    Column("cop_index_y", _F32, "1", "paper eq. 4: pressure-weighted grid index along y, from 1"),
+    Column("cop_ground_x_m", _F32, "m", "centre of pressure, ground frame (paper eq. 3)"),
+    Column("cop_ground_y_m", _F32, "m", "centre of pressure, ground frame"),
+    Column("angle_rad", _F32, "rad", "angle of the foot segment from the servo"),
+    Column("contact", pa.uint8(), "1", "1: the foot bears load", missing=CONTACT_UNKNOWN),
+    Column(
+        "estimate_status",
+        pa.uint16(),
+        "bits",
+        "1 saturated, 2 extrapolated, 4 outlier_replaced, 8 gap, 16 cop_masked, 32 tile_missing, "
+        "64 assumed_scale, 128 tare_old, 256 over_rated",
+    ),
+)
+"""What the estimator makes of it: `service.estimation.estimate.Estimates`."""
+
+TRUTH = (
+    Column("true_force_n", pa.float64(), "N", "emulation: force on the dome along its axis", True),
+    Column("true_grf_n", pa.float64(), "N", "emulation: vertical sum of the dome forces"),
+    Column("true_plate_n", pa.float64(), "N", "emulation: vertical force on the whole foot"),
+    Column("true_cop_x_m", pa.float64(), "m", "emulation: true centre of pressure, foot frame"),
+    Column("true_cop_y_m", pa.float64(), "m", "emulation: true centre of pressure, foot frame"),
+    Column("true_angle_rad", pa.float64(), "rad", "emulation: true angle of the foot segment"),
+)
+"""What an emulated scene knows: `devices.emulation.world.Truth`."""
+
+MILL = (
+    Column("pressed_tile", pa.string(), "1", "serial of the tile under the spindle"),
+    Column("phase", pa.string(), "1", "rest, load, unload, hold, release, tap or soak"),
+)
+"""What the operator of an indentation rig writes down beside the frames."""
+
+KNOWN = {column.name: column for column in (*FRAMES, *ESTIMATES, *TRUTH, *MILL)}
+
+
+# --- wire -----------------------------------------------------------------------------------------
+
+
+def wire_schema(info: ArrayInfo) -> pa.Schema:
+    """Arrow schema of a stream of frames of this array."""
+    tiles = len(info.tiles)
+    return pa.schema(
+        [
+            column.field(
+                column.name,
+                pa.list_(pa.field("item", column.type, nullable=False), tiles)
+                if column.per_tile
+                else column.type,
+                nullable=False,
+            )
+            for column in FRAMES
+        ],
+        metadata={ARRAY_INFO_KEY: info.model_dump_json().encode()},
+    )
+
+
+def to_record_batch(batch: FrameBatch, schema: pa.Schema) -> pa.RecordBatch:
+    """Frames as one Arrow record batch; buffers are shared, not copied."""
+    arrays = []
+    for column, field in zip(FRAMES, schema, strict=True):
+        values = getattr(batch, column.name)
+        flat = pa.array(values.reshape(-1))
+        arrays.append(
+            pa.FixedSizeListArray.from_arrays(flat, type=field.type) if column.per_tile else flat
+        )
+    return pa.RecordBatch.from_arrays(arrays, schema=schema)
+
+
+def from_record_batch(record: pa.RecordBatch) -> FrameBatch:
+    """Numpy views of a record batch; `to_record_batch` backwards.
+
+    Raises:
+        FileFormatError: the record is not one of frames.
+    """
+    try:
+        columns = {}
+        for column in FRAMES:
+            array = record.column(column.name)
+            flat = array.flatten() if isinstance(array, pa.FixedSizeListArray) else array
+            values = flat.to_numpy(zero_copy_only=True)
+            columns[column.name] = values.reshape(len(record), -1) if column.per_tile else values
+        return FrameBatch(**columns)
+    except (KeyError, ValueError, TypeError, AttributeError, pa.ArrowException) as error:
+        raise FileFormatError(
+            f"the Arrow message holds no frames: {error}",
+            expected="the columns " + ", ".join(column.name for column in FRAMES),
+        ) from error
+
+
+def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
+    """The description of the array that a schema carries.
+
+    Raises:
+        FileFormatError: it carries none, or one of another version.
+    """
+    text = (schema.metadata or {}).get(ARRAY_INFO_KEY)
+    if text is None:
+        raise FileFormatError(
+            "no description of the tile array in it",
+            where=where,
+            expected="a file written by foottile",
+        )
+    try:
+        return ArrayInfo.model_validate_json(text)
+    except ValueError as error:
+        raise FileFormatError(
+            f"its description of the tile array is not readable: {error}", where=where
+        ) from error
+
+
+# --- flat -----------------------------------------------------------------------------------------
+
+
+def flat_columns(
+    columns: Sequence[Column], values: Mapping[str, Array]
+) -> list[tuple[pa.Field[Any], pa.Array[Any]]]:
+    """Fields and arrays of a flat table, in the order of `columns`; missing values become null."""
+    out = []
+    for column in columns:
+        data = values[column.name]
+        parts = data.T if column.per_tile else data[None]
+        may_miss = column.missing is not None or not np.issubdtype(data.dtype, np.integer)
+        for name, part in zip(column.flat_names(len(parts)), parts, strict=True):
+            array = _to_arrow(np.ascontiguousarray(part), column)
+            out.append((column.field(name, column.type, nullable=may_miss), array))
+    return out
+
+
+def _to_arrow(values: Array, column: Column) -> pa.Array[Any]:
+    mask = None
+    if column.missing is not None:
+        mask = values == column.missing
+    # from_pandas: NaN is null. Arrow refuses a cast that would lose an integer's value.
+    return pa.array(values, mask=mask, from_pandas=True).cast(column.type, safe=column.type != _F32)
+
+
+def from_flat(column: Column, table: pa.Table, tiles: int) -> Array:
+    """One column of a flat table as numpy, (n,) or (n, tiles); nulls are what they are in memory.
+
+    Raises:
+        KeyError: the table lacks it.
+        ValueError: its type is not the column's.
+    """
+    parts = []
+    for name in column.flat_names(tiles):
+        array = table.column(name).combine_chunks()
+        if array.type != column.type:
+            raise ValueError(f"column {name} is {array.type}, not {column.type}")
+        if column.missing is not None:
+            array = array.fill_null(column.missing)
+        elif array.null_count and pa.types.is_integer(array.type):
+            raise ValueError(f"column {name} has {array.null_count} empty values")
+        parts.append(array.to_numpy(zero_copy_only=False))
+    return np.stack(parts, axis=1) if column.per_tile else parts[0]

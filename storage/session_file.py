@@ -1,0 +1,231 @@
+"""A sealed session: one Parquet file of flat columns, written and read here and nowhere else.
+
+Integers are delta-encoded, floats byte-stream-split, all of it zstd (6 bytes a frame of four tiles
+where CSV takes 54, performance.md). A row group is about a minute. The file appears whole or not at
+all: it is written beside its place under a name of its own, synced, and renamed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from devices.errors import FileFormatError
+from devices.frames import ArrayInfo, FrameBatch
+from storage.schema import (
+    ARRAY_INFO_KEY,
+    FRAMES,
+    KNOWN,
+    Array,
+    array_info,
+    flat_columns,
+    from_flat,
+)
+
+FORMAT_KEY = b"foottile.format"
+FORMAT = b"1"
+NOTES_KEY = b"foottile.notes"
+
+ROW_GROUP_NS = 60_000_000_000
+
+
+class SessionWriter:
+    """Writes frames, and whatever goes with them, to a Parquet file that appears when sealed.
+
+    Use as a context manager: an exception in the block leaves nothing behind.
+
+    Args:
+        path: where the sealed file will be. A file there is replaced at sealing, not before.
+        info: description of the array.
+        notes: anything else a reader should know; JSON-able, kept in the file's metadata.
+    """
+
+    def __init__(self, path: Path, info: ArrayInfo, notes: Mapping[str, object]) -> None:
+        self.path = path
+        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        self._info = info
+        self._notes = dict(notes)
+        self._waiting: list[dict[str, Array]] = []
+        self._writer: pq.ParquetWriter | None = None
+
+    def add_notes(self, notes: Mapping[str, object]) -> None:
+        """Add what became known later; must precede the first row group's end."""
+        self._notes |= notes
+
+    def append(self, frames: FrameBatch, extra: Mapping[str, Array]) -> None:
+        """Add frames with their extra columns, which must be the same ones in every call.
+
+        Args:
+            frames: n frames.
+            extra: columns of `storage.schema.KNOWN` by name, n rows each.
+        """
+        self._waiting.append(
+            {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)
+        )
+        begin_ns = self._waiting[0]["t_mono_ns"][0]
+        if frames.t_mono_ns[-1] - begin_ns >= ROW_GROUP_NS:
+            self._write_group()
+
+    def seal(self) -> None:
+        """Write what is left, sync, and give the file its name.
+
+        Raises:
+            FileFormatError: not one frame was appended.
+            OSError: the disk is full or not writable; nothing is left behind then.
+        """
+        self._write_group()
+        if self._writer is None:
+            raise FileFormatError("no frames to write", where=str(self.path))
+        self._writer.close()
+        self._writer = None
+        with self._temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        self._temporary.replace(self.path)
+        _sync_folder(self.path.parent)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None:
+                self.seal()
+        finally:
+            self._discard()
+
+    def _write_group(self) -> None:
+        if not self._waiting:
+            return
+        names = list(self._waiting[0])
+        values = {name: np.concatenate([piece[name] for piece in self._waiting]) for name in names}
+        self._waiting = []
+        fields, arrays = zip(*flat_columns([KNOWN[name] for name in names], values), strict=True)
+        schema = pa.schema(
+            list(fields),
+            metadata={
+                FORMAT_KEY: FORMAT,
+                ARRAY_INFO_KEY: self._info.model_dump_json().encode(),
+                NOTES_KEY: json.dumps(self._notes, sort_keys=True).encode(),
+            },
+        )
+        table = pa.Table.from_arrays(list(arrays), schema=schema)
+        if self._writer is None:
+            self._writer = pq.ParquetWriter(
+                self._temporary,
+                table.schema,
+                compression="zstd",
+                use_dictionary=[f.name for f in schema if pa.types.is_string(f.type)],  # type: ignore[arg-type]  # the stub knows bool only
+                column_encoding={f.name: e for f in schema if (e := _encoding(f.type))},
+            )
+        self._writer.write_table(table, row_group_size=len(table))
+
+    def _discard(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+        self._temporary.unlink(missing_ok=True)
+
+
+def _encoding(type_: pa.DataType) -> str | None:
+    if pa.types.is_floating(type_):
+        return "BYTE_STREAM_SPLIT"
+    if pa.types.is_integer(type_):
+        return "DELTA_BINARY_PACKED"
+    return None
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class SessionReader:
+    """Reads what `SessionWriter` wrote, one row group at a time."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a sealed session.
+
+        Raises:
+            FileFormatError: no such file, not Parquet, or not one of ours.
+        """
+        self.path = path
+        try:
+            self._file = pq.ParquetFile(path)
+        except (OSError, pa.ArrowException) as error:
+            raise FileFormatError(
+                f"cannot be read as Parquet: {error}", where=str(path), expected="a sealed session"
+            ) from error
+        schema = self._file.schema_arrow
+        self.info = array_info(schema, where=str(path))
+        version = schema.metadata.get(FORMAT_KEY)
+        if version != FORMAT:
+            raise FileFormatError(
+                f"format {version!r} is not known to this version",
+                where=str(path),
+                expected=f"format {FORMAT.decode()}",
+                remedy="Update foottile",
+            )
+        self.notes: dict[str, object] = json.loads(schema.metadata[NOTES_KEY])
+        self.column_names = frozenset(schema.names)
+        self.frame_count = self._file.metadata.num_rows
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def has(self, *names: str) -> bool:
+        """Does the file have these columns (of `storage.schema.KNOWN`)?"""
+        tiles = len(self.info.tiles)
+        return all(self.column_names.issuperset(KNOWN[name].flat_names(tiles)) for name in names)
+
+    def batches(self, *extra: str) -> Iterator[tuple[FrameBatch, dict[str, Array]]]:
+        """Frames in the order they were written, with the extra columns asked for.
+
+        Raises:
+            FileFormatError: a column is missing, of another type, or damaged.
+        """
+        tiles = len(self.info.tiles)
+        wanted = [*(column.name for column in FRAMES), *extra]
+        names = [flat for name in wanted for flat in KNOWN[name].flat_names(tiles)]
+        for group in range(self._file.num_row_groups):
+            try:
+                table = self._file.read_row_group(group, columns=names)
+                values: dict[str, Any] = {
+                    name: from_flat(KNOWN[name], table, tiles) for name in wanted
+                }
+                frames = FrameBatch(**{column.name: values.pop(column.name) for column in FRAMES})
+            except (KeyError, ValueError, OSError, pa.ArrowException) as error:
+                raise FileFormatError(
+                    f"row group {group} cannot be read: {error}", where=str(self.path)
+                ) from error
+            yield frames, values
+
+    def frames(self) -> FrameBatch:
+        """All frames at once.
+
+        Raises:
+            FileFormatError: as for `batches`.
+        """
+        return FrameBatch.concatenate([frames for frames, _ in self.batches()])
