@@ -27,10 +27,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 from devices.clock import Clock
-from devices.dynamixel import (
+from devices.dynamixel import MODELS
+from devices.dynamixel_packets import (
     ALERT,
     BROADCAST_ID,
-    MODELS,
     Instruction,
     Packet,
     PacketDecoder,

@@ -12,15 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.clock import SystemClock, VirtualClock
-from devices.dynamixel import (
-    MODELS,
-    Dynamixel,
+from devices.dynamixel import MODELS, Dynamixel, open_servo
+from devices.dynamixel_packets import (
     Instruction,
     Packet,
     PacketDecoder,
     crc16,
     instruction_packet,
-    open_servo,
     read_packet,
     wire_time_ns,
 )

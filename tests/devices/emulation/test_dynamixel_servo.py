@@ -13,7 +13,7 @@ import pytest
 import serial
 
 from devices.clock import SystemClock, VirtualClock
-from devices.dynamixel import Instruction, PacketDecoder, instruction_packet, read_packet
+from devices.dynamixel_packets import Instruction, PacketDecoder, instruction_packet, read_packet
 from devices.emulation.dynamixel import EmulatedServo
 from devices.errors import UsageError
 
