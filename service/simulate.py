@@ -5,7 +5,8 @@ The same command and version give the same bytes: time is virtual, every draw co
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
@@ -67,6 +68,8 @@ class Simulated:
     missed_slots: int
     pressed: PressedTrace | None
     accuracy: Accuracy | None
+    wall_s: float
+    """What taking, estimating and writing the frames took, set-up and bench left out."""
 
 
 class Simulation:
@@ -131,8 +134,12 @@ class Simulation:
             yield replace(batch, frame_status=batch.frame_status | lead), extra
 
 
-def simulate(options: SimulateOptions, out: Path, estimate: EstimateOptions | None) -> Simulated:
+def simulate(
+    options: SimulateOptions, out: Path, estimate: Callable[[], EstimateOptions] | None
+) -> Simulated:
     """Run a session and seal it at `out`; without `estimate`, raw frames only.
+
+    `estimate` is asked for once the scene is known to run, since a calibration may take a while.
 
     Raises:
         FootTileError: anything wrong with scene, load or calibration; `out` is not touched then.
@@ -151,9 +158,10 @@ def simulate(options: SimulateOptions, out: Path, estimate: EstimateOptions | No
         pieces: Iterator[tuple[FrameBatch, Extra]] = simulation.pieces()
         stream = None
         if estimate is not None:
-            stream = EstimateStream(simulation.info, estimate)
+            stream = EstimateStream(simulation.info, estimate())
             pieces = iter(stream.run(pieces))
         writer = stack.enter_context(SessionWriter(out, simulation.info, notes))
+        began_s = time.perf_counter()
         for batch, extra in pieces:
             if stream is not None and stream.plan is not None and not frames:
                 writer.add_notes(notes_of(stream.plan))
@@ -172,6 +180,7 @@ def simulate(options: SimulateOptions, out: Path, estimate: EstimateOptions | No
         missed_slots=simulation.acquisition.missed_slots,
         pressed=simulation.pressed,
         accuracy=judge(joined(judged)) if judged else None,
+        wall_s=time.perf_counter() - began_s,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
@@ -69,6 +68,7 @@ def simulate_command(
     from devices.emulation.load_trace import CopTransform
     from service.calibrations import find_calibration, with_tiles
     from service.cli.report import accuracy_table
+    from service.estimation.plan import check_models
     from service.pipeline import EstimateOptions
     from service.simulate import SimulateOptions, simulate
     from storage.load_trace_file import read_load_trace
@@ -92,20 +92,21 @@ def simulate_command(
         load_scale=load_scale,
         cop=CopTransform(cop_scale, pair(cop_offset_m, "--cop-offset-m") or (0.0, 0.0), cop_axes),
     )
-    estimate = None
-    if not no_estimates and the_scene.calibration != "none":
-        with progress("calibrating on the emulated bench"):
-            calibration = find_calibration(
-                the_scene.calibration,
-                [tile.serial for tile in the_scene.tile],
-                parts_seed=parts_seed,
-                progress=remark,
-            )
-        estimate = EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS)
-    began = time.perf_counter()
+    has_estimates = not no_estimates and the_scene.calibration != "none"
+    if has_estimates:
+        check_models(the_scene.models)
+
+    def estimate() -> EstimateOptions:
+        calibration = find_calibration(
+            the_scene.calibration,
+            [tile.serial for tile in the_scene.tile],
+            parts_seed=parts_seed,
+            progress=remark,
+        )
+        return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS)
+
     with progress(f"simulating {the_scene.name}"):
-        result = simulate(options, path, estimate)
-    wall_s = time.perf_counter() - began
+        result = simulate(options, path, estimate if has_estimates else None)
     pressed = result.pressed
     if as_json:
         print_json(
@@ -128,7 +129,9 @@ def simulate_command(
         highlight=False,
         soft_wrap=True,
     )
-    remark(f"{wall_s:.1f} s of wall time, {result.seconds / wall_s:.1f} times real time")
+    remark(
+        f"{result.wall_s:.1f} s of wall time, {result.seconds / result.wall_s:.1f} times real time"
+    )
     if pressed is not None:
         stdout.print(
             f"load: {pressed.moved_to_edge} samples had their COP moved to the hull's edge, "

@@ -77,11 +77,7 @@ def make_plan(
         UsageError: an unknown model, no `static`, or a negative lag.
         CalibrationError: a tile is not calibrated.
     """
-    for name in models:
-        if name not in MODELS:
-            raise UsageError(f"unknown model {name!r}", expected=f"some of {', '.join(MODELS)}")
-    if "static" not in models:
-        raise UsageError("without the model 'static' there is no force", remedy="Add it")
+    check_models(models)
     if not lag_ms >= 0.0:
         raise UsageError(f"a look-ahead of {lag_ms} ms", expected="zero or more")
     entries = [calibration.of(tile.serial) for tile in info.tiles]
@@ -110,3 +106,16 @@ def make_plan(
         assumed_scale=any(entry.absolute_scale == "assumed" for entry in entries),
         gap_ns=round(GAP * 1e9 / info.nominal_rate_hz),
     )
+
+
+def check_models(models: Sequence[str]) -> None:
+    """Refuse models that there are not, and a ladder without force.
+
+    Raises:
+        UsageError: an unknown model, or no `static`.
+    """
+    for name in models:
+        if name not in MODELS:
+            raise UsageError(f"unknown model {name!r}", expected=f"some of {', '.join(MODELS)}")
+    if "static" not in models:
+        raise UsageError("without the model 'static' there is no force", remedy="Add it")

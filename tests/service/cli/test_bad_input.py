@@ -1,0 +1,203 @@
+"""Everything wrong that a user can say: a clear line, the right exit code, nothing half-written."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+STANDING = (resources.files("devices") / "scenes" / "standing.toml").read_text("utf-8")
+GOOD_TRACE = "time_s,fz_n,cop_x_m,cop_y_m\n" + "".join(
+    f"{0.01 * i:.2f},{10 + i},0.0,0.0\n" for i in range(50)
+)
+
+
+def left(folder: Path, *given: str) -> list[str]:
+    """What lies in the folder beside what the test put there."""
+    return sorted(path.name for path in folder.iterdir() if path.name not in given)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("schedule =", "shedule ="), ["array.shedule", "spelling"]),
+        (('serial = "T01"', "serial = 1"), ["tile.0.serial"]),
+        (("wait_ms = 1.6", 'wait_ms = "1.6"'), ["array.wait_ms", "'1.6'"]),
+        (("channel = 1", "channel = 0"), ["0x70", "channel 0", "two tiles"]),
+        (('serial = "T02"', 'serial = "T01"'), ["T01", "twice"]),
+        (("x_m = -0.021", "x_m = -21.0"), ["tile.0.x_m", "-21"]),
+        (('kind = "plate"', 'kind = "plates"'), ["ground", "plate"]),
+        (("[array]", "[array"), ["not TOML"]),
+        (('models = ["unwrap", "static"]', 'models = ["unwrap"]'), ["static"]),
+        (('models = ["unwrap", "static"]', 'models = ["static", "magic"]'), ["magic", "unwrap"]),
+        (('name = "standing"', 'name = "standing"\ncalibration = "gone.json"'), ["gone.json"]),
+    ],
+)
+def test_a_wrong_scene_names_the_key(run, tmp_path, change, says):
+    assert change[0] in STANDING
+    (tmp_path / "scene.toml").write_text(STANDING.replace(*change, 1))
+    outcome = run("simulate", "--scene", "scene.toml", "--seconds", 2, "--out", "s.parquet")
+    assert outcome.code in (1, 2)
+    assert outcome.err.startswith("foottile: ")
+    assert "Traceback" not in outcome.err
+    for word in says:
+        assert word in outcome.err
+    assert left(tmp_path, "scene.toml") == []
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (GOOD_TRACE.replace("time_s", "time_ms"), ["time_s", "time_ms"]),
+        (GOOD_TRACE.replace("fz_n", "fz_kn"), ["fz_n", "fz_kn"]),
+        (GOOD_TRACE.replace("0.20,", "0.10,"), ["row 21", "rise"]),
+        (GOOD_TRACE.replace("0.20,", "0.19,"), ["row 21", "rise"]),
+        (GOOD_TRACE.replace("0.20,30,", "0.20,nan,"), ["fz_n", "row 21"]),
+        (GOOD_TRACE.replace("0.20,30,", "0.20,,"), ["fz_n", "row 21"]),
+        (GOOD_TRACE.replace("0.20,30,0.0,0.0", "0.20,30,,"), ["row 21", "centre of pressure"]),
+        (GOOD_TRACE.replace("0.20,30,", "0.20,much,"), ["fz_n"]),
+        ("time_s,cell1_n,cell2_n\n0,1,1\n1,1,1\n", ["2 cell columns", "4 tiles"]),
+        ("", ["cannot be read"]),
+        ("\x00\xff\x00", ["cannot be read", "expected"]),
+    ],
+)
+def test_a_wrong_load_trace_names_the_place(run, tmp_path, text, says):
+    (tmp_path / "load.csv").write_bytes(text.encode("latin-1"))
+    outcome = run("simulate", "--scene", "standing", "--load", "load.csv", "--out", "s.parquet")
+    assert outcome.code == 1
+    assert "load.csv" in outcome.err
+    for word in says:
+        assert word in outcome.err
+    assert left(tmp_path, "load.csv") == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["--scene", "nowhere"], 2, ["nowhere", "standing"]),
+        (["--scene", "insole"], 2, ["--load"]),
+        (["--scene", "standing"], 2, ["--seconds"]),
+        (["--scene", "standing", "--seconds", "-1"], 2, ["--seconds"]),
+        (["--scene", "standing", "--seconds", "nan"], 2, ["--seconds"]),
+        (["--scene", "standing", "--seconds", "2", "--schedule", "fast"], 2, ["simultaneous"]),
+        (["--scene", "standing", "--seconds", "2", "--tiles", "T01"], 2, ["--tiles"]),
+        (["--scene", "standing", "--load", "gone.csv"], 1, ["gone.csv"]),
+        (["--scene", "standing", "--seconds", "2", "--out", "gone/s.parquet"], 2, ["gone"]),
+        (["--scene", "standing", "--seconds", "2", "--cop-offset-m", "1"], 2, ["--cop-offset-m"]),
+        (["--scene", "standing", "--seconds", "0.02"], 1, ["T01", "20"]),
+    ],
+)
+def test_simulate_refuses(run, tmp_path, arguments, code, says):
+    outcome = run("simulate", *arguments)
+    assert outcome.code == code, outcome.err
+    for word in says:
+        assert word in outcome.err
+    assert left(tmp_path) == []
+
+
+def test_an_axis_name_that_is_none_is_refused(run, tmp_path):
+    (tmp_path / "load.csv").write_text(GOOD_TRACE)
+    outcome = run("simulate", "--scene", "standing", "--load", "load.csv", "--cop-axes", "xx")
+    assert outcome.code == 2
+    assert "--cop-axes" in outcome.err
+
+
+@pytest.fixture
+def session(run, tmp_path) -> Path:
+    outcome = run(
+        *("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
+    )
+    assert outcome.code == 0
+    return tmp_path / "s.parquet"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        ([], 1, ["--calibration"]),
+        (["--calibration", "gone.json"], 1, ["gone.json", "paper-eq2-shape"]),
+        (["--calibration", "other.json"], 1, ["T01", "T09", "foottile calibrate"]),
+        (["--calibration", "broken.json"], 1, ["broken.json"]),
+        (["--calibration", "paper-eq2-shape", "--models", "magic"], 2, ["magic"]),
+        (["--calibration", "paper-eq2-shape", "--lag-ms", "-1"], 2, ["look-ahead"]),
+        (["--calibration", "paper-eq2-shape", "--tare-s", "1"], 2, ["--tare-s"]),
+        (["--calibration", "paper-eq2-shape", "--tare-s", "5,6"], 1, ["T01", "--tare-s"]),
+        (["--calibration", "paper-eq2-shape", "--tare-s", "1,0"], 2, ["--tare-s"]),
+        (
+            ["--scene", "rolling", "--calibration", "paper-eq2-shape", "--scene", "insole"],
+            2,
+            ["T08"],
+        ),
+    ],
+)
+def test_estimate_refuses(run, tmp_path, session, arguments, code, says):
+    from service.estimation.calibration import Calibration, paper_eq2_shape
+
+    preset = paper_eq2_shape()
+    other = Calibration(
+        name="other",
+        reference="none",
+        date=preset.date,
+        tiles=(preset.tiles[0].model_copy(update={"serial": "T09"}),),
+    )
+    (tmp_path / "other.json").write_text(other.to_json())
+    (tmp_path / "broken.json").write_text(other.to_json().replace("15.0", "16.0"))
+    outcome = run("estimate", session, "--out", "e.parquet", *arguments)
+    assert outcome.code == code, outcome.err
+    for word in says:
+        assert word in outcome.err
+    assert left(tmp_path, "s.parquet", "other.json", "broken.json") == []
+
+
+def test_estimate_refuses_what_is_no_session(run, tmp_path):
+    (tmp_path / "x.parquet").write_bytes(b"PAR1 not really PAR1")
+    for name in ("x.parquet", "gone.parquet"):
+        outcome = run("estimate", name, "--out", "e.parquet")
+        assert outcome.code == 1
+        assert name in outcome.err
+    assert left(tmp_path, "x.parquet") == []
+
+
+def test_calibrate_refuses_a_session_that_is_no_indentation(run, tmp_path, session):
+    outcome = run("calibrate", session, "--out", "cal.json")
+    assert outcome.code == 1
+    assert "not an indentation" in outcome.err
+    assert left(tmp_path, "s.parquet") == []
+
+
+def test_calibrate_refuses_an_indentation_that_never_loads_the_tile(run, tmp_path):
+    text = (resources.files("devices") / "scenes" / "indentation.toml").read_text("utf-8")
+    text = text.replace('kind = "indentation"', 'kind = "indentation"\nload_n = 0.2')
+    (tmp_path / "scene.toml").write_text(text)
+    run("simulate", "--scene", "scene.toml", "--tiles", "T01", "--out", "bench.parquet")
+    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--plot", "cal.png")
+    assert outcome.code == 1
+    assert "never loads the tile" in outcome.err
+    assert "T01" in outcome.err
+    assert left(tmp_path, "scene.toml", "bench.parquet") == []
+
+
+def test_calibrate_refuses_one_tile_from_two_files(run, tmp_path):
+    for name in ("a.parquet", "b.parquet"):
+        run("simulate", "--scene", "indentation", "--tiles", "T01", "--out", name)
+    outcome = run("calibrate", "a.parquet", "b.parquet", "--out", "cal.json")
+    assert outcome.code == 1
+    assert "T01" in outcome.err
+    assert "a.parquet" in outcome.err
+    assert "b.parquet" in outcome.err
+
+
+def test_a_full_disk_is_an_error_and_leaves_nothing(run, tmp_path, monkeypatch):
+    import os
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    outcome = run(
+        *("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
+    )
+    assert outcome.code == 1
+    assert "No space left" in outcome.err
+    assert left(tmp_path) == []

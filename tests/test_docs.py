@@ -1,0 +1,112 @@
+"""The documents say what the code does: every key, column and command is in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import pytest
+import typer.main
+from pydantic import BaseModel
+
+from devices.scene import (
+    ArrayScene,
+    EmulationScene,
+    FaultScene,
+    GroundScene,
+    Scene,
+    ServoScene,
+    TileScene,
+    builtin_scenes,
+)
+from service.cli.main import app
+from service.estimation.calibration import TileCalibration
+from service.estimation.estimate import EstimateStatus
+from storage.schema import KNOWN
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENES = (ROOT / "docs" / "scenes.md").read_text("utf-8")
+FORMATS = (ROOT / "docs" / "formats.md").read_text("utf-8")
+README = (ROOT / "README.md").read_text("utf-8")
+
+GROUNDS = get_args(get_args(GroundScene)[0])
+SECTIONS = {"array", "tile", "servo", "ground", "emulation", "fault"}
+
+
+@pytest.mark.parametrize(
+    "section", [Scene, ArrayScene, TileScene, ServoScene, EmulationScene, FaultScene, *GROUNDS]
+)
+def test_every_scene_key_is_documented(section: type[BaseModel]) -> None:
+    for key in section.model_fields:
+        if key not in SECTIONS or section is not Scene:
+            assert f"`{key}`" in SCENES, key
+
+
+def test_every_ground_and_builtin_scene_is_documented() -> None:
+    for ground in GROUNDS:
+        assert f"`{get_args(ground.model_fields['kind'].annotation)[0]}`" in SCENES
+    for scene in builtin_scenes():
+        assert f"`{scene}`" in SCENES
+
+
+@pytest.mark.parametrize(
+    ("heading", "section"),
+    [("[array]", ArrayScene), ("[servo]", ServoScene), ("[emulation]", EmulationScene)],
+)
+def test_documented_defaults_are_the_defaults(heading: str, section: type[BaseModel]) -> None:
+    part = SCENES.split(f"### `{heading}`")[1].split("###")[0]
+    cells = [[cell.strip() for cell in row.split("|")] for row in part.splitlines() if "`" in row]
+    documented = {row[1].strip("`"): row[2].strip('`"') for row in cells if len(row) > 3}
+    compared = 0
+    for key, field in section.model_fields.items():
+        if key in documented and isinstance(field.default, float | int | str):
+            compared += 1
+            shown = documented[key]
+            if isinstance(field.default, bool | str):
+                assert shown == str(field.default).lower(), key
+            else:
+                assert float(shown) == field.default, key
+    assert compared >= 4
+
+
+def test_every_column_is_documented_with_its_unit() -> None:
+    for name, column in KNOWN.items():
+        shown = f"`{name}_i`" if column.per_tile else f"`{name}`"
+        row = next((line for line in FORMATS.splitlines() if line.startswith(f"| {shown} |")), None)
+        assert row is not None, name
+        assert f"| {column.unit} |" in row
+        assert column.description in row
+
+
+def test_every_estimate_status_bit_is_documented() -> None:
+    for bit in EstimateStatus:
+        assert f"| {bit.value} | {bit.name.lower()} |" in FORMATS
+
+
+def test_every_command_is_in_the_readme_and_says_what_its_options_do() -> None:
+    root = typer.main.get_command(app)
+    for name, command in root.commands.items():
+        assert f"`foottile {name}`" in README
+        for parameter in command.params:
+            if parameter.name != "help":
+                assert parameter.help, f"{name} {parameter.name}"
+
+
+def test_every_option_in_the_readme_exists() -> None:
+    root = typer.main.get_command(app)
+    known = {
+        option
+        for c in root.commands.values()
+        for p in c.params
+        for option in getattr(p, "opts", [])
+    }
+    for line in README.splitlines():
+        if line.startswith("foottile "):
+            used = {word for word in line.split("#")[0].split() if word.startswith("--")}
+            assert used <= known, line
+
+
+def test_the_calibration_file_is_described() -> None:
+    for name in ("r2", "rmse_n", "cv_rmse_n", "hysteresis_n"):
+        assert name in TileCalibration.model_fields
+        assert f"`{name}" in FORMATS
