@@ -13,7 +13,7 @@ from devices.errors import CalibrationError, FileFormatError, UsageError
 from devices.frames import ArrayInfo
 from devices.scene import Scene, load_scene
 from service.accuracy import JUDGED, Accuracy, judge
-from service.calibrations import find_calibration
+from service.calibrations import BENCH, find_calibration
 from service.estimation.calibration import Calibration
 from service.estimation.plan import EstimationPlan
 from service.pipeline import EstimateOptions, EstimateStream, notes_of
@@ -105,20 +105,29 @@ def _calibration(
     remark: Callable[[str], None],
 ) -> Calibration:
     notes = session.notes
-    inside = Calibration.model_validate(notes["calibration"]) if "calibration" in notes else None
+    where = str(session.path)
+    try:
+        inside = (
+            Calibration.model_validate(notes["calibration"]) if "calibration" in notes else None
+        )
+    except ValueError as error:
+        raise FileFormatError(f"its calibration is not readable: {error}", where=where) from error
     if inside is not None and wanted in (None, inside.id):
         return inside
     name = wanted or (scene.calibration if scene is not None else None)
     if name is None:
         raise CalibrationError(
             "no calibration: the session brings none and none was named",
-            where=str(session.path),
+            where=where,
             remedy="Add --calibration FILE, or --scene with a scene that names one",
         )
-    parts_seed = notes.get("parts_seed", 0)
+    if name == BENCH and "parts_seed" not in notes:
+        # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
+        raise CalibrationError(
+            "the emulated bench knows emulated tiles only, and this session is of real ones",
+            where=where,
+            remedy="Press the tiles on a real bench and run `foottile calibrate`",
+        )
     return find_calibration(
-        name,
-        session.info.serials,
-        parts_seed=parts_seed if isinstance(parts_seed, int) else 0,
-        progress=remark,
+        name, session.info.serials, parts_seed=int(notes.get("parts_seed", 0)), progress=remark
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -133,10 +134,14 @@ class SessionWriter:
         self._writer.write_table(table, row_group_size=len(table))
 
     def _discard(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-        self._temporary.unlink(missing_ok=True)
+        try:
+            if self._writer is not None:
+                # What is thrown away need not get its footer, which a full disk has no room for.
+                with suppress(OSError, pa.ArrowException):
+                    self._writer.close()
+                self._writer = None
+        finally:
+            self._temporary.unlink(missing_ok=True)
 
 
 def _encoding(type_: pa.DataType) -> str | None:
@@ -181,7 +186,12 @@ class SessionReader:
                 expected=f"format {FORMAT.decode()}",
                 remedy="Update foottile",
             )
-        self.notes: dict[str, object] = json.loads(schema.metadata[NOTES_KEY])
+        try:
+            self.notes: dict[str, Any] = json.loads(schema.metadata[NOTES_KEY])
+        except (KeyError, ValueError) as error:
+            raise FileFormatError(
+                f"its notes are not readable: {error}", where=str(path), expected="JSON"
+            ) from error
         self.column_names = frozenset(schema.names)
         self.frame_count = self._file.metadata.num_rows
 

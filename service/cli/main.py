@@ -13,6 +13,8 @@ from service.cli.estimate import estimate_command
 from service.cli.simulate import simulate_command
 from service.version import SOFTWARE
 
+_TYPER_INTERRUPTED = 130
+
 app = typer.Typer(
     name="foottile",
     help="Data service for arrays of FootTile pressure sensors on robot feet.",
@@ -51,9 +53,9 @@ def main() -> None:
     except FootTileError as error:
         sys.stderr.write(f"foottile: {error}\n")
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        sys.stderr.write("foottile: interrupted, nothing was written\n")
-        sys.exit(1)
+    except SystemExit as end:
+        # typer's code for Ctrl-C; ours are 0 to 3, and what was not finished has failed.
+        sys.exit(1 if end.code == _TYPER_INTERRUPTED else end.code)
     except OSError as error:
         sys.stderr.write(f"foottile: {error}\n")
         sys.exit(1)

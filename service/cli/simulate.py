@@ -115,6 +115,7 @@ def simulate_command(
                 "frames": result.frames,
                 "seconds": result.seconds,
                 "rate_hz": result.rate_hz,
+                "missed_slots": result.missed_slots,
                 "bytes": path.stat().st_size,
                 "moved_to_edge": pressed.moved_to_edge if pressed else None,
                 "limited": pressed.limited if pressed else None,
@@ -132,6 +133,8 @@ def simulate_command(
     remark(
         f"{result.wall_s:.1f} s of wall time, {result.seconds / result.wall_s:.1f} times real time"
     )
+    if result.missed_slots:
+        stdout.print(f"{result.missed_slots} slots were missed: the bus cannot keep this rate")
     if pressed is not None:
         stdout.print(
             f"load: {pressed.moved_to_edge} samples had their COP moved to the hull's edge, "

@@ -1,0 +1,53 @@
+"""What is installed: whole, and quick to start."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_a_wheel_holds_the_scenes_and_the_packages_and_no_tests(tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    for scene in (ROOT / "devices" / "scenes").glob("*.toml"):
+        assert f"devices/scenes/{scene.name}" in names
+    assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {
+        *("devices", "storage", "service")
+    }
+
+
+def test_help_does_not_wait_for_heavy_libraries() -> None:
+    code = (
+        "import sys; import service.cli.main; "
+        "print([m for m in ('scipy', 'pyarrow', 'matplotlib') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+    assert done.stdout.decode().strip() == "[]"
+
+
+def test_ctrl_c_leaves_no_file_and_a_failing_exit_code(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from service.cli.main import main; main()", "simulate"]
+    arguments = ["--scene", "standing", "--seconds", "100000", "--no-estimates"]
+    process = subprocess.Popen(
+        command + arguments, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    try:
+        for _ in range(600):  # until it has begun to write
+            if any(tmp_path.iterdir()):
+                break
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 1
+    assert b"Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
