@@ -38,8 +38,8 @@ class ArrayScene(_Section):
 
     bus: str = "emulated"
     """A device such as /dev/i2c-1, or "emulated"."""
-    scl_hz: _Positive = 400_000.0
-    """Bus clock of the emulation; on hardware it is set in config.txt."""
+    scl_hz: Annotated[float, Field(ge=10_000, le=1_000_000)] = 400_000.0
+    """Bus clock of the emulation; on hardware it is set in config.txt. The bounds catch kHz."""
     schedule: ScheduleName = "simultaneous"
     wait_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 3.0
     """How long the driver waits for a conversion. The default is the data sheet's maximum; shorter
