@@ -34,6 +34,7 @@ BATCH_NS = 25_000_000
 """Length of a batch: at 10 ms two fifths of a message would be header (performance.md)."""
 
 _BATCH_FRAMES_MAX = 64
+_AGE_MAX_US = 2**31 - 1
 
 
 class ServoSource(Protocol):
@@ -130,7 +131,7 @@ class Acquisition:
             reading = self._servo.latest(t_mono_ns)
             if reading is not None:
                 servo_counts, age_ns = reading[0], t_mono_ns - reading[1]
-                servo_age_us = age_ns // 1000
+                servo_age_us = min(age_ns // 1000, _AGE_MAX_US)
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_status |= FrameStatus.SERVO_STALE
         columns["seq"][row] = self._next_seq

@@ -111,7 +111,7 @@ class TileArray:
             y_m=tile.y_m,
             z_m=tile.z_m,
             reference=tile.reference,
-            conversion_ms=CONVERSION_TYPICAL_NS * 1e-6,
+            conversion_ms=CONVERSION_TYPICAL_NS / 1e6,
         )
 
     def scan(self) -> Scan:

@@ -127,7 +127,11 @@ def open_bus(name: str, emulated: I2cAdapter | None = None) -> I2cBus:
         adapter = SMBus(name)
     except OSError as error:
         raise _classified(error, name, ()) from error
-    if adapter.fd is not None:
-        # smbus2 has no call of its own for it.
-        fcntl.ioctl(adapter.fd, I2C_TIMEOUT, TIMEOUT_10MS)
+    try:
+        if adapter.fd is not None:
+            # smbus2 has no call of its own for it.
+            fcntl.ioctl(adapter.fd, I2C_TIMEOUT, TIMEOUT_10MS)
+    except OSError as error:
+        adapter.close()
+        raise _classified(error, name, ()) from error
     return I2cBus(adapter, name)

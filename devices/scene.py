@@ -93,6 +93,20 @@ class ServoScene(_Section):
     ankle_travel_m_per_rad: _Number | None = None
     """Forward travel of the ankle per radian of the segment; absent: not known."""
 
+    @field_validator("sign", mode="before")
+    @classmethod
+    def _sign_is_a_number(cls, sign: object) -> object:
+        if isinstance(sign, bool):  # true equals 1, and would pass
+            raise ValueError(f"{sign} is no sign, which is 1 or -1")  # noqa: TRY004  # pydantic's
+        return sign
+
+    @field_validator("ratio")
+    @classmethod
+    def _ratio_turns_the_segment(cls, ratio: float) -> float:
+        if ratio == 0.0:
+            raise ValueError("0 would never turn the segment")
+        return ratio
+
 
 class _Ground(_Section):
     pass
@@ -165,7 +179,7 @@ class EmulationScene(_Section):
     """Creep of the dome."""
     hysteresis: bool = True
     """Rate-independent loop of the dome."""
-    ambient_degc: _Number = 21.0
+    ambient_degc: Annotated[float, Field(gt=-273.15, allow_inf_nan=False)] = 21.0
     temperature_step_k: _Number = 0.0
     """A step of the surroundings' temperature ..."""
     temperature_step_s: _NotNegative = 0.0
@@ -213,6 +227,8 @@ class Scene(_Section):
         plugs = [f"mux 0x{tile.mux:02x} channel {tile.channel}" for tile in self.tile]
         if twice := _repeated(plugs):
             raise ValueError(f"{twice} is used by two tiles; plug each into a channel of its own")
+        if all(tile.reference for tile in self.tile):
+            raise ValueError("every tile is a reference tile; at least one has to bear load")
         for fault in self.fault:
             if fault.tile not in serials:
                 raise ValueError(
@@ -272,6 +288,6 @@ def _first_complaint(error: ValidationError) -> str:
         return f"unknown key {key!r}. Check its spelling, or remove it"
     if complaint["type"] == "missing":
         return f"key {key!r} is missing"
-    if complaint["type"] == "value_error":
+    if complaint["type"] == "value_error" and isinstance(complaint["input"], dict):
         return f"{key}: {message}"
     return f"{key} = {complaint['input']!r}: {message}"

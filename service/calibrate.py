@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from devices.errors import CalibrationError
-from devices.frames import NOT_READ, FrameBatch, TileStatus
+from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.fit import fit_tile
 from service.estimation.indentation import Indentation
@@ -67,8 +67,7 @@ def read_indentations(session: SessionReader) -> list[Indentation]:
     frames = FrameBatch.concatenate([frames for frames, _ in pieces])
     pressed = np.concatenate([extra["pressed_tile"] for _, extra in pieces])
     phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
-    unreadable = ((frames.status & TileStatus.UNUSABLE) != 0) | (frames.padc == NOT_READ)
-    kpa = np.where(unreadable, np.nan, Compensation(session.info).kpa(frames.padc, frames.tadc))
+    kpa = Compensation(session.info).readable_kpa(frames)
     tiles = [
         Indentation(
             serial=serial,

@@ -57,7 +57,9 @@ def find_calibration(
             tiles=tuple(tile for entry in entries for tile in entry.tiles),
         )
     calibration = PRESETS[name]() if name in PRESETS else read_calibration(Path(name))
-    return calibration.restricted_to(serials)
+    for serial in serials:
+        calibration.of(serial)
+    return calibration
 
 
 def read_calibration(path: Path) -> Calibration:

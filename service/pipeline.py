@@ -21,15 +21,12 @@ from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimates, EstimationState, finish, step
 from service.estimation.plan import EstimationPlan, make_plan
 from service.estimation.pressure import Compensation
-from service.estimation.tare import Tare, take_tare
+from service.estimation.tare import RECOGNISE_WITHIN_NS, Tare, take_tare
 
 Extra = Mapping[str, npt.NDArray[Any]]
 
 CHUNK = 4096
 """Rows per step: numpy slows down once its temporaries leave the cache (performance.md)."""
-
-RECOGNISE_WITHIN_NS = 60_000_000_000
-"""An unloaded interval is looked for in the first minute of a recording."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +47,12 @@ class EstimateStream:
         self._info = info
         self._options = options
         # Refuse now what would fail later: unknown models, tiles without calibration.
-        serials = info.serials
         if options.tare_s is not None and not 0 <= options.tare_s[0] < options.tare_s[1]:
             raise UsageError(
                 f"--tare-s {options.tare_s[0]:g},{options.tare_s[1]:g} is no interval",
                 expected="BEGIN,END in seconds from the first frame, BEGIN before END",
             )
-        options.calibration.restricted_to(serials)
-        nothing = np.zeros(len(serials))
+        nothing = np.zeros(len(info.tiles))
         make_plan(
             info,
             options.calibration,
@@ -122,7 +117,7 @@ class EstimateStream:
         if self._options.tare_s is not None:
             return since_ns > self._options.tare_s[1] * 1e9
         if first.frame_status[0] & FrameStatus.LEAD:
-            return not newest.frame_status[-1] & FrameStatus.LEAD
+            return any(not (frames.frame_status & FrameStatus.LEAD).all() for frames, _ in taken)
         return since_ns > RECOGNISE_WITHIN_NS
 
 
@@ -157,7 +152,7 @@ def notes_of(plan: EstimationPlan) -> dict[str, object]:
     tare = plan.tare
     return {
         "calibration_id": plan.calibration.id,
-        "calibration": plan.calibration.restricted_to(plan.info.serials).model_dump(mode="json"),
+        "calibration": plan.calibration.model_dump(mode="json"),
         "absolute_scale": "assumed" if plan.assumed_scale else "measured",
         "models": list(plan.models),
         "lag_ms": plan.lag_ns * 1e-6,

@@ -20,7 +20,6 @@ from devices.emulation.load_trace import LoadTrace
 from devices.errors import LoadTraceError
 
 _UNITS = {"time": "time_s", "fz": "fz_n", "cop_x": "cop_x_m", "cop_y": "cop_y_m"}
-_NEGATIVE_PART = 0.5
 
 
 def read_load_trace(path: Path) -> LoadTrace:
@@ -32,9 +31,12 @@ def read_load_trace(path: Path) -> LoadTrace:
     """
     table = _read_table(path)
     where = str(path)
-    columns = {name.lower(): table.column(name) for name in table.column_names}
-    if len(columns) < len(table.column_names):
-        raise LoadTraceError("two columns differ only in case", where=where)
+    names = [name.lower() for name in table.column_names]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise LoadTraceError(
+            f"column {', '.join(twice)} is there twice, whatever its case", where=where
+        )
+    columns = dict(zip(names, table.columns, strict=True))
 
     def numbers(name: str, *, may_be_empty: bool = False) -> npt.NDArray[np.float64]:
         return _numbers(columns, name, where, may_be_empty=may_be_empty)
@@ -68,9 +70,11 @@ def read_load_trace(path: Path) -> LoadTrace:
             expected=_other_unit(columns, "fz_n") or "fz_n, or cell1_n, cell2_n, ...",
         )
     fz_n = numbers("fz_n") if has_total else None
-    if fz_n is not None and (fz_n < 0).mean() > _NEGATIVE_PART:
+    cells_n = np.stack([numbers(name) for _, name in cells], axis=1) if cells else None
+    pressed_n = cells_n if cells_n is not None else fz_n
+    if pressed_n is not None and pressed_n.sum() < 0.0:
         raise LoadTraceError(
-            "fz_n is mostly negative",
+            "the load is mostly negative",
             where=where,
             expected="the force of the ground on the foot, positive under load",
             remedy="Change its sign",
@@ -83,7 +87,7 @@ def read_load_trace(path: Path) -> LoadTrace:
     return LoadTrace(
         where=where,
         time_s=time_s,
-        cells_n=np.stack([numbers(name) for _, name in cells], axis=1) if cells else None,
+        cells_n=cells_n,
         fz_n=fz_n,
         cop_m=cop_m,
         angle_rad=numbers("angle_rad") if "angle_rad" in columns else None,
@@ -93,14 +97,17 @@ def read_load_trace(path: Path) -> LoadTrace:
 def _read_table(path: Path) -> pa.Table:
     try:
         if path.suffix.lower() == ".parquet":
-            return pyarrow.parquet.read_table(path)
-        return pyarrow.csv.read_csv(path)
+            table = pyarrow.parquet.read_table(path)
+        else:
+            table = pyarrow.csv.read_csv(path)
+        _ = table.column_names  # decoded only here
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         raise LoadTraceError(
             f"cannot be read: {error}",
             where=str(path),
-            expected="a CSV file with a header line, or a Parquet file",
+            expected="a CSV file in UTF-8 with a header line, or a Parquet file",
         ) from error
+    return table
 
 
 def _numbers(

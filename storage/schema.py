@@ -169,18 +169,22 @@ def from_record_batch(record: pa.RecordBatch) -> FrameBatch:
         FileFormatError: the record is not one of frames.
     """
     try:
-        columns = {}
-        for column in FRAMES:
-            array = record.column(column.name)
-            flat = array.flatten() if isinstance(array, pa.FixedSizeListArray) else array
-            values = flat.to_numpy(zero_copy_only=True)
-            columns[column.name] = values.reshape(len(record), -1) if column.per_tile else values
-        return FrameBatch(**columns)
+        return FrameBatch(**{column.name: _view(record, column) for column in FRAMES})
     except (KeyError, ValueError, TypeError, AttributeError, pa.ArrowException) as error:
         raise FileFormatError(
             f"the Arrow message holds no frames: {error}",
             expected="the columns " + ", ".join(column.name for column in FRAMES),
         ) from error
+
+
+def _view(record: pa.RecordBatch, column: Column) -> Array:
+    array = record.column(column.name)
+    if array.null_count:  # an empty row hides its values: what is left would be dealt out anew
+        raise ValueError(f"column {column.name} has {array.null_count} empty rows")
+    if isinstance(array, pa.FixedSizeListArray):
+        values = array.flatten().to_numpy(zero_copy_only=True)
+        return values.reshape(len(record), array.type.list_size)
+    return array.to_numpy(zero_copy_only=True)
 
 
 def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:

@@ -55,6 +55,7 @@ class SessionWriter:
         self._info = info
         self._notes = dict(notes)
         self._waiting: list[dict[str, Array]] = []
+        self._group_end_ns: int | None = None
         self._writer: pq.ParquetWriter | None = None
 
     def add_notes(self, notes: Mapping[str, object]) -> None:
@@ -68,12 +69,19 @@ class SessionWriter:
             frames: n frames.
             extra: columns of `storage.schema.KNOWN` by name, n rows each.
         """
-        self._waiting.append(
-            {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)
-        )
-        begin_ns = self._waiting[0]["t_mono_ns"][0]
-        if frames.t_mono_ns[-1] - begin_ns >= ROW_GROUP_NS:
-            self._write_group()
+        columns = {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)
+        begin = 0
+        while begin < len(frames):
+            fresh = self._group_end_ns is None
+            if self._group_end_ns is None:
+                self._group_end_ns = int(frames.t_mono_ns[begin]) + ROW_GROUP_NS
+            inside = int(np.searchsorted(frames.t_mono_ns[begin:], self._group_end_ns))
+            end = begin + max(inside, int(fresh))
+            if end > begin:
+                self._waiting.append({name: v[begin:end] for name, v in columns.items()})
+            if end < len(frames):
+                self._write_group()
+            begin = end
 
     def seal(self) -> None:
         """Write what is left, sync, and give the file its name.
@@ -113,6 +121,7 @@ class SessionWriter:
         names = list(self._waiting[0])
         values = {name: np.concatenate([piece[name] for piece in self._waiting]) for name in names}
         self._waiting = []
+        self._group_end_ns = None
         fields, arrays = zip(*flat_columns([KNOWN[name] for name in names], values), strict=True)
         schema = pa.schema(
             list(fields),
@@ -129,6 +138,7 @@ class SessionWriter:
                 table.schema,
                 compression="zstd",
                 use_dictionary=[f.name for f in schema if pa.types.is_string(f.type)],  # type: ignore[arg-type]  # the stub knows bool only
+                write_page_checksum=True,  # packed integers do not show a flipped bit
                 column_encoding={f.name: e for f in schema if (e := _encoding(f.type))},
             )
         self._writer.write_table(table, row_group_size=len(table))
@@ -171,29 +181,27 @@ class SessionReader:
         """
         self.path = path
         try:
-            self._file = pq.ParquetFile(path)
-        except (OSError, pa.ArrowException) as error:
+            self._file = pq.ParquetFile(path, page_checksum_verification=True)
+        except (OSError, ValueError, pa.ArrowException) as error:
             raise FileFormatError(
                 f"cannot be read as Parquet: {error}", where=str(path), expected="a sealed session"
             ) from error
         schema = self._file.schema_arrow
-        self.info = array_info(schema, where=str(path))
-        version = schema.metadata.get(FORMAT_KEY)
+        metadata = schema.metadata or {}
+        version = metadata.get(FORMAT_KEY)
         if version != FORMAT:
             raise FileFormatError(
-                f"format {version!r} is not known to this version",
+                f"its format is {version!r}" if version else "it states no format",
                 where=str(path),
-                expected=f"format {FORMAT.decode()}",
-                remedy="Update foottile",
+                expected=f"a session of format {FORMAT.decode()}, written by foottile",
+                remedy="Update foottile" if version else "",
             )
-        try:
-            self.notes: dict[str, Any] = json.loads(schema.metadata[NOTES_KEY])
-        except (KeyError, ValueError) as error:
-            raise FileFormatError(
-                f"its notes are not readable: {error}", where=str(path), expected="JSON"
-            ) from error
+        self.info = array_info(schema, where=str(path))
+        self.notes = _notes(metadata.get(NOTES_KEY), where=str(path))
         self.column_names = frozenset(schema.names)
         self.frame_count = self._file.metadata.num_rows
+        if not self.frame_count:
+            raise FileFormatError("the session has no frames", where=str(path))
 
     def close(self) -> None:
         """Close the file."""
@@ -239,3 +247,13 @@ class SessionReader:
             FileFormatError: as for `batches`.
         """
         return FrameBatch.concatenate([frames for frames, _ in self.batches()])
+
+
+def _notes(text: bytes | None, *, where: str) -> dict[str, Any]:
+    try:
+        notes = json.loads(text or b"")
+    except ValueError as error:
+        raise FileFormatError(f"its notes are not readable: {error}", where=where) from error
+    if not isinstance(notes, dict):
+        raise FileFormatError("its notes are no JSON object", where=where)
+    return notes

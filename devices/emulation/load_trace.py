@@ -2,7 +2,8 @@
 
 A trace gives either a force per tile, or a total force with its centre of pressure. In the second
 case, among the non-negative tile forces with this sum and moment the one with the least sum of
-squares is pressed. Ground truth is what was pressed, so every change made here is counted.
+squares is pressed. Ground truth is what was pressed, so moved and limited samples are counted;
+negative forces, which plates show as noise, press nothing.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ TOUCH_S = 0.010
 """A trace that begins or ends under load is entered and left in this time."""
 
 _COP_NEEDED_FROM = 0.01  # of the greatest force: below it a centre of pressure may be missing
+_NO_LOAD_N = 1e-12
 _EXACT = 1e4  # weight of sum and moment against the squares: they hold to 1e-8
 _MOVED_M = 1e-6
 
@@ -155,7 +157,8 @@ def _share(
         )
     fz_n = np.maximum(trace.fz_n, 0.0)
     defined = ~np.isnan(trace.cop_m[:, 0] + trace.cop_m[:, 1])
-    missing = ~defined & (np.abs(trace.fz_n) > _COP_NEEDED_FROM * np.abs(trace.fz_n).max())
+    loaded = np.abs(trace.fz_n) >= max(_COP_NEEDED_FROM * np.abs(trace.fz_n).max(), _NO_LOAD_N)
+    missing = ~defined & loaded
     if missing.any():
         row = int(np.flatnonzero(missing)[0])
         raise LoadTraceError(

@@ -12,11 +12,13 @@ from collections.abc import Sequence
 from typing import Literal, Self
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from devices.errors import CalibrationError
 
 ANY_SERIAL = "*"
+LOOP_OPENS_N = 1.0
 BASIS = 3
 """A cubic without constant term has three coefficients to be uncertain about."""
 
@@ -46,7 +48,10 @@ class TileCalibration(BaseModel):
     covariance: tuple[tuple[float, ...], ...]
     """Of coefficients 1 to 3, in units of `f_scale_n` squared."""
     relative_misfit: float = Field(ge=0)
-    """Standard deviation of a new loading's force about the curve, as a part of the force."""
+    loop_misfit_n: float = Field(ge=0)
+    """How a new loading's force scatters about the curve: the variance is the sum of
+    (`relative_misfit` F)^2, a gain that differs between loadings, and (`loop_misfit_n`
+    `loop_share(F)`)^2, a hysteresis loop that opens with the first newton."""
     r2: float | None
     rmse_n: float | None
     cv_rmse_n: float | None
@@ -113,15 +118,6 @@ class Calibration(BaseModel):
             "calibration with --calibration",
         )
 
-    def restricted_to(self, serials: Sequence[str]) -> Calibration:
-        """The same with the entries of `serials` only, which it must have.
-
-        Raises:
-            CalibrationError: a serial is not in it.
-        """
-        entries = tuple(dict.fromkeys(self.of(serial) for serial in serials))
-        return self.model_copy(update={"tiles": entries})
-
     def to_json(self) -> str:
         """Text of a calibration file; the id is in it for people, and checked when read."""
         content = {"id": self.id, **self.model_dump(mode="json")}
@@ -159,6 +155,11 @@ class Calibration(BaseModel):
         return calibration
 
 
+def loop_share(force_n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """How far a hysteresis loop is open at a force: closed at zero, half open at one newton."""
+    return np.asarray(1.0 - LOOP_OPENS_N / (np.abs(force_n) + LOOP_OPENS_N))
+
+
 def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) -> bool:
     """Whether the cubic rises all over `range_u`: its slope is a parabola, ends and vertex tell."""
     _, c1, c2, c3 = coefficients
@@ -192,6 +193,7 @@ def paper_eq2_shape() -> Calibration:
         absolute_scale="assumed",
         covariance=none,
         relative_misfit=0.1,
+        loop_misfit_n=0.0,
         r2=None,
         rmse_n=None,
         cv_rmse_n=None,

@@ -14,7 +14,7 @@ from enum import IntFlag
 import numpy as np
 import numpy.typing as npt
 
-from devices.frames import NOT_READ, FrameBatch, FrameStatus, TileStatus
+from devices.frames import FrameBatch, FrameStatus
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from service.estimation.contact import UNKNOWN, UNLOADED, RunState, believed, seeming
 from service.estimation.geometry import angle_rad, to_ground_x_m
@@ -156,18 +156,10 @@ def _memoryless(
     plan: EstimationPlan, frames: FrameBatch, state: EstimationState
 ) -> tuple[Estimates, npt.NDArray[np.bool_]]:
     """All that follows from a frame alone, and which frames come after a gap."""
-    padc = frames.padc.astype(np.float64)
-    tadc = frames.tadc.astype(np.float64)
-    missing = (
-        ((frames.status & TileStatus.UNUSABLE) != 0)
-        | (frames.padc == NOT_READ)
-        | (frames.tadc == NOT_READ)
-    )
-    kpa = plan.compensation.kpa(padc, tadc)
+    kpa = plan.compensation.readable_kpa(frames)
     if "unwrap" in plan.models:
-        kpa = unwrap(padc, kpa, plan.compensation.kpa_per_count(tadc))
-    else:
-        missing = missing | (kpa < PRESSURE_MIN_KPA)
+        kpa = unwrap(kpa, plan.compensation.kpa_per_count(frames.tadc))
+    missing = ~(kpa >= PRESSURE_MIN_KPA)
     gauge_kpa = np.where(missing, np.nan, kpa - plan.tare.baseline_kpa)
 
     static = plan.curves.force(gauge_kpa)
@@ -178,7 +170,7 @@ def _memoryless(
     with np.errstate(invalid="ignore"):
         saturated = gauge_kpa > plan.curves.high_kpa
         extrapolated = gauge_kpa < plan.curves.low_kpa - SIGMAS * pressure_sigma_kpa
-        over_rated = (kpa > PRESSURE_MAX_KPA) & ~saturated & ~missing
+        over_rated = (kpa > PRESSURE_MAX_KPA) & ~saturated
     # A lower bound has no standard uncertainty.
     force_sigma_n = np.where(saturated, np.nan, force_sigma_n)
     force_n = np.where(plan.bears, static.force_n, np.nan)
@@ -307,11 +299,12 @@ def _angle(plan: EstimationPlan, frames: FrameBatch) -> Floats:
 def _after_gap(
     plan: EstimationPlan, frames: FrameBatch, state: EstimationState
 ) -> npt.NDArray[np.bool_]:
-    seq = frames.seq.astype(np.int64)
-    last_seq = seq[0] - 1 if state.last_seq is None else state.last_seq
+    # Unsigned throughout: a difference wraps, and a number of any size is compared as it is.
+    first = frames.seq[:1] - np.uint64(1) if state.last_seq is None else [state.last_seq]
+    before = np.concatenate([np.asarray(first, dtype=np.uint64), frames.seq[:-1]])
     last_t_ns = frames.t_mono_ns[0] if state.last_seq is None else state.last_t_ns
-    jumped = np.diff(seq, prepend=last_seq) != 1
-    return np.asarray(jumped | (np.diff(frames.t_mono_ns, prepend=last_t_ns) > plan.gap_ns))
+    late = np.diff(frames.t_mono_ns, prepend=last_t_ns) > plan.gap_ns
+    return np.asarray((frames.seq - before != 1) | late)
 
 
 def _sum(values: Floats, tiles: npt.NDArray[np.intp] | range) -> Floats:

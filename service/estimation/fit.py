@@ -8,9 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import nnls
 
 from devices.errors import CalibrationError
-from service.estimation.calibration import TileCalibration, is_monotonic
+from service.estimation.calibration import (
+    LOOP_OPENS_N,
+    TileCalibration,
+    is_monotonic,
+    loop_share,
+)
 from service.estimation.indentation import Indentation, Strokes, place, strokes, unloaded
 
 Floats = npt.NDArray[np.float64]
@@ -62,17 +68,17 @@ def fit_tile(recording: Indentation) -> TileCalibration:
         )
     # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
     without = np.stack([cubic.solve(blocks.rows(blocks.repeat != r)) for r in repeats])
+    left_out = [blocks.rows(blocks.repeat == r) for r in repeats]
     left_out_n = np.concatenate(
-        [
-            cubic.residual_n(blocks.rows(blocks.repeat == r), c)
-            for r, c in zip(repeats, without, strict=True)
-        ]
+        [cubic.residual_n(part, c) for part, c in zip(left_out, without, strict=True)]
     )
+    left_out_force_n = np.concatenate([part.force_n for part in left_out])
     deviation = without - without.mean(axis=0)
     covariance = (len(repeats) - 1) / len(repeats) * deviation.T @ deviation
     residual_n = cubic.residual_n(blocks, coefficients)
     spread_n = blocks.force_n - blocks.force_n.mean()
     loop = cubic.solve(blocks.rows(blocks.loading)) - cubic.solve(blocks.rows(~blocks.loading))
+    relative_misfit, loop_misfit_n = _misfit(left_out_force_n, left_out_n)
     zero = unloaded(recording)
     return TileCalibration(
         serial=recording.serial,
@@ -87,7 +93,8 @@ def fit_tile(recording: Indentation) -> TileCalibration:
         monotonic=True,
         absolute_scale="measured",
         covariance=tuple(tuple(float(c) for c in row) for row in covariance),
-        relative_misfit=float(np.sqrt((left_out_n**2).sum() / (blocks.force_n**2).sum())),
+        relative_misfit=relative_misfit,
+        loop_misfit_n=loop_misfit_n,
         r2=float(1 - (residual_n**2).sum() / (spread_n**2).sum()),
         rmse_n=_rms(residual_n),
         cv_rmse_n=_rms(left_out_n),
@@ -96,6 +103,19 @@ def fit_tile(recording: Indentation) -> TileCalibration:
         baseline_kpa=zero.baseline_kpa,
         noise_kpa=zero.noise_kpa,
     )
+
+
+def _misfit(force_n: Floats, residual_n: Floats) -> tuple[float, float]:
+    """Gain and loop part of the scatter of left-out residuals (see `TileCalibration`).
+
+    Non-negative least squares of the squared residuals, each relative to the size of its force,
+    so that small loads count as much as large ones.
+    """
+    weight = 1.0 / (force_n**2 + LOOP_OPENS_N**2)
+    parts = np.stack([force_n**2, loop_share(force_n) ** 2], axis=1)
+    variances, _ = nnls(parts * weight[:, None], residual_n**2 * weight)
+    relative, loop = np.sqrt(variances)
+    return float(relative), float(loop)
 
 
 def _refuse_unloaded(blocks: Strokes, repeats: int, where: str) -> None:

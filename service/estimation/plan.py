@@ -30,6 +30,7 @@ CONTACT_MIN_NS = 10_000_000
 COP_SIGMA_MAX_M = 0.003
 TARE_OLD_NS = 1_800_000_000_000
 """Half an hour: at the 0.3 kPa/K of a sealed bubble a degree in that time is half a newton."""
+LAG_MAX_MS = 60_000.0
 GAP = 1.5
 """A frame this many nominal periods after the one before comes after a gap."""
 
@@ -78,8 +79,10 @@ def make_plan(
         CalibrationError: a tile is not calibrated.
     """
     check_models(models)
-    if not lag_ms >= 0.0:
-        raise UsageError(f"a look-ahead of {lag_ms} ms", expected="zero or more")
+    if not 0.0 <= lag_ms <= LAG_MAX_MS:
+        raise UsageError(f"a look-ahead of {lag_ms} ms", expected=f"0 to {LAG_MAX_MS:g} ms")
+    if all(tile.reference for tile in info.tiles):
+        raise UsageError("every tile of the array is a reference tile: nothing bears load")
     entries = [calibration.of(tile.serial) for tile in info.tiles]
     curves = StaticCurves(entries)
     bears = np.array([not tile.reference for tile in info.tiles])

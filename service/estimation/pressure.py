@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from devices.frames import ArrayInfo
+from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
 from devices.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
 
 Floats = npt.NDArray[np.float64]
@@ -25,6 +25,15 @@ class Compensation:
     def kpa(self, padc: npt.ArrayLike, tadc: npt.ArrayLike) -> Floats:
         """Absolute pressure, (n, tiles), of raw counts of that shape."""
         return compensate_kpa(padc, tadc, self._a0, self._b1, self._b2, self._c12)
+
+    def readable_kpa(self, frames: FrameBatch) -> Floats:
+        """Absolute pressure of frames, NaN wherever a tile gave none."""
+        unreadable = (
+            ((frames.status & TileStatus.UNUSABLE) != 0)
+            | (frames.padc == NOT_READ)
+            | (frames.tadc == NOT_READ)
+        )
+        return np.where(unreadable, np.nan, self.kpa(frames.padc, frames.tadc))
 
     def kpa_per_count(self, tadc: npt.ArrayLike) -> Floats:
         """Pressure step of one count of `padc`; negative."""

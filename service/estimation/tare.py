@@ -1,8 +1,8 @@
 """The tare: each tile's baseline and noise, from an interval without load.
 
-It comes from an interval the user names, else from frames marked as lead, else from the first
-interval that can be recognised as unloaded; else there is none, and that is an error, because a
-wrong baseline is a wrong force that looks right.
+It comes from an interval the user names, else from frames marked as lead, else from an interval
+that can be recognised as unloaded; else there is none, and that is an error, because a wrong
+baseline is a wrong force that looks right.
 """
 
 from __future__ import annotations
@@ -14,18 +14,22 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.errors import TareError
-from devices.frames import FrameBatch, FrameStatus, TileStatus
+from devices.frames import FrameBatch, FrameStatus
 from service.estimation.calibration import Calibration
 from service.estimation.pressure import Compensation
 
 Floats = npt.NDArray[np.float64]
 
 FRAMES_MIN = 20
+RECOGNISE_WITHIN_NS = 60_000_000_000
+"""An unloaded interval is looked for in the first minute of a recording."""
 WINDOW_NS = 500_000_000
 NEAR_BASELINE_KPA = 1.5
 """How far an unloaded bubble may be from its baseline on the bench: 5 K, by p0 / T0."""
 QUIET = 1.5
 """An unloaded tile's readings scatter at most so much more than on the bench."""
+STILL_SIGMAS = 4.0
+"""The halves of a window, and the window and the lowest one, differ by no more than chance does."""
 
 Source = Literal["interval", "lead", "recognised"]
 
@@ -80,9 +84,13 @@ def take_tare(
         begin_s, end_s = interval_s
         rows = (t_s >= begin_s) & (t_s <= end_s)
         return _from_rows(frames, compensation, serials, rows, "interval")
-    lead = (frames.frame_status & FrameStatus.LEAD) != 0
-    if lead.any():
+    lead = np.logical_and.accumulate((frames.frame_status & FrameStatus.LEAD) != 0)
+    if lead[0]:
         return _from_rows(frames, compensation, serials, lead, "lead")
+    # How many frames are at hand must not matter, only which ones a recording begins with.
+    frames = frames.rows(
+        0, int(np.searchsorted(frames.t_ns, frames.t_ns[0] + RECOGNISE_WITHIN_NS, side="right"))
+    )
     rows = _recognise(frames, compensation, calibration, serials)
     return _from_rows(frames, compensation, serials, rows, "recognised")
 
@@ -94,8 +102,7 @@ def _from_rows(
     rows: npt.NDArray[np.bool_],
     source: Source,
 ) -> Tare:
-    kpa = compensation.kpa(frames.padc[rows], frames.tadc[rows])
-    kpa[(frames.status[rows] & TileStatus.UNUSABLE) != 0] = np.nan
+    kpa = compensation.readable_kpa(frames)[rows]
     readable = np.isfinite(kpa).sum(axis=0)
     for serial, count in zip(serials, readable, strict=True):
         if count < FRAMES_MIN:
@@ -105,7 +112,8 @@ def _from_rows(
                 remedy="Name another interval with --tare-s BEGIN,END",
             )
     # A perfectly quiet reading is still rounded to a count.
-    floor_kpa = compensation.rounding_kpa(np.nanmean(frames.tadc[rows], axis=0))
+    tadc = np.where(np.isfinite(kpa), frames.tadc[rows], np.nan)
+    floor_kpa = compensation.rounding_kpa(np.nanmean(tadc, axis=0))
     noise_kpa = np.maximum(np.nanstd(kpa, axis=0, ddof=1), floor_kpa)
     t_s = (frames.t_ns[rows] - frames.t_ns[0]) * 1e-9
     return Tare(
@@ -126,7 +134,12 @@ def _recognise(
     calibration: Calibration,
     serials: tuple[str, ...],
 ) -> npt.NDArray[np.bool_]:
-    """Rows of the first half second in which every tile is quiet and near its bench baseline."""
+    """Rows of half a second without load.
+
+    Of all windows in which every tile is quiet, still and near its bench baseline, those count in
+    which no tile is higher than in the lowest of them: a foot that stands still is quiet too, but
+    presses. The first of these is taken.
+    """
     entries = [calibration.of(serial) for serial in serials]
     if any(entry.baseline_kpa is None or entry.noise_kpa is None for entry in entries):
         raise TareError(
@@ -135,18 +148,27 @@ def _recognise(
         )
     expected_kpa = np.array([entry.baseline_kpa for entry in entries], dtype=np.float64)
     noise_kpa = np.array([entry.noise_kpa for entry in entries], dtype=np.float64)
-    kpa = compensation.kpa(frames.padc, frames.tadc)
-    kpa[(frames.status & TileStatus.UNUSABLE) != 0] = np.nan
+    kpa = compensation.readable_kpa(frames)
     since_ns = frames.t_ns - frames.t_ns[0]
+    found: list[tuple[npt.NDArray[np.bool_], Floats, Floats]] = []
     for begin_ns in range(0, int(since_ns[-1]) + 1, WINDOW_NS // 2):
         rows = (since_ns >= begin_ns) & (since_ns < begin_ns + WINDOW_NS)
         window_kpa = kpa[rows]
-        if len(window_kpa) < FRAMES_MIN or not np.isfinite(window_kpa).all():
+        n = len(window_kpa)
+        if n < FRAMES_MIN or not np.isfinite(window_kpa).all():
             continue
-        near = np.abs(window_kpa.mean(axis=0) - expected_kpa) < NEAR_BASELINE_KPA
+        mean_kpa = window_kpa.mean(axis=0)
+        mean_sigma_kpa = noise_kpa / np.sqrt(n)
+        drift_kpa = window_kpa[: n // 2].mean(axis=0) - window_kpa[n // 2 :].mean(axis=0)
+        near = np.abs(mean_kpa - expected_kpa) < NEAR_BASELINE_KPA
         quiet = window_kpa.std(axis=0, ddof=1) < QUIET * noise_kpa
-        if (near & quiet).all():
-            return np.asarray(rows)
+        still = np.abs(drift_kpa) < STILL_SIGMAS * 2.0 * mean_sigma_kpa
+        if (near & quiet & still).all():
+            found.append((rows, mean_kpa, mean_sigma_kpa))
+    lowest_kpa = np.min([mean_kpa for _, mean_kpa, _ in found], axis=0, initial=np.inf)
+    for rows, mean_kpa, mean_sigma_kpa in found:
+        if (mean_kpa < lowest_kpa + STILL_SIGMAS * np.sqrt(2.0) * mean_sigma_kpa).all():
+            return rows
     raise TareError(
         "no interval can be recognised as unloaded",
         expected=f"{WINDOW_NS / 1e9:g} s in which every tile is quiet and within "

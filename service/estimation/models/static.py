@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.estimation.calibration import BASIS, TileCalibration
+from service.estimation.calibration import BASIS, TileCalibration, loop_share
 
 Floats = npt.NDArray[np.float64]
 
@@ -38,6 +38,7 @@ class StaticCurves:
             np.array([t.coefficients[k] * t.f_scale_n for t in tiles]) for k in (1, 2, 3)
         )
         self._misfit = np.array([t.relative_misfit for t in tiles])
+        self._loop_n = np.array([t.loop_misfit_n for t in tiles])
         self._covariance = np.array([t.covariance for t in tiles]) * np.array(
             [[[t.f_scale_n**2]] for t in tiles]
         )
@@ -46,7 +47,7 @@ class StaticCurves:
         self._u0 = -self._offset_kpa / self._scale_kpa
         self._zero_n = np.array(
             [
-                t.f_offset_n + (t.f_scale_n * _horner(t, u0) if t.zero_mode == "as_fitted" else 0.0)
+                t.f_offset_n + t.f_scale_n * _horner(t, u0) if t.zero_mode == "as_fitted" else 0.0
                 for t, u0 in zip(tiles, self._u0, strict=True)
             ]
         )
@@ -65,10 +66,15 @@ class StaticCurves:
         )
         below_kpa = np.minimum(gauge_kpa, 0.0)
         from_zero_n = curve_n + below_kpa * self.slope_at_zero_n_per_kpa
+        fit_variance = (
+            self._coefficient_variance(u)
+            + (self._misfit * from_zero_n) ** 2
+            + (self._loop_n * loop_share(from_zero_n)) ** 2
+        )
         return StaticForce(
             force_n=from_zero_n + self._zero_n,
             slope_n_per_kpa=self._slope(u),
-            fit_sigma_n=np.sqrt(self._coefficient_variance(u) + (self._misfit * from_zero_n) ** 2),
+            fit_sigma_n=np.sqrt(fit_variance),
         )
 
     def _slope(self, u: Floats) -> Floats:

@@ -1,0 +1,208 @@
+"""Frames as columns, their flags, and what travels with them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from devices.frames import (
+    FRAME_COLUMNS,
+    NO_SERVO_AGE,
+    NO_SERVO_COUNTS,
+    NOT_READ,
+    ArrayInfo,
+    FrameBatch,
+    FrameStatus,
+    ServoInfo,
+    TileInfo,
+    TileStatus,
+)
+
+# design.md 4, table of the columns
+DESIGN = {
+    "seq": ("uint64", False),
+    "t_mono_ns": ("int64", False),
+    "t_ns": ("int64", False),
+    "padc": ("uint16", True),
+    "tadc": ("uint16", True),
+    "sample_offset_us": ("int32", True),
+    "servo_counts": ("int32", False),
+    "servo_age_us": ("int32", False),
+    "status": ("uint8", True),
+    "frame_status": ("uint8", False),
+    "reference_force_n": ("float32", False),
+}
+
+
+def batch(n: int = 3, tiles: int = 2, first: int = 0) -> FrameBatch:
+    """Every cell of every column is different from its neighbours."""
+    columns = {
+        name: np.arange(first, first + n * (tiles if per_tile else 1))
+        .reshape((n, tiles) if per_tile else (n,))
+        .astype(dtype)
+        for name, (dtype, per_tile) in DESIGN.items()
+    }
+    return FrameBatch(**columns)
+
+
+def test_the_columns_are_those_of_the_design() -> None:
+    assert [f.name for f in fields(FrameBatch)] == list(DESIGN)
+    found = {name: (np.dtype(t).name, per_tile) for name, (t, per_tile) in FRAME_COLUMNS.items()}
+    assert found == DESIGN
+
+
+def test_the_marks_of_what_was_not_read_are_those_of_the_design() -> None:
+    assert (NOT_READ, NO_SERVO_COUNTS, NO_SERVO_AGE) == (65535, -2147483648, -1)
+
+
+def test_the_status_bits_are_those_of_the_design() -> None:
+    assert {bit.name: bit.value for bit in TileStatus} == {
+        "NO_ANSWER": 1,
+        "STALE": 2,
+        "RETRIED": 4,
+        "IMPLAUSIBLE": 8,
+        "OVER_RANGE": 16,
+        "NOT_CONVERTED": 32,
+    }
+    assert {bit.name: bit.value for bit in FrameStatus} == {
+        "OVERRUN": 1,
+        "SERVO_STALE": 2,
+        "BUS_FAULT": 4,
+        "LEAD": 8,
+        "NEW_ARRAY_INFO": 16,
+    }
+
+
+def test_a_retried_or_over_ranged_tile_is_still_usable() -> None:
+    usable = [bit.name for bit in TileStatus if not bit & TileStatus.UNUSABLE]
+    assert usable == ["RETRIED", "OVER_RANGE"]
+
+
+@pytest.mark.parametrize("name", DESIGN)
+def test_a_column_of_another_type_is_refused_by_name(name: str) -> None:
+    good = batch()
+    wrong = getattr(good, name).astype(np.complex128)
+    with pytest.raises(ValueError, match=rf"FrameBatch\.{name}\b"):
+        replace(good, **{name: wrong})
+
+
+@pytest.mark.parametrize("name", [name for name in DESIGN if name != "padc"])
+def test_a_column_of_another_length_is_refused_by_name(name: str) -> None:
+    good = batch()
+    with pytest.raises(ValueError, match=rf"FrameBatch\.{name}\b"):
+        replace(good, **{name: getattr(good, name)[:-1]})
+
+
+@pytest.mark.parametrize("name", [n for n, (_, per_tile) in DESIGN.items() if per_tile])
+def test_a_column_for_another_number_of_tiles_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=r"FrameBatch\."):
+        replace(batch(tiles=2), **{name: getattr(batch(tiles=3), name)})
+
+
+def test_a_batch_knows_its_size() -> None:
+    assert len(batch(n=3, tiles=2)) == 3
+    assert batch(n=3, tiles=2).tile_count == 2
+    assert len(batch(n=0, tiles=4)) == 0
+    assert batch(n=0, tiles=4).tile_count == 4
+
+
+@given(
+    sizes=st.lists(st.integers(0, 5), min_size=1, max_size=6),
+    tiles=st.integers(1, 4),
+    data=st.data(),
+)
+def test_rows_and_concatenation_undo_each_other(
+    sizes: list[int], tiles: int, data: st.DataObject
+) -> None:
+    whole = batch(n=sum(sizes), tiles=tiles)
+    ends = np.cumsum(sizes).tolist()
+    pieces = [whole.rows(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    assert [len(piece) for piece in pieces] == sizes
+    again = FrameBatch.concatenate(pieces)
+    for name in DESIGN:
+        np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
+        assert getattr(again, name).dtype == getattr(whole, name).dtype
+    row = data.draw(st.integers(0, max(0, sum(sizes) - 1)))
+    np.testing.assert_array_equal(whole.rows(row, row + 1).padc, whole.padc[row : row + 1])
+
+
+def test_rows_copy_nothing() -> None:
+    whole = batch()
+    part = whole.rows(1, 3)
+    for name in DESIGN:
+        assert np.shares_memory(getattr(part, name), getattr(whole, name))
+
+
+def test_batches_of_different_arrays_do_not_join() -> None:
+    with pytest.raises(ValueError, match="dimension"):
+        FrameBatch.concatenate([batch(tiles=2), batch(tiles=3)])
+
+
+def test_no_batch_at_all_does_not_join() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        FrameBatch.concatenate([])
+
+
+def facts() -> dict[str, Any]:
+    tile = TileInfo(
+        serial="T01",
+        mux=0x70,
+        channel=3,
+        coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
+        x_m=0.021,
+        y_m=0.0,
+        z_m=-0.15,
+        reference=False,
+        conversion_ms=1.6,
+    )
+    servo = ServoInfo(
+        model="MX-28",
+        counts_per_turn=4096,
+        zero_counts=2048,
+        sign=-1,
+        ratio=0.1,
+        ankle_travel_m_per_rad=None,
+    )
+    return {
+        "node": "pi",
+        "boot_id": "00ff",
+        "tiles": (tile, tile.model_copy(update={"serial": "T02"})),
+        "servo": servo,
+        "schedule": "simultaneous",
+        "nominal_rate_hz": 394.87,
+        "utc_offset_ns": 1_577_836_800_000_000_000,
+        "clock_set": True,
+        "software": "foottile 0",
+        "scene": "standing",
+        "models": ("static",),
+    }
+
+
+def test_array_info_travels_as_json_without_loss() -> None:
+    info = ArrayInfo(**facts())
+    assert ArrayInfo.model_validate_json(info.model_dump_json()) == info
+    plain = json.loads(info.model_dump_json())
+    assert plain["utc_offset_ns"] == 1_577_836_800_000_000_000
+    assert plain["tiles"][0]["coefficient_words"] == [0x3ECE, 0xB3F9, 0xC517, 0x33C8]
+    assert plain["servo"]["ankle_travel_m_per_rad"] is None
+
+
+def test_serials_come_in_the_order_of_the_tiles() -> None:
+    assert ArrayInfo(**facts()).serials == ("T01", "T02")
+
+
+def test_array_info_of_a_newer_version_is_refused_rather_than_half_read() -> None:
+    with pytest.raises(ValidationError, match="phase_of_the_moon"):
+        ArrayInfo(**(facts() | {"phase_of_the_moon": 1}))
+
+
+def test_array_info_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        ArrayInfo(**facts()).node = "other"

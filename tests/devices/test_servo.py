@@ -1,0 +1,163 @@
+"""The servo in lock-step with virtual time: nothing is known before its answer is complete."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devices.clock import VirtualClock
+from devices.dynamixel import PositionReading, open_servo
+from devices.emulation.dynamixel import EmulatedServo
+from devices.errors import ServoError, ServoPacketError, ServoStatusError, ServoTimeoutError
+from devices.servo import PolledServo
+
+MS = 1_000_000
+ANSWER_NS = 600_000
+
+
+class Scripted:
+    """A servo whose n-th reading is n, takes 0.6 ms, and is true in the middle of it."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock = clock
+        self.asked_ns: list[int] = []
+        self.error: ServoError | None = None
+        self.answer_ns = ANSWER_NS
+
+    def read_position(self) -> PositionReading:
+        begin_ns = self.clock.now_ns()
+        self.asked_ns.append(begin_ns)
+        self.clock.sleep_until_ns(begin_ns + self.answer_ns)
+        if self.error is not None:
+            raise self.error
+        return PositionReading(
+            counts=len(self.asked_ns),
+            t_mono_ns=begin_ns + self.answer_ns // 2,
+            half_width_ns=self.answer_ns // 2,
+            done_ns=begin_ns + self.answer_ns,
+        )
+
+
+def polled(rate_hz: float = 100.0, start_ns: int = 0) -> tuple[PolledServo, Scripted]:
+    clock = VirtualClock(start_ns)
+    servo: Any = Scripted(clock)
+    return PolledServo(servo, clock, rate_hz=rate_hz), servo
+
+
+def test_a_position_is_known_only_from_the_end_of_its_answer_on() -> None:
+    source, _ = polled(start_ns=5 * MS)
+    assert source.latest(5 * MS - 1) is None
+    assert source.latest(5 * MS) is None
+    assert source.latest(5 * MS + ANSWER_NS - 1) is None
+    assert source.latest(5 * MS + ANSWER_NS) == (1, 5 * MS + ANSWER_NS // 2)
+
+
+def test_the_position_before_is_given_until_the_next_one_is_complete() -> None:
+    source, _ = polled()
+    assert source.latest(10 * MS + ANSWER_NS - 1) == (1, ANSWER_NS // 2)
+    assert source.latest(10 * MS + ANSWER_NS) == (2, 10 * MS + ANSWER_NS // 2)
+
+
+def test_the_servo_is_asked_at_its_own_rate_however_often_frames_ask() -> None:
+    often, often_servo = polled(rate_hz=100.0)
+    for t_ns in range(0, 100 * MS, MS // 3):
+        often.latest(t_ns)
+    seldom, seldom_servo = polled(rate_hz=100.0)
+    seldom.latest(100 * MS - 1)
+    expected = [10 * MS * i for i in range(10)]
+    assert often_servo.asked_ns == seldom_servo.asked_ns == expected
+
+
+@given(steps=st.lists(st.integers(1, 40 * MS), min_size=1, max_size=40))
+def test_what_a_frame_sees_does_not_depend_on_who_asked_before(steps: list[int]) -> None:
+    source, _ = polled()
+    t_ns = 0
+    for step in steps:
+        t_ns += step
+        seen = source.latest(t_ns)
+        complete = (t_ns - ANSWER_NS) // (10 * MS)  # number of the newest complete answer
+        if complete < 0:
+            assert seen is None
+        else:
+            assert seen == (complete + 1, complete * 10 * MS + ANSWER_NS // 2)
+
+
+def test_a_servo_slower_than_its_rate_is_asked_again_as_soon_as_it_is_done() -> None:
+    source, servo = polled(rate_hz=1000.0)
+    servo.answer_ns = 1_700_000
+    source.latest(5 * MS)
+    assert servo.asked_ns == [0, 1_700_000, 3_400_000]
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0, 1000.0])
+def test_a_position_is_stale_after_three_intervals(rate_hz: float) -> None:
+    assert polled(rate_hz=rate_hz)[0].stale_after_ns == round(3e9 / rate_hz)
+
+
+@pytest.mark.parametrize("kind", [ServoTimeoutError, ServoPacketError, ServoStatusError])
+def test_a_reading_that_fails_is_counted_and_the_last_position_grows_old(
+    kind: type[ServoError],
+) -> None:
+    source, servo = polled()
+    assert source.latest(MS) == (1, ANSWER_NS // 2)
+    servo.error = kind("no answer")
+    assert source.latest(35 * MS) == (1, ANSWER_NS // 2)
+    assert source.failures == 3
+    servo.error = None
+    assert source.latest(45 * MS) == (5, 40 * MS + ANSWER_NS // 2)
+    assert source.failures == 3
+
+
+def test_what_is_no_error_of_the_servo_is_raised() -> None:
+    source, servo = polled()
+    servo.error = ZeroDivisionError("a bug")  # type: ignore[assignment]
+    with pytest.raises(ZeroDivisionError):
+        source.latest(0)
+
+
+def test_a_servo_that_never_answers_has_no_position() -> None:
+    source, servo = polled()
+    servo.error = ServoTimeoutError("no answer")
+    assert source.latest(95 * MS) is None
+    assert source.failures == 10
+
+
+@contextlib.contextmanager
+def emulated(
+    position: Callable[[int], int], asked_id: int = 1, timeout_s: float = 5.0
+) -> Iterator[tuple[PolledServo, VirtualClock]]:
+    line_clock = VirtualClock(1_000 * MS)
+    with EmulatedServo(position, line_clock) as servo:
+        driver = open_servo(
+            servo.port,
+            baudrate=1_000_000,
+            clock=line_clock,
+            servo_id=asked_id,
+            timeout_s=timeout_s,
+        )
+        with contextlib.closing(driver):
+            yield PolledServo(driver, line_clock, rate_hz=200.0), line_clock
+
+
+def test_an_emulated_servo_is_read_over_its_line_and_ages_right() -> None:
+    with emulated(lambda t_ns: t_ns // 1000 % 100_000) as (source, _):
+        for t_ns in (1_010 * MS, 1_013 * MS, 1_050 * MS):
+            seen = source.latest(t_ns)
+            assert seen is not None
+            counts, sampled_ns = seen
+            # The position of this servo is the time in us; 200 Hz, and an answer of 0.8 ms.
+            assert 0 < t_ns - sampled_ns < 6 * MS
+            assert counts == pytest.approx(sampled_ns // 1000 % 100_000, abs=260)
+        assert source.failures == 0
+
+
+def test_a_servo_of_another_id_is_counted_as_failing() -> None:
+    with emulated(lambda _: 0, asked_id=2, timeout_s=0.01) as (source, line_clock):
+        assert source.latest(1_000 * MS) is None
+        assert source.failures == 1
+        assert line_clock.now_ns() >= 1_010 * MS, "the time-out passes on the virtual clock"

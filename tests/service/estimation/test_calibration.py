@@ -1,0 +1,255 @@
+"""The calibration file: what it holds, that it is what it says, and the paper's preset."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from devices.errors import CalibrationError
+from service.estimation.calibration import (
+    PRESETS,
+    Calibration,
+    TileCalibration,
+    is_monotonic,
+    paper_eq2_shape,
+)
+from service.estimation.models.static import StaticCurves
+
+TileOf = Callable[..., TileCalibration]
+CalibrationOf = Callable[..., Calibration]
+
+numbers = st.floats(-100, 100)
+
+
+def force_n(tile: TileCalibration, gauge_kpa: float) -> float:
+    return float(StaticCurves([tile]).force(np.array([[gauge_kpa]])).force_n[0, 0])
+
+
+def leaves(value: object, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
+    if isinstance(value, dict):
+        return [leaf for key, inner in value.items() for leaf in leaves(inner, (*path, key))]
+    if isinstance(value, list):
+        return [leaf for key, inner in enumerate(value) for leaf in leaves(inner, (*path, key))]
+    return [path]
+
+
+def changed(value: object) -> object:
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int | float):
+        return value * 1.0000001 + 1e-12
+    return 1.0 if value is None else f"{value}x"
+
+
+@given(
+    c=st.tuples(numbers, st.floats(0.1, 100), st.floats(0, 100), st.floats(0, 100)),
+    offset_n=numbers,
+    scale_kpa=st.floats(0.01, 100),
+    high_kpa=st.floats(0.1, 100),
+    variance=st.floats(0, 1),
+    serial=st.text(min_size=1, max_size=8),
+)
+def test_a_calibration_survives_its_json_bit_by_bit(
+    tile_of: TileOf,
+    calibration_of: CalibrationOf,
+    c: tuple[float, float, float, float],
+    offset_n: float,
+    scale_kpa: float,
+    high_kpa: float,
+    variance: float,
+    serial: str,
+) -> None:
+    tile = tile_of(
+        serial,
+        coefficients=c,
+        f_offset_n=offset_n,
+        p_scale_kpa=scale_kpa,
+        range_kpa=(0.0, high_kpa),
+        covariance=((variance, 0.1, 0.0), (0.1, 1.0, 0.0), (0.0, 0.0, 1 / 3)),
+        r2=0.9999,
+    )
+    calibration = calibration_of(tile)
+    again = Calibration.from_json(calibration.to_json(), where="here")
+    assert again == calibration
+    assert again.id == calibration.id
+
+
+def test_the_same_content_has_the_same_id_and_other_content_another(
+    tile_of: TileOf, calibration_of: CalibrationOf
+) -> None:
+    one, same = calibration_of(tile_of("T01")), calibration_of(tile_of("T01"))
+    assert one.id == same.id
+    assert len(one.id) == 16
+    assert int(one.id, 16) >= 0
+    others = [
+        calibration_of(tile_of("T02")),
+        calibration_of(tile_of("T01", relative_misfit=1e-300)),
+        one.model_copy(update={"date": "2020-01-02"}),
+        one.model_copy(update={"reference": "another"}),
+    ]
+    assert len({one.id, *(other.id for other in others)}) == 5
+
+
+def test_an_edit_of_any_field_of_the_file_is_refused(
+    tile_of: TileOf, calibration_of: CalibrationOf
+) -> None:
+    text = calibration_of(tile_of("T01"), tile_of("T02", rmse_n=0.1)).to_json()
+    paths = leaves(json.loads(text))
+    assert len(paths) > 50
+    for path in paths:
+        content = json.loads(text)
+        at = content
+        for key in path[:-1]:
+            at = at[key]
+        at[path[-1]] = changed(at[path[-1]])
+        with pytest.raises(CalibrationError) as caught:
+            Calibration.from_json(json.dumps(content), where="bench.json")
+        assert "bench.json" in str(caught.value), path
+
+
+def test_an_edited_number_is_named_as_an_edit_and_not_as_a_format_error(
+    tile_of: TileOf, calibration_of: CalibrationOf
+) -> None:
+    calibration = calibration_of(tile_of("T01"))
+    text = calibration.to_json().replace('"repeats": 4', '"repeats": 5')
+    with pytest.raises(CalibrationError, match="edited by hand or damaged") as caught:
+        Calibration.from_json(text, where="bench.json")
+    assert calibration.id in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "no json", "[]", "3", '"text"', "null", "{}", '{"id": "0", "tiles": []}', '{"id": [1]}'],
+)
+def test_a_text_that_is_no_calibration_is_refused_by_name(text: str) -> None:
+    with pytest.raises(CalibrationError, match=r"bench\.json: not a calibration"):
+        Calibration.from_json(text, where="bench.json")
+
+
+def test_an_unknown_field_and_a_missing_one_are_named(
+    tile_of: TileOf, calibration_of: CalibrationOf
+) -> None:
+    content = json.loads(calibration_of(tile_of("T01")).to_json())
+    with pytest.raises(CalibrationError, match="colour"):
+        Calibration.from_json(json.dumps(content | {"colour": "red"}), where="x")
+    del content["tiles"][0]["p_scale_kpa"]
+    with pytest.raises(CalibrationError, match=r"tiles\.0\.p_scale_kpa"):
+        Calibration.from_json(json.dumps(content), where="x")
+
+
+def test_a_calibration_of_a_later_version_is_refused(
+    tile_of: TileOf, calibration_of: CalibrationOf
+) -> None:
+    content = json.loads(calibration_of(tile_of("T01")).to_json()) | {"version": 2}
+    with pytest.raises(CalibrationError, match="version"):
+        Calibration.from_json(json.dumps(content), where="x")
+
+
+@pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity"])
+@pytest.mark.parametrize("field", ["p_scale_kpa", "f_offset_n", "relative_misfit"])
+def test_nan_and_infinity_in_a_file_are_refused(
+    tile_of: TileOf, calibration_of: CalibrationOf, field: str, value: str
+) -> None:
+    content = json.loads(calibration_of(tile_of("T01")).to_json())
+    content["tiles"][0][field] = float(value)
+    with pytest.raises(CalibrationError, match=field):
+        Calibration.from_json(json.dumps(content), where="x")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"range_kpa": (5.0, 5.0)},
+        {"range_kpa": (5.0, 4.0)},
+        {"covariance": ((0.0, 0.0), (0.0, 0.0))},
+        {"covariance": ((0.0,) * 4,) * 3},
+        {"p_scale_kpa": 0.0},
+        {"f_scale_n": -1.0},
+        {"relative_misfit": -0.1},
+        {"loop_misfit_n": -0.1},
+        {"monotonic": False},
+        {"coefficients": (0.0, -1.0, 0.0, 0.0)},
+        {"coefficients": (0.0, 1.0, 0.0)},
+        {"zero_mode": "maybe"},
+        {"coefficients": (0.0, float("nan"), 0.0, 0.0)},
+    ],
+)
+def test_a_contradictory_entry_cannot_be_made(tile_of: TileOf, changes: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        tile_of("T01", **changes)
+
+
+def test_a_missing_serial_is_named_with_what_there_is_and_the_remedy(
+    tile_of: TileOf, calibration_of: CalibrationOf
+) -> None:
+    calibration = calibration_of(tile_of("T01"), tile_of("T02"))
+    with pytest.raises(CalibrationError) as caught:
+        calibration.of("T07")
+    text = str(caught.value)
+    assert "T07" in text
+    assert "T01, T02" in text
+    assert calibration.id in text
+    assert "foottile calibrate" in text
+
+
+@given(
+    c=st.tuples(*[st.integers(-20, 20).map(lambda i: i / 4)] * 4),
+    low=st.integers(-12, 12).map(lambda i: i / 4),
+    width=st.integers(1, 24).map(lambda i: i / 4),
+)
+def test_a_cubic_is_monotonic_exactly_if_no_point_of_a_fine_grid_falls(
+    c: tuple[float, float, float, float], low: float, width: float
+) -> None:
+    u = low + width * np.linspace(0, 1, 4001)
+    slope = c[1] + 2 * c[2] * u + 3 * c[3] * u**2
+    assume(abs(slope.min()) > 1e-3)  # nearer to zero the grid cannot tell
+    assert is_monotonic(c, (low, low + width)) == bool(slope.min() > 0)
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "expected"),
+    [
+        ((0.0, 1.0, 0.0, 0.0), True),
+        ((0.0, 0.0, 1.0, 0.0), False),  # flat at the lower end: no pressure tells which force
+        ((0.0, 1.0, -1.2, 0.6), True),  # 1 - 2.4 u + 1.8 u^2 is at least 0.2, at u = 2/3
+        ((0.0, 1.0, -1.8, 1.0), False),  # 1 - 3.6 u + 3 u^2 is -0.08 at u = 0.6, positive at ends
+        ((0.0, 1.0, 0.0, -1 / 3 - 1e-9), False),  # just flat at the upper end
+    ],
+)
+def test_monotony_is_judged_at_both_ends_and_in_between(
+    coefficients: tuple[float, float, float, float], expected: bool
+) -> None:
+    assert is_monotonic(coefficients, (0.0, 1.0)) is expected
+
+
+# --- the paper's equation 2, hardware.md 7 --------------------------------------------------------
+
+
+def test_the_papers_preset_is_zero_at_zero_and_30_n_at_15_kpa() -> None:
+    tile = PRESETS["paper-eq2-shape"]().of("any serial at all")
+    assert force_n(tile, 0.0) == 0.0
+    assert force_n(tile, 15.0) == pytest.approx(30.0, abs=1e-12)
+
+
+def test_the_papers_preset_has_the_papers_shape_at_41_45_n_per_unit() -> None:
+    tile = paper_eq2_shape().of("T01")
+    assert tile.f_scale_n == pytest.approx(41.45, abs=0.005)
+    for gauge_kpa in np.linspace(0.0, 15.0, 61).tolist():
+        p = gauge_kpa / 15.0
+        expected_n = (0.13 * p**3 + 0.02354 * p**2 + 0.5702 * p) * 41.45
+        assert force_n(tile, gauge_kpa) == pytest.approx(expected_n, abs=0.004)
+
+
+def test_the_papers_preset_says_that_its_scale_is_assumed_and_doubts_it_by_a_tenth() -> None:
+    tile = paper_eq2_shape().of("T01")
+    assert tile.absolute_scale == "assumed"
+    assert tile.relative_misfit == 0.1
+    assert tile.monotonic
+    assert tile.range_kpa == (0.0, 15.0)
+    assert "assumed" in paper_eq2_shape().reference
