@@ -19,8 +19,9 @@ from devices.errors import LoadTraceError, UsageError
 
 Floats = npt.NDArray[np.float64]
 
-FORCE_LIMIT_N = 60.0
-"""Twice what a tile is made for (paper III-A: 25 to 35 N); more is not pressed on it."""
+FORCE_LIMIT_N = 120.0
+"""Four times what a tile is made for (paper III-A: 25 to 35 N); more is not pressed on it. Below it
+lie saturation of all parts and, for one in eight, the count that wraps."""
 
 TOUCH_S = 0.010
 """A trace that begins or ends under load is entered and left in this time."""

@@ -12,7 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.mpl115a2 import CONVERSION_MAX_NS, Coefficients, padc_of_kpa
+from devices.mpl115a2 import (
+    CONVERSION_MAX_NS,
+    PRESSURE_MAX_KPA,
+    Coefficients,
+    padc_of_kpa,
+)
 
 
 @dataclass(frozen=True)
@@ -71,13 +76,22 @@ def draw_chip(serial: str, parts_seed: int) -> ChipPart:
 
 
 def draw_dome(serial: str, parts_seed: int) -> DomePart:
-    """The dome of a serial: an 11 mm Vytaflex 60 dome, give or take what casting does."""
+    """The dome of a serial: an 11 mm Vytaflex 60 dome, give or take what casting does.
+
+    It reads the chip's full scale of 115 kPa at a slow force of 25 to 35 N (paper III-A).
+    """
     rng = _rng("dome", serial, parts_seed)
+    seal_kpa = rng.uniform(98.0, 102.5)
+    knee_n = rng.uniform(8.0, 13.0)
+    wall_per_kpa = rng.uniform(0.0010, 0.0015)
+    full_scale_n = rng.uniform(25.0, 35.0)
+    stretched = 1.0 + wall_per_kpa * (PRESSURE_MAX_KPA - seal_kpa)
+    lost = 1.0 - seal_kpa / (PRESSURE_MAX_KPA * stretched)
     return DomePart(
-        seal_kpa=rng.uniform(98.0, 102.5),
-        knee_n=rng.uniform(8.0, 13.0),
-        stiffening=rng.uniform(0.078, 0.092),
-        wall_per_kpa=rng.uniform(0.0010, 0.0015),
+        seal_kpa=seal_kpa,
+        knee_n=knee_n,
+        stiffening=float(lost / np.log1p(full_scale_n / knee_n)),
+        wall_per_kpa=wall_per_kpa,
         conduction_s=float(np.exp(rng.uniform(np.log(0.008), np.log(0.042)))),
         gas_lag_s=rng.uniform(2.0, 6.0),
         chip_lag_s=rng.uniform(0.8, 2.0),

@@ -265,6 +265,11 @@ def test_the_tables_hold_just_the_columns_of_the_contract() -> None:
     truth = "true_force_n true_grf_n true_plate_n true_cop_x_m true_cop_y_m true_angle_rad"
     assert [c.name for c in TRUTH] == truth.split()
     assert [c.name for c in MILL] == ["pressed_tile", "phase"]
+    per_tile = {column.name for column in KNOWN.values() if column.per_tile}
+    assert per_tile == {
+        *("padc", "tadc", "sample_offset_us", "status"),
+        *("gauge_kpa", "force_n", "force_sigma_n", "true_force_n"),
+    }
 
 
 def test_the_array_travels_as_json_that_others_can_read() -> None:

@@ -317,18 +317,18 @@ def test_a_reference_tile_is_no_cell() -> None:
 
 
 def test_more_than_a_tile_bears_is_limited_and_counted_by_sample() -> None:
-    cells = [[10.0, 61.0, 80.0, 0.0], [60.0, 60.0, 60.0, 60.0], [0.0, 0.0, 0.0, 60.1]]
+    cells = [[10.0, 121.0, 180.0, 0.0], [120.0, 120.0, 120.0, 120.0], [0.0, 0.0, 0.0, 120.1]]
     result = pressed(trace_of(cells_n=cells))
-    assert FORCE_LIMIT_N == 60.0
+    assert FORCE_LIMIT_N == 120.0  # four times 30 N, the middle of paper III-A's range
     assert result.limited == 2
     np.testing.assert_allclose(
-        result.forces_n[1:-1], [[10, 60, 60, 0], [60] * 4, [0, 0, 0, 60]], atol=1e-9
+        result.forces_n[1:-1], [[10, 120, 120, 0], [120] * 4, [0, 0, 0, 120]], atol=1e-9
     )
 
 
 def test_a_load_is_scaled_before_it_is_limited() -> None:
     assert pressed(trace_of(cells_n=[[800.0] * 4]), load_scale=0.05).limited == 0
-    assert pressed(trace_of([10_000.0], [(0, 0)]), load_scale=0.05).limited == 1
+    assert pressed(trace_of([20_000.0], [(0, 0)]), load_scale=0.05).limited == 1
     assert pressed(trace_of([4_000.0], [(0, 0)]), load_scale=0.05).limited == 0
 
 

@@ -177,6 +177,27 @@ def test_a_fault_of_the_scene_is_null_and_flagged_while_the_others_go_on(run, tm
     assert (table["estimate_status"].to_numpy()[silent] & 32 == 32).all()
 
 
+def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touch(run, tmp_path):
+    # T09 is a part whose padc falls through zero at 95 N; face value would be about 23 kPa.
+    (tmp_path / "foot.toml").write_text(scene_text("standing").replace("T01", "T09"))
+    rows = "".join(f"{0.01 * i:.2f},110,5,5,5\n" for i in range(100))
+    (tmp_path / "load.csv").write_text("time_s,cell1_n,cell2_n,cell3_n,cell4_n\n" + rows)
+    simulate = ("simulate", "--scene", "foot.toml", "--load", "load.csv", "--out", "s.parquet")
+    assert run(*simulate, "--truth").code == 0
+    table = pq.read_table(tmp_path / "s.parquet")
+    pressed = table["true_force_n_0"].to_numpy() == 110.0
+    wrapped = pressed & (table["padc_0"].to_numpy() > 900)
+    assert wrapped.sum() > 100
+    assert (table["status_0"].to_numpy()[wrapped] & 16 == 16).all()
+    assert (table["estimate_status"].to_numpy()[pressed] & 1 == 1).all()
+    assert (table["force_n_0"].to_numpy()[pressed] > 25.0).all()
+    assert np.isnan(table["force_sigma_n_0"].to_numpy()[pressed]).all()
+    # Without the model it is no force at all.
+    outcome = run("estimate", "s.parquet", "--models", "static", "--out", "e.parquet")
+    assert outcome.code == 0, outcome.err
+    assert np.isnan(pq.read_table(tmp_path / "e.parquet")["force_n_0"].to_numpy()[wrapped]).all()
+
+
 def test_json_is_on_stdout_alone(run):
     outcome = run("simulate", "--scene", "standing", "--seconds", 2, "--json")
     assert json.loads(outcome.out)["frames"] > 700

@@ -120,11 +120,16 @@ def laid_out(frames: FrameBatch, how: str) -> FrameBatch:
         elif how == "read only":
             values = values.copy()
             values.flags.writeable = False
+        elif how == "at an odd address":  # as in a message that somebody cut out of another
+            shape, dtype = values.shape, values.dtype
+            values = np.frombuffer(b"x" + values.tobytes(), dtype, offset=1).reshape(shape)
         columns[f.name] = values
     return FrameBatch(**columns)
 
 
-layouts = st.sampled_from(["as it is", "fortran", "every other", "backwards", "read only"])
+layouts = st.sampled_from(
+    ["as it is", "fortran", "every other", "backwards", "read only", "at an odd address"]
+)
 
 
 @pytest.mark.parametrize("lag_ms", [0, 5, 10, 100])
