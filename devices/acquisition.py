@@ -13,22 +13,17 @@ import numpy as np
 
 from devices.array import Scan, TileArray
 from devices.clock import Clock, UtcAnchor
+from devices.compensation import Compensation
 from devices.frames import (
     FRAME_COLUMNS,
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,
-    NOT_READ,
     FrameBatch,
     FrameStatus,
     TileInfo,
     TileStatus,
 )
-from devices.mpl115a2 import (
-    PRESSURE_MAX_KPA,
-    PRESSURE_MIN_KPA,
-    Coefficients,
-    compensate_kpa,
-)
+from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 
 BATCH_NS = 25_000_000
 """Length of a batch: at 10 ms two fifths of a message would be header (performance.md)."""
@@ -77,10 +72,7 @@ class Acquisition:
         self._period_ns = round(1e9 / rate_hz) if rate_hz else 0
         self._servo = servo
         self._reference = reference
-        coefficients = [Coefficients.from_words(tile.coefficient_words) for tile in tiles]
-        self._a0, self._b1, self._b2, self._c12 = (
-            np.array([getattr(c, name) for c in coefficients]) for name in ("a0", "b1", "b2", "c12")
-        )
+        self._compensation = Compensation(tiles)
         self._next_seq = 0
 
     def run(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
@@ -159,7 +151,6 @@ class Acquisition:
     def _flag_over_range(self, batch: FrameBatch) -> None:
         # Raw counts are kept as read. A part pressed past its range falls through zero and comes
         # back near full count (hardware.md 1.3), so both ends are out of range.
-        kpa = compensate_kpa(batch.padc, batch.tadc, self._a0, self._b1, self._b2, self._c12)
+        kpa = self._compensation.readable_kpa(batch)
         outside = (kpa > PRESSURE_MAX_KPA) | (kpa < PRESSURE_MIN_KPA) | (batch.padc <= 1)
-        readable = (batch.padc != NOT_READ) & ((batch.status & TileStatus.UNUSABLE) == 0)
-        batch.status[outside & readable] |= np.uint8(TileStatus.OVER_RANGE)
+        batch.status[outside & ~np.isnan(kpa)] |= np.uint8(TileStatus.OVER_RANGE)

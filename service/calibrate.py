@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from devices.compensation import Compensation
 from devices.errors import CalibrationError
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.fit import fit_tile
 from service.estimation.indentation import Indentation
-from service.estimation.pressure import Compensation
 from storage.session_file import SessionReader
 
 
@@ -67,7 +67,7 @@ def read_indentations(session: SessionReader) -> list[Indentation]:
     frames = FrameBatch.concatenate([frames for frames, _ in pieces])
     pressed = np.concatenate([extra["pressed_tile"] for _, extra in pieces])
     phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
-    kpa = Compensation(session.info).readable_kpa(frames)
+    kpa = Compensation(session.info.tiles).readable_kpa(frames)
     tiles = [
         Indentation(
             serial=serial,

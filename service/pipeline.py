@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from devices.compensation import Compensation
 from devices.errors import TareError, UsageError
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import Estimates, EstimationState, finish, step
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.pressure import Compensation
 from service.estimation.tare import RECOGNISE_WITHIN_NS, Tare, take_tare
 
 Extra = Mapping[str, npt.NDArray[Any]]
@@ -102,7 +102,7 @@ class EstimateStream:
         options = self._options
         tare = take_tare(
             frames,
-            Compensation(self._info),
+            Compensation(self._info.tiles),
             options.calibration,
             self._info.serials,
             interval_s=options.tare_s,

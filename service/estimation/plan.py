@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from devices.compensation import Compensation
 from devices.errors import UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.contact import ContactRule
 from service.estimation.geometry import grid_indices, hull
 from service.estimation.models.static import StaticCurves
-from service.estimation.pressure import Compensation
 from service.estimation.tare import Tare
 
 Floats = npt.NDArray[np.float64]
@@ -95,7 +95,7 @@ def make_plan(
         tare=tare,
         models=tuple(name for name in MODELS if name in models),
         lag_ns=round(lag_ms * 1e6),
-        compensation=Compensation(info),
+        compensation=Compensation(info.tiles),
         curves=curves,
         bears=bears,
         positions_m=positions_m,

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from devices.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch, FrameStatus
 from service.estimation.calibration import Calibration
-from service.estimation.pressure import Compensation
 
 Floats = npt.NDArray[np.float64]
 

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from devices.compensation import Compensation
 from devices.frames import (
     NO_SERVO_COUNTS,
     ArrayInfo,
@@ -28,7 +29,6 @@ from devices.frames import (
 from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
 from service.estimation.estimate import Estimates, EstimateStatus, EstimationState, finish, step
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.pressure import Compensation
 from service.estimation.tare import take_tare
 
 InfoOf = Callable[..., ArrayInfo]
@@ -786,7 +786,7 @@ def test_with_white_noise_and_a_perfect_curve_intervals_cover_what_they_say(
     # Noise of 1.3 counts (0.165 kPa), rounding, and a tare from half a second of the same.
     rng = np.random.default_rng(20)
     info = info_of(SQUARE)
-    compensation = Compensation(info)
+    compensation = Compensation(info.tiles)
     calibration = calibration_of(
         *(tile_of(serial, coefficients=(0.0, 1.0, 0.002, 1e-5)) for serial in info.serials)
     )

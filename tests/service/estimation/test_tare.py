@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from devices.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus, TileStatus
 from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
-from service.estimation.pressure import Compensation
 from service.estimation.tare import Tare, take_tare
 
 InfoOf = Callable[..., ArrayInfo]
@@ -47,7 +47,7 @@ def tare_of(info_of: InfoOf, tile_of: TileOf, calibration_of: CalibrationOf) -> 
         if calibration is None:
             calibration = calibration_of(*(tile_of(s, **bench) for s in info.serials))
         return take_tare(
-            frames, Compensation(info), calibration, info.serials, interval_s=interval_s
+            frames, Compensation(info.tiles), calibration, info.serials, interval_s=interval_s
         )
 
     return take
@@ -127,7 +127,7 @@ def test_a_tile_that_is_silent_half_of_the_time_has_the_noise_of_its_other_half(
     forces_n = np.tile([[1.0], [np.nan], [-1.0], [np.nan]], (50, 1))
     tare = take_tare(
         frames_of(forces_n),
-        Compensation(info),
+        Compensation(info.tiles),
         calibration_of(tile_of("T01")),
         info.serials,
         interval_s=(0.0, 1.0),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
-from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
+from devices.frames import NOT_READ, FrameBatch, TileInfo, TileStatus
 from devices.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
 
 Floats = npt.NDArray[np.float64]
@@ -16,8 +18,8 @@ _ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of what rounding to one co
 class Compensation:
     """The coefficients of an array's chips, as arrays over tiles."""
 
-    def __init__(self, info: ArrayInfo) -> None:
-        chips = [Coefficients.from_words(tile.coefficient_words) for tile in info.tiles]
+    def __init__(self, tiles: Sequence[TileInfo]) -> None:
+        chips = [Coefficients.from_words(tile.coefficient_words) for tile in tiles]
         self._a0, self._b1, self._b2, self._c12 = (
             np.array([getattr(chip, name) for chip in chips]) for name in ("a0", "b1", "b2", "c12")
         )
