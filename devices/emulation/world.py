@@ -19,17 +19,16 @@ from devices.emulation.dome import Domes, Surroundings
 from devices.emulation.dynamixel import EmulatedServo
 from devices.emulation.faults import Fault, scene_fault
 from devices.emulation.front_end import front_ends
-from devices.emulation.ground import Indentation, Rolling, make_ground, tile_positions_m
+from devices.emulation.ground import Rolling, make_ground, tile_positions_m
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.emulation.load_trace import Floats, PressedTrace
+from devices.emulation.mill import Indentation, Mill
 from devices.emulation.mpl115a2 import EmulatedMpl115a2
 from devices.emulation.parts import draw_chip, draw_dome, random_of
 from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.scene import FaultKind, Scene, ServoScene
 
 _COUNTS_PER_TURN = 4096
-_MILL_NOISE_N = 0.02
-_MILL_COUNT_N = 100.0 / 4096  # 12 bits over +-50 N (hardware.md 6)
 
 
 @dataclass(frozen=True)
@@ -184,34 +183,3 @@ class World:
         angle_rad = 0.0 if angle is None else float(angle[0])
         turns = angle_rad / (2 * math.pi) / (servo.sign * servo.ratio)
         return servo.zero_counts + math.floor(turns * _COUNTS_PER_TURN + 0.5)
-
-
-class Mill:
-    """The reference force sensor of the indentation rig, with its own noise and 12-bit steps."""
-
-    def __init__(self, ground: Indentation, epoch_ns: int, rng: np.random.Generator) -> None:
-        self._ground = ground
-        self._epoch_ns = epoch_ns
-        self._rng = rng
-
-    def force_n(self, t_mono_ns: int) -> float:
-        """Force under the spindle in newtons; NaN where it presses no tile."""
-        spindle_n = self._ground.spindle_n((t_mono_ns - self._epoch_ns) * 1e-9)
-        if spindle_n is None:
-            return math.nan
-        noisy_n = spindle_n + _MILL_NOISE_N * float(self._rng.standard_normal())
-        return round(noisy_n / _MILL_COUNT_N) * _MILL_COUNT_N
-
-    def notes(self, t_mono_ns: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[np.object_]]:
-        """What the mill's operator notes at each instant.
-
-        Returns:
-            `pressed_tile`, serial of the tile under the spindle or None, and `phase`.
-        """
-        t_s = np.asarray((t_mono_ns - self._epoch_ns) * 1e-9)
-        serials = np.array([*self._ground.serials, None], dtype=object)
-        phases = np.array(self._ground.PHASES, dtype=object)
-        return {
-            "pressed_tile": serials[self._ground.pressed_tile(t_s)],
-            "phase": phases[self._ground.phase(t_s)],
-        }

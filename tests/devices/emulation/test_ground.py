@@ -12,13 +12,13 @@ import pytest
 
 from devices.emulation.ground import (
     Ground,
-    Indentation,
     Rolling,
     TraceLoad,
     make_ground,
     tile_positions_m,
 )
 from devices.emulation.load_trace import PressedTrace
+from devices.emulation.mill import Indentation
 from devices.errors import SceneError, UsageError
 from devices.scene import Scene, load_scene
 
