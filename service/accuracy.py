@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.estimation.estimate import EstimateStatus
+from service.estimation.estimates import EstimateStatus
 
 Floats = npt.NDArray[np.float64]
 

@@ -19,7 +19,8 @@ from devices.compensation import Compensation
 from devices.errors import TareError, UsageError
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import Estimates, EstimationState, finish, step
+from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
 from service.estimation.tare import RECOGNISE_WITHIN_NS, Tare, take_tare
 

@@ -108,7 +108,7 @@ ESTIMATES = (
         "64 assumed_scale, 128 tare_old, 256 over_rated",
     ),
 )
-"""What the estimator makes of it: `service.estimation.estimate.Estimates`."""
+"""What the estimator makes of it: `service.estimation.estimates.Estimates`."""
 
 TRUTH = (
     Column("true_force_n", pa.float64(), "N", "emulation: force on the dome along its axis", True),

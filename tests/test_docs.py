@@ -21,7 +21,7 @@ from devices.scene import (
 )
 from service.cli.main import app
 from service.estimation.calibration import TileCalibration
-from service.estimation.estimate import EstimateStatus
+from service.estimation.estimates import EstimateStatus
 from storage.schema import KNOWN
 
 ROOT = Path(__file__).resolve().parents[1]

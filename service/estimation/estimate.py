@@ -9,79 +9,19 @@ matrix, or dependent on how rows lie in memory.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from enum import IntFlag
 
 import numpy as np
 import numpy.typing as npt
 
-from devices.frames import FrameBatch, FrameStatus
-from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
+from devices.frames import FrameBatch
 from service.estimation.contact import UNKNOWN, UNLOADED, RunState, believed, seeming
-from service.estimation.geometry import angle_rad, to_ground_x_m
-from service.estimation.models.unwrap import unwrap
-from service.estimation.plan import TARE_OLD_NS, EstimationPlan
+from service.estimation.estimates import Estimates, EstimateStatus
+from service.estimation.instant import estimate_instants
+from service.estimation.plan import SIGMAS, EstimationPlan
 
 Floats = npt.NDArray[np.float64]
 
-SIGMAS = 5.0
-"""COP needs a GRF of so many sigma: below, the first-order variance of a ratio is not valid. And a
-pressure so many sigma below the calibrated range is no noise."""
 HULL_SIGMAS = 3.0
-
-
-class EstimateStatus(IntFlag):
-    """Bits of `Estimates.estimate_status`, one value per frame."""
-
-    SATURATED = 1
-    """A tile is beyond its calibrated range: force and GRF are lower bounds."""
-    EXTRAPOLATED = 2
-    """A tile is below its calibrated range: suction, or a tare that no longer holds."""
-    OUTLIER_REPLACED = 4
-    GAP = 8
-    """Frames are missing before this one."""
-    COP_MASKED = 16
-    """No centre of pressure: no contact, or it would be too uncertain."""
-    TILE_MISSING = 32
-    """A tile gave no pressure, so there is no sum."""
-    ASSUMED_SCALE = 64
-    """The calibration's scale is assumed: newtons are not to be trusted."""
-    TARE_OLD = 128
-    OVER_RATED = 256
-    """A tile is above the chip's 115 kPa, but within its calibration."""
-
-
-@dataclass(frozen=True)
-class Estimates:
-    """Estimates of n frames; the columns of `storage.schema.ESTIMATES` in float64.
-
-    Arrays are (n,), those of tiles (n, tiles). Undefined is NaN, contact 255.
-    """
-
-    seq: npt.NDArray[np.uint64]
-    t_ns: npt.NDArray[np.int64]
-    gauge_kpa: Floats
-    force_n: Floats
-    force_sigma_n: Floats
-    grf_n: Floats
-    grf_sigma_n: Floats
-    cop_x_m: Floats
-    cop_y_m: Floats
-    cop_sigma_x_m: Floats
-    cop_sigma_y_m: Floats
-    cop_index_x: Floats
-    cop_index_y: Floats
-    cop_ground_x_m: Floats
-    cop_ground_y_m: Floats
-    angle_rad: Floats
-    contact: npt.NDArray[np.uint8]
-    estimate_status: npt.NDArray[np.uint16]
-
-    def __len__(self) -> int:
-        return len(self.seq)
-
-    def rows(self, start: int, stop: int) -> Estimates:
-        """Rows `start` to `stop` as views."""
-        return Estimates(**{f.name: getattr(self, f.name)[start:stop] for f in fields(self)})
 
 
 _COP_COLUMNS = (
@@ -130,7 +70,8 @@ def step(
     Returns:
         The estimates due (any number, possibly none), and the state for the next step.
     """
-    now, broken = _memoryless(plan, frames, state)
+    broken = _after_gap(plan, frames, state)
+    now = estimate_instants(plan, frames, broken)
     loaded, since_ns, run = seeming(plan.contact, now.grf_n, frames.t_mono_ns, broken, state.run)
     known = _append(state.pending, _Pending(now, loaded, since_ns, frames.t_mono_ns))
     due = int(np.searchsorted(known.t_ns, known.t_ns[-1] - plan.lag_ns, side="right"))
@@ -150,80 +91,6 @@ def finish(plan: EstimationPlan, state: EstimationState) -> Estimates | None:
     known = state.pending
     estimates, _ = _release(plan, known, len(known.t_ns), state)
     return estimates
-
-
-def _memoryless(
-    plan: EstimationPlan, frames: FrameBatch, state: EstimationState
-) -> tuple[Estimates, npt.NDArray[np.bool_]]:
-    """All that follows from a frame alone, and which frames come after a gap."""
-    kpa = plan.compensation.readable_kpa(frames)
-    if "unwrap" in plan.models:
-        kpa = unwrap(kpa, plan.compensation.kpa_per_count(frames.tadc))
-    missing = ~(kpa >= PRESSURE_MIN_KPA)
-    gauge_kpa = np.where(missing, np.nan, kpa - plan.tare.baseline_kpa)
-
-    static = plan.curves.force(gauge_kpa)
-    pressure_sigma_kpa = np.sqrt(plan.tare.noise_kpa**2 + plan.tare.baseline_sigma_kpa**2)
-    force_sigma_n = np.sqrt(
-        (static.slope_n_per_kpa * pressure_sigma_kpa) ** 2 + static.fit_sigma_n**2
-    )
-    with np.errstate(invalid="ignore"):
-        saturated = gauge_kpa > plan.curves.high_kpa
-        extrapolated = gauge_kpa < plan.curves.low_kpa - SIGMAS * pressure_sigma_kpa
-        over_rated = (kpa > PRESSURE_MAX_KPA) & ~saturated
-    # A lower bound has no standard uncertainty.
-    force_sigma_n = np.where(saturated, np.nan, force_sigma_n)
-    force_n = np.where(plan.bears, static.force_n, np.nan)
-    force_sigma_n = np.where(plan.bears, force_sigma_n, np.nan)
-
-    bearing = np.flatnonzero(plan.bears)
-    grf_n = _sum(force_n, bearing)
-    grf_sigma_n = np.sqrt(_sum(force_sigma_n**2, bearing))
-    divisor_n = np.where(grf_n == 0.0, np.nan, grf_n)
-    cop_m, cop_sigma_m = [], []
-    for axis in range(3):
-        arm_m = plan.positions_m[:, axis]
-        at_m = _sum(force_n * arm_m, bearing) / divisor_n
-        spread = _sum(((arm_m - at_m[:, None]) * force_sigma_n) ** 2, bearing)
-        cop_m.append(at_m)
-        cop_sigma_m.append(np.sqrt(spread) / np.abs(divisor_n))
-    index = _grid_index(plan, gauge_kpa, bearing)
-    angle = _angle(plan, frames)
-    travel = plan.info.servo.ankle_travel_m_per_rad if plan.info.servo else None
-
-    status = np.zeros(len(frames), dtype=np.uint16)
-    broken = _after_gap(plan, frames, state)
-    for mask, bit in (
-        (_any(saturated, bearing), EstimateStatus.SATURATED),
-        (_any(extrapolated, bearing), EstimateStatus.EXTRAPOLATED),
-        (_any(over_rated, bearing), EstimateStatus.OVER_RATED),
-        (_any(missing, bearing), EstimateStatus.TILE_MISSING),
-        (broken, EstimateStatus.GAP),
-        (np.full(len(frames), plan.assumed_scale), EstimateStatus.ASSUMED_SCALE),
-        (frames.t_ns - plan.tare.t_ns > TARE_OLD_NS, EstimateStatus.TARE_OLD),
-    ):
-        status[mask] |= np.uint16(bit)
-    estimates = Estimates(
-        seq=frames.seq,
-        t_ns=frames.t_ns,
-        gauge_kpa=gauge_kpa,
-        force_n=force_n,
-        force_sigma_n=force_sigma_n,
-        grf_n=grf_n,
-        grf_sigma_n=grf_sigma_n,
-        cop_x_m=cop_m[0],
-        cop_y_m=cop_m[1],
-        cop_sigma_x_m=cop_sigma_m[0],
-        cop_sigma_y_m=cop_sigma_m[1],
-        cop_index_x=index[0],
-        cop_index_y=index[1],
-        cop_ground_x_m=to_ground_x_m(cop_m[0], cop_m[2], angle, travel),
-        cop_ground_y_m=cop_m[1] if travel is not None else np.full(len(frames), np.nan),
-        angle_rad=angle,
-        contact=np.full(len(frames), UNKNOWN, dtype=np.uint8),
-        estimate_status=status,
-    )
-    return estimates, broken
 
 
 def _release(
@@ -273,52 +140,6 @@ def _cop_masked(plan: EstimationPlan, e: Estimates) -> npt.NDArray[np.bool_]:
     return ~good
 
 
-def _grid_index(
-    plan: EstimationPlan, gauge_kpa: Floats, bearing: npt.NDArray[np.intp]
-) -> tuple[Floats, Floats]:
-    """Paper eq. 4 to the letter: grid indices from 1, weighted by gauge pressure."""
-    if plan.grid is None:
-        nothing = np.full(len(gauge_kpa), np.nan)
-        return nothing, nothing
-    total_kpa = _sum(gauge_kpa, bearing)
-    divisor_kpa = np.where(total_kpa == 0.0, np.nan, total_kpa)
-    x, y = (
-        _sum(gauge_kpa[:, bearing] * index, range(len(bearing))) / divisor_kpa
-        for index in plan.grid
-    )
-    return x, y
-
-
-def _angle(plan: EstimationPlan, frames: FrameBatch) -> Floats:
-    if plan.info.servo is None:
-        return np.full(len(frames), np.nan)
-    angle = angle_rad(plan.info.servo, frames.servo_counts)
-    return np.where((frames.frame_status & FrameStatus.SERVO_STALE) != 0, np.nan, angle)
-
-
-def _after_gap(
-    plan: EstimationPlan, frames: FrameBatch, state: EstimationState
-) -> npt.NDArray[np.bool_]:
-    # Unsigned throughout: a difference wraps, and a number of any size is compared as it is.
-    first = frames.seq[:1] - np.uint64(1) if state.last_seq is None else [state.last_seq]
-    before = np.concatenate([np.asarray(first, dtype=np.uint64), frames.seq[:-1]])
-    last_t_ns = frames.t_mono_ns[0] if state.last_seq is None else state.last_t_ns
-    late = np.diff(frames.t_mono_ns, prepend=last_t_ns) > plan.gap_ns
-    return np.asarray((frames.seq - before != 1) | late)
-
-
-def _sum(values: Floats, tiles: npt.NDArray[np.intp] | range) -> Floats:
-    # One tile after the other: numpy's own sum over an axis may round in another order.
-    total = np.zeros(len(values))
-    for tile in tiles:
-        total = total + values[:, tile]
-    return total
-
-
-def _any(masks: npt.NDArray[np.bool_], tiles: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
-    return np.asarray(masks[:, tiles].any(axis=1))
-
-
 def _append(before: _Pending | None, new: _Pending) -> _Pending:
     if before is None:
         return new
@@ -332,3 +153,14 @@ def _append(before: _Pending | None, new: _Pending) -> _Pending:
         np.concatenate([before.since_ns, new.since_ns]),
         np.concatenate([before.t_ns, new.t_ns]),
     )
+
+
+def _after_gap(
+    plan: EstimationPlan, frames: FrameBatch, state: EstimationState
+) -> npt.NDArray[np.bool_]:
+    # Unsigned throughout: a difference wraps, and a number of any size is compared as it is.
+    first = frames.seq[:1] - np.uint64(1) if state.last_seq is None else [state.last_seq]
+    before = np.concatenate([np.asarray(first, dtype=np.uint64), frames.seq[:-1]])
+    last_t_ns = frames.t_mono_ns[0] if state.last_seq is None else state.last_t_ns
+    late = np.diff(frames.t_mono_ns, prepend=last_t_ns) > plan.gap_ns
+    return np.asarray((frames.seq - before != 1) | late)

@@ -27,6 +27,9 @@ MODELS = ("unwrap", "static")
 CONTACT_ON_SIGMA = 5.0
 CONTACT_OFF_SIGMA = 3.0
 CONTACT_MIN_NS = 10_000_000
+SIGMAS = 5.0
+"""COP needs a GRF of so many sigma: below, the first-order variance of a ratio is not valid. And a
+pressure so many sigma below the calibrated range is no noise."""
 COP_SIGMA_MAX_M = 0.003
 TARE_OLD_NS = 1_800_000_000_000
 """Half an hour: at the 0.3 kPa/K of a sealed bubble a degree in that time is half a newton."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.accuracy import JUDGED, Accuracy, judge
-from service.estimation.estimate import EstimateStatus
+from service.estimation.estimates import EstimateStatus
 
 PERIOD_NS = 10_000_000
 

@@ -20,7 +20,8 @@ from devices.errors import CalibrationError, TareError, UsageError
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus, TileInfo, TileStatus
 from service import pipeline
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.estimate import Estimates, EstimationState, finish, step
+from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimates import Estimates
 from service.estimation.plan import make_plan
 from service.estimation.tare import Tare
 from service.pipeline import EstimateOptions, EstimateStream, estimate_columns, notes_of

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, ServoInfo, TileInfo
-from service.estimation.estimate import Estimates
+from service.estimation.estimates import Estimates
 from storage.schema import (
     ARRAY_INFO_KEY,
     ESTIMATES,

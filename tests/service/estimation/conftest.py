@@ -25,7 +25,8 @@ from devices.frames import (
     TileStatus,
 )
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.estimate import Estimates, EstimationState, finish, step
+from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
 from service.estimation.tare import Tare
 

@@ -19,7 +19,7 @@ from mpmath import mp, mpf
 
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
 from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
-from service.estimation.estimate import Estimates
+from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
 from service.estimation.tare import Tare
 

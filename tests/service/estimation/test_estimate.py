@@ -27,7 +27,8 @@ from devices.frames import (
     TileStatus,
 )
 from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
-from service.estimation.estimate import Estimates, EstimateStatus, EstimationState, finish, step
+from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.plan import EstimationPlan, make_plan
 from service.estimation.tare import take_tare
 

@@ -1,0 +1,66 @@
+"""What an estimate of frames consists of, and the flags it carries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from enum import IntFlag
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+
+class EstimateStatus(IntFlag):
+    """Bits of `Estimates.estimate_status`, one value per frame."""
+
+    SATURATED = 1
+    """A tile is beyond its calibrated range: force and GRF are lower bounds."""
+    EXTRAPOLATED = 2
+    """A tile is below its calibrated range: suction, or a tare that no longer holds."""
+    OUTLIER_REPLACED = 4
+    GAP = 8
+    """Frames are missing before this one."""
+    COP_MASKED = 16
+    """No centre of pressure: no contact, or it would be too uncertain."""
+    TILE_MISSING = 32
+    """A tile gave no pressure, so there is no sum."""
+    ASSUMED_SCALE = 64
+    """The calibration's scale is assumed: newtons are not to be trusted."""
+    TARE_OLD = 128
+    OVER_RATED = 256
+    """A tile is above the chip's 115 kPa, but within its calibration."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Estimates of n frames; the columns of `storage.schema.ESTIMATES` in float64.
+
+    Arrays are (n,), those of tiles (n, tiles). Undefined is NaN, contact 255.
+    """
+
+    seq: npt.NDArray[np.uint64]
+    t_ns: npt.NDArray[np.int64]
+    gauge_kpa: Floats
+    force_n: Floats
+    force_sigma_n: Floats
+    grf_n: Floats
+    grf_sigma_n: Floats
+    cop_x_m: Floats
+    cop_y_m: Floats
+    cop_sigma_x_m: Floats
+    cop_sigma_y_m: Floats
+    cop_index_x: Floats
+    cop_index_y: Floats
+    cop_ground_x_m: Floats
+    cop_ground_y_m: Floats
+    angle_rad: Floats
+    contact: npt.NDArray[np.uint8]
+    estimate_status: npt.NDArray[np.uint16]
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+    def rows(self, start: int, stop: int) -> Estimates:
+        """Rows `start` to `stop` as views."""
+        return Estimates(**{f.name: getattr(self, f.name)[start:stop] for f in fields(self)})
