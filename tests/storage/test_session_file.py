@@ -308,6 +308,26 @@ def test_the_same_session_is_the_same_bytes(tmp_path: Path) -> None:
     assert one.read_bytes() == two.read_bytes()
 
 
+def test_an_integer_that_does_not_fit_its_column_is_an_error_and_not_another_integer(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(pa.ArrowInvalid):
+        write(tmp_path / "s.parquet", frames(2), estimate_status=np.array([1, 65536 + 1]))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_that_was_read_is_closed(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", frames(3))
+
+    def is_open() -> bool:
+        return str(path) in {os.path.realpath(fd) for fd in Path("/proc/self/fd").iterdir()}
+
+    with SessionReader(path) as session:
+        assert len(session.frames()) == 3
+        assert is_open()
+    assert not is_open()
+
+
 # --- row groups -----------------------------------------------------------------------------------
 
 
