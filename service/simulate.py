@@ -105,7 +105,8 @@ class Simulation:
         # One frame before the stream tells what rate this bus gives.
         begin_ns = self._clock.now_ns()
         array.scan()
-        self.rate_hz = scene.rate_hz or 1e9 / (self._clock.now_ns() - begin_ns)
+        bus_hz = 1e9 / (self._clock.now_ns() - begin_ns)
+        self.rate_hz = min(scene.rate_hz or bus_hz, bus_hz)
         self.info = _array_info(scene, schedule, tiles, anchor, self.rate_hz, options.seed)
         self.acquisition = Acquisition(
             array,

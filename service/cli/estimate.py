@@ -14,6 +14,7 @@ from service.cli.options import (
     print_json,
     progress,
     remark,
+    say,
     stdout,
 )
 from service.cli.simulate import OFFLINE_LAG_MS
@@ -84,14 +85,12 @@ def estimate_command(
             }
         )
         return
-    stdout.print(
+    say(
         f"{path}: {result.frames} frames, calibration {plan.calibration.name} "
         f"({plan.calibration.id}), models {', '.join(plan.models)}, tare {plan.tare.source} "
-        f"{plan.tare.begin_s:.2f} to {plan.tare.end_s:.2f} s",
-        highlight=False,
-        soft_wrap=True,
+        f"{plan.tare.begin_s:.2f} to {plan.tare.end_s:.2f} s"
     )
     if plan.assumed_scale:
-        stdout.print("The scale of this calibration is assumed: do not trust the newtons.")
+        say("The scale of this calibration is assumed: do not trust the newtons.")
     if result.accuracy is not None:
         stdout.print(accuracy_table(result.accuracy))

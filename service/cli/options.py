@@ -69,6 +69,11 @@ def progress(message: str) -> Iterator[None]:
         yield
 
 
+def say(message: str) -> None:
+    """A line of the result on stdout, as it is."""
+    stdout.print(message, highlight=False, soft_wrap=True, markup=False)
+
+
 def remark(message: str) -> None:
     """A line on stderr that a user should see, wherever it goes."""
-    stderr.print(message, style="dim", highlight=False)
+    stderr.print(message, style="dim", highlight=False, markup=False)

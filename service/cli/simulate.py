@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
@@ -16,8 +16,13 @@ from service.cli.options import (
     print_json,
     progress,
     remark,
+    say,
     stdout,
 )
+from service.cli.report import accuracy_table
+
+if TYPE_CHECKING:
+    from service.simulate import Simulated
 
 OFFLINE_LAG_MS = 100.0
 
@@ -62,12 +67,12 @@ def simulate_command(
     """Run a scene on emulated hardware in virtual time and write the session.
 
     The real driver reads emulated chips through an emulated bus; the same command and version give
-    the same bytes. Exit codes: 0 good, 1 failed, 2 wrong usage.
+    the same bytes. Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but the bus cannot keep
+    the scene's frame rate.
     """
     # Imported here: the physics pulls in scipy, which `--help` need not wait for.
     from devices.emulation.load_trace import CopTransform
     from service.calibrations import find_calibration, with_tiles
-    from service.cli.report import accuracy_table
     from service.estimation.plan import check_models
     from service.pipeline import EstimateOptions
     from service.simulate import SimulateOptions, simulate
@@ -107,40 +112,44 @@ def simulate_command(
 
     with progress(f"simulating {the_scene.name}"):
         result = simulate(options, path, estimate if has_estimates else None)
-    pressed = result.pressed
     if as_json:
-        print_json(
-            {
-                "out": str(path),
-                "frames": result.frames,
-                "seconds": result.seconds,
-                "rate_hz": result.rate_hz,
-                "missed_slots": result.missed_slots,
-                "bytes": path.stat().st_size,
-                "moved_to_edge": pressed.moved_to_edge if pressed else None,
-                "limited": pressed.limited if pressed else None,
-                "accuracy": result.accuracy.as_dict() if result.accuracy else None,
-            }
-        )
-        return
+        print_json(_as_json(result, path))
+    else:
+        _print(result, path)
+    if result.missed_slots:
+        raise typer.Exit(3)
+
+
+def _as_json(result: Simulated, path: Path) -> dict[str, object]:
+    pressed = result.pressed
+    return {
+        "out": str(path),
+        "frames": result.frames,
+        "seconds": result.seconds,
+        "rate_hz": result.rate_hz,
+        "missed_slots": result.missed_slots,
+        "bytes": path.stat().st_size,
+        "moved_to_edge": pressed.moved_to_edge if pressed else None,
+        "limited": pressed.limited if pressed else None,
+        "accuracy": result.accuracy.as_dict() if result.accuracy else None,
+    }
+
+
+def _print(result: Simulated, path: Path) -> None:
     size = path.stat().st_size
-    stdout.print(
+    say(
         f"{path}: {result.frames} frames in {result.seconds:.3f} s of virtual time, "
-        f"{result.rate_hz:.1f} frames/s, {size} bytes ({size / result.frames:.1f} a frame)",
-        highlight=False,
-        soft_wrap=True,
+        f"{result.rate_hz:.1f} frames/s, {size} bytes ({size / result.frames:.1f} a frame)"
     )
     remark(
         f"{result.wall_s:.1f} s of wall time, {result.seconds / result.wall_s:.1f} times real time"
     )
     if result.missed_slots:
-        stdout.print(f"{result.missed_slots} slots were missed: the bus cannot keep this rate")
-    if pressed is not None:
-        stdout.print(
-            f"load: {pressed.moved_to_edge} samples had their COP moved to the hull's edge, "
-            f"{pressed.limited} had a tile's force limited",
-            highlight=False,
-            soft_wrap=True,
+        say(f"{result.missed_slots} slots were missed: the bus cannot keep this rate")
+    if result.pressed is not None:
+        say(
+            f"load: {result.pressed.moved_to_edge} samples had their COP moved to the hull's edge, "
+            f"{result.pressed.limited} had a tile's force limited"
         )
     if result.accuracy is not None:
         stdout.print(accuracy_table(result.accuracy))

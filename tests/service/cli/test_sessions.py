@@ -198,6 +198,20 @@ def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touc
     assert np.isnan(pq.read_table(tmp_path / "e.parquet")["force_n_0"].to_numpy()[wrapped]).all()
 
 
+def test_a_rate_that_the_bus_cannot_keep_is_said_and_gives_exit_code_3(run, tmp_path):
+    text = scene_text("standing").replace('name = "standing"', 'name = "fast"\nrate_hz = 1000')
+    (tmp_path / "fast.toml").write_text(text)
+    outcome = run("simulate", "--scene", "fast.toml", "--seconds", 3, "--out", "s.parquet")
+    assert outcome.code == 3
+    assert "slots were missed" in outcome.out
+    table = pq.read_table(tmp_path / "s.parquet")
+    overrun = table["frame_status"].to_numpy() & 1 == 1
+    assert overrun.mean() > 0.5
+    # What is lost is lost at the sensor: no frame is taken to be missing, and contact is seen.
+    assert (table["estimate_status"].to_numpy() & 8 == 0).mean() > 0.99
+    assert table["contact"].to_numpy().max() == 1
+
+
 def test_json_is_on_stdout_alone(run):
     outcome = run("simulate", "--scene", "standing", "--seconds", 2, "--json")
     assert json.loads(outcome.out)["frames"] > 700
