@@ -86,7 +86,7 @@ def test_a_peak_is_compared_with_a_peak_wherever_each_lies() -> None:
 
 def test_a_touch_or_a_stance_with_a_hole_is_no_stance() -> None:
     # 40 ms is a touch; 50 ms is a stance; a NaN in it leaves no impulse to compare
-    assert judge(columns([0.0] + [10.0] * 5 + [0.0])).stances == 0
+    assert judge(columns([0.5] + [10.0] * 5 + [0.5])).stances == 0
     assert judge(columns([0.0] + [10.0] * 6 + [0.0])).stances == 1
     grf_n = [0.0, 10.0, 10.0, np.nan, 10.0, 10.0, 10.0, 0.0]
     assert judge(columns([0.0] + [10.0] * 6 + [0.0], grf_n=grf_n)).stances == 0
@@ -99,12 +99,14 @@ def test_a_stance_may_begin_and_end_the_recording() -> None:
 
 
 def test_the_centre_is_judged_by_distance_where_it_is_stated_under_more_than_3_n() -> None:
-    # distances of 5 mm (3, 4), 0 and 2 mm; the frame at 3 N does not count
+    # distances of 5 mm (3, 4), 0 and 2 mm from a truth that moves; the frame at 3 N does not count
     a = judge(
         columns(
-            [3.0, 4.0, 10.0, 10.0],
-            cop_x_m=[0.9, 0.003, 0.0, 0.002],
-            cop_y_m=[0.9, -0.004, 0.0, 0.0],
+            [3.0, 3.1, 10.0, 10.0],
+            true_cop_x_m=[0.0, 0.05, -0.02, 0.02],
+            true_cop_y_m=[0.0, 0.01, -0.01, 0.01],
+            cop_x_m=[0.9, 0.053, -0.02, 0.022],
+            cop_y_m=[0.9, 0.006, -0.01, 0.01],
         )
     )
     assert a.cop_frames == 3
