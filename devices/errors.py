@@ -16,6 +16,7 @@
      |    +-- ServoPacketError  (ValueError)   bytes that are no valid packet
      |    +-- ServoStatusError                 the servo answered with an error number
      +-- FileFormatError       (ValueError)    a file is not what it should be
+     +-- StorageError          (OSError)       a file cannot be written: disk full, read-only
      +-- CalibrationError      (ValueError)    a calibration is absent, unphysical or does not fit
      +-- TareError             (ValueError)    no interval to tare on
 
@@ -146,6 +147,10 @@ class ServoStatusError(ServoError):
 
 class FileFormatError(FootTileError, ValueError):
     """A file is absent, unreadable, or not of the kind the command needs."""
+
+
+class StorageError(FootTileError, OSError):
+    """A file cannot be written: the disk is full, read-only, or gone."""
 
 
 class CalibrationError(FootTileError, ValueError):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.schema import (
     ARRAY_INFO_KEY,
@@ -88,17 +88,18 @@ class SessionWriter:
 
         Raises:
             FileFormatError: not one frame was appended.
-            OSError: the disk is full or not writable; nothing is left behind then.
+            StorageError: the disk is full or not writable; nothing is left behind then.
         """
         self._write_group()
         if self._writer is None:
             raise FileFormatError("no frames to write", where=str(self.path))
-        self._writer.close()
-        self._writer = None
-        with self._temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        self._temporary.replace(self.path)
-        _sync_folder(self.path.parent)
+        with self._errors():
+            self._writer.close()
+            self._writer = None
+            with self._temporary.open("rb") as file:
+                os.fsync(file.fileno())
+            self._temporary.replace(self.path)
+            _sync_folder(self.path.parent)
 
     def __enter__(self) -> Self:
         return self
@@ -132,16 +133,28 @@ class SessionWriter:
             },
         )
         table = pa.Table.from_arrays(list(arrays), schema=schema)
-        if self._writer is None:
-            self._writer = pq.ParquetWriter(
-                self._temporary,
-                table.schema,
-                compression="zstd",
-                use_dictionary=[f.name for f in schema if pa.types.is_string(f.type)],  # type: ignore[arg-type]  # the stub knows bool only
-                write_page_checksum=True,  # packed integers do not show a flipped bit
-                column_encoding={f.name: e for f in schema if (e := _encoding(f.type))},
-            )
-        self._writer.write_table(table, row_group_size=len(table))
+        with self._errors():
+            if self._writer is None:
+                self._writer = pq.ParquetWriter(
+                    self._temporary,
+                    table.schema,
+                    compression="zstd",
+                    use_dictionary=[f.name for f in schema if pa.types.is_string(f.type)],  # type: ignore[arg-type]  # the stub knows bool only
+                    write_page_checksum=True,  # packed integers do not show a flipped bit
+                    column_encoding={f.name: e for f in schema if (e := _encoding(f.type))},
+                )
+            self._writer.write_table(table, row_group_size=len(table))
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise StorageError(
+                f"the session cannot be written: {error}",
+                where=str(self.path),
+                remedy="Free space on the disk, or write elsewhere; nothing was left behind",
+            ) from error
 
     def _discard(self) -> None:
         try:
