@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from collections import Counter
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -22,9 +23,12 @@ ScheduleName = Literal["simultaneous", "sequential"]
 ReadDuringConversion = Literal["stale", "abort", "torn"]
 FaultKind = Literal["no_answer", "stale"]
 
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_Number = Annotated[float, Field(allow_inf_nan=False)]
+# No quantity here is meant beyond a million; what is, is a slip of the keyboard or of the unit.
+_Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
+_NotNegative = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+_Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+_Load = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+_Kelvin = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
 _Position = Annotated[float, Field(gt=-1.0, lt=1.0)]  # a tile 50 m away was meant in millimetres
 
 
@@ -87,7 +91,7 @@ class ServoScene(_Section):
     rate_hz: _Positive = 100.0
     """How often the position is read."""
     sign: Literal[-1, 1] = 1
-    zero_counts: int = 2048
+    zero_counts: Annotated[int, Field(ge=-(2**28), le=2**28)] = 2048
     ratio: _Number = 1.0
     """Turns of the segment per turn of the servo."""
     ankle_travel_m_per_rad: _Number | None = None
@@ -122,7 +126,7 @@ class PlateGround(_Ground):
     """Somebody stands on a plate and sways."""
 
     kind: Literal["plate"]
-    load_n: _Positive = 40.0
+    load_n: _Load = 40.0
     sway_m: _NotNegative = 0.006
     """Amplitude of the centre of pressure's slow sway along the array."""
 
@@ -131,7 +135,7 @@ class RollingGround(_Ground):
     """The paper's rolling rig: a rigid plate passes under the foot's arc at constant speed."""
 
     kind: Literal["rolling"]
-    load_n: _Positive = 8.92
+    load_n: _Load = 8.92
     """The paper's leg weighs 0.909 kg."""
     radius_m: _Positive = 0.150
     """Radius of the foot's arc (paper II-D)."""
@@ -144,11 +148,11 @@ class IndentationGround(_Ground):
     """The mill: each tile in turn is pressed by a spindle against a reference force sensor."""
 
     kind: Literal["indentation"]
-    load_n: _Positive = 30.0
+    load_n: _Load = 30.0
     stroke_s: _Positive = 4.0
     """Duration of one slow loading, and of one unloading."""
     repeats: Annotated[int, Field(ge=2)] = 4
-    soak_k: _Number = 4.0
+    soak_k: _Kelvin = 4.0
     """Temperature step of the unloaded soak at the end."""
 
 
@@ -167,11 +171,11 @@ GroundScene = Annotated[
 class EmulationScene(_Section):
     """`[emulation]`: which effects the emulated domes and chips show. A real node ignores it."""
 
-    noise_kpa: _NotNegative = 0.165
+    noise_kpa: Annotated[float, Field(ge=0, le=100)] = 0.165
     """Standard deviation of a single reading in all: core, outliers and rounding."""
     correlated_ms: _NotNegative = 0.0
     """Correlation time of the noise's core; 0: white."""
-    repeatability: _NotNegative = 0.0
+    repeatability: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Standard deviation of the normalised output between loadings (paper III-A: 0.03)."""
     gas: bool = True
     """Adiabatic overshoot of fast loads."""
@@ -180,7 +184,7 @@ class EmulationScene(_Section):
     hysteresis: bool = True
     """Rate-independent loop of the dome."""
     ambient_degc: Annotated[float, Field(gt=-273.15, allow_inf_nan=False)] = 21.0
-    temperature_step_k: _Number = 0.0
+    temperature_step_k: _Kelvin = 0.0
     """A step of the surroundings' temperature ..."""
     temperature_step_s: _NotNegative = 0.0
     """... this long after power-up. Chip and gas follow with different delays."""
@@ -273,9 +277,20 @@ def parse_scene(text: str, *, where: str) -> Scene:
         SceneError: as for `load_scene`.
     """
     try:
-        return Scene.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
+        content = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise SceneError(f"not TOML: {error}", where=where) from error
+    return build_scene(content, where=where)
+
+
+def build_scene(content: Mapping[str, object], *, where: str) -> Scene:
+    """Build a scene from what a scene file holds.
+
+    Raises:
+        SceneError: as for `load_scene`.
+    """
+    try:
+        return Scene.model_validate(content)
     except ValidationError as error:
         raise SceneError(_first_complaint(error), where=where) from error
 

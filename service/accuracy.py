@@ -6,6 +6,7 @@ paper's (GRF within 1 N, COP within 4 mm) come from a real one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -69,8 +70,8 @@ class Accuracy:
     saturated_frames: int
 
     def as_dict(self) -> dict[str, float | int | None]:
-        """For JSON: NaN is null."""
-        return {name: None if value != value else value for name, value in asdict(self).items()}
+        """For JSON: what is not finite is null."""
+        return {n: value if math.isfinite(value) else None for n, value in asdict(self).items()}
 
 
 def judge(c: Mapping[str, npt.NDArray[Any]]) -> Accuracy:

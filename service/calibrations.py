@@ -7,15 +7,17 @@ parts seed and version, and would come out the same if it were made anew.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from devices.errors import CalibrationError
-from devices.scene import Scene, TileScene, load_scene
+from devices.errors import CalibrationError, StorageError
+from devices.scene import Scene, build_scene, load_scene
 from service.calibrate import calibrate
 from service.estimation.calibration import PRESETS, Calibration
 from service.simulate import SimulateOptions, simulate
@@ -78,37 +80,47 @@ def read_calibration(path: Path) -> Calibration:
     return Calibration.from_json(text, where=str(path))
 
 
-def write_calibration(calibration: Calibration, path: Path) -> None:
-    """Write a calibration file, whole or not at all.
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file, whole or not at all.
 
     Raises:
-        OSError: the folder is missing or not writable.
+        StorageError: the disk is full or not writable; nothing is left behind then.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(calibration.to_json())
+        with temporary.open("wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+    except OSError as error:
+        raise StorageError(
+            f"cannot be written: {error}",
+            where=str(path),
+            remedy="Free space on the disk, or write elsewhere",
+        ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) -> Calibration:
-    kept = folder / f"{SOFTWARE.replace(' ', '-')}-parts{parts_seed}-{serial}.json"
+    scene = bench_scene(serial)
+    # Another version or another bench is another result.
+    made_by = hashlib.sha256(f"{SOFTWARE}/{parts_seed}/{scene.model_dump_json()}".encode())
+    kept = folder / f"{serial}-{made_by.hexdigest()[:16]}.json"
     if kept.exists():
         try:
             return read_calibration(kept)
         except CalibrationError:
-            kept.unlink()  # a damaged cache is no calibration, and no reason to fail
+            kept.unlink(missing_ok=True)  # a damaged cache is no calibration, and no reason to fail
     progress(f"pressing tile {serial} on the emulated bench")
     with tempfile.TemporaryDirectory(prefix="foottile-bench-") as work:
         recording = Path(work) / f"bench-{serial}.parquet"
-        simulate(SimulateOptions(bench_scene(serial), parts_seed=parts_seed), recording, None)
+        simulate(SimulateOptions(scene, parts_seed=parts_seed), recording, None)
         calibration = calibrate([recording], name=f"{BENCH}-{serial}", reference=BENCH_REFERENCE)
     folder.mkdir(parents=True, exist_ok=True)
-    write_calibration(calibration, kept)
+    write_whole(kept, calibration.to_json().encode())
     return calibration
 
 
@@ -119,10 +131,15 @@ def bench_scene(serial: str) -> Scene:
 
 def with_tiles(scene: Scene, serials: Sequence[str]) -> Scene:
     """The same scene with these tiles, plugged in and placed one after another."""
-    tiles = tuple(
-        TileScene(
-            serial=serial, mux=0x70 + i // 8, channel=i % 8, x_m=0.014 * i, y_m=0.0, z_m=-0.15
-        )
+    tiles = [
+        {
+            "serial": serial,
+            "mux": 0x70 + i // 8,
+            "channel": i % 8,
+            "x_m": 0.014 * i,
+            "y_m": 0.0,
+            "z_m": -0.15,
+        }
         for i, serial in enumerate(serials)
-    )
-    return Scene.model_validate({**scene.model_dump(), "tile": [t.model_dump() for t in tiles]})
+    ]
+    return build_scene({**scene.model_dump(), "tile": tiles}, where=f"scene {scene.name}")

@@ -106,12 +106,15 @@ def _calibration(
 ) -> Calibration:
     notes = session.notes
     where = str(session.path)
-    try:
-        inside = (
-            Calibration.model_validate(notes["calibration"]) if "calibration" in notes else None
-        )
-    except ValueError as error:
-        raise FileFormatError(f"its calibration is not readable: {error}", where=where) from error
+    inside = None
+    if "calibration" in notes:
+        try:
+            inside = Calibration.model_validate(notes["calibration"])
+        except ValueError as error:
+            if wanted is None:
+                raise FileFormatError(
+                    f"its calibration is not readable: {error}", where=where
+                ) from error
     if inside is not None and wanted in (None, inside.id):
         return inside
     name = wanted or (scene.calibration if scene is not None else None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from storage.session_file import SessionReader
 INTERVAL_95 = 1.96
 
 
-def plot_calibration(calibration: Calibration, recordings: Sequence[Path], out: Path) -> None:
+def plot_calibration(calibration: Calibration, recordings: Sequence[Path]) -> bytes:
     """Curve with 95 % band, measured strokes and residuals of every tile, as a PNG.
 
     Raises:
@@ -90,4 +91,6 @@ def plot_calibration(calibration: Calibration, recordings: Sequence[Path], out: 
         "dashed: end of range",
         fontsize=9,
     )
-    figure.savefig(out, dpi=120)
+    png = BytesIO()
+    figure.savefig(png, dpi=120, format="png")
+    return png.getvalue()

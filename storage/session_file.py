@@ -212,6 +212,11 @@ class SessionReader:
         self.info = array_info(schema, where=str(path))
         self.notes = _notes(metadata.get(NOTES_KEY), where=str(path))
         self.column_names = frozenset(schema.names)
+        tiles = len(self.info.tiles)
+        if f"padc_{tiles}" in schema.names:
+            raise FileFormatError(
+                f"it describes {tiles} tiles and has columns of more", where=str(path)
+            )
         self.frame_count = self._file.metadata.num_rows
         if not self.frame_count:
             raise FileFormatError("the session has no frames", where=str(path))

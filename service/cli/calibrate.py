@@ -29,18 +29,21 @@ def calibrate_command(
     `foottile simulate --scene indentation` makes it. Exit codes: 0 good, 1 failed, 2 wrong usage.
     """
     from service.calibrate import calibrate
-    from service.calibrations import write_calibration
+    from service.calibrations import write_whole
     from service.cli.report import calibration_json, calibration_table
 
-    path = output_path(out)
-    plot_path = output_path(plot) if plot is not None else None
+    path = output_path(out, *recordings)
+    plot_path = output_path(plot, out, *recordings) if plot is not None else None
     with progress("fitting"):
         calibration = calibrate(recordings, name=path.stem, reference=reference)
+        png = None
         if plot_path is not None:
             from service.plots import plot_calibration
 
-            plot_calibration(calibration, recordings, plot_path)
-    write_calibration(calibration, path)
+            png = plot_calibration(calibration, recordings)
+    write_whole(path, calibration.to_json().encode())
+    if plot_path is not None and png is not None:
+        write_whole(plot_path, png)
     if as_json:
         print_json(calibration_json(calibration))
     else:

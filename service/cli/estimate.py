@@ -54,7 +54,8 @@ def estimate_command(
     from service.cli.report import accuracy_table
     from service.estimate_session import estimate_session
 
-    path = output_path(out)
+    # The session itself may be written anew: it is replaced whole, and nothing raw is lost.
+    path = output_path(out, *(Path(name) for name in (calibration, scene) if name is not None))
     with progress(f"estimating {session}"):
         result = estimate_session(
             session,

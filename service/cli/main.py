@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from typing import Annotated
 
@@ -48,6 +49,8 @@ def _root(
 
 def main() -> None:
     """Run the command line; every expected error becomes one line on stderr and an exit code."""
+    # So that what is half-written is cleaned up when the machine is shut down, too.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     try:
         app()
     except FootTileError as error:

@@ -40,18 +40,24 @@ def pair(text: str | None, option: str) -> tuple[float, float] | None:
     return first, second
 
 
-def output_path(path: Path) -> Path:
-    """`path`, after a look whether it can be written, before anything takes time.
+def output_path(path: Path, *inputs: Path) -> Path:
+    """Where to write, links resolved, after a look whether it can be, before anything takes time.
 
     Raises:
-        UsageError: its folder is missing or not writable, or it is a folder.
+        UsageError: its folder is missing or not writable, it is no regular file, or one of the
+            inputs, which would be lost.
     """
-    folder = path.parent
+    target = path.resolve()
+    folder = target.parent
     if not folder.is_dir():
         raise UsageError(f"no folder {str(folder)!r} to write {path.name} in", remedy="Make it")
-    if path.is_dir() or not os.access(folder, os.W_OK):
+    if (target.exists() and not target.is_file()) or not os.access(folder, os.W_OK):
         raise UsageError(f"{str(path)!r} cannot be written")
-    return path
+    if any(target == given.resolve() for given in inputs):
+        raise UsageError(
+            f"{str(path)!r} is an input and would be lost", remedy="Write to another file"
+        )
+    return target
 
 
 def print_json(value: object) -> None:

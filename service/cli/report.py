@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from rich.markup import escape
 from rich.table import Table
 
 from service.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
@@ -43,9 +44,11 @@ def accuracy_table(a: Accuracy) -> Table:
 def calibration_table(calibration: Calibration) -> Table:
     """Quality of every tile's fit."""
     table = Table(
-        title=f"Calibration {calibration.name} ({calibration.id})",
-        caption=f"left out: error on a repeat the fit has not seen; loop: hysteresis\n"
-        f"reference: {calibration.reference}; {calibration.date}",
+        title=escape(f"Calibration {calibration.name} ({calibration.id})"),
+        caption=escape(
+            "left out: error on a repeat the fit has not seen; loop: hysteresis\n"
+            f"reference: {calibration.reference}; {calibration.date}"
+        ),
         title_justify="left",
     )
     for heading in (

@@ -84,7 +84,8 @@ def simulate_command(
             raise UsageError("--tiles chooses what the mill presses", expected="an indentation")
         the_scene = with_tiles(the_scene, tiles.split(","))
     _check(the_scene, seconds, lead_s, load_scale, cop_scale)
-    path = output_path(out if out is not None else Path(f"{the_scene.name}.parquet"))
+    inputs = [Path(scene), *([load] if load is not None else [])]
+    path = output_path(out if out is not None else Path(f"{the_scene.name}.parquet"), *inputs)
     options = SimulateOptions(
         scene=the_scene,
         seconds=seconds,

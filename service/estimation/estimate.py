@@ -64,12 +64,14 @@ def step(
 
     Args:
         plan: constants of this estimate.
-        frames: n >= 1 frames with rising `seq` and `t_mono_ns`.
+        frames: n frames with rising `seq` and `t_mono_ns`.
         state: from the step before.
 
     Returns:
         The estimates due (any number, possibly none), and the state for the next step.
     """
+    if not len(frames):
+        return estimate_instants(plan, frames, np.zeros(0, dtype=np.bool_)), state
     broken = _after_gap(plan, frames, state)
     now = estimate_instants(plan, frames, broken)
     loaded, since_ns, run = seeming(plan.contact, now.grf_n, frames.t_mono_ns, broken, state.run)

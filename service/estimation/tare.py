@@ -26,6 +26,9 @@ RECOGNISE_WITHIN_NS = 60_000_000_000
 WINDOW_NS = 500_000_000
 NEAR_BASELINE_KPA = 1.5
 """How far an unloaded bubble may be from its baseline on the bench: 5 K, by p0 / T0."""
+LOADED_KPA = 3.0
+"""A tile this far above its bench baseline, 10 K by p0 / T0, is not taken for an unloaded one, even
+if the user or a flag says so."""
 QUIET = 1.5
 """An unloaded tile's readings scatter at most so much more than on the bench."""
 STILL_SIGMAS = 4.0
@@ -83,10 +86,12 @@ def take_tare(
     if interval_s is not None:
         begin_s, end_s = interval_s
         rows = (t_s >= begin_s) & (t_s <= end_s)
-        return _from_rows(frames, compensation, serials, rows, "interval")
+        tare = _from_rows(frames, compensation, serials, rows, "interval")
+        return _refuse_loaded(tare, calibration, serials)
     lead = np.logical_and.accumulate((frames.frame_status & FrameStatus.LEAD) != 0)
     if lead[0]:
-        return _from_rows(frames, compensation, serials, lead, "lead")
+        tare = _from_rows(frames, compensation, serials, lead, "lead")
+        return _refuse_loaded(tare, calibration, serials)
     # How many frames are at hand must not matter, only which ones a recording begins with.
     frames = frames.rows(
         0, int(np.searchsorted(frames.t_ns, frames.t_ns[0] + RECOGNISE_WITHIN_NS, side="right"))
@@ -126,6 +131,24 @@ def _from_rows(
         frames=int(rows.sum()),
         source=source,
     )
+
+
+def _refuse_loaded(tare: Tare, calibration: Calibration, serials: tuple[str, ...]) -> Tare:
+    """Refuse a tare under load, which would make every force after it too small.
+
+    A colder tile lies lower than on the bench, and no load does that, so only above is refused.
+    """
+    for serial, baseline_kpa in zip(serials, tare.baseline_kpa, strict=True):
+        bench_kpa = calibration.of(serial).baseline_kpa
+        if bench_kpa is not None and baseline_kpa > bench_kpa + LOADED_KPA:
+            raise TareError(
+                f"tile {serial} reads {baseline_kpa:.2f} kPa in the interval, and "
+                f"{bench_kpa:.2f} kPa unloaded on the bench: it seems to be loaded",
+                expected=f"at most {LOADED_KPA} kPa more",
+                remedy="Name an unloaded interval with --tare-s BEGIN,END, or calibrate at this "
+                "temperature",
+            )
+    return tare
 
 
 def _recognise(

@@ -201,3 +201,52 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(run, tmp_path, monkeypatch):
     assert outcome.code == 1
     assert "No space left" in outcome.err
     assert left(tmp_path) == []
+
+
+def test_a_tare_under_load_is_refused(run, tmp_path):
+    run("simulate", "--scene", "standing", "--seconds", 4, "--out", "s.parquet")
+    outcome = run("estimate", "s.parquet", "--tare-s", "2,3", "--out", "e.parquet")
+    assert outcome.code == 1
+    assert "seems to be loaded" in outcome.err
+    assert left(tmp_path, "s.parquet") == []
+
+
+def test_no_output_takes_the_place_of_an_input_or_a_device(run, tmp_path):
+    (tmp_path / "foot.toml").write_text(STANDING)
+    (tmp_path / "load.csv").write_text(GOOD_TRACE)
+    (tmp_path / "folder").mkdir()
+    simulate = ("simulate", "--scene", "foot.toml", "--load", "load.csv", "--out")
+    for target in ("foot.toml", "load.csv", "folder"):
+        outcome = run(*simulate, target)
+        assert outcome.code == 2, target
+    import os
+
+    os.mkfifo(tmp_path / "pipe")
+    assert run(*simulate, "pipe").code == 2
+    assert (tmp_path / "foot.toml").read_text() == STANDING
+    assert (tmp_path / "load.csv").read_text() == GOOD_TRACE
+
+
+def test_an_output_through_a_link_lands_where_the_link_points(run, tmp_path):
+    (tmp_path / "real.parquet").write_bytes(b"")
+    (tmp_path / "link.parquet").symlink_to("real.parquet")
+    simulate = ("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out")
+    assert run(*simulate, "link.parquet").code == 0
+    assert (tmp_path / "link.parquet").is_symlink()
+    assert (tmp_path / "real.parquet").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("tiles", ["", "T01,T01", "../x"])
+def test_a_wrong_list_of_tiles_is_refused(run, tmp_path, tiles):
+    outcome = run("simulate", "--scene", "indentation", "--tiles", tiles)
+    assert outcome.code == 2
+    assert outcome.err.startswith("foottile: ")
+    assert left(tmp_path) == []
+
+
+def test_a_reference_with_brackets_is_printed_as_it_is(run, tmp_path):
+    run("simulate", "--scene", "indentation", "--tiles", "T01", "--out", "bench.parquet")
+    reference = "load cell [/dev/ttyUSB0]"
+    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--reference", reference)
+    assert outcome.code == 0, outcome.err
+    assert reference in outcome.out

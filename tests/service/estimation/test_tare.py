@@ -288,6 +288,44 @@ def test_a_foot_that_is_slowly_let_down_is_not_unloaded(
     assert (off_kpa < 6 * tare.baseline_sigma_kpa).all()
 
 
+@pytest.mark.parametrize("newtons_per_second", [1.0, -1.0])
+def test_a_load_that_moves_slowly_all_the_time_is_refused(
+    frames_of: FramesOf, tare_of: TareOf, newtons_per_second: float
+) -> None:
+    # No window is unloaded, and half a newton in one hides in the noise of single readings.
+    forces_n = noise_counts(1000, 2)
+    forces_n += np.linspace(0.0, newtons_per_second * 2.0 * 0.63 / COUNT_KPA, 1000)[:, None]
+    with pytest.raises(TareError, match="no interval can be recognised"):
+        tare_of(frames_of(forces_n))
+
+
+def test_an_interval_of_half_a_second_is_found_at_every_quarter_of_a_second(
+    frames_of: FramesOf, tare_of: TareOf
+) -> None:
+    forces_n = noise_counts(750, 2) + 30.0
+    forces_n[125:376] -= 30.0  # 0.25 to 0.75 s
+    assert tare_of(frames_of(forces_n)).begin_s == pytest.approx(0.25)
+
+
+def test_a_tile_that_is_noisier_than_on_the_bench_is_not_quiet(
+    frames_of: FramesOf, tare_of: TareOf
+) -> None:
+    # one count on the bench; up to one and a half is let pass
+    noise = np.random.default_rng(8).normal(0.0, 1.0, (500, 2))
+    assert tare_of(frames_of(1.3 * noise)).source == "recognised"
+    with pytest.raises(TareError):
+        tare_of(frames_of(noise * [1.0, 1.75]))
+
+
+def test_one_tile_without_a_bench_baseline_is_enough_to_recognise_nothing(
+    frames_of: FramesOf, tare_of: TareOf, tile_of: TileOf, calibration_of: CalibrationOf
+) -> None:
+    for missing in ("baseline_kpa", "noise_kpa"):
+        mixed = calibration_of(tile_of("T01"), tile_of("T02", **{missing: None}))
+        with pytest.raises(TareError, match="does not say where an unloaded tile lies"):
+            tare_of(frames_of(noise_counts(500, 2)), calibration=mixed)
+
+
 def test_a_calibration_without_bench_baselines_cannot_recognise_anything(
     frames_of: FramesOf, tare_of: TareOf
 ) -> None:
