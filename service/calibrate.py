@@ -30,9 +30,11 @@ def calibrate(paths: Sequence[Path], *, name: str, reference: str) -> Calibratio
         CalibrationError: no tile was pressed, one was pressed in two files, or a fit fails.
     """
     recordings: dict[str, Indentation] = {}
+    chips: dict[str, tuple[int, int, int, int]] = {}
     newest_ns = 0
     for path in paths:
         with SessionReader(path) as session:
+            chips |= {tile.serial: tile.coefficient_words for tile in session.info.tiles}
             for recording in read_indentations(session):
                 if recording.serial in recordings:
                     raise CalibrationError(
@@ -46,7 +48,10 @@ def calibrate(paths: Sequence[Path], *, name: str, reference: str) -> Calibratio
         name=name,
         reference=reference,
         date=datetime.fromtimestamp(newest_ns // 1_000_000_000, tz=UTC).isoformat(),
-        tiles=tuple(fit_tile(recordings[serial]) for serial in sorted(recordings)),
+        tiles=tuple(
+            fit_tile(recordings[serial]).model_copy(update={"coefficient_words": chips[serial]})
+            for serial in sorted(recordings)
+        ),
     )
 
 

@@ -63,6 +63,9 @@ class TileCalibration(BaseModel):
     """Absolute pressure unloaded, when it was calibrated."""
     noise_kpa: float | None
     """Standard deviation of a single reading, unloaded."""
+    coefficient_words: tuple[int, int, int, int] | None = None
+    """Registers of the chip that was calibrated: a serial can be re-labelled, a chip can not.
+    None: for any chip, as a preset is."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.compensation import Compensation
-from devices.errors import UsageError
+from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.contact import ContactRule
@@ -87,6 +87,15 @@ def make_plan(
     if all(tile.reference for tile in info.tiles):
         raise UsageError("every tile of the array is a reference tile: nothing bears load")
     entries = [calibration.of(tile.serial) for tile in info.tiles]
+    for tile, entry in zip(info.tiles, entries, strict=True):
+        if entry.coefficient_words not in (None, tile.coefficient_words):
+            raise CalibrationError(
+                f"tile {tile.serial} is not the part that was calibrated: its chip has the "
+                f"coefficients {tile.coefficient_words}, the calibrated one "
+                f"{entry.coefficient_words}",
+                where=f"calibration {calibration.name} ({calibration.id})",
+                remedy="Press this tile on the bench and calibrate it, or correct the serial",
+            )
     curves = StaticCurves(entries)
     bears = np.array([not tile.reference for tile in info.tiles])
     positions_m = np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in info.tiles])

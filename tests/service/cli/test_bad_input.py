@@ -250,3 +250,15 @@ def test_a_reference_with_brackets_is_printed_as_it_is(run, tmp_path):
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--reference", reference)
     assert outcome.code == 0, outcome.err
     assert reference in outcome.out
+
+
+def test_a_calibration_of_another_part_with_the_same_serial_is_refused(run, tmp_path):
+    run("simulate", "--scene", "indentation", "--tiles", "T01", "--out", "bench.parquet")
+    assert run("calibrate", "bench.parquet", "--out", "cal.json").code == 0
+    other = ("--tiles", "T01", "--parts-seed", 3, "--seconds", 2, "--out", "other.parquet")
+    assert run("simulate", "--scene", "indentation", *other).code == 0
+    arguments = ("--calibration", "cal.json", "--out", "e.parquet")
+    outcome = run("estimate", "other.parquet", *arguments)
+    assert outcome.code == 1
+    assert "T01 is not the part that was calibrated" in outcome.err
+    assert run("estimate", "bench.parquet", *arguments).code == 0
