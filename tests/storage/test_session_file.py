@@ -641,6 +641,13 @@ def test_a_file_with_more_columns_than_ours_is_read(tmp_path: Path) -> None:
     same(read(rewritten(tmp_path / "more.parquet", table)), batch)
 
 
+def test_a_file_that_describes_fewer_tiles_than_it_has_is_refused(tmp_path: Path) -> None:
+    # a COP of half of the foot would look right
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5, 4)))
+    two = array(2).model_dump_json().encode()
+    refused(rewritten(tmp_path / "two.parquet", table, array_info=two), "2 tiles")
+
+
 def test_a_file_whose_rows_were_all_filtered_away_is_refused_by_name(tmp_path: Path) -> None:
     table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
     refused(rewritten(tmp_path / "none.parquet", table.slice(0, 0)))

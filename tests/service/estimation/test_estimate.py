@@ -275,6 +275,16 @@ def test_a_step_changes_neither_its_frames_nor_its_state(
         assert getattr(frames, f.name).tobytes() == getattr(kept, f.name).tobytes(), f.name
 
 
+def test_a_batch_of_no_frames_gives_none_and_changes_nothing(
+    info_of: InfoOf, plan_of: PlanOf, frames_of: FramesOf, estimate: Estimate
+) -> None:
+    plan = plan_of(info_of(SQUARE, servo=servo()), lag_ms=10)
+    frames = wild_frames(frames_of, 30, 4, 4)
+    nothing = frames.rows(0, 0)
+    pieces = [nothing, frames.rows(0, 20), nothing, nothing, frames.rows(20, 30), nothing]
+    same_bits(estimate(plan, *pieces), estimate(plan, frames))
+
+
 @pytest.mark.parametrize(
     ("lag_ms", "first_in_contact"), [(0, 15), (4, 13), (8, 11), (10, 10), (50, 10)]
 )

@@ -103,6 +103,19 @@ def test_a_tile_without_calibration_is_refused_by_serial(
         plan_of(info_of(LINE), tiles=[tile_of("T01"), tile_of("T02")])
 
 
+def test_another_chip_under_the_same_serial_is_refused(
+    info_of: InfoOf, plan_of: PlanOf, tile_of: TileOf
+) -> None:
+    chips = [(0x3ECE, 0xB3F9, 0xC517, 0x33C8)] * 3
+    own = [tile_of(f"T0{i}", coefficient_words=chips[0]) for i in (1, 2, 3)]
+    assert plan_of(info_of(LINE, chips=chips), tiles=own).calibration.tiles == tuple(own)
+    chips[1] = (0x3ECE, 0xB3F9, 0xC517, 0x33C4)
+    with pytest.raises(CalibrationError, match="T02 is not the part that was calibrated"):
+        plan_of(info_of(LINE, chips=chips), tiles=own)
+    for_any_chip = [tile_of(f"T0{i}") for i in (1, 2, 3)]
+    assert plan_of(info_of(LINE, chips=chips), tiles=for_any_chip).bears.all()
+
+
 def test_an_array_without_a_tile_that_bears_load_is_refused_with_the_reason(
     info_of: InfoOf, plan_of: PlanOf
 ) -> None:

@@ -220,6 +220,27 @@ def test_without_either_the_first_unloaded_half_second_is_recognised(
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=3 * COUNT_KPA / 250**0.5)
 
 
+@pytest.mark.parametrize("how", ["interval", "lead"])
+def test_a_tile_that_seems_loaded_is_no_tare_even_if_somebody_says_so(
+    frames_of: FramesOf, tare_of: TareOf, how: str
+) -> None:
+    # 3 kPa are 23.6 counts; far below the bench's baseline it may be, for a colder tile is
+    def take(*counts: float) -> Tare:
+        frames = frames_of(np.tile(counts, (100, 1)), frame_status=lead(100, 100))
+        return tare_of(frames, (0.0, 0.1) if how == "interval" else None)
+
+    assert take(23.0, -60.0).source == how
+    with pytest.raises(TareError, match=r"T02 reads 103\.05 kPa .*100\.00 kPa unloaded.*--tare-s"):
+        take(0.0, 24.0)
+
+
+def test_a_preset_does_not_know_what_an_unloaded_tile_reads(
+    frames_of: FramesOf, tare_of: TareOf
+) -> None:
+    loaded = frames_of(np.full((100, 2), 60.0))
+    assert tare_of(loaded, (0.0, 0.1), calibration=paper_eq2_shape()).source == "interval"
+
+
 def stretches(kinds: list[str]) -> np.ndarray:
     """Forces on two tiles, one second each, at 500 frames/s."""
     rng = np.random.default_rng(len(kinds))
