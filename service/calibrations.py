@@ -8,20 +8,19 @@ parts seed and version, and would come out the same if it were made anew.
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from devices.errors import CalibrationError, StorageError
+from devices.errors import CalibrationError
 from devices.scene import Scene, build_scene, load_scene
 from service.calibrate import calibrate
 from service.estimation.calibration import PRESETS, Calibration
 from service.simulate import SimulateOptions, simulate
 from service.version import SOFTWARE
+from storage.durable import write_whole
 
 BENCH = "bench"
 BENCH_REFERENCE = "emulated mill, 12 bit over 100 N"
@@ -78,30 +77,6 @@ def read_calibration(path: Path) -> Calibration:
             expected=f"a file, {BENCH!r}, or a preset: {', '.join(PRESETS)}",
         ) from error
     return Calibration.from_json(text, where=str(path))
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file, whole or not at all.
-
-    Raises:
-        StorageError: the disk is full or not writable; nothing is left behind then.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        raise StorageError(
-            f"cannot be written: {error}",
-            where=str(path),
-            remedy="Free space on the disk, or write elsewhere",
-        ) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) -> Calibration:

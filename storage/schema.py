@@ -126,7 +126,10 @@ MILL = (
 )
 """What the operator of an indentation rig writes down beside the frames."""
 
-KNOWN = {column.name: column for column in (*FRAMES, *ESTIMATES, *TRUTH, *MILL)}
+PARTS = (Column("part", pa.uint16(), "1", "which part of the session, one for each start"),)
+"""A recorded session goes on when its node is switched on anew; `seq` then begins again."""
+
+KNOWN = {column.name: column for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL)}
 
 
 # --- wire -----------------------------------------------------------------------------------------

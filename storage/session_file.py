@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,8 +19,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from devices.errors import FileFormatError, StorageError
+from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
+from storage.durable import storage_errors, sync_folder
 from storage.schema import (
     ARRAY_INFO_KEY,
     FRAMES,
@@ -72,6 +73,9 @@ class SessionWriter:
         columns = {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)
         begin = 0
         while begin < len(frames):
+            t_mono_ns = int(frames.t_mono_ns[begin])
+            if self._group_end_ns is not None and t_mono_ns < self._group_end_ns - ROW_GROUP_NS:
+                self._write_group()  # the node was switched on anew: another part begins
             fresh = self._group_end_ns is None
             if self._group_end_ns is None:
                 self._group_end_ns = int(frames.t_mono_ns[begin]) + ROW_GROUP_NS
@@ -99,7 +103,7 @@ class SessionWriter:
             with self._temporary.open("rb") as file:
                 os.fsync(file.fileno())
             self._temporary.replace(self.path)
-            _sync_folder(self.path.parent)
+            sync_folder(self.path.parent)
 
     def __enter__(self) -> Self:
         return self
@@ -145,16 +149,10 @@ class SessionWriter:
                 )
             self._writer.write_table(table, row_group_size=len(table))
 
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise StorageError(
-                f"the session cannot be written: {error}",
-                where=str(self.path),
-                remedy="Free space on the disk, or write elsewhere; nothing was left behind",
-            ) from error
+    def _errors(self) -> AbstractContextManager[None]:
+        return storage_errors(
+            self.path, "Free space on the disk, or write elsewhere; nothing was left behind"
+        )
 
     def _discard(self) -> None:
         try:
@@ -173,14 +171,6 @@ def _encoding(type_: pa.DataType) -> str | None:
     if pa.types.is_integer(type_):
         return "DELTA_BINARY_PACKED"
     return None
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 class SessionReader:

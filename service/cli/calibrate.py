@@ -29,8 +29,8 @@ def calibrate_command(
     `foottile simulate --scene indentation` makes it. Exit codes: 0 good, 1 failed, 2 wrong usage.
     """
     from service.calibrate import calibrate
-    from service.calibrations import write_whole
     from service.cli.report import calibration_json, calibration_table
+    from storage.durable import write_whole
 
     path = output_path(out, *recordings)
     plot_path = output_path(plot, out, *recordings) if plot is not None else None

@@ -1,0 +1,84 @@
+"""Sets of sequence numbers as closed intervals: what is held, what is missing, what was lost."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator
+
+
+class Intervals:
+    """A set of integers, kept as sorted intervals `(first, last)` that neither touch nor overlap.
+
+    A stream without losses is one interval, however long it runs.
+    """
+
+    def __init__(self, intervals: Iterable[tuple[int, int]] = ()) -> None:
+        self._intervals: list[tuple[int, int]] = []
+        for first, last in intervals:
+            self.add(first, last)
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        return iter(self._intervals)
+
+    def __bool__(self) -> bool:
+        return bool(self._intervals)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Intervals) and self._intervals == other._intervals
+
+    def __repr__(self) -> str:
+        return f"Intervals({self._intervals})"
+
+    __hash__ = None  # type: ignore[assignment]  # it changes
+
+    @property
+    def count(self) -> int:
+        """How many numbers it holds."""
+        return sum(last - first + 1 for first, last in self._intervals)
+
+    @property
+    def last(self) -> int | None:
+        """Greatest number; None for an empty set."""
+        return self._intervals[-1][1] if self._intervals else None
+
+    def add(self, first: int, last: int) -> None:
+        """Add `first` to `last`, both included; those already there stay.
+
+        Raises:
+            ValueError: `last` lies before `first`.
+        """
+        if last < first:
+            raise ValueError(f"interval {first} to {last} is empty")
+        begin = bisect_left(self._intervals, first - 1, key=lambda interval: interval[1])
+        end = begin
+        while end < len(self._intervals) and self._intervals[end][0] <= last + 1:
+            first = min(first, self._intervals[end][0])
+            last = max(last, self._intervals[end][1])
+            end += 1
+        self._intervals[begin:end] = [(first, last)]
+
+    def within(self, first: int, last: int) -> Intervals:
+        """The numbers of this set from `first` to `last`."""
+        found = Intervals()
+        found._intervals = [
+            (max(a, first), min(b, last))
+            for a, b in self._intervals
+            if a <= last and b >= first and first <= last
+        ]
+        return found
+
+    def missing(self, first: int, last: int) -> Intervals:
+        """The numbers from `first` to `last` that are not in this set."""
+        gaps = Intervals()
+        at = first
+        for a, b in self.within(first, last):
+            if at < a:
+                gaps._intervals.append((at, a - 1))
+            at = b + 1
+        if at <= last:
+            gaps._intervals.append((at, last))
+        return gaps
+
+    def without(self, other: Intervals) -> Intervals:
+        """The numbers of this set that are not in `other`."""
+        return Intervals(gap for a, b in self._intervals for gap in other.missing(a, b))
