@@ -63,6 +63,13 @@ class UtcAnchor:
     clock_set: bool
 
     @classmethod
+    def now(cls, *, clock_set: bool) -> UtcAnchor:
+        """Anchor of this machine's clocks, read at one instant as near as can be."""
+        before_ns = time.monotonic_ns()
+        t_ns = time.time_ns()
+        return cls.of((before_ns + time.monotonic_ns()) // 2, t_ns, clock_set=clock_set)
+
+    @classmethod
     def of(cls, t_mono_ns: int, t_ns: int, *, clock_set: bool) -> UtcAnchor:
         """Anchor from one simultaneous reading of both clocks."""
         return cls(offset_ns=t_ns - t_mono_ns, clock_set=clock_set)

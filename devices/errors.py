@@ -19,6 +19,9 @@
      +-- StorageError          (OSError)       a file cannot be written: disk full, read-only
      +-- CalibrationError      (ValueError)    a calibration is absent, unphysical or does not fit
      +-- TareError             (ValueError)    no interval to tare on
+     +-- LinkError             (ConnectionError) node, server or client cannot talk to each other
+     +-- StateError                            not now: recording already, node away, not sealed
+     +-- UnknownError          (LookupError)   no such node, session, tare
 
 Every error keeps its facts: `what` happened, `where`, what was `expected`, and the `remedy`. Those
 that a stranger would catch by a built-in type are that type too. In a running stream a fault is a
@@ -159,3 +162,15 @@ class CalibrationError(FootTileError, ValueError):
 
 class TareError(FootTileError, ValueError):
     """No unloaded interval to tare on."""
+
+
+class LinkError(FootTileError, ConnectionError):
+    """The other end of a link is away, refuses, or does not speak the protocol."""
+
+
+class StateError(FootTileError):
+    """What is asked for does not fit the present state: recording already, node away."""
+
+
+class UnknownError(FootTileError, LookupError):
+    """There is no node, session or tare of that name."""

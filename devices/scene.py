@@ -19,6 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from devices.errors import SceneError
 from devices.tca9548a import ADDRESSES, CHANNELS
 
+EMULATED = "emulated"
+"""Name of a bus or port that is emulated."""
+
 ScheduleName = Literal["simultaneous", "sequential"]
 ReadDuringConversion = Literal["stale", "abort", "torn"]
 FaultKind = Literal["no_answer", "stale"]
@@ -40,7 +43,7 @@ class _Section(BaseModel):
 class ArrayScene(_Section):
     """`[array]`: the bus and how it is asked."""
 
-    bus: str = "emulated"
+    bus: str = EMULATED
     """A device such as /dev/i2c-1, or "emulated"."""
     scl_hz: Annotated[float, Field(ge=10_000, le=1_000_000)] = 400_000.0
     """Bus clock of the emulation; on hardware it is set in config.txt. The bounds catch kHz."""
@@ -82,7 +85,7 @@ class TileScene(_Section):
 class ServoScene(_Section):
     """`[servo]`: the Dynamixel whose position goes with the frames."""
 
-    port: str = "emulated"
+    port: str = EMULATED
     """A device such as /dev/ttyUSB0, or "emulated"."""
     model: Literal["MX-28", "MX-64"] = "MX-64"
     protocol: Literal[2] = 2

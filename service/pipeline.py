@@ -1,7 +1,8 @@
 """Frames to estimates for a recording that comes in pieces: finds the tare, then estimates.
 
-Used by `simulate` while frames are taken and by `estimate` from a file; frames wait until a tare is
-known, and estimates leave together with the frames they are about.
+Used by `simulate` while frames are taken, by `estimate` from a file, and by the server live and
+when a session is sealed. Frames wait until a tare is known, and estimates leave together with the
+frames they are about.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from service.estimation.plan import EstimationPlan, make_plan
 from service.estimation.tare import RECOGNISE_WITHIN_NS, Tare, take_tare
 
 Extra = Mapping[str, npt.NDArray[Any]]
+Columns = dict[str, npt.NDArray[Any]]
 
 CHUNK = 4096
 """Rows per step: numpy slows down once its temporaries leave the cache (performance.md)."""
@@ -38,6 +40,33 @@ class EstimateOptions:
     models: tuple[str, ...]
     lag_ms: float
     tare_s: tuple[float, float] | None = None
+    tares: tuple[Tare, ...] = ()
+    """Tares that were taken while the stream ran, oldest first; they win over what can be found."""
+
+
+class EstimateRun:
+    """Estimates of consecutive frames with one tare, each leaving with the frames it is about."""
+
+    def __init__(self, plan: EstimationPlan) -> None:
+        self.plan = plan
+        self._state = EstimationState()
+        self._held: deque[tuple[FrameBatch, Extra]] = deque()
+
+    def feed(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
+        """Take the next frames; give those whose estimates are due, in order."""
+        for begin in range(0, len(frames), CHUNK):
+            end = min(begin + CHUNK, len(frames))
+            rows = frames.rows(begin, end)
+            self._held.append((rows, {name: v[begin:end] for name, v in extra.items()}))
+            estimates, self._state = step(self.plan, rows, self._state)
+            yield from _paired(self._held, estimates)
+
+    def finish(self) -> Iterator[tuple[FrameBatch, Columns]]:
+        """Give the frames that still wait for a look-ahead, which will not come."""
+        last = finish(self.plan, self._state)
+        self._state = EstimationState()
+        if last is not None:
+            yield from _paired(self._held, last)
 
 
 class EstimateStream:
@@ -54,37 +83,44 @@ class EstimateStream:
                 expected="BEGIN,END in seconds from the first frame, BEGIN before END",
             )
         nothing = np.zeros(len(info.tiles))
-        make_plan(
-            info,
-            options.calibration,
-            Tare(nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"),
-            models=options.models,
-            lag_ms=options.lag_ms,
-        )
+        self._make_plan(Tare(nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
 
     def run(
         self, pieces: Iterable[tuple[FrameBatch, Extra]]
-    ) -> Iterator[tuple[FrameBatch, dict[str, npt.NDArray[Any]]]]:
+    ) -> Iterator[tuple[FrameBatch, Columns]]:
         """Frames with their extra columns and estimates, in order, every frame once.
 
         Raises:
             TareError: no tare can be found.
         """
         pieces = iter(pieces)
-        taken = self._until_tare(pieces)
-        plan = self.plan = self._make_plan(FrameBatch.concatenate([f for f, _ in taken]))
-        held: deque[tuple[FrameBatch, Extra]] = deque()
-        state = EstimationState()
-        for frames, extra in chain(taken, pieces):
-            for begin in range(0, len(frames), CHUNK):
-                end = min(begin + CHUNK, len(frames))
-                rows = frames.rows(begin, end)
-                held.append((rows, {name: values[begin:end] for name, values in extra.items()}))
-                estimates, state = step(plan, rows, state)
-                yield from _paired(held, estimates)
-        last = finish(plan, state)
-        if last is not None:
-            yield from _paired(held, last)
+        changes = deque(self._options.tares[1:])
+        if self._options.tares:
+            self.plan = self._make_plan(self._options.tares[0])
+        else:
+            taken = self._until_tare(pieces)
+            self.plan = self._make_plan(self._find_tare([frames for frames, _ in taken]))
+            pieces = chain(taken, pieces)
+        run = EstimateRun(self.plan)
+        last_t_mono_ns = 0
+        for frames, extra in pieces:
+            rest, rest_of = frames, extra
+            if int(rest.t_mono_ns[0]) < last_t_mono_ns:  # the node was switched on anew
+                yield from run.finish()
+            last_t_mono_ns = int(rest.t_mono_ns[-1])
+            while changes and int(rest.t_ns[-1]) > changes[0].t_ns:
+                tare = changes.popleft()
+                at = int(np.searchsorted(rest.t_ns, tare.t_ns, side="right"))
+                if at:
+                    head = {name: v[:at] for name, v in rest_of.items()}
+                    yield from run.feed(rest.rows(0, at), head)
+                    rest = rest.rows(at, len(rest))
+                    rest_of = {name: v[at:] for name, v in rest_of.items()}
+                yield from run.finish()
+                run = EstimateRun(self._make_plan(tare))
+            if len(rest):
+                yield from run.feed(rest, rest_of)
+        yield from run.finish()
 
     def _until_tare(
         self, pieces: Iterator[tuple[FrameBatch, Extra]]
@@ -99,15 +135,17 @@ class EstimateStream:
             raise TareError("the recording has no frames")
         return taken
 
-    def _make_plan(self, frames: FrameBatch) -> EstimationPlan:
-        options = self._options
-        tare = take_tare(
-            frames,
+    def _find_tare(self, frames: list[FrameBatch]) -> Tare:
+        return take_tare(
+            FrameBatch.concatenate(frames),
             Compensation(self._info.tiles),
-            options.calibration,
+            self._options.calibration,
             self._info.serials,
-            interval_s=options.tare_s,
+            interval_s=self._options.tare_s,
         )
+
+    def _make_plan(self, tare: Tare) -> EstimationPlan:
+        options = self._options
         return make_plan(
             self._info, options.calibration, tare, models=options.models, lag_ms=options.lag_ms
         )
@@ -124,7 +162,7 @@ class EstimateStream:
 
 def _paired(
     held: deque[tuple[FrameBatch, Extra]], estimates: Estimates
-) -> Iterator[tuple[FrameBatch, dict[str, npt.NDArray[Any]]]]:
+) -> Iterator[tuple[FrameBatch, Columns]]:
     """Cut the held frames to where the estimates reach."""
     at = 0
     while at < len(estimates):
@@ -148,23 +186,21 @@ def estimate_columns(estimates: Estimates) -> dict[str, npt.NDArray[Any]]:
     }
 
 
-def notes_of(plan: EstimationPlan) -> dict[str, object]:
-    """What a file says of how its estimates were made; enough to make them again."""
-    tare = plan.tare
-    return {
+def notes_of(plan: EstimationPlan, tares: tuple[Tare, ...] = ()) -> dict[str, object]:
+    """What a file says of how its estimates were made; enough to make them again.
+
+    Args:
+        plan: constants of the estimate.
+        tares: all tares of the recording, if they were taken while it ran.
+    """
+    notes: dict[str, object] = {
         "calibration_id": plan.calibration.id,
         "calibration": plan.calibration.model_dump(mode="json"),
         "absolute_scale": "assumed" if plan.assumed_scale else "measured",
         "models": list(plan.models),
         "lag_ms": plan.lag_ns * 1e-6,
-        "tare": {
-            "source": tare.source,
-            "begin_s": tare.begin_s,
-            "end_s": tare.end_s,
-            "frames": tare.frames,
-            "t_ns": tare.t_ns,
-            "baseline_kpa": tare.baseline_kpa.tolist(),
-            "baseline_sigma_kpa": tare.baseline_sigma_kpa.tolist(),
-            "noise_kpa": tare.noise_kpa.tolist(),
-        },
+        "tare": plan.tare.as_dict(),
     }
+    if tares:
+        notes["tares"] = [tare.as_dict() for tare in tares]
+    return notes

@@ -19,19 +19,18 @@ import numpy.typing as npt
 from devices.acquisition import Acquisition
 from devices.array import TileArray
 from devices.clock import UtcAnchor, VirtualClock
-from devices.dynamixel import MODELS as SERVO_MODELS
 from devices.dynamixel import open_servo
-from devices.emulation.ground import tile_positions_m
-from devices.emulation.load_trace import CopTransform, LoadTrace, PressedTrace, press
+from devices.emulation.ground import press_on
+from devices.emulation.load_trace import CopTransform, LoadTrace, PressedTrace
 from devices.emulation.world import World
 from devices.errors import UsageError
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus, ServoInfo, TileInfo
+from devices.frames import FrameBatch, FrameStatus
 from devices.i2c import open_bus
 from devices.scene import Scene, ScheduleName, ServoScene
 from devices.servo import PolledServo
 from service.accuracy import JUDGED, Accuracy, judge
+from service.describe import describe
 from service.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
-from service.version import SOFTWARE
 from storage.session_file import SessionWriter
 
 START_NS = 1_577_836_800_000_000_000
@@ -78,7 +77,15 @@ class Simulation:
     def __init__(self, options: SimulateOptions, stack: ExitStack) -> None:
         scene = options.scene
         self._options = options
-        self.pressed = _press(options)
+        self.pressed = None
+        if options.load is not None:
+            self.pressed = press_on(
+                scene,
+                options.load,
+                load_scale=options.load_scale,
+                cop=options.cop,
+                lead_s=options.lead_s,
+            )
         self._clock = VirtualClock()
         self._world = World(
             scene,
@@ -107,7 +114,15 @@ class Simulation:
         array.scan()
         bus_hz = 1e9 / (self._clock.now_ns() - begin_ns)
         self.rate_hz = min(scene.rate_hz or bus_hz, bus_hz)
-        self.info = _array_info(scene, schedule, tiles, anchor, self.rate_hz, options.seed)
+        self.info = describe(
+            scene,
+            tiles,
+            anchor,
+            node=NODE,
+            boot_id=f"{options.seed:032x}",
+            schedule=schedule,
+            rate_hz=self.rate_hz,
+        )
         self.acquisition = Acquisition(
             array,
             tiles,
@@ -190,19 +205,6 @@ def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArra
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
-def _press(options: SimulateOptions) -> PressedTrace | None:
-    if options.load is None:
-        return None
-    return press(
-        options.load,
-        tile_positions_m(options.scene.tile)[:, :2],
-        np.array([not tile.reference for tile in options.scene.tile]),
-        load_scale=options.load_scale,
-        cop=options.cop,
-        lead_s=options.lead_s,
-    )
-
-
 def _end_ns(options: SimulateOptions, ground_s: float | None) -> int:
     seconds = options.seconds if options.seconds is not None else ground_s
     if seconds is None:
@@ -224,36 +226,3 @@ def _polled_servo(world: World, scene: ServoScene, now_ns: int, stack: ExitStack
     )
     stack.callback(servo.close)
     return PolledServo(servo, line_clock, rate_hz=scene.rate_hz)
-
-
-def _array_info(
-    scene: Scene,
-    schedule: ScheduleName,
-    tiles: tuple[TileInfo, ...],
-    anchor: UtcAnchor,
-    rate_hz: float,
-    seed: int,
-) -> ArrayInfo:
-    servo = None
-    if scene.servo is not None:
-        servo = ServoInfo(
-            model=scene.servo.model,
-            counts_per_turn=SERVO_MODELS[scene.servo.model].counts_per_turn,
-            zero_counts=scene.servo.zero_counts,
-            sign=scene.servo.sign,
-            ratio=scene.servo.ratio,
-            ankle_travel_m_per_rad=scene.servo.ankle_travel_m_per_rad,
-        )
-    return ArrayInfo(
-        node=NODE,
-        boot_id=f"{seed:032x}",
-        tiles=tiles,
-        servo=servo,
-        schedule=schedule,
-        nominal_rate_hz=rate_hz,
-        utc_offset_ns=anchor.offset_ns,
-        clock_set=anchor.clock_set,
-        software=SOFTWARE,
-        scene=scene.name,
-        models=scene.models,
-    )

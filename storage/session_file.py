@@ -140,12 +140,7 @@ class SessionWriter:
         with self._errors():
             if self._writer is None:
                 self._writer = pq.ParquetWriter(
-                    self._temporary,
-                    table.schema,
-                    compression="zstd",
-                    use_dictionary=[f.name for f in schema if pa.types.is_string(f.type)],  # type: ignore[arg-type]  # the stub knows bool only
-                    write_page_checksum=True,  # packed integers do not show a flipped bit
-                    column_encoding={f.name: e for f in schema if (e := _encoding(f.type))},
+                    self._temporary, table.schema, **parquet_options(table.schema)
                 )
             self._writer.write_table(table, row_group_size=len(table))
 
@@ -163,6 +158,16 @@ class SessionWriter:
                 self._writer = None
         finally:
             self._temporary.unlink(missing_ok=True)
+
+
+def parquet_options(schema: pa.Schema) -> dict[str, Any]:
+    """How every Parquet file of ours is written."""
+    return {
+        "compression": "zstd",
+        "use_dictionary": [f.name for f in schema if pa.types.is_string(f.type)],
+        "write_page_checksum": True,  # packed integers do not show a flipped bit
+        "column_encoding": {f.name: e for f in schema if (e := _encoding(f.type))},
+    }
 
 
 def _encoding(type_: pa.DataType) -> str | None:

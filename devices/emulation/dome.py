@@ -12,6 +12,7 @@ interpolated where a chip samples: the physics does not know who asks, or when.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -109,9 +110,11 @@ class Domes:
         self._last_ln_p = np.log(self._seal_kpa)
 
         self._next = 0  # grid index of the first point that is not computed
-        self._first = 0  # grid index of the first point that is kept
-        self._kpa: list[list[float]] = []
-        self._extend()
+        # First grid index that is kept, and the pressures from there on: swapped at one stroke,
+        # because on a real clock another thread computes ahead.
+        self._kept: tuple[int, list[list[float]]] = (0, [])
+        self._extending = threading.Lock()
+        self._extend(0)
 
     def pressure_kpa(self, dome: int, t_s: float) -> float:
         """Absolute gas pressure of one dome. Times may not go back by more than a block.
@@ -121,15 +124,27 @@ class Domes:
         """
         position = t_s / GRID_S
         index = int(position)
-        while index + 1 >= self._next:
-            self._extend()
-        row = index - self._first
+        if index + 1 >= self._next:
+            self._extend(index + 1)
+        first, kept = self._kept
+        row = index - first
         if row < 0:
             raise ValueError(f"dome pressure at {t_s} s was asked for too late")
-        low, high = self._kpa[row][dome], self._kpa[row + 1][dome]
+        low, high = kept[row][dome], kept[row + 1][dome]
         return low + (position - index) * (high - low)
 
-    def _extend(self) -> None:
+    def foresee(self, t_s: float) -> None:
+        """Have the pressures up to `t_s` ready, so that nobody who samples has to wait for them."""
+        if int(t_s / GRID_S) + 1 >= self._next:
+            self._extend(int(t_s / GRID_S) + 1)
+
+    def _extend(self, index: int) -> None:
+        """Compute blocks until grid point `index` is there."""
+        with self._extending:
+            while index >= self._next:
+                self._compute_block()
+
+    def _compute_block(self) -> None:
         """Compute one more block; keep it and the one before."""
         t_s: Floats = GRID_S * np.arange(self._next, self._next + _BLOCK, dtype=np.float64)
         force_n = self._load.forces_n(t_s)
@@ -137,9 +152,8 @@ class Domes:
         lost = self._stiffening * np.log1p(felt_n / self._knee_n) * self._loading_gains(force_n)
         kpa = self._gas(t_s, 1.0 - lost)
         self._last_force_n = force_n[-1]
-        kept = self._kpa[-_BLOCK:]
-        self._first = self._next - len(kept)
-        self._kpa = kept + kpa.tolist()
+        before = self._kept[1][-_BLOCK:]
+        self._kept = (self._next - len(before), before + kpa.tolist())
         self._next += _BLOCK
 
     def _creeping(self, force_n: Floats) -> Floats:

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from devices.emulation.load_trace import Floats, PressedTrace
+from devices.emulation.load_trace import CopTransform, Floats, LoadTrace, PressedTrace, press
 from devices.emulation.mill import Indentation
 from devices.emulation.parts import random_of
 from devices.errors import SceneError, UsageError
@@ -160,32 +160,51 @@ class Rolling:
 
 
 class TraceLoad:
-    """A recorded load, linear between its samples."""
+    """A recorded load, linear between its samples; over and over again if it is `looped`."""
 
-    def __init__(self, pressed: PressedTrace) -> None:
+    _PAUSE_S = 1.0
+    """In the air between two rounds, long enough for a tare."""
+
+    def __init__(self, pressed: PressedTrace, lead_s: float = 0.0, *, looped: bool = False) -> None:
         self._pressed = pressed
+        self._lead_s = lead_s
+        self._round_s = float(pressed.time_s[-1]) - lead_s + self._PAUSE_S if looped else np.inf
 
     @property
-    def duration_s(self) -> float:
-        """End of the trace, after the foot has been lifted."""
-        return float(self._pressed.time_s[-1])
+    def duration_s(self) -> float | None:
+        """End of the trace, after the foot has been lifted; None for one that is looped."""
+        return None if np.isfinite(self._round_s) else float(self._pressed.time_s[-1])
 
     def forces_n(self, t_s: Floats) -> Floats:
         """The trace's forces; zero before and after it."""
         time_s, forces_n = self._pressed.time_s, self._pressed.forces_n
+        at_s = self._in_trace(t_s)
         return np.stack(
-            [np.interp(t_s, time_s, f, left=0.0, right=0.0) for f in forces_n.T], axis=1
+            [np.interp(at_s, time_s, f, left=0.0, right=0.0) for f in forces_n.T], axis=1
         )
 
     def angle_rad(self, t_s: Floats) -> Floats | None:
         """The trace's angle, if it has one."""
         if self._pressed.angle_rad is None:
             return None
-        return np.interp(t_s, self._pressed.time_s, self._pressed.angle_rad)
+        return np.interp(self._in_trace(t_s), self._pressed.time_s, self._pressed.angle_rad)
+
+    def _in_trace(self, t_s: Floats) -> Floats:
+        if not np.isfinite(self._round_s):
+            return t_s
+        since_s = np.asarray(t_s) - self._lead_s
+        return np.where(since_s < 0.0, t_s, np.mod(since_s, self._round_s) + self._lead_s)
 
 
-def make_ground(scene: Scene, *, seed: int, lead_s: float, pressed: PressedTrace | None) -> Ground:
-    """The ground of a scene.
+def make_ground(
+    scene: Scene,
+    *,
+    seed: int,
+    lead_s: float,
+    pressed: PressedTrace | None,
+    looped: bool = False,
+) -> Ground:
+    """The ground of a scene, or a recorded load in its place, `looped` or once.
 
     Raises:
         UsageError: the scene wants a load trace and there is none.
@@ -194,7 +213,7 @@ def make_ground(scene: Scene, *, seed: int, lead_s: float, pressed: PressedTrace
     positions_m = tile_positions_m(scene.tile)
     bears = np.array([not tile.reference for tile in scene.tile])
     if pressed is not None:
-        return TraceLoad(pressed)
+        return TraceLoad(pressed, lead_s, looped=looped)
     match scene.ground:
         case NoGround():
             return NoLoad(len(bears))
@@ -209,6 +228,24 @@ def make_ground(scene: Scene, *, seed: int, lead_s: float, pressed: PressedTrace
                 f"scene {scene.name!r} presses a recorded load, and none was given",
                 remedy="Add --load FILE",
             )
+
+
+def press_on(
+    scene: Scene, load: LoadTrace, *, load_scale: float, cop: CopTransform, lead_s: float
+) -> PressedTrace:
+    """A recorded load as forces on the scene's tiles; see `devices.emulation.load_trace.press`.
+
+    Raises:
+        LoadTraceError: it cannot be pressed on them.
+    """
+    return press(
+        load,
+        tile_positions_m(scene.tile)[:, :2],
+        np.array([not tile.reference for tile in scene.tile]),
+        load_scale=load_scale,
+        cop=cop,
+        lead_s=lead_s,
+    )
 
 
 def tile_positions_m(tiles: tuple[TileScene, ...]) -> Floats:

@@ -7,6 +7,7 @@ servo, and nothing else. Truth is for whoever runs the scene, to judge an estima
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.scene import FaultKind, Scene, ServoScene
 
 _COUNTS_PER_TURN = 4096
+_FORESIGHT_S = 0.4
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class World:
         parts_seed: draws other parts for the same serials.
         lead_s: seconds without load before the ground begins.
         pressed: a recorded load instead of the scene's ground.
+        looped: press it over and over again.
     """
 
     def __init__(
@@ -73,10 +76,12 @@ class World:
         parts_seed: int = 0,
         lead_s: float = 1.0,
         pressed: PressedTrace | None = None,
+        looped: bool = False,
     ) -> None:
         self.scene = scene
+        self._clock = clock
         self.epoch_ns = clock.now_ns()
-        self.ground = make_ground(scene, seed=seed, lead_s=lead_s, pressed=pressed)
+        self.ground = make_ground(scene, seed=seed, lead_s=lead_s, pressed=pressed, looped=looped)
         self._positions_m = tile_positions_m(scene.tile)
         serials = [tile.serial for tile in scene.tile]
         chips = [draw_chip(serial, parts_seed) for serial in serials]
@@ -84,7 +89,9 @@ class World:
         surroundings = self._surroundings()
         # By scene too: a tile on the bench and in the field must not see the same noise again.
         draw = f"{scene.name}/{seed}"
-        domes = Domes(parts, serials, self.ground, scene.emulation, surroundings, draw)
+        domes = self._domes = Domes(
+            parts, serials, self.ground, scene.emulation, surroundings, draw
+        )
         senses = front_ends(
             chips, parts, serials, domes, surroundings, scene.emulation, self.epoch_ns, draw
         )
@@ -130,6 +137,26 @@ class World:
             baudrate=servo.baudrate,
         ) as emulated:
             yield emulated
+
+    @contextmanager
+    def foresight(self) -> Iterator[None]:
+        """For a real clock: compute the physics ahead in a thread while the block runs.
+
+        Without it the bus would now and then wait for it, which no silicon does.
+        """
+        stop = threading.Event()
+
+        def look_ahead() -> None:
+            while not stop.wait(_FORESIGHT_S / 4):
+                self._domes.foresee((self._clock.now_ns() - self.epoch_ns) * 1e-9 + _FORESIGHT_S)
+
+        thread = threading.Thread(target=look_ahead, name="physics", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
 
     def truth(self, t_mono_ns: npt.NDArray[np.int64]) -> Truth:
         """Ground truth at instants of the node's monotonic clock."""

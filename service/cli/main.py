@@ -10,7 +10,11 @@ import typer
 
 from devices.errors import FootTileError
 from service.cli.calibrate import calibrate_command
+from service.cli.demo import demo_command
 from service.cli.estimate import estimate_command
+from service.cli.node import node_command
+from service.cli.serve import serve_command
+from service.cli.sessions import export_command, pull_command, sessions_command
 from service.cli.simulate import simulate_command
 from service.version import SOFTWARE
 
@@ -24,6 +28,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+app.command("demo")(demo_command)
+app.command("serve")(serve_command)
+app.command("node")(node_command)
+app.command("sessions")(sessions_command)
+app.command("pull")(pull_command)
+app.command("export")(export_command)
 app.command("simulate")(simulate_command)
 app.command("estimate")(estimate_command)
 app.command("calibrate")(calibrate_command)

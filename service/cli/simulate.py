@@ -173,6 +173,12 @@ def _check(
             f"scene {scene.name!r} is for {scene.array.bus}, and simulate only emulates",
             remedy='Set array.bus = "emulated"',
         )
+    if scene.servo is not None and scene.servo.port != "emulated":
+        raise UsageError(
+            f"the servo of scene {scene.name!r} is at {scene.servo.port}, and simulate only "
+            "emulates",
+            remedy='Set servo.port = "emulated"',
+        )
     for option, value, least in (
         ("--seconds", 1.0 if seconds is None else seconds, 0.0),
         ("--load-scale", load_scale, 0.0),

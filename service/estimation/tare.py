@@ -7,8 +7,9 @@ baseline is a wrong force that looks right.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +35,7 @@ QUIET = 1.5
 STILL_SIGMAS = 4.0
 """The halves of a window, and the window and the lowest one, differ by no more than chance does."""
 
-Source = Literal["interval", "lead", "recognised"]
+Source = Literal["interval", "lead", "recognised", "unloaded"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,36 @@ class Tare:
     frames: int
     source: Source
 
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            f.name: value.tolist() if isinstance(value, np.ndarray) else value
+            for f in fields(self)
+            for value in (getattr(self, f.name),)
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], *, tiles: int) -> Tare:
+        """From JSON, for an array of `tiles` tiles.
+
+        Raises:
+            TareError: it is no tare, or of another number of tiles.
+        """
+        try:
+            values = {f.name: content[f.name] for f in fields(cls)}
+            for name in ("baseline_kpa", "baseline_sigma_kpa", "noise_kpa"):
+                values[name] = np.array(values[name], dtype=np.float64)
+            tare = cls(**values)
+            finite = np.isfinite(tare.baseline_kpa + tare.baseline_sigma_kpa + tare.noise_kpa)
+        except (KeyError, TypeError, ValueError) as error:
+            raise TareError(f"a recorded tare is not readable: {error}") from error
+        if finite.shape != (tiles,) or not finite.all():
+            raise TareError(
+                "a recorded tare is not of this array",
+                expected=f"a baseline for each of {tiles} tiles",
+            )
+        return tare
+
 
 def take_tare(
     frames: FrameBatch,
@@ -86,27 +117,32 @@ def take_tare(
     if interval_s is not None:
         begin_s, end_s = interval_s
         rows = (t_s >= begin_s) & (t_s <= end_s)
-        tare = _from_rows(frames, compensation, serials, rows, "interval")
-        return _refuse_loaded(tare, calibration, serials)
+        tare = tare_from_rows(frames, compensation, serials, rows, "interval")
+        return refuse_loaded(tare, calibration, serials)
     lead = np.logical_and.accumulate((frames.frame_status & FrameStatus.LEAD) != 0)
     if lead[0]:
-        tare = _from_rows(frames, compensation, serials, lead, "lead")
-        return _refuse_loaded(tare, calibration, serials)
+        tare = tare_from_rows(frames, compensation, serials, lead, "lead")
+        return refuse_loaded(tare, calibration, serials)
     # How many frames are at hand must not matter, only which ones a recording begins with.
     frames = frames.rows(
         0, int(np.searchsorted(frames.t_ns, frames.t_ns[0] + RECOGNISE_WITHIN_NS, side="right"))
     )
     rows = _recognise(frames, compensation, calibration, serials)
-    return _from_rows(frames, compensation, serials, rows, "recognised")
+    return tare_from_rows(frames, compensation, serials, rows, "recognised")
 
 
-def _from_rows(
+def tare_from_rows(
     frames: FrameBatch,
     compensation: Compensation,
     serials: tuple[str, ...],
     rows: npt.NDArray[np.bool_],
     source: Source,
 ) -> Tare:
+    """The tare from those `frames` that `rows` marks, a boolean array over them.
+
+    Raises:
+        TareError: a tile has fewer than `FRAMES_MIN` readable frames among them.
+    """
     kpa = compensation.readable_kpa(frames)[rows]
     readable = np.isfinite(kpa).sum(axis=0)
     for serial, count in zip(serials, readable, strict=True):
@@ -133,7 +169,7 @@ def _from_rows(
     )
 
 
-def _refuse_loaded(tare: Tare, calibration: Calibration, serials: tuple[str, ...]) -> Tare:
+def refuse_loaded(tare: Tare, calibration: Calibration, serials: tuple[str, ...]) -> Tare:
     """Refuse a tare under load, which would make every force after it too small.
 
     A colder tile lies lower than on the bench, and no load does that, so only above is refused.

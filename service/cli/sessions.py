@@ -1,0 +1,174 @@
+"""`foottile sessions`, `pull` and `export`: what was recorded, and how to get it."""
+
+from __future__ import annotations
+
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from devices.errors import UsageError
+from service.cli.options import JsonOption, output_path, print_json, progress, remark, say, stdout
+
+if TYPE_CHECKING:
+    from storage.export import Format
+
+SERVER = "http://127.0.0.1:8000"
+
+ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
+
+
+def sessions_command(
+    server: ServerOption = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Data folder to look into, without any server.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List recorded sessions, newest first."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    if server is not None and data is not None:
+        raise UsageError("--server and --data are two places to look in", remedy="Name one")
+    if data is not None:
+        found = _in_folder(data)
+    else:
+        from service.client import Client
+
+        with Client(server or SERVER) as client:
+            found = client.sessions()
+    if as_json:
+        print_json({"items": found})
+        return
+    table = Table(title_justify="left")
+    for heading in ("session", "name", "node", "started (UTC)", "s", "frames", "state", "complete"):
+        table.add_column(heading, overflow="fold")
+    for session in found:
+        started = datetime.fromtimestamp(session["started_t_ns"] // 10**9, UTC)
+        complete = session["complete"]
+        table.add_row(
+            session["id"],
+            escape(session["name"]),
+            session["node"],
+            f"{started:%Y-%m-%d %H:%M:%S}",
+            f"{session['duration_s']:.1f}",
+            str(session["frames"]),
+            session["state"],
+            complete if complete == "lossy" else "yes" if complete else "no",
+        )
+    stdout.print(table)
+
+
+def pull_command(
+    session: Annotated[str, typer.Argument(help="Id of the session.")],
+    out: Annotated[Path, typer.Option(help="Folder to put it in; made if absent.")],
+    server: ServerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Download a sealed session: data, description, events. Goes on where it was broken off.
+
+    The data is compared with its hash. Exit code 3: the session is complete on disk, but lossy.
+    """
+    from service.client import Client
+
+    with Client(server or SERVER) as client, progress(f"pulling {session}"):
+        pulled = client.pull(session, out)
+    if as_json:
+        print_json(pulled)
+    else:
+        say(f"{pulled['path']}: {pulled['frames']} frames, {pulled['bytes']} bytes, hash verified")
+        if pulled["resumed_bytes"]:
+            remark(f"{pulled['resumed_bytes']} bytes were there from before")
+    if pulled["complete"] == "lossy":
+        remark("the session is lossy: some frames are missing for good")
+        raise typer.Exit(3)
+
+
+def export_command(
+    session: Annotated[
+        str, typer.Argument(help="A sealed file, a session's folder, or an id in --data.")
+    ],
+    out: Annotated[Path, typer.Option(help="File to write.")],
+    to: Annotated[str, typer.Option("--format", help="parquet, arrow or csv.")],
+    data: Annotated[
+        Path | None, typer.Option(help="Data folder of the server; default: the user's.")
+    ] = None,
+    start_s: Annotated[
+        float | None, typer.Option(help="From so many seconds after the first frame.")
+    ] = None,
+    end_s: Annotated[float | None, typer.Option(help="Before so many seconds.")] = None,
+    columns: Annotated[
+        str | None, typer.Option(help="Names with commas between: t_ns,grf_n,force_n_0.")
+    ] = None,
+) -> None:
+    """Write a sealed session, or a slice of it, in another format."""
+    from storage.durable import storage_errors
+    from storage.export import FORMATS, Slice, export
+    from storage.schema import FRAMES, KNOWN
+    from storage.session_file import SessionReader
+
+    if to not in FORMATS:
+        raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))
+    chosen: Format = to
+    source = _sealed_file(session, data)
+    path = output_path(out, source)
+    names = tuple(name.strip() for name in (columns or "").split(",") if name.strip())
+    frame_names = {column.name for column in FRAMES}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with SessionReader(source) as reader:
+        extra = [name for name in KNOWN if name not in frame_names and reader.has(name)]
+        chunks = export(
+            reader.batches(*extra),
+            reader.info,
+            reader.notes,
+            chosen,
+            Slice(start_s, end_s, names),
+        )
+        try:
+            with storage_errors(path), progress(f"writing {path.name}"):
+                with temporary.open("wb") as file:
+                    for chunk in chunks:
+                        file.write(chunk)
+                temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    say(f"{path}: {path.stat().st_size} bytes")
+
+
+def _in_folder(data: Path) -> list[dict[str, Any]]:
+    from storage.session import SessionFolder
+
+    if not data.is_dir():
+        raise UsageError(f"no data folder {str(data)!r}")
+    folder = SessionFolder(data / "sessions")
+    found = []
+    for session_id in folder.ids():
+        session = folder.load(session_id)
+        ledger = session.ledger
+        content = session.model_dump(mode="json", exclude={"ledger", "events", "clock"})
+        complete = False if ledger is None else "lossy" if ledger.lossy else ledger.complete
+        found.append({**content, "complete": complete})
+    return found
+
+
+def _sealed_file(session: str, data: Path | None) -> Path:
+    from platformdirs import user_data_path
+
+    from storage.session import FRAMES_NAME, SessionFolder
+
+    path = Path(session)
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        root = data if data is not None else user_data_path("foottile")
+        path = SessionFolder(root / "sessions").path(session)
+    if not (path / FRAMES_NAME).is_file():
+        raise UsageError(
+            f"no sealed session {session!r}",
+            where=str(path),
+            expected=f"a file, a folder with {FRAMES_NAME}, or the id of a session in --data",
+        )
+    return path / FRAMES_NAME

@@ -1,0 +1,118 @@
+"""A tare while the stream runs: the newest unloaded interval among the frames just seen.
+
+The foot is in the air now and then, or somebody lifts it and presses the button; either way some
+quarter of a second of the last seconds was without load. If none can be told to be, there is no
+tare, because a tare under load makes every force after it too small.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from devices.compensation import Compensation
+from devices.errors import TareError
+from devices.frames import FrameBatch
+from service.estimation.calibration import Calibration
+from service.estimation.tare import (
+    FRAMES_MIN,
+    NEAR_BASELINE_KPA,
+    QUIET,
+    STILL_SIGMAS,
+    Tare,
+    refuse_loaded,
+    tare_from_rows,
+)
+
+LOOK_BACK_NS = 10_000_000_000
+WINDOW_NS = 250_000_000
+
+
+def tare_in_flight(
+    frames: FrameBatch,
+    compensation: Compensation,
+    calibration: Calibration,
+    serials: tuple[str, ...],
+    *,
+    present: Tare | None,
+) -> Tare:
+    """The tare from the newest unloaded window of `frames`.
+
+    Of all windows in which every tile is quiet and still, those count in which no tile is higher
+    than in the lowest of them, nor far above the present tare or, without one, the bench: a foot
+    that stands still is quiet too, but presses. The newest of these is taken.
+
+    Args:
+        frames: the last `LOOK_BACK_NS` of the stream, in order.
+        compensation: of the array's chips.
+        calibration: of its tiles, whose bench baselines tell an unloaded tile.
+        serials: of the tiles, in order.
+        present: the tare now in force.
+
+    Raises:
+        TareError: the foot was loaded or moved all the time, or a tile gave no readings.
+    """
+    kpa = compensation.readable_kpa(frames)
+    silent = [s for s, column in zip(serials, kpa.T, strict=True) if not np.isfinite(column).any()]
+    if silent:
+        raise TareError(
+            f"tile {', '.join(silent)} gave no readings in the last seconds",
+            remedy="Plug it in, or take it out of the scene",
+        )
+    entries = [calibration.of(serial) for serial in serials]
+    bench_kpa = np.array([np.nan if e.baseline_kpa is None else e.baseline_kpa for e in entries])
+    usual_kpa = np.array([np.nan if e.noise_kpa is None else e.noise_kpa for e in entries])
+    if present is not None:
+        usual_kpa = np.where(np.isnan(usual_kpa), present.noise_kpa, usual_kpa)
+    since_ns = frames.t_ns - frames.t_ns[0]
+    windows = []
+    for begin_ns in range(int(since_ns[-1]) - WINDOW_NS, -1, -WINDOW_NS // 4):
+        rows = (since_ns >= begin_ns) & (since_ns <= begin_ns + WINDOW_NS)
+        n = int(rows.sum())
+        if n < FRAMES_MIN or not np.isfinite(kpa[rows]).all():
+            continue
+        mean_kpa, noise_kpa = kpa[rows].mean(axis=0), kpa[rows].std(axis=0, ddof=1)
+        expected_kpa = np.where(np.isnan(usual_kpa), noise_kpa, usual_kpa)
+        drift_kpa = kpa[rows][: n // 2].mean(axis=0) - kpa[rows][n // 2 :].mean(axis=0)
+        mean_sigma_kpa = expected_kpa / np.sqrt(n)
+        quiet = noise_kpa < QUIET * expected_kpa
+        still = np.abs(drift_kpa) < STILL_SIGMAS * 2.0 * mean_sigma_kpa
+        if (quiet & still).all():
+            windows.append((rows, mean_kpa, mean_sigma_kpa))
+    if not windows:
+        raise TareError(
+            "the foot moved or was loaded all the time in the last seconds",
+            expected=f"{WINDOW_NS / 1e9:g} s at rest in the air",
+            remedy="Lift the foot, hold it still for a second, and tare again",
+        )
+    lowest_kpa = np.min([mean_kpa for _, mean_kpa, _ in windows], axis=0)
+    low = [
+        rows for rows, mean_kpa, sigma_kpa in windows if _as_low(mean_kpa, lowest_kpa, sigma_kpa)
+    ]
+    if not low:
+        raise TareError(
+            "no tile was unloaded while all others were, in the last seconds",
+            remedy="Lift the whole foot, hold it still for a second, and tare again",
+        )
+    tare = tare_from_rows(frames, compensation, serials, low[0], "unloaded")
+    if present is not None:
+        _refuse_above(tare, present, serials)
+    if np.isfinite(bench_kpa).all():
+        refuse_loaded(tare, calibration, serials)
+    return tare
+
+
+def _as_low(mean_kpa: np.ndarray, lowest_kpa: np.ndarray, sigma_kpa: np.ndarray) -> bool:
+    return bool((mean_kpa < lowest_kpa + STILL_SIGMAS * np.sqrt(2.0) * sigma_kpa).all())
+
+
+def _refuse_above(tare: Tare, present: Tare, serials: tuple[str, ...]) -> None:
+    rise_kpa = tare.baseline_kpa - present.baseline_kpa
+    worst = int(np.argmax(rise_kpa))
+    if rise_kpa[worst] > NEAR_BASELINE_KPA:
+        raise TareError(
+            f"tile {serials[worst]} reads {rise_kpa[worst]:.2f} kPa more than at the last tare: "
+            "the foot seems to be loaded",
+            expected=f"at most {NEAR_BASELINE_KPA} kPa, as 5 K of warming give",
+            remedy="Lift the foot and tare again; if it really has warmed up so much, undo the "
+            "last tare first",
+        )

@@ -1,0 +1,204 @@
+"""The server's end of the link: takes in what a node sends, and hangs up with a reason."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from contextlib import suppress
+
+from pydantic import ValidationError
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from devices.errors import FileFormatError, FootTileError, LinkError, StorageError
+from service.link import (
+    MESSAGE_BYTES_MAX,
+    PROTOCOL,
+    SILENCE_S,
+    SUBPROTOCOL,
+    ClockRow,
+    Close,
+    FromNode,
+    Hello,
+    Probe,
+    Status,
+    Welcome,
+)
+from service.nodes import Node
+from service.server import Link, Server
+
+log = logging.getLogger("foottile.ingest")
+
+_REASON_BYTES_MAX = 120  # RFC 6455: 125 with the code
+
+
+class _HangUp(Exception):  # noqa: N818  # no error: how a connection ends
+    def __init__(self, code: Close, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason
+
+
+async def ingest(socket: WebSocket, server: Server) -> None:
+    """Serve one node's connection until it ends."""
+    offered = socket.scope.get("subprotocols", [])
+    await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
+    link: Link | None = None
+    try:
+        link = await _greet(socket, server, offered)
+        await _serve(socket, server, link)
+    except _HangUp as end:
+        await _close(socket, end)
+    except (WebSocketDisconnect, RuntimeError):  # it went away, perhaps while we were sending
+        pass
+    finally:
+        if link is not None:
+            _leave(server, link)
+
+
+async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
+    if SUBPROTOCOL not in offered:
+        raise _HangUp(
+            Close.WRONG_VERSION,
+            f"subprotocol {', '.join(offered) or 'none'} offered; this server speaks {SUBPROTOCOL}",
+        )
+    hello = _parse(await _receive(socket), Close.BAD_HELLO)
+    if not isinstance(hello, Hello):
+        raise _HangUp(Close.BAD_HELLO, "the first message has to be hello")
+    if hello.protocol != PROTOCOL:
+        raise _HangUp(
+            Close.WRONG_VERSION, f"protocol {hello.protocol}; this server speaks {PROTOCOL}"
+        )
+    name, boot_id = hello.array_info.node, hello.array_info.boot_id
+    other = server.links.get(name)
+    if other is not None:
+        if other.node.boot_id != boot_id:
+            raise _HangUp(
+                Close.NAME_TAKEN,
+                f"a node {name!r} is connected already; give this one another name (--name)",
+            )
+        other.end(Close.SUPERSEDED, "the same node has connected again")
+    try:
+        node = server.nodes.greet(hello)
+        _follow_restart(server, node, hello)
+        held = node.attach(hello)
+    except (LinkError, StorageError) as error:
+        code = Close.TRY_LATER if isinstance(error, StorageError) else Close.BAD_HELLO
+        raise _HangUp(code, str(error)) from error
+    link = server.links[name] = Link(node)
+    lacks = [*held.missing(hello.first_seq, max(hello.first_seq, held.last or 0))]
+    beyond = max(hello.first_seq, (held.last + 1) if held.last is not None else 0)
+    closed = [(a, b) for a, b in lacks if b < beyond]
+    welcome = Welcome(protocol=PROTOCOL, lacks=(*closed, (beyond, None)))
+    await socket.send_text(welcome.model_dump_json())
+    log.info("node %s connected, stream %s", name, boot_id)
+    server.tell_node(node)
+    return link
+
+
+def _follow_restart(server: Server, node: Node, hello: Hello) -> None:
+    """Tell the recorder if this is a new stream of a node it knows."""
+    if node.boot_id != hello.array_info.boot_id:
+        ended_boot_id, ended_t_ns = node.boot_id, node.last_seen_t_ns
+        node.attach(hello)
+        server.recorder.node_restarted(node, ended_boot_id, ended_t_ns)
+
+
+async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
+    tasks = [
+        asyncio.create_task(_take(socket, server, link)),
+        asyncio.create_task(_acknowledge(socket, link)),
+        asyncio.create_task(link.ended.wait()),
+    ]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+        if link.closing is not None:
+            raise _HangUp(*link.closing)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _take(socket: WebSocket, server: Server, link: Link) -> None:
+    node = link.node
+    while True:
+        message = await _receive(socket)
+        if isinstance(message, bytes):
+            tare_before = node.live.tare
+            try:
+                seq_first, seq_last, due = node.take(message, time.time_ns())
+            except FileFormatError as error:
+                raise _HangUp(Close.MALFORMED, f"node {node.name!r}: {error}") from error
+            if node.storage_problem is None:
+                link.unsynced.add(seq_first, seq_last)
+            server.hub.publish(node, due)
+            if node.live.tare is not tare_before:
+                server.tell_node(node)
+            continue
+        said = _parse(message, Close.MALFORMED)
+        match said:
+            case Probe(id=number):
+                answer = Probe(id=number, server_t_ns=time.time_ns())
+                await socket.send_text(answer.model_dump_json())
+            case ClockRow():
+                node.clock = said
+                with suppress(FootTileError):
+                    server.recorder.note_clock(node)
+            case Status():
+                node.missed_slots = said.missed_slots
+                node.node_first_seq = max(node.node_first_seq, said.first_seq)
+                server.tell_node(node)
+            case Hello():
+                raise _HangUp(Close.MALFORMED, "hello was said before")
+
+
+async def _acknowledge(socket: WebSocket, link: Link) -> None:
+    while True:
+        ack = await link.outbox.get()
+        await socket.send_text(ack.model_dump_json())
+
+
+async def _receive(socket: WebSocket) -> str | bytes:
+    try:
+        async with asyncio.timeout(SILENCE_S):
+            message = await socket.receive()
+    except TimeoutError as error:
+        raise _HangUp(Close.SILENT, f"nothing was heard for {SILENCE_S:g} s") from error
+    if message["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(message.get("code", 1005))
+    data: str | bytes | None = message.get("bytes")
+    if data is None:
+        data = message["text"]
+    if len(data) > MESSAGE_BYTES_MAX:
+        raise _HangUp(Close.TOO_BIG, f"a message of {len(data)} bytes")
+    return data
+
+
+def _parse(message: str | bytes, code: Close) -> Hello | Probe | ClockRow | Status:
+    try:
+        if isinstance(message, bytes):
+            raise _HangUp(code, "a text message was expected, and a binary one came")
+        return FromNode.validate_json(message)
+    except ValidationError as error:
+        complaint = error.errors()[0]
+        where = ".".join(str(part) for part in complaint["loc"])
+        raise _HangUp(code, f"message not understood: {where}: {complaint['msg']}") from error
+
+
+async def _close(socket: WebSocket, end: _HangUp) -> None:
+    log.warning("link closed: %s", end.reason)
+    reason = end.reason.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")
+    if socket.application_state is not WebSocketState.DISCONNECTED:
+        with suppress(RuntimeError, WebSocketDisconnect):
+            await socket.close(end.code, reason)
+
+
+def _leave(server: Server, link: Link) -> None:
+    if server.links.get(link.node.name) is link:
+        del server.links[link.node.name]
+        link.node.detach()
+        server.tell_node(link.node)
+        log.info("node %s has gone", link.node.name)

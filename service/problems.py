@@ -1,0 +1,93 @@
+"""Every error of the API as RFC 9457 problem+json: what, where, what was expected, what to do."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from devices.errors import (
+    FootTileError,
+    StateError,
+    StorageError,
+    TareError,
+    UnknownError,
+    UsageError,
+)
+
+log = logging.getLogger("foottile.api")
+
+MEDIA_TYPE = "application/problem+json"
+
+_STATUS: tuple[tuple[type[FootTileError], HTTPStatus], ...] = (
+    (UnknownError, HTTPStatus.NOT_FOUND),
+    (StateError, HTTPStatus.CONFLICT),
+    (TareError, HTTPStatus.CONFLICT),
+    (StorageError, HTTPStatus.INSUFFICIENT_STORAGE),
+    (UsageError, HTTPStatus.UNPROCESSABLE_ENTITY),
+)
+
+
+def problem(
+    path: str, status: int, detail: str, headers: Mapping[str, str] | None = None
+) -> JSONResponse:
+    """A problem as an answer.
+
+    Args:
+        path: what was asked for.
+        status: HTTP status.
+        detail: for a person: what is wrong and what to do.
+        headers: more headers.
+    """
+    content = {
+        "type": "about:blank",
+        "title": HTTPStatus(status).phrase,
+        "status": status,
+        "detail": detail,
+        "instance": path[:200],
+    }
+    return JSONResponse(content, status, dict(headers or {}), MEDIA_TYPE)
+
+
+def install(app: FastAPI) -> None:
+    """Answer every error of the app with a problem."""
+    app.add_exception_handler(FootTileError, _on_ours)
+    app.add_exception_handler(RequestValidationError, _on_invalid)
+    app.add_exception_handler(HTTPException, _on_http)
+    app.add_exception_handler(Exception, _on_bug)
+
+
+def status_of(error: FootTileError) -> HTTPStatus:
+    """HTTP status of one of our errors."""
+    found = (status for kind, status in _STATUS if isinstance(error, kind))
+    return next(found, HTTPStatus.INTERNAL_SERVER_ERROR)
+
+
+async def _on_ours(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, FootTileError)  # noqa: S101  # by registration
+    return problem(request.url.path, status_of(error), str(error))
+
+
+async def _on_invalid(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)  # noqa: S101  # by registration
+    complaints = "; ".join(
+        f"{'.'.join(str(part) for part in complaint['loc'])}: {complaint['msg']}"
+        for complaint in error.errors()[:5]
+    )
+    return problem(request.url.path, HTTPStatus.UNPROCESSABLE_ENTITY, complaints)
+
+
+async def _on_http(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)  # noqa: S101  # by registration
+    return problem(request.url.path, error.status_code, str(error.detail), error.headers)
+
+
+async def _on_bug(request: Request, error: Exception) -> JSONResponse:
+    log.error("%s %s: this is a bug", request.method, request.url.path, exc_info=error)
+    detail = f"The server made a mistake ({type(error).__name__}); its log says more"
+    return problem(request.url.path, HTTPStatus.INTERNAL_SERVER_ERROR, detail)

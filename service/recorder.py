@@ -1,0 +1,367 @@
+"""Recording: sessions as intervals of the nodes' streams, from their start to the sealed file.
+
+Starting and stopping only note numbers and instants; the frames are in the journals anyway. A
+session that was stopped while its node was away is `pending` until the node has brought what it
+took before the stop. Sealing runs in a thread and is tried again if the disk is full.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+import uuid
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+from devices.errors import FootTileError, StateError, UnknownError
+from service.nodes import Node, Nodes
+from service.sealing import Sources, ledger_of, seal, write_events
+from storage.intervals import Intervals
+from storage.session import (
+    ClockOffset,
+    Event,
+    Ledger,
+    Part,
+    Session,
+    SessionFolder,
+    new_session_id,
+)
+
+log = logging.getLogger("foottile.recorder")
+
+_SEAL_AGAIN_S = 10.0
+
+
+class Recorder:
+    """All sessions of a server.
+
+    Args:
+        folder: where they are kept.
+        nodes: whose frames are recorded.
+        changed: told of every session that changed.
+
+    Raises:
+        FileFormatError: a session's file is damaged.
+    """
+
+    def __init__(
+        self, folder: SessionFolder, nodes: Nodes, changed: Callable[[Session], None]
+    ) -> None:
+        self.folder = folder
+        self._nodes = nodes
+        self._changed = changed
+        self._sessions: dict[str, Session] = {}
+        self._sealing: dict[str, asyncio.Task[None]] = {}
+        self._seal_after: dict[str, float] = {}
+        for session_id in folder.ids():
+            try:
+                self._sessions[session_id] = folder.load(session_id)
+            except FootTileError as error:
+                log.warning("session %s is left out: %s", session_id, error)
+
+    def all(self) -> list[Session]:
+        """All sessions, newest first."""
+        return sorted(self._sessions.values(), key=lambda s: (s.started_t_ns, s.id), reverse=True)
+
+    def get(self, session_id: str) -> Session:
+        """One session, with the counts of the moment.
+
+        Raises:
+            UnknownError: there is none of this id.
+        """
+        self.folder.path(session_id)
+        if session_id not in self._sessions:
+            raise UnknownError(f"no session {session_id!r}")
+        return self._sessions[session_id]
+
+    def recording_on(self, node: str) -> list[Session]:
+        """Sessions that are being recorded on a node."""
+        return [s for s in self._sessions.values() if s.node == node and s.state == "recording"]
+
+    def start(
+        self,
+        node_name: str,
+        name: str,
+        *,
+        pre_roll_s: float = 0.0,
+        subject: str = "",
+        notes: str = "",
+        tags: tuple[str, ...] = (),
+    ) -> Session:
+        """Begin a session with the next frame, or `pre_roll_s` earlier if the ring reaches so far.
+
+        Raises:
+            UnknownError: no such node.
+            StateError: it is away, has sent nothing yet, or is being recorded already.
+            StorageError: the session cannot be written down; nothing was started then.
+        """
+        node = self._nodes.get(node_name)
+        if not node.connected or node.last_seq is None or node.last_t_ns is None:
+            raise StateError(
+                f"node {node_name!r} is not sending", remedy="Record when it is connected"
+            )
+        if recording := self.recording_on(node_name):
+            raise StateError(
+                f"node {node_name!r} is being recorded already: session {recording[0].id} "
+                f"({recording[0].name})",
+                remedy="Stop it first",
+            )
+        seq_first = node.last_seq + 1
+        if pre_roll_s > 0 and node.journal is not None:
+            since_t_ns = node.last_t_ns - round(pre_roll_s * 1e9)
+            reached = node.journal.first_seq_since(since_t_ns)
+            seq_first = min(seq_first, reached if reached is not None else seq_first)
+        now = datetime.now(UTC)
+        session = Session(
+            id=new_session_id(now),
+            name=name,
+            node=node_name,
+            state="recording",
+            started_t_ns=time.time_ns(),
+            parts=(Part(boot_id=node.boot_id, seq_first=seq_first),),
+            subject=subject,
+            notes=notes,
+            tags=tags,
+            scene=node.info.scene,
+            missed_slots_at_start=node.missed_slots,
+            clock=_clock_rows(node),
+        )
+        self._keep(session)
+        return session
+
+    def stop(self, session_id: str) -> Session:
+        """End a session at this instant; it is sealed as soon as all its frames are there.
+
+        Raises:
+            UnknownError: no such session.
+            StateError: it was stopped before.
+            StorageError: that cannot be written down.
+        """
+        session = self.get(session_id)
+        if session.state != "recording":
+            raise StateError(
+                f"session {session_id} was stopped already and is {session.state}",
+                expected="a session that is recording",
+            )
+        stopped = session.model_copy(
+            update={"stopped_t_ns": time.time_ns(), "state": "pending", "problem": None}
+        )
+        self._keep(stopped)
+        self.settle()
+        return self._sessions[session_id]
+
+    def change(self, session_id: str, **changes: object) -> Session:
+        """Change what people say of a session: name, subject, notes, tags.
+
+        Raises:
+            UnknownError: no such session.
+            StorageError: it cannot be written down.
+        """
+        session = self.get(session_id).model_copy(update=changes)
+        self._keep(session)
+        return session
+
+    def mark(self, session_id: str, label: str, t_ns: int | None) -> Event:
+        """Note an event, now or at `t_ns` of the server's UTC.
+
+        Raises:
+            UnknownError: no such session.
+            StorageError: it cannot be written down.
+        """
+        session = self.get(session_id)
+        event = Event(
+            id=uuid.uuid4().hex[:12], label=label, t_ns=time.time_ns() if t_ns is None else t_ns
+        )
+        session = session.model_copy(update={"events": (*session.events, event)})
+        self._keep(session)
+        if session.state == "sealed":
+            write_events(session, self.folder.path(session_id))
+        return event
+
+    def node_restarted(self, node: Node, ended_boot_id: str, ended_t_ns: int | None) -> None:
+        """The node has begun a new stream: its recording goes on in a new part.
+
+        Frames of the old stream that were not sent are gone; how many there may have been is noted.
+        """
+        for session in list(self._sessions.values()):
+            open_here = session.parts[-1].boot_id == ended_boot_id and session.node == node.name
+            if open_here and session.state in ("recording", "pending"):
+                ended = self._end_part(session, node, ended_t_ns)
+                self._keep(_continued(ended, node) if ended.state == "recording" else ended)
+
+    def note_clock(self, node: Node) -> None:
+        """Keep a new measurement of a node's clock with its recordings."""
+        for session in self.recording_on(node.name):
+            self._keep(session.model_copy(update={"clock": session.clock + _clock_rows(node)[-1:]}))
+
+    def settle(self) -> None:
+        """Find the end of stopped sessions, and seal those whose frames are all there."""
+        for session in list(self._sessions.values()):
+            if session.state == "pending":
+                ended = self._with_end(session)
+                ledger = self.ledger(session.id)
+                if ended.parts[-1].seq_last is not None and not any(
+                    p.pending for p in ledger.parts
+                ):
+                    self._keep(ended.model_copy(update={"state": "sealing"}))
+            now = self._sessions[session.id]
+            due = time.monotonic() >= self._seal_after.get(session.id, 0.0)
+            if now.state == "sealing" and session.id not in self._sealing and due:
+                self._sealing[session.id] = asyncio.create_task(self._seal(session.id))
+
+    async def settled(self, session_id: str, timeout_s: float) -> Session:
+        """The session once it is sealed, or as it is after `timeout_s`."""
+        end = time.monotonic() + timeout_s
+        while self._sessions[session_id].state != "sealed" and time.monotonic() < end:
+            await asyncio.sleep(0.02)
+        return self._sessions[session_id]
+
+    async def close(self) -> None:
+        """Wait for what is being sealed."""
+        await asyncio.gather(*self._sealing.values(), return_exceptions=True)
+
+    def ledger(self, session_id: str) -> Ledger:
+        """What became of every frame of a session, as of now.
+
+        Raises:
+            UnknownError: no such session.
+        """
+        session = self.get(session_id)
+        if session.state == "sealed" and session.ledger is not None:
+            return session.ledger
+        node = self._nodes.get(session.node)
+        ends = session.stopped_t_ns is not None
+        return ledger_of(
+            session,
+            {boot_id: journal.held for boot_id, journal in node.journals.items()},
+            open_boot_id=node.boot_id,
+            node_first_seq=node.node_first_seq,
+            missed_slots=max(0, node.missed_slots - session.missed_slots_at_start),
+            finished=ends,
+        )
+
+    def nominal_rate_hz(self, session: Session) -> float:
+        """Rate of the stream it is recorded from."""
+        return self._nodes.get(session.node).info.nominal_rate_hz
+
+    def sources(self, session_id: str) -> Sources:
+        """What a session is made from, sealed or given away before.
+
+        Raises:
+            UnknownError: no such session.
+        """
+        session = self.get(session_id)
+        node = self._nodes.get(session.node)
+        first = node.journals.get(session.parts[0].boot_id)
+        info = first.info if first is not None else node.info
+        begin_ns = node.node_t_ns(session.started_t_ns)
+        end_ns = node.node_t_ns(session.stopped_t_ns or time.time_ns())
+        return Sources(
+            session=session,
+            info=info,
+            journals=dict(node.journals),
+            calibration=node.hello.calibration,
+            tares=node.tares.during(info, begin_ns, end_ns),
+            notes={"scene": node.hello.scene, "emulated": node.hello.emulated},
+        )
+
+    def needed(self, node: str) -> dict[str, Intervals]:
+        """Numbers by boot_id that unsealed sessions of a node still need in its journals."""
+        needed: dict[str, Intervals] = {}
+        for session in self._sessions.values():
+            if session.node == node and session.state != "sealed":
+                for part in session.parts:
+                    last = part.seq_last if part.seq_last is not None else 2**62
+                    if last >= part.seq_first:
+                        needed.setdefault(part.boot_id, Intervals()).add(part.seq_first, last)
+        return needed
+
+    def _with_end(self, session: Session) -> Session:
+        """The session with the end of its last part, if the stream has passed the stop."""
+        part = session.parts[-1]
+        node = self._nodes.get(session.node)
+        journal = node.journals.get(part.boot_id)
+        if part.seq_last is not None or journal is None or session.stopped_t_ns is None:
+            return session
+        last = journal.last_seq_until(node.node_t_ns(session.stopped_t_ns), at_least=part.seq_first)
+        if last is None:
+            return session
+        return self._keep(_ended(session, last))
+
+    def _end_part(self, session: Session, node: Node, ended_t_ns: int | None) -> Session:
+        """End the last part where its stream ended; note how many frames may be missing."""
+        part = session.parts[-1]
+        if part.seq_last is not None:
+            return session
+        journal = node.journals.get(part.boot_id)
+        last = journal.held.last if journal is not None else None
+        until_t_ns = min(session.stopped_t_ns or time.time_ns(), time.time_ns())
+        silent_s = 0.0 if ended_t_ns is None else max(0.0, (until_t_ns - ended_t_ns) * 1e-9)
+        tail = round(silent_s * node.info.nominal_rate_hz) + 1
+        tails = {**session.unsynced_tail_max, part.boot_id: tail}
+        ended = _ended(session, part.seq_first - 1 if last is None else max(last, part.seq_first))
+        return ended.model_copy(update={"unsynced_tail_max": tails})
+
+    async def _seal(self, session_id: str) -> None:
+        try:
+            sources = self.sources(session_id)
+            ledger = self.ledger(session_id)
+            for part in sources.session.parts:
+                if part.boot_id in sources.journals:
+                    sources.journals[part.boot_id].sync()
+            sealed = await asyncio.to_thread(seal, sources, self.folder.path(session_id), ledger)
+            # Name, notes and events may have changed meanwhile.
+            now = self._sessions[session_id]
+            people = {n: getattr(now, n) for n in ("name", "subject", "notes", "tags", "events")}
+            if now.events != sealed.events:
+                write_events(now, self.folder.path(session_id))
+            self._keep(sealed.model_copy(update=people))
+        except Exception as error:
+            if not isinstance(error, FootTileError):
+                log.exception("session %s: this is a bug", session_id)
+            log.warning("session %s cannot be sealed: %s", session_id, error)
+            self._seal_after[session_id] = time.monotonic() + _SEAL_AGAIN_S
+            now = self._sessions[session_id]
+            self._sessions[session_id] = now.model_copy(
+                update={"problem": f"cannot be sealed yet, and is tried again: {error}"}
+            )
+            self._changed(self._sessions[session_id])
+        finally:
+            del self._sealing[session_id]
+
+    def _keep(self, session: Session) -> Session:
+        self.folder.save(session)
+        self._sessions[session.id] = session
+        self._changed(session)
+        return session
+
+
+def _ended(session: Session, seq_last: int) -> Session:
+    parts = (*session.parts[:-1], session.parts[-1].model_copy(update={"seq_last": seq_last}))
+    return session.model_copy(update={"parts": parts})
+
+
+def _continued(session: Session, node: Node) -> Session:
+    """The session with a part for the node's new stream, if that has the same tiles."""
+    before = node.journals.get(session.parts[-1].boot_id)
+    if before is not None and before.info.serials != node.info.serials:
+        problem = "the node came back with other tiles: recording ended"
+        return session.model_copy(
+            update={"state": "pending", "stopped_t_ns": time.time_ns(), "problem": problem}
+        )
+    part = Part(boot_id=node.boot_id, seq_first=0)
+    return session.model_copy(update={"parts": (*session.parts, part)})
+
+
+def _clock_rows(node: Node) -> tuple[ClockOffset, ...]:
+    if node.clock is None:
+        return ()
+    return (
+        ClockOffset(
+            boot_id=node.boot_id,
+            t_mono_ns=node.clock.t_mono_ns,
+            server_minus_node_ns=node.clock.server_minus_node_ns,
+            uncertainty_ns=node.clock.uncertainty_ns,
+        ),
+    )

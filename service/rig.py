@@ -1,0 +1,163 @@
+"""An array and its servo, opened on a real clock and ready to stream: real, emulated, or mixed."""
+
+from __future__ import annotations
+
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from statistics import median
+
+import numpy as np
+
+from devices.acquisition import Acquisition
+from devices.array import TileArray
+from devices.clock import SystemClock, UtcAnchor
+from devices.dynamixel import open_servo
+from devices.emulation.ground import press_on
+from devices.emulation.load_trace import CopTransform, LoadTrace
+from devices.emulation.world import World
+from devices.frames import ArrayInfo, FrameBatch, FrameStatus
+from devices.i2c import open_bus
+from devices.realtime import clock_is_set, run_before_others, sharpen_timers
+from devices.scene import EMULATED, Scene, ServoScene
+from devices.servo import ServoReader
+from service.describe import describe
+
+_TRIAL_FRAMES = 15
+
+# Threads of an emulated world must not make the bus wait for Python's lock longer than a bit or so.
+_SWITCH_S = 0.0002
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """What to open; everything but `scene` and `node` is for emulation."""
+
+    scene: Scene
+    node: str
+    load: LoadTrace | None = None
+    load_scale: float = 1.0
+    cop: CopTransform = CopTransform()  # noqa: RUF009  # frozen, so one for all is safe
+    lead_s: float = 1.0
+    seed: int = 0
+    parts_seed: int = 0
+
+    @property
+    def emulated(self) -> bool:
+        """Are the tiles emulated?"""
+        return self.scene.array.bus == EMULATED
+
+
+class Rig:
+    """One array, identified over its bus, with its servo beside it.
+
+    Args:
+        options: what to open.
+        stack: what is opened is closed with it.
+
+    Raises:
+        I2cError, TileSetupError, ServoSetupError, LoadTraceError, UsageError: it cannot be opened.
+    """
+
+    def __init__(self, options: RigOptions, stack: ExitStack) -> None:
+        scene = options.scene
+        sharpen_timers()
+        self._clock = SystemClock()
+        self._lead_end_ns: int | None = None
+        world = self._world(options, stack)
+        bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
+        stack.callback(bus.close)
+        array = TileArray(
+            bus,
+            scene.tile,
+            self._clock,
+            schedule=scene.array.schedule,
+            wait_ms=scene.array.wait_ms,
+        )
+        tiles = array.identify()
+        servo = self._servo(scene.servo, world, stack) if scene.servo is not None else None
+        anchor = UtcAnchor.now(clock_set=clock_is_set())
+        bus_hz = self._bus_hz(array)
+        self.info: ArrayInfo = describe(
+            scene,
+            tiles,
+            anchor,
+            node=options.node,
+            boot_id=uuid.uuid4().hex,
+            schedule=scene.array.schedule,
+            rate_hz=min(scene.rate_hz or bus_hz, bus_hz),
+        )
+        self.acquisition = Acquisition(
+            array,
+            tiles,
+            self._clock,
+            anchor,
+            rate_hz=scene.rate_hz,
+            servo=servo,
+            reference=world.mill if world is not None and options.emulated else None,
+        )
+        if not options.emulated:
+            # Last, and only this thread: an emulated world would starve the rest of the machine.
+            run_before_others()
+
+    def batches(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
+        """Frames until `stop()`; those before an emulated load begins are marked as lead."""
+        for batch in self.acquisition.run(stop):
+            if self._lead_end_ns is None or int(batch.t_mono_ns[0]) >= self._lead_end_ns:
+                yield batch
+                continue
+            lead = np.where(batch.t_mono_ns < self._lead_end_ns, FrameStatus.LEAD, 0)
+            yield replace(batch, frame_status=batch.frame_status | lead.astype(np.uint8))
+
+    def _world(self, options: RigOptions, stack: ExitStack) -> World | None:
+        scene = options.scene
+        if not options.emulated and (scene.servo is None or scene.servo.port != EMULATED):
+            return None
+        sys.setswitchinterval(_SWITCH_S)
+        pressed = None
+        if options.load is not None:
+            pressed = press_on(
+                scene,
+                options.load,
+                load_scale=options.load_scale,
+                cop=options.cop,
+                lead_s=options.lead_s,
+            )
+        world = World(
+            scene,
+            self._clock,
+            seed=options.seed,
+            parts_seed=options.parts_seed,
+            lead_s=options.lead_s,
+            pressed=pressed,
+            looped=True,
+        )
+        if options.emulated:
+            self._lead_end_ns = world.epoch_ns + round(options.lead_s * 1e9)
+        stack.enter_context(world.foresight())
+        return world
+
+    def _servo(self, scene: ServoScene, world: World | None, stack: ExitStack) -> ServoReader:
+        port = scene.port
+        if port == EMULATED and world is not None:
+            port = stack.enter_context(world.servo(scene, self._clock)).port
+        servo = open_servo(
+            port,
+            baudrate=scene.baudrate,
+            clock=self._clock,
+            servo_id=scene.id,
+            model=scene.model,
+        )
+        stack.callback(servo.close)
+        return stack.enter_context(ServoReader(servo, self._clock, rate_hz=scene.rate_hz))
+
+    def _bus_hz(self, array: TileArray) -> float:
+        """What rate this bus gives, from some frames before the stream begins."""
+        periods_ns = []
+        for _ in range(_TRIAL_FRAMES):
+            begin_ns = self._clock.now_ns()
+            array.scan()
+            periods_ns.append(self._clock.now_ns() - begin_ns)
+        return 1e9 / median(periods_ns)

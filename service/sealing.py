@@ -1,0 +1,269 @@
+"""From journals to a sealed session: frames with estimates in one Parquet file, and its ledger.
+
+The same frames, with estimates made the same way, are what a session that is still recorded or
+pending gives away as CSV or Arrow.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from devices.errors import FileFormatError, FootTileError
+from devices.frames import ArrayInfo, FrameBatch
+from service.estimation.calibration import Calibration
+from service.estimation.plan import EstimationPlan
+from service.estimation.tare import Tare
+from service.pipeline import Columns, EstimateOptions, EstimateStream, notes_of
+from storage.durable import write_whole
+from storage.intervals import Intervals
+from storage.journal import Journal
+from storage.session import FRAMES_NAME, Ledger, PartLedger, Session
+from storage.session_file import SessionWriter
+
+OFFLINE_LAG_MS = 100.0
+_GATHER_FRAMES = 4096
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What a session is sealed from.
+
+    Attributes:
+        session: intervals, events, clock.
+        info: description of the array in its first part.
+        journals: by boot_id.
+        calibration: to estimate with; None: raw frames only.
+        tares: that were in force, oldest first.
+        notes: more for the file's metadata.
+    """
+
+    session: Session
+    info: ArrayInfo
+    journals: Mapping[str, Journal]
+    calibration: Calibration | None
+    tares: tuple[Tare, ...]
+    notes: Mapping[str, object]
+
+
+class SessionFrames:
+    """Frames of a session, with the column `part` and, where possible, estimates.
+
+    `plan` is there once the first frames are; without estimates it stays None, and `problem` says
+    why.
+    """
+
+    def __init__(self, sources: Sources) -> None:
+        self.plan: EstimationPlan | None = None
+        self.problem: str | None = None
+        self._sources = sources
+
+    def __iter__(self) -> Iterator[tuple[FrameBatch, Columns]]:
+        sources = self._sources
+        if sources.calibration is None:
+            self.problem = "no estimates: the node named no calibration"
+            yield from self._raw()
+            return
+        options = EstimateOptions(
+            sources.calibration, sources.info.models, OFFLINE_LAG_MS, tares=sources.tares
+        )
+        try:
+            stream = EstimateStream(sources.info, options)
+            pieces = stream.run(self._raw())
+            first = next(pieces, None)
+        except FootTileError as error:  # no tare, or a calibration of other tiles
+            self.problem = f"no estimates: {error}"
+            yield from self._raw()
+            return
+        self.plan = stream.plan
+        if first is not None:
+            yield first
+            yield from pieces
+
+    def _raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
+        for number, part in enumerate(self._sources.session.parts):
+            journal = self._sources.journals.get(part.boot_id)
+            if journal is None:
+                continue
+            last = part.seq_last if part.seq_last is not None else journal.held.last
+            if last is None:
+                continue
+            for batch in _gathered(journal.read(part.seq_first, last)):
+                yield batch, {"part": np.full(len(batch), number, dtype=np.uint16)}
+
+
+def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
+    """Write the session's files; give the session as it is then.
+
+    Args:
+        sources: what to seal; every part has an end.
+        folder: the session's own.
+        ledger: final.
+
+    Raises:
+        FootTileError: the disk is full, or a journal is damaged. The journals are untouched.
+    """
+    session = sources.session
+    if not any(part.recorded for part in ledger.parts):
+        update = {"state": "sealed", "ledger": ledger, "problem": "not one frame was recorded"}
+        return session.model_copy(update=update)
+    frames = SessionFrames(sources)
+    path = folder / FRAMES_NAME
+    count = duration_ns = earlier_ns = part_begin_ns = 0
+    notes: dict[str, object] = {
+        **sources.notes,
+        "session": session.model_dump(mode="json", include=_IN_FILE),
+        "ledger": ledger.model_dump(mode="json"),
+    }
+    last_part = -1
+    with SessionWriter(path, sources.info, notes) as writer:
+        for batch, columns in frames:
+            if not count:
+                if frames.plan is not None:
+                    writer.add_notes(notes_of(frames.plan, sources.tares))
+                else:
+                    writer.add_notes({"estimates": frames.problem})
+            writer.append(batch, columns)
+            count += len(batch)
+            part = int(columns["part"][0])
+            if part != last_part:
+                last_part, part_begin_ns = part, int(batch.t_mono_ns[0])
+                earlier_ns = duration_ns
+            duration_ns = earlier_ns + int(batch.t_mono_ns[-1]) - part_begin_ns
+    recorded = sum(part.recorded for part in ledger.parts)
+    if count != recorded:
+        raise FileFormatError(
+            f"{count} frames were sealed, the ledger has {recorded}", where=str(path)
+        )
+    write_events(session, folder)
+    _write_clock(session, folder)
+    plan = frames.plan
+    return session.model_copy(
+        update={
+            "state": "sealed",
+            "problem": frames.problem,
+            "ledger": ledger,
+            "frames": count,
+            "duration_s": duration_ns * 1e-9,
+            "bytes": path.stat().st_size,
+            "sha256": sha256_of(path),
+            "calibration_id": plan.calibration.id if plan is not None else None,
+            "absolute_scale": (
+                None if plan is None else "assumed" if plan.assumed_scale else "measured"
+            ),
+        }
+    )
+
+
+_IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts", "scene"}
+"""What the sealed file says of its session; names and notes may change later and are not in it."""
+
+
+def ledger_of(
+    session: Session,
+    held: Mapping[str, Intervals],
+    *,
+    open_boot_id: str | None,
+    node_first_seq: int,
+    missed_slots: int,
+    finished: bool,
+) -> Ledger:
+    """Count every frame of a session once.
+
+    Args:
+        session: what it consists of; a part without end reaches to what is held.
+        held: numbers on the server, by boot_id.
+        open_boot_id: the stream that its node can still give frames of.
+        node_first_seq: the oldest frame of that stream that the node still has.
+        missed_slots: slots without a frame.
+        finished: no more parts will be added to it.
+    """
+    parts = []
+    for part in session.parts:
+        here = held.get(part.boot_id, Intervals())
+        last = part.seq_last if part.seq_last is not None else (here.last or part.seq_first - 1)
+        gaps = here.missing(part.seq_first, last) if last >= part.seq_first else Intervals()
+        lost: dict[str, int] = {}
+        if part.boot_id == open_boot_id:
+            evicted = gaps.within(0, node_first_seq - 1).count
+            if evicted:
+                lost["evicted"] = evicted
+        elif gaps:
+            lost["node_restarted"] = gaps.count
+        length = max(0, last - part.seq_first + 1)
+        parts.append(
+            PartLedger(
+                boot_id=part.boot_id,
+                seq_first=part.seq_first,
+                seq_last=last,
+                recorded=length - gaps.count,
+                lost=lost,
+                pending=gaps.count - sum(lost.values()),
+                unsynced_tail_max=session.unsynced_tail_max.get(part.boot_id, 0),
+            )
+        )
+    lossy = any(part.lost or part.unsynced_tail_max for part in parts)
+    return Ledger(
+        complete=finished and not lossy and not any(part.pending for part in parts),
+        lossy=lossy,
+        parts=tuple(parts),
+        missed_slots=missed_slots,
+    )
+
+
+def write_events(session: Session, folder: Path) -> None:
+    """Write `events.parquet` anew.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    _write_table(
+        pa.table(
+            {
+                "id": pa.array([event.id for event in session.events], pa.string()),
+                "label": pa.array([event.label for event in session.events], pa.string()),
+                "t_ns": pa.array([event.t_ns for event in session.events], pa.int64()),
+            }
+        ),
+        folder / "events.parquet",
+    )
+
+
+def _write_clock(session: Session, folder: Path) -> None:
+    rows = session.clock
+    numbers = {
+        name: pa.array([getattr(row, name) for row in rows], pa.int64())
+        for name in ("t_mono_ns", "server_minus_node_ns", "uncertainty_ns")
+    }
+    boot_ids = pa.array([row.boot_id for row in rows], pa.string())
+    _write_table(pa.table({"boot_id": boot_ids, **numbers}), folder / "clock.parquet")
+
+
+def _write_table(table: pa.Table, path: Path) -> None:
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd")
+    write_whole(path, sink.getvalue().to_pybytes())
+
+
+def sha256_of(path: Path) -> str:
+    """Hash of a file's bytes, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _gathered(batches: Iterator[FrameBatch]) -> Iterator[FrameBatch]:
+    """Fewer and longer batches: estimates of ten rows cost nearly what those of thousands do."""
+    waiting: list[FrameBatch] = []
+    for batch in batches:
+        waiting.append(batch)
+        if sum(len(b) for b in waiting) >= _GATHER_FRAMES:
+            yield FrameBatch.concatenate(waiting)
+            waiting = []
+    if waiting:
+        yield FrameBatch.concatenate(waiting)

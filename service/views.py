@@ -1,0 +1,239 @@
+"""What the API says of nodes, tares and sessions: the JSON shapes, with their descriptions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Generic, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from devices.frames import ServoInfo
+from service.estimation.calibration import Calibration
+from service.nodes import Node
+from service.recorder import Recorder
+from service.tares import RecordedTare
+from storage.session import Part, Session
+
+T = TypeVar("T")
+
+
+class View(BaseModel):
+    """Base of all answers."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class Page(View, Generic[T]):
+    """A part of a list."""
+
+    items: list[T]
+    next_cursor: str | None = Field(
+        default=None, description="Ask again with `?cursor=` this for more; null: that was all."
+    )
+
+
+class TileView(View):
+    """One tile of an array."""
+
+    serial: str = Field(examples=["T01"])
+    mux: int = Field(description="I2C address of its multiplexer.", examples=[112])
+    channel: int
+    x_m: float = Field(description="Position in the foot frame: forward.")
+    y_m: float = Field(description="To the left.")
+    z_m: float = Field(description="Along the segment, towards the ankle.")
+    reference: bool = Field(description="A bare tile that bears no load.")
+    range_kpa: tuple[float, float] | None = Field(
+        description="Calibrated range of gauge pressure; above it force is a lower bound."
+    )
+    full_scale_n: float | None = Field(description="Force at the end of that range.")
+
+
+class CalibrationView(View):
+    """Which calibration is in use."""
+
+    id: str
+    name: str
+    absolute_scale: Literal["measured", "assumed"]
+
+
+class TareView(View):
+    """One tare."""
+
+    id: str
+    t_ns: int = Field(description="End of the interval it was taken from, node's UTC.")
+    source: Literal["interval", "lead", "recognised", "unloaded"]
+    frames: int = Field(description="How many frames it was taken from.")
+    baseline_kpa: list[float] = Field(description="Absolute pressure unloaded, by tile.")
+    baseline_sigma_kpa: list[float] = Field(description="Its standard uncertainty.")
+    noise_kpa: list[float] = Field(description="Standard deviation of one reading.")
+    undone: bool
+
+    @classmethod
+    def of(cls, recorded: RecordedTare) -> TareView:
+        """From the history."""
+        content = recorded.tare.as_dict()
+        return cls(
+            id=recorded.id,
+            undone=recorded.undone,
+            **{name: content[name] for name in cls.model_fields if name in content},
+        )
+
+
+class ClockView(View):
+    """Offset of the clocks, measured by the best of eight probes."""
+
+    server_minus_node_ns: int
+    uncertainty_ns: int = Field(description="Half the round trip of that probe.")
+
+
+class NodeView(View):
+    """One node, connected or remembered."""
+
+    node: str = Field(examples=["demo"])
+    connected: bool
+    boot_id: str = Field(description="Name of its present stream; a new one at each start.")
+    scene: str
+    emulated: bool
+    tiles: list[TileView]
+    servo: ServoInfo | None
+    schedule: str
+    nominal_rate_hz: float
+    calibration: CalibrationView | None
+    calibration_problem: str | None = Field(description="Why there is no calibration.")
+    tare: TareView | None = Field(description="The tare in force.")
+    tare_problem: str | None = Field(description="Why there is none.")
+    storage_problem: str | None = Field(description="Why frames are not being kept.")
+    clock: ClockView | None = Field(description="Null: not measured yet.")
+    clock_set: bool = Field(description="Whether anything had set the node's date.")
+    rate_hz: float | None = Field(description="Frames a second over the last second.")
+    lost_frames: int = Field(description="Frames of this stream that never came.")
+    missed_slots: int = Field(description="Slots in which no frame was taken.")
+    last_seq: int | None
+    last_t_ns: int | None
+    last_seen_t_ns: int | None = Field(description="When its last frame came, server's UTC.")
+    recording: list[str] = Field(description="Ids of sessions that are being recorded.")
+
+    @classmethod
+    def of(cls, node: Node, recorder: Recorder) -> NodeView:
+        """Of a node as it is now."""
+        info, live = node.info, node.live
+        calibration = live.calibration
+        tare = node.tares.in_force(info)
+        return cls(
+            node=node.name,
+            connected=node.connected,
+            boot_id=node.boot_id,
+            scene=info.scene,
+            emulated=node.hello.emulated,
+            tiles=_tiles(node),
+            servo=info.servo,
+            schedule=info.schedule,
+            nominal_rate_hz=info.nominal_rate_hz,
+            calibration=None
+            if calibration is None
+            else CalibrationView(
+                id=calibration.id,
+                name=calibration.name,
+                absolute_scale=_scale(calibration, info.serials),
+            ),
+            calibration_problem=live.calibration_problem or node.hello.calibration_problem,
+            tare=TareView.of(tare) if tare is not None else None,
+            tare_problem=None
+            if tare is not None
+            else "not tared: lift the foot, hold it still, and tare",
+            storage_problem=node.storage_problem,
+            clock=None
+            if node.clock is None
+            else ClockView(
+                server_minus_node_ns=node.clock.server_minus_node_ns,
+                uncertainty_ns=node.clock.uncertainty_ns,
+            ),
+            clock_set=info.clock_set,
+            rate_hz=node.rate_hz if node.connected else None,
+            lost_frames=node.lost_frames,
+            missed_slots=node.missed_slots,
+            last_seq=node.last_seq,
+            last_t_ns=node.last_t_ns,
+            last_seen_t_ns=node.last_seen_t_ns,
+            recording=[session.id for session in recorder.recording_on(node.name)],
+        )
+
+
+class SessionView(View):
+    """One recorded session."""
+
+    id: str = Field(examples=["20261121T101500Z-1a2b3c"])
+    name: str
+    node: str
+    state: Literal["recording", "pending", "sealing", "sealed"] = Field(
+        description="pending: stopped while the node was away, completes when it returns."
+    )
+    complete: bool | Literal["lossy"] = Field(
+        description="true: every frame is in it; 'lossy': some never will be."
+    )
+    started_t_ns: int = Field(description="Server's UTC.")
+    stopped_t_ns: int | None
+    duration_s: float
+    frames: int
+    bytes: int | None = Field(description="Size of the sealed file.")
+    sha256: str | None = Field(description="Hash of the sealed file.")
+    parts: list[Part] = Field(description="Intervals of streams, ends included.")
+    subject: str
+    notes: str
+    tags: list[str]
+    scene: str
+    calibration_id: str | None
+    absolute_scale: Literal["measured", "assumed"] | None
+    problem: str | None = Field(description="What a person should know of it.")
+
+    @classmethod
+    def of(cls, session: Session, recorder: Recorder) -> SessionView:
+        """Of a session as it is now."""
+        ledger = recorder.ledger(session.id)
+        frames = sum(part.recorded for part in ledger.parts)
+        duration_s = session.duration_s
+        if session.state != "sealed" and frames:
+            duration_s = frames / recorder.nominal_rate_hz(session)
+        content = session.model_dump(include=set(cls.model_fields) - {"frames", "duration_s"})
+        return cls(
+            **content,
+            complete="lossy" if ledger.lossy else ledger.complete,
+            frames=frames,
+            duration_s=duration_s,
+        )
+
+
+class EventView(View):
+    """Something that was marked in a session."""
+
+    id: str
+    label: str
+    t_ns: int = Field(description="Server's UTC.")
+
+
+class Problem(BaseModel):
+    """RFC 9457: what went wrong, where, and what to do."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    instance: str
+
+
+def _tiles(node: Node) -> list[TileView]:
+    calibration, full_scale_n = node.live.calibration, node.live.full_scale_n
+    placed = {"serial", "mux", "channel", "x_m", "y_m", "z_m", "reference"}
+    return [
+        TileView(
+            range_kpa=calibration.of(tile.serial).range_kpa if calibration is not None else None,
+            full_scale_n=float(full_scale_n[i]) if full_scale_n is not None else None,
+            **tile.model_dump(include=placed),
+        )
+        for i, tile in enumerate(node.info.tiles)
+    ]
+
+
+def _scale(calibration: Calibration, serials: Iterable[str]) -> Literal["measured", "assumed"]:
+    assumed = any(calibration.of(serial).absolute_scale == "assumed" for serial in serials)
+    return "assumed" if assumed else "measured"

@@ -1,0 +1,163 @@
+"""A recorded session: which intervals of which streams, what people say of it, and its state.
+
+Each has a folder `<sessions>/<id>/` with `session.json`, replaced whole at every change, and, once
+it is sealed, `frames.parquet`, `events.parquet` and `clock.parquet`.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from devices.errors import FileFormatError, UnknownError
+from storage.durable import storage_errors, write_whole
+
+FRAMES_NAME = "frames.parquet"
+_ID = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{6}")
+
+State = Literal["recording", "pending", "sealing", "sealed"]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Part(_Record):
+    """An interval of one stream, both ends included; `seq_last` is None while it is recorded."""
+
+    boot_id: str
+    seq_first: int
+    seq_last: int | None = None
+
+
+class PartLedger(_Record):
+    """Each number of a part, counted once: recorded, lost for a reason, or still to come."""
+
+    boot_id: str
+    seq_first: int
+    seq_last: int
+    recorded: int
+    lost: dict[str, int]
+    pending: int
+    unsynced_tail_max: int = 0
+    """How many more frames there may have been when the node stopped without a word."""
+
+
+class Ledger(_Record):
+    """What became of every frame of a session."""
+
+    complete: bool
+    lossy: bool
+    parts: tuple[PartLedger, ...]
+    missed_slots: int
+    """Slots in which the node took no frame; they never had a number."""
+
+
+class Event(_Record):
+    """Something a person marked."""
+
+    id: str
+    label: str
+    t_ns: int
+    """In the server's UTC."""
+
+
+class ClockOffset(_Record):
+    """One measurement of the clocks' offset."""
+
+    boot_id: str
+    t_mono_ns: int
+    server_minus_node_ns: int
+    uncertainty_ns: int
+
+
+class Session(_Record):
+    """One recorded session."""
+
+    id: str
+    name: str
+    node: str
+    state: State
+    started_t_ns: int
+    """When it was started, in the server's UTC."""
+    stopped_t_ns: int | None = None
+    parts: tuple[Part, ...]
+    subject: str = ""
+    notes: str = ""
+    tags: tuple[str, ...] = ()
+    scene: str
+    events: tuple[Event, ...] = ()
+    clock: tuple[ClockOffset, ...] = ()
+    missed_slots_at_start: int = 0
+    unsynced_tail_max: dict[str, int] = Field(default_factory=dict)
+    """By boot_id, of parts that ended because the node went away."""
+    problem: str | None = None
+    """What a person should know: why it could not be sealed yet, why it has no estimates."""
+    ledger: Ledger | None = None
+    """Final once it is sealed."""
+    frames: int = 0
+    duration_s: float = 0.0
+    bytes: int | None = None
+    sha256: str | None = None
+    calibration_id: str | None = None
+    absolute_scale: Literal["measured", "assumed"] | None = None
+
+
+def new_session_id(now: datetime) -> str:
+    """An id that sorts by time and is its folder's name."""
+    return f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+
+
+class SessionFolder:
+    """All sessions of a data folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def path(self, session_id: str) -> Path:
+        """Folder of a session.
+
+        Raises:
+            UnknownError: the id has not the form of one, so it can not leave the folder either.
+        """
+        if not _ID.fullmatch(session_id):
+            raise UnknownError(f"no session {session_id[:80]!r}")
+        return self._folder / session_id
+
+    def save(self, session: Session) -> None:
+        """Write `session.json`.
+
+        Raises:
+            StorageError: the disk is full or not writable; the old one is still there then.
+        """
+        folder = self.path(session.id)
+        with storage_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / "session.json", session.model_dump_json(indent=1).encode())
+
+    def load(self, session_id: str) -> Session:
+        """Read `session.json`.
+
+        Raises:
+            UnknownError: there is no such session.
+            FileFormatError: it is damaged.
+        """
+        path = self.path(session_id) / "session.json"
+        try:
+            return Session.model_validate_json(path.read_bytes())
+        except FileNotFoundError as error:
+            raise UnknownError(f"no session {session_id!r}") from error
+        except (OSError, ValidationError) as error:
+            raise FileFormatError(f"not a session: {error}", where=str(path)) from error
+
+    def ids(self) -> Iterator[str]:
+        """Ids of all sessions, newest first."""
+        if self._folder.is_dir():
+            names = [path.name for path in self._folder.iterdir() if _ID.fullmatch(path.name)]
+            yield from sorted(names, reverse=True)

@@ -1,0 +1,91 @@
+// REST calls: the token, problem+json, and nothing the page does not need.
+
+import { byId } from "./text.js";
+
+const PREFIX = "/api/v1";
+const TOKEN_KEY = "foottile.token";
+
+/** A refusal by the server; `message` is its `detail`, which says what to do. */
+export class Refusal extends Error {
+  constructor(message, status) {
+    super(message);
+    this.status = status;
+  }
+}
+
+/** Take #token=... out of the address bar, where it would be shared by accident. */
+export function takeTokenFromAddress() {
+  const fields = new URLSearchParams(location.hash.slice(1));
+  const token = fields.get("token");
+  if (token === null) return;
+  store(token);
+  fields.delete("token");
+  const rest = fields.toString();
+  history.replaceState(null, "", location.pathname + location.search + (rest ? `#${rest}` : ""));
+}
+
+// Storage may be forbidden (private windows): the page must still work, for this visit.
+let tokenHere = null;
+function store(token) {
+  tokenHere = token;
+  try { sessionStorage.setItem(TOKEN_KEY, token); } catch { /* kept in memory */ }
+}
+function token() {
+  try { return tokenHere ?? sessionStorage.getItem(TOKEN_KEY); } catch { return tokenHere; }
+}
+
+let asking = null;
+/** One dialog at a time, however many calls were refused. Resolves to true if a token was given. */
+function askForToken(why) {
+  asking ??= new Promise((resolve) => {
+    const dialog = byId("token-dialog");
+    const field = byId("token-field");
+    byId("token-why").textContent = why;
+    field.value = "";
+    dialog.returnValue = "";
+    dialog.addEventListener("close", () => {
+      const given = field.value.trim();
+      field.value = "";
+      asking = null;
+      if (dialog.returnValue === "ok" && given) store(given);
+      resolve(dialog.returnValue === "ok" && given !== "");
+    }, { once: true });
+    dialog.showModal();
+  });
+  return asking;
+}
+
+/** Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. */
+export async function call(method, path, body) {
+  const headers = { Accept: "application/json" };
+  if (body !== undefined) headers["Content-Type"] = "application/json";
+  const bearer = token();
+  if (bearer && method !== "GET") headers.Authorization = `Bearer ${bearer}`;
+  let response;
+  try {
+    response = await fetch(PREFIX + path, {
+      method, headers, cache: "no-store",
+      body: body === undefined ? undefined : JSON.stringify(body),
+      signal: AbortSignal.timeout(10_000),
+    });
+  } catch (error) {
+    const slow = error.name === "TimeoutError";
+    throw new Refusal(slow ? "The server did not answer within 10 s." : "The server cannot be reached.", 0);
+  }
+  const answer = response.status === 204 ? null : await response.json().catch(() => null);
+  if (response.ok) return answer;
+  const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
+  if (response.status === 401 && await askForToken(String(detail))) return call(method, path, body);
+  throw new Refusal(String(detail), response.status);
+}
+
+const id = encodeURIComponent;
+export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, {});
+export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
+export const startSession = (node, name) => call("POST", "/sessions", { node, name });
+export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
+export const markEvent = (session, label) => call("POST", `/sessions/${id(session)}/events`, { label });
+export const renameSession = (session, name) => call("PATCH", `/sessions/${id(session)}`, { name });
+export const listSessions = (cursor) =>
+  call("GET", `/sessions?limit=20${cursor ? `&cursor=${id(cursor)}` : ""}`);
+export const dataAddress = (session, format) => `${PREFIX}/sessions/${id(session)}/data?format=${format}`;

@@ -1,0 +1,188 @@
+// Ties the page together: one state, messages in, one drawing per display frame.
+
+import { Actions } from "./actions.js";
+import { takeTokenFromAddress } from "./api.js";
+import { Bars } from "./bars.js";
+import { Foot } from "./foot.js";
+import { drawGrf } from "./grf.js";
+import { Link } from "./link.js";
+import { Notes } from "./notes.js";
+import { Sessions } from "./sessions.js";
+import { Status } from "./status.js";
+import { byId, el, setText } from "./text.js";
+import { Trace } from "./trace.js";
+
+const NODE_KEY = "foottile.node";
+const RESYNC_MS = 5000; // frame counts of a running recording are counted here between two looks
+
+const state = {
+  nodes: new Map(),
+  wanted: null, // name of the node to show: survives a restart of the server
+  node: null, // the chosen one, as the server last described it
+  frame: null, // the newest frame of the chosen node; spans merged since the last drawing
+  fresh: false, // `frame` has not been drawn yet
+  heard: { frameMs: null, beat: null, sinceMs: performance.now() },
+  recordings: new Map(),
+  serverAheadMs: 0,
+  serverNowMs: () => Date.now() + state.serverAheadMs,
+};
+
+takeTokenFromAddress();
+const bars = new Bars(() => { state.fresh = true; });
+const foot = new Foot();
+foot.resized = () => { state.fresh = true; };
+const trace = new Trace();
+const notes = new Notes();
+const sessions = new Sessions();
+const actions = new Actions(state, takeSession);
+
+const handlers = {
+  hello(message) {
+    state.nodes = new Map((message.nodes ?? []).map((node) => [node.node, node]));
+    state.recordings.clear();
+    (message.recording ?? []).forEach(takeSession);
+    chooseNode();
+    sessions.reload().then((items) => items.forEach(takeSession));
+  },
+  node({ node }) {
+    const isNew = !state.nodes.has(node.node);
+    const wasBoot = state.nodes.get(node.node)?.boot_id;
+    state.nodes.set(node.node, node);
+    if (state.node?.node === node.node) {
+      if (wasBoot !== node.boot_id) forget(); // it restarted: the old trace is another story
+      state.node = node;
+      state.fresh = true;
+    }
+    if (isNew || !state.node) chooseNode();
+  },
+  session: ({ session }) => takeSession(session),
+  heartbeat(message) {
+    state.heard.beat = message.nodes?.[state.node?.node] ?? null;
+  },
+  dropped(message) {
+    if (message.node === state.node?.node) trace.dropped(message.from_seq, message.to_seq);
+  },
+  frame(message) {
+    for (const session of state.recordings.values()) {
+      if (session.node === message.node) session.since = (session.since ?? 0) + (message.n ?? 1);
+    }
+    if (message.node === state.node?.node) takeFrame(message);
+  },
+};
+
+const link = new Link({
+  onMessage(message) {
+    if (Number.isFinite(message.t_ns) && ["hello", "heartbeat", "pong"].includes(message.type)) {
+      state.serverAheadMs = message.t_ns / 1e6 - Date.now();
+    }
+    // Unknown types are a newer server's business.
+    if (Object.hasOwn(handlers, message.type)) handlers[message.type](message);
+  },
+  onChange: () => {},
+});
+const status = new Status(link);
+
+function takeFrame(frame) {
+  const nowMs = performance.now();
+  if (state.fresh && state.frame && !document.hidden) keepSpan(frame, state.frame); // two messages, one drawing: keep both peaks
+  state.frame = frame;
+  state.fresh = true;
+  state.heard.frameMs = nowMs;
+  status.see(frame);
+  notes.see(state.node, frame, nowMs);
+  trace.add(frame, state.node.nominal_rate_hz, nowMs);
+}
+
+function keepSpan(frame, earlier) {
+  const wider = (now, before, pick) => now?.map((value, i) => {
+    const old = before?.[i];
+    return Number.isFinite(value) && Number.isFinite(old) ? pick(value, old) : value;
+  });
+  frame.force_min_n = wider(frame.force_min_n, earlier.force_min_n, Math.min);
+  frame.force_max_n = wider(frame.force_max_n, earlier.force_max_n, Math.max);
+}
+
+function takeSession(session) {
+  const before = state.recordings.get(session.id);
+  if (session.state === "recording") {
+    // Do not count backwards when the server's number is a little older than ours.
+    const since = before ? Math.max(0, before.frames + before.since - session.frames) : 0;
+    state.recordings.set(session.id, { ...session, since: since < 1000 ? since : 0 });
+  } else state.recordings.delete(session.id);
+  sessions.take(session);
+  actions.draw();
+}
+
+function forget() {
+  state.frame = null;
+  state.heard = { frameMs: null, beat: null, sinceMs: performance.now() };
+  trace.clear();
+  notes.clear();
+  status.clear();
+}
+
+function kept() {
+  try { return localStorage.getItem(NODE_KEY); } catch { return null; }
+}
+
+/** Keep the choice; else the remembered node, else one that is there. */
+function chooseNode(wanted = state.wanted ?? kept()) {
+  const all = [...state.nodes.values()];
+  const next = state.nodes.get(wanted) ?? all.find((node) => node.connected) ?? all[0] ?? null;
+  if (next?.node !== state.node?.node || next?.boot_id !== state.node?.boot_id) forget();
+  state.node = next;
+  state.wanted = wanted ?? next?.node ?? null;
+  state.fresh = true;
+  const select = byId("node-select");
+  const names = all.map((node) => node.node).sort();
+  if (names.join("\n") !== [...select.options].map((option) => option.value).join("\n")) {
+    select.replaceChildren(...names.map((name) => el("option", { value: name, text: name })));
+  }
+  if (next) select.value = next.node;
+}
+
+byId("node-select").addEventListener("change", (event) => {
+  try { localStorage.setItem(NODE_KEY, event.target.value); } catch { /* private window */ }
+  chooseNode(event.target.value);
+});
+
+/** What must also be right while the tab draws nothing: live or frozen, and the counters. */
+function tick() {
+  const { node } = state;
+  const reached = link.open || node;
+  byId("empty").hidden = Boolean(node) || !reached;
+  byId("live").hidden = !node && Boolean(reached);
+  document.body.dataset.nodes = String(state.nodes.size);
+  byId("node-choice").hidden = state.nodes.size < 2;
+  byId("node-name").hidden = state.nodes.size >= 2;
+  setText(byId("node-name"), node?.node ?? "");
+  byId("status").hidden = !node;
+  byId("emulated").hidden = !node?.emulated;
+  const nowMs = performance.now();
+  // The chosen node may not be known yet: the banner still says that the server is not there.
+  status.draw(node ?? { node: "?", tiles: [] }, state.heard, nowMs, state.serverNowMs());
+  if (node) notes.draw(node, state.frame, nowMs, state.serverNowMs());
+  actions.draw();
+}
+
+function draw() {
+  requestAnimationFrame(draw);
+  const { node } = state;
+  if (!node) return;
+  const nowMs = performance.now();
+  if (state.fresh) {
+    state.fresh = false;
+    bars.draw(node, state.frame, nowMs);
+    foot.draw(node, state.frame);
+    drawGrf(node, state.frame);
+  }
+  trace.draw(nowMs, status.live);
+}
+
+setText(byId("start-command"), `foottile node --scene FILE --server ${location.origin}`);
+setInterval(tick, 100);
+setInterval(() => {
+  if (state.recordings.size && !document.hidden) sessions.load().then((items) => items.forEach(takeSession));
+}, RESYNC_MS);
+tick();
+draw();

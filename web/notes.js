@@ -1,0 +1,86 @@
+// Plain notes about what to trust. They change seldom: an estimate's flag is held so it can be read.
+
+import { byId, el, roughly, setText } from "./text.js";
+import { ESTIMATE, FRAME, TILE } from "./tile.js";
+
+const HOLD_MS = 3000;
+
+const FROM_ESTIMATE = [
+  [ESTIMATE.EXTRAPOLATED, "Below the calibrated range: suction, or an old tare."],
+  [ESTIMATE.TILE_MISSING, "Tile missing: force and COP incomplete."],
+  [ESTIMATE.OVER_RATED, "Above the 115 kPa the chip is rated for, yet calibrated."],
+];
+const FROM_FRAME = [
+  [FRAME.BUS_FAULT, "Bus fault: the node cannot read all tiles. Check its cable and supply."],
+  [FRAME.OVERRUN, "The node is late: frames take longer than their slot."],
+];
+
+export class Notes {
+  constructor() {
+    this.list = byId("notes");
+    this.seenMs = new Map(); // text of a flag -> when it was last set
+    this.shown = "";
+  }
+
+  clear() {
+    this.seenMs.clear();
+  }
+
+  /** Called per message, so that a flag between two drawings counts. */
+  see(node, frame, nowMs) {
+    const mark = (text) => this.seenMs.set(text, nowMs);
+    for (const [bit, text] of FROM_ESTIMATE) if (frame.estimate_status & bit) mark(text);
+    for (const [bit, text] of FROM_FRAME) if (frame.frame_status & bit) mark(text);
+    node.tiles.forEach((tile, i) => {
+      if (frame.status?.[i] & TILE.OVER_RANGE && !frame.saturated?.[i]) mark(`${tile.serial} is out of the chip's range of 50 to 115 kPa.`);
+    });
+  }
+
+  draw(node, frame, nowMs, serverNowMs) {
+    const notes = standing(node, frame, serverNowMs);
+    for (const [text, seenMs] of this.seenMs) {
+      if (nowMs - seenMs > HOLD_MS) this.seenMs.delete(text);
+      else notes.push(text);
+    }
+    const key = notes.join("\n");
+    if (key !== this.shown) {
+      this.shown = key;
+      this.list.replaceChildren(...notes.map((text) => el("li", { text })));
+    }
+    setText(byId("facts"), facts(node, frame, serverNowMs));
+  }
+}
+
+function standing(node, frame, serverNowMs) {
+  const notes = [];
+  const bits = frame?.estimate_status ?? 0;
+  const tare = node.tare && !node.tare.undone ? node.tare : null;
+  if (!node.calibration) notes.push(said("No calibration", node.calibration_problem || "pressures only, no newtons."));
+  else if (node.calibration.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE) {
+    notes.push("Scale assumed, not measured: newtons are not to be trusted.");
+  }
+  if (!tare) notes.push(said("Not tared", node.tare_problem || "lift the foot off the ground and press Tare."));
+  else {
+    if (node.tare_problem) notes.push(`Tare: ${node.tare_problem}`);
+    if (bits & ESTIMATE.TARE_OLD) notes.push(`Tare is old (${tareAge(tare, serverNowMs)}): lift the foot, press Tare.`);
+  }
+  if (node.clock_set === false) notes.push("Clock of the node not set: dates are wrong.");
+  return notes;
+}
+
+/** The reason, without saying twice what it begins with. */
+const said = (what, why) => (why.toLowerCase().startsWith(what.toLowerCase()) ? why[0].toUpperCase() + why.slice(1) : `${what}: ${why}`);
+
+const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) / 1000);
+
+const SOURCES = { lead: "in the lead-in", unloaded: "unloaded", recognised: "recognised in flight" };
+
+function facts(node, frame, serverNowMs) {
+  const tare = node.tare && !node.tare.undone ? node.tare : null;
+  const parts = [];
+  if (tare) parts.push(`Tared ${tareAge(tare, serverNowMs)} ago${SOURCES[tare.source] ? `, ${SOURCES[tare.source]}` : ""}`);
+  if (node.calibration) parts.push(`calibration “${node.calibration.name}”, scale ${node.calibration.absolute_scale}`);
+  if (!node.clock) parts.push("clock offset not measured yet");
+  if (frame && frame.frame_status & FRAME.LEAD) parts.push("unloaded lead-in of the scene");
+  return parts.join(" · ");
+}

@@ -1,0 +1,95 @@
+// How good the picture is: rate, loss, latency, age; and when it is no picture of now at all.
+
+import { byId, number, roughly, setData, setText } from "./text.js";
+
+const FROZEN_AFTER_MS = 600; // with a tick of 100 ms well within the promised second
+const LATE_MS = 1000; // frames that old when they arrive show the past
+const EVERY_MS = 250; // numbers that change faster cannot be read
+
+export class Status {
+  constructor(link) {
+    this.link = link;
+    this.live = false;
+    this.writtenMs = 0;
+    this.delayMs = null;
+  }
+
+  clear() {
+    this.delayMs = null;
+    this.writtenMs = 0;
+  }
+
+  see(frame) {
+    const halfMs = (this.link.roundTripMs ?? 0) / 2;
+    const delayMs = Number.isFinite(frame.age_ms) ? Math.max(0, frame.age_ms) + halfMs : null;
+    const steady = delayMs !== null && this.delayMs !== null && Math.abs(delayMs - this.delayMs) < 200;
+    this.delayMs = steady ? 0.9 * this.delayMs + 0.1 * delayMs : delayMs;
+  }
+
+  /** Decide on live or frozen, and show it. Returns true while live. */
+  draw(node, heard, nowMs, serverNowMs) {
+    const sinceMs = heard.frameMs === null ? null : nowMs - heard.frameMs;
+    const late = this.delayMs !== null && this.delayMs > LATE_MS;
+    const live = sinceMs !== null && sinceMs <= FROZEN_AFTER_MS && !late;
+    const banner = byId("frozen");
+    setData(document.body, "live", String(live));
+    banner.hidden = live;
+    if (!live) {
+      const frozen = sinceMs === null || sinceMs > FROZEN_AFTER_MS;
+      setText(byId("frozen-text"), !frozen ? `Picture is ${number(this.delayMs / 1000)} s late`
+        : `No data for ${howLong(sinceMs, node, nowMs, serverNowMs, heard)}`);
+      setText(byId("frozen-reason"), frozen ? this.reason(node) : "The node or the network is catching up.");
+    }
+    if (live !== this.live) {
+      this.live = live;
+      // Said once; the counting banner itself would never let a screen reader finish.
+      setText(byId("announce"), live ? "Data are live." : `No data. ${this.reason(node)}`);
+    }
+    if (!live || nowMs - this.writtenMs > EVERY_MS) {
+      this.writtenMs = nowMs;
+      this.numbers(node, heard, sinceMs);
+    }
+    return live;
+  }
+
+  reason(node) {
+    if (!this.link.open) {
+      return `Link to the server is down${this.link.closeReason ? ` (${this.link.closeReason})` : ""}; trying again.`;
+    }
+    if (this.link.serverSilent) return "The server does not answer.";
+    if (!node.connected) return `Node ${node.node} is away.`;
+    return `Node ${node.node} is silent, though connected.`;
+  }
+
+  numbers(node, heard, sinceMs) {
+    const beat = heard.beat ?? {};
+    const rateHz = beat.rate_hz ?? node.rate_hz;
+    const nominalHz = node.nominal_rate_hz;
+    const slow = rateHz !== null && nominalHz && rateHz < 0.97 * nominalHz;
+    write("rate", `${number(rateHz ?? NaN)} of ${number(nominalHz ?? NaN)} `, slow);
+    const lost = beat.lost_frames ?? node.lost_frames ?? 0;
+    const missed = beat.missed_slots ?? node.missed_slots ?? 0;
+    write("lost", `${lost} frames, ${missed} slots`, lost > 0 || missed > 0);
+    write("latency", this.delayMs === null ? "unknown" : `${number(this.delayMs, 0)} ms`, this.delayMs > 250);
+    const ageS = sinceMs === null ? null : (sinceMs + (this.delayMs ?? 0)) / 1000;
+    const ago = ageS !== null && ageS < 10 ? `${number(ageS, 2)} s ago` : `${roughly(ageS ?? 0)} ago`;
+    write("age", ageS === null ? "none yet" : ago, ageS === null || ageS > 1);
+  }
+}
+
+function write(id, text, bad) {
+  const element = byId(id);
+  setText(element, text);
+  setData(element, "bad", String(Boolean(bad)));
+}
+
+/** After a reload the page has heard nothing, but the node's own last word tells how long it is silent. */
+function howLong(sinceMs, node, nowMs, serverNowMs, heard) {
+  let silentMs = sinceMs;
+  if (silentMs === null) {
+    silentMs = node.last_seen_t_ns ? serverNowMs - node.last_seen_t_ns / 1e6 : nowMs - heard.sinceMs;
+    silentMs = Math.max(silentMs, nowMs - heard.sinceMs);
+  }
+  const seconds = silentMs / 1000;
+  return seconds < 90 ? `${number(seconds)} s` : roughly(seconds);
+}

@@ -1,0 +1,71 @@
+// Small helpers for text and elements. All text from the server goes through textContent.
+
+export const byId = (id) => document.getElementById(id);
+
+/** An element with class, text and children; never markup from a string. */
+export function el(tag, { cls = "", text = null, ...attributes } = {}, ...children) {
+  const element = document.createElement(tag);
+  if (cls) element.className = cls;
+  if (text !== null) element.textContent = text;
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
+/** Write only what changed: thirty messages a second must not touch the DOM in vain. */
+export function setText(element, text) {
+  if (element.textContent === text) return;
+  const only = element.childNodes.length === 1 ? element.firstChild : null;
+  if (only?.nodeType === Node.TEXT_NODE && text !== "") only.data = text; // no new node per message
+  else element.textContent = text;
+}
+
+export function setData(element, name, value) {
+  if (element.dataset[name] !== value) element.dataset[name] = value;
+}
+
+const MINUS = "\u2212";
+
+/** A number with a fixed count of decimals; a true minus sign, and never "-0.0". */
+export function number(value, decimals = 1) {
+  if (!Number.isFinite(value)) return "–";
+  const text = value.toFixed(decimals);
+  if (Number(text) === 0) return text.replace("-", "");
+  return text.replace("-", MINUS);
+}
+
+/** What a test reads: three decimals with an ASCII minus, or nothing. */
+export const plain = (value) => (Number.isFinite(value) ? value.toFixed(3) : "");
+
+export function duration(seconds) {
+  if (!Number.isFinite(seconds)) return "–";
+  if (seconds < 60) return `${seconds.toFixed(1)} s`;
+  const whole = Math.floor(seconds);
+  const two = (n) => String(n).padStart(2, "0");
+  const hours = Math.floor(whole / 3600);
+  const rest = `${two(Math.floor((whole % 3600) / 60))}:${two(whole % 60)}`;
+  return hours ? `${hours}:${rest} h` : `${rest} min`;
+}
+
+/** "3 min", for ages that need no precision. */
+export function roughly(seconds) {
+  if (seconds < 90) return `${Math.max(0, Math.round(seconds))} s`;
+  if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
+  if (seconds < 129600) return `${Math.round(seconds / 3600)} h`;
+  return `${Math.round(seconds / 86400)} days`;
+}
+
+export function bytes(count) {
+  if (!Number.isFinite(count)) return "–";
+  if (count < 1e3) return `${count} B`;
+  if (count < 1e6) return `${(count / 1e3).toFixed(0)} kB`;
+  return count < 1e9 ? `${(count / 1e6).toFixed(1)} MB` : `${(count / 1e9).toFixed(2)} GB`;
+}
+
+const two = (n) => String(n).padStart(2, "0");
+
+/** Local time, sortable: what a robotics notebook has. */
+export function localTime(date) {
+  return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())} `
+    + `${two(date.getHours())}:${two(date.getMinutes())}:${two(date.getSeconds())}`;
+}

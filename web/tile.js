@@ -1,0 +1,63 @@
+// What one tile has to say in one unit: a value, a bound, or the plain reason why there is none.
+
+export const TILE = { NO_ANSWER: 1, STALE: 2, RETRIED: 4, IMPLAUSIBLE: 8, OVER_RANGE: 16, NOT_CONVERTED: 32 };
+export const ESTIMATE = {
+  SATURATED: 1, EXTRAPOLATED: 2, OUTLIER_REPLACED: 4, GAP: 8, COP_MASKED: 16,
+  TILE_MISSING: 32, ASSUMED_SCALE: 64, TARE_OLD: 128, OVER_RATED: 256,
+};
+export const FRAME = { OVERRUN: 1, SERVO_STALE: 2, BUS_FAULT: 4, LEAD: 8 };
+
+const FALLBACK = { kPa: 15, N: 30 };
+
+const FAULTS = [
+  [TILE.NO_ANSWER, "no_answer", "no answer"],
+  [TILE.STALE, "stale", "stale"],
+  [TILE.IMPLAUSIBLE, "implausible", "implausible"],
+  [TILE.NOT_CONVERTED, "not_converted", "not converted"],
+];
+export const FAULT_STATES = new Set(FAULTS.map(([, state]) => state));
+
+/** The unit a tile is shown in: a reference tile bears no load, so it has no newtons. */
+export const unitOf = (tile, unit) => (tile.reference ? "kPa" : unit);
+
+const given = (tile, unit) => (unit === "kPa" ? tile.range_kpa?.[1] : tile.full_scale_n);
+export const hasFullScale = (tile, unit) => given(tile, unit) > 0;
+
+export function fullScale(tile, unit) {
+  return hasFullScale(tile, unit) ? given(tile, unit) : FALLBACK[unit];
+}
+
+const at = (list, i) => (Number.isFinite(list?.[i]) ? list[i] : null);
+
+/**
+ * {state, text, bound, value, low, high, sigma, unit}: `value` is null unless the state is "ok";
+ * `text` is what to say instead of a number, `bound` what a saturated tile bears at least.
+ */
+export function readTile(node, i, frame, unitChosen) {
+  const tile = node.tiles[i];
+  const unit = unitOf(tile, unitChosen);
+  const none = (state, text, bound = "") => ({ state, text, bound, value: null, low: null, high: null, sigma: null, unit });
+  if (!frame || !Number.isFinite(frame.status?.[i])) return none("waiting", "waiting");
+
+  for (const [bit, state, text] of FAULTS) if (frame.status[i] & bit) return none(state, text);
+
+  const value = unit === "kPa" ? at(frame.gauge_kpa, i) : at(frame.force_n, i);
+  if (frame.saturated?.[i]) return none("saturated", "saturated", lowerBound(tile, unit, value));
+  if (value === null) {
+    if (!node.tare || node.tare.undone) return none("not_tared", "not tared");
+    if (unit === "N" && (!node.calibration || !tile.full_scale_n)) return none("no_calibration", "no calibration");
+    return none("waiting", "waiting");
+  }
+  if (unit === "kPa") return { state: "ok", text: "", bound: "", value, low: null, high: null, sigma: null, unit };
+  return {
+    state: "ok", text: "", bound: "", value, unit,
+    low: at(frame.force_min_n, i), high: at(frame.force_max_n, i), sigma: at(frame.force_sigma_n, i),
+  };
+}
+
+/** Both full scale and the value are lower bounds of a saturated tile: say the better one, rounded down. */
+function lowerBound(tile, unit, value) {
+  const bound = Math.max(given(tile, unit) ?? -Infinity, value ?? -Infinity);
+  if (!Number.isFinite(bound)) return "";
+  return unit === "kPa" ? (Math.floor(bound * 10) / 10).toFixed(1) : String(Math.floor(bound));
+}
