@@ -2,8 +2,8 @@
 
 import { byId, el } from "./text.js";
 
-const GOOD_FOR_MS = 6000;
-const MOST = 3;
+const GOOD_FOR_MS = 4000;
+const MOST = 2;
 
 export function notice(text, { bad = false } = {}) {
   const box = byId("notices");

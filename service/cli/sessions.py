@@ -45,7 +45,7 @@ def sessions_command(
         return
     table = Table(title_justify="left")
     for heading in ("session", "name", "node", "started (UTC)", "s", "frames", "state", "complete"):
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading, no_wrap=heading == "session", overflow="fold")
     for session in found:
         started = datetime.fromtimestamp(session["started_t_ns"] // 10**9, UTC)
         complete = session["complete"]
