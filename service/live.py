@@ -50,6 +50,8 @@ class Piece:
     n: int
     t_ns: int
     newest: Mapping[str, Any]
+    gauge_min_kpa: Floats
+    gauge_max_kpa: Floats
     force_min_n: Floats
     force_max_n: Floats
     grf_min_n: float
@@ -63,6 +65,8 @@ class Piece:
             n=self.n + later.n,
             t_ns=later.t_ns,
             newest=later.newest,
+            gauge_min_kpa=np.fmin(self.gauge_min_kpa, later.gauge_min_kpa),
+            gauge_max_kpa=np.fmax(self.gauge_max_kpa, later.gauge_max_kpa),
             force_min_n=np.fmin(self.force_min_n, later.force_min_n),
             force_max_n=np.fmax(self.force_max_n, later.force_max_n),
             grf_min_n=min_of(self.grf_min_n, later.grf_min_n),
@@ -158,6 +162,8 @@ class Encoder:
                 "t_ns": piece.t_ns,
                 "n": piece.n,
                 **piece.newest,
+                "gauge_min_kpa": rounded(piece.gauge_min_kpa, "kpa"),
+                "gauge_max_kpa": rounded(piece.gauge_max_kpa, "kpa"),
                 "force_min_n": rounded(piece.force_min_n, "n"),
                 "force_max_n": rounded(piece.force_max_n, "n"),
                 "grf_min_n": one(piece.grf_min_n, "n"),
@@ -226,6 +232,7 @@ def sum_up(node: Node, frames: FrameBatch, columns: Mapping[str, npt.NDArray[Any
         int(columns["estimate_status"][-1]) if "estimate_status" in columns else 0
     )
     newest["saturated"] = _saturated(node, columns)
+    gauge_kpa = columns.get("gauge_kpa", unknown)
     force_n = columns.get("force_n", unknown)
     grf_n = columns.get("grf_n", unknown[:, 0])
     return Piece(
@@ -234,6 +241,8 @@ def sum_up(node: Node, frames: FrameBatch, columns: Mapping[str, npt.NDArray[Any
         n=len(frames),
         t_ns=int(frames.t_ns[-1]),
         newest=newest,
+        gauge_min_kpa=np.fmin.reduce(gauge_kpa, axis=0),
+        gauge_max_kpa=np.fmax.reduce(gauge_kpa, axis=0),
         force_min_n=np.fmin.reduce(force_n, axis=0),
         force_max_n=np.fmax.reduce(force_n, axis=0),
         grf_min_n=float(np.fmin.reduce(grf_n)),

@@ -98,8 +98,8 @@ function keepSpan(frame, earlier) {
     const old = before?.[i];
     return Number.isFinite(value) && Number.isFinite(old) ? pick(value, old) : value;
   });
-  frame.force_min_n = wider(frame.force_min_n, earlier.force_min_n, Math.min);
-  frame.force_max_n = wider(frame.force_max_n, earlier.force_max_n, Math.max);
+  for (const name of ["gauge_min_kpa", "force_min_n"]) frame[name] = wider(frame[name], earlier[name], Math.min);
+  for (const name of ["gauge_max_kpa", "force_max_n"]) frame[name] = wider(frame[name], earlier[name], Math.max);
 }
 
 function takeSession(session) {

@@ -36,10 +36,6 @@ export class Bars {
   showUnit() {
     byId("unit-kpa").setAttribute("aria-pressed", String(this.unit === "kPa"));
     byId("unit-n").setAttribute("aria-pressed", String(this.unit === "N"));
-    // The contract has a span for forces only; pretending one for kPa would hide peaks.
-    setText(byId("bars-legend"), this.unit === "N"
-      ? "band: min to max of all frames, tick: peak of 1 s"
-      : "newest frame only; switch to N for min to max");
   }
 
   /** Build the cells for the node's tiles; nothing happens while they stay the same. */

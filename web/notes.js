@@ -5,8 +5,10 @@ import { ESTIMATE, FRAME, TILE } from "./tile.js";
 
 const HOLD_MS = 3000;
 
+// A chip throws an outlier now and then, which is no suction: this flag has to stay for a while.
+const BELOW_RANGE = "Below the calibrated range: suction, or an old tare.";
+const SETTLE_MESSAGES = 15;
 const FROM_ESTIMATE = [
-  [ESTIMATE.EXTRAPOLATED, "Below the calibrated range: suction, or an old tare."],
   [ESTIMATE.TILE_MISSING, "Tile missing: force and COP incomplete."],
   [ESTIMATE.OVER_RATED, "Above the 115 kPa the chip is rated for, yet calibrated."],
 ];
@@ -20,15 +22,20 @@ export class Notes {
     this.list = byId("notes");
     this.seenMs = new Map(); // text of a flag -> when it was last set
     this.shown = "";
+    this.belowShare = 0; // of the last half second's messages
   }
 
   clear() {
+    this.belowShare = 0;
     this.seenMs.clear();
   }
 
   /** Called per message, so that a flag between two drawings counts. */
   see(node, frame, nowMs) {
     const mark = (text) => this.seenMs.set(text, nowMs);
+    const below = frame.estimate_status & ESTIMATE.EXTRAPOLATED ? 1 : 0;
+    this.belowShare += (below - this.belowShare) / SETTLE_MESSAGES;
+    if (this.belowShare > 0.5) mark(BELOW_RANGE);
     for (const [bit, text] of FROM_ESTIMATE) if (frame.estimate_status & bit) mark(text);
     for (const [bit, text] of FROM_FRAME) if (frame.frame_status & bit) mark(text);
     node.tiles.forEach((tile, i) => {
@@ -64,7 +71,7 @@ function standing(node, frame, serverNowMs) {
     if (node.tare_problem) notes.push(`Tare: ${node.tare_problem}`);
     if (bits & ESTIMATE.TARE_OLD) notes.push(`Tare is old (${tareAge(tare, serverNowMs)}): lift the foot, press Tare.`);
   }
-  if (node.clock_set === false) notes.push("Clock of the node not set: dates are wrong.");
+  if (node.clock_set === false) notes.push("Clock of the node not set: dates may be wrong.");
   return notes;
 }
 

@@ -48,10 +48,12 @@ export function readTile(node, i, frame, unitChosen) {
     if (unit === "N" && (!node.calibration || !tile.full_scale_n)) return none("no_calibration", "no calibration");
     return none("waiting", "waiting");
   }
-  if (unit === "kPa") return { state: "ok", text: "", bound: "", value, low: null, high: null, sigma: null, unit };
+  const [low, high, sigma] = unit === "kPa"
+    ? [frame.gauge_min_kpa, frame.gauge_max_kpa, null]
+    : [frame.force_min_n, frame.force_max_n, frame.force_sigma_n];
   return {
     state: "ok", text: "", bound: "", value, unit,
-    low: at(frame.force_min_n, i), high: at(frame.force_max_n, i), sigma: at(frame.force_sigma_n, i),
+    low: at(low, i), high: at(high, i), sigma: at(sigma, i),
   };
 }
 
