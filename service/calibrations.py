@@ -16,9 +16,7 @@ from platformdirs import user_cache_path
 
 from devices.errors import CalibrationError
 from devices.scene import Scene, build_scene, load_scene
-from service.calibrate import calibrate
 from service.estimation.calibration import PRESETS, Calibration
-from service.simulate import SimulateOptions, simulate
 from service.version import SOFTWARE
 from storage.durable import write_whole
 
@@ -89,6 +87,10 @@ def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) 
             return read_calibration(kept)
         except CalibrationError:
             kept.unlink(missing_ok=True)  # a damaged cache is no calibration, and no reason to fail
+    # Here, because only the emulated bench needs the physics.
+    from service.calibrate import calibrate
+    from service.simulate import SimulateOptions, simulate
+
     progress(f"pressing tile {serial} on the emulated bench")
     with tempfile.TemporaryDirectory(prefix="foottile-bench-") as work:
         recording = Path(work) / f"bench-{serial}.parquet"

@@ -68,6 +68,7 @@ class Node:
         self.node_first_seq = 0
         """The oldest frame of the present stream that the node still has."""
         self._folder = folder
+        self._schema = wire_schema(hello.array_info)
         self._journals_folder = journals
         self._pace: deque[tuple[int, int]] = deque()
         for path in sorted(journals.glob("*")):
@@ -113,6 +114,7 @@ class Node:
             self.clock = None
             self._pace.clear()
         known = (self.hello.array_info, self.hello.calibration)
+        self._schema = wire_schema(hello.array_info)
         fresh = (hello.array_info, hello.calibration) != known
         self.hello = hello
         self.node_first_seq = hello.first_seq
@@ -141,7 +143,7 @@ class Node:
         Raises:
             FileFormatError: it is not a message of this stream's frames.
         """
-        frames = decode(payload, wire_schema(self.info))
+        frames = decode(payload, self._schema)
         try:
             self._journal_now().append(frames, payload)
             self.storage_problem = None

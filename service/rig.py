@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,13 +18,15 @@ from devices.clock import SystemClock, UtcAnchor
 from devices.dynamixel import open_servo
 from devices.emulation.ground import press_on
 from devices.emulation.load_trace import CopTransform, LoadTrace
-from devices.emulation.world import World
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from devices.i2c import open_bus
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
 from devices.scene import EMULATED, Scene, ServoScene
 from devices.servo import ServoReader
 from service.describe import describe
+
+if TYPE_CHECKING:
+    from devices.emulation.world import World
 
 _TRIAL_FRAMES = 15
 
@@ -115,6 +118,9 @@ class Rig:
         scene = options.scene
         if not options.emulated and (scene.servo is None or scene.servo.port != EMULATED):
             return None
+        # Here, because a real node need not wait for scipy, nor have room for it.
+        from devices.emulation.world import World
+
         sys.setswitchinterval(_SWITCH_S)
         pressed = None
         if options.load is not None:

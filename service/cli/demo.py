@@ -58,6 +58,7 @@ def demo_command(
     The scene goes on for ever; a recorded load is pressed over and over again. Ctrl-C stops what is
     being recorded, seals it, and ends both.
     """
+    import uvloop
     from platformdirs import user_data_path
 
     the_scene = scene_with(scene, bus=None, servo=None)
@@ -93,7 +94,7 @@ def demo_command(
     }
     arguments = [f"{name}={value}" for name, value in node_options.items() if value is not None]
     folder = data if data is not None else user_data_path("foottile") / "demo"
-    asyncio.run(_demo(host, port, folder, seconds, arguments))
+    uvloop.run(_demo(host, port, folder, seconds, arguments))
 
 
 async def _demo(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,12 +31,14 @@ def serve_command(
     other address than loopback, changes need a token: FOOTTILE_TOKEN, or one that is made and kept
     in the data folder. Ctrl-C ends it; what is being recorded goes on when it runs again.
     """
+    import uvloop
+
     from service.settings import load_settings
 
     settings = load_settings(
         config, host=host, port=port, data=data, allow_host=tuple(allow_host or ()) or None
     )
-    asyncio.run(_serve(settings))
+    uvloop.run(_serve(settings))
 
 
 async def _serve(settings: Settings) -> None:

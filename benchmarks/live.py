@@ -1,0 +1,128 @@
+"""Latency, server CPU and sizes of the live path: `python benchmarks/live.py [SECONDS] [SCENE]`.
+
+Server and node run as processes of their own, as in `foottile serve` and `foottile node`; the bus
+is emulated on the real clock. Latency is from the sample instant of the newest frame of a message
+to its arrival at a websocket client on this machine, so both ends share a clock. It contains the
+batch (25 ms), the estimator's look-ahead (10 ms) and the pacing of the messages (33 ms).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import httpx
+import numpy as np
+from websockets.sync.client import connect
+
+COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(") ", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(path.read_text().rsplit(") ", 1)[1].split()[1]) == pid:
+                found.append(int(path.parent.name))
+        except (OSError, IndexError):
+            continue
+    return found
+
+
+def main() -> None:
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 30.0
+    scene = sys.argv[2] if len(sys.argv) > 2 else "standing"
+    with tempfile.TemporaryDirectory() as folder:
+        server = subprocess.Popen(
+            [*COMMAND, "serve", "--port=0", f"--data={folder}"], stdout=subprocess.PIPE, text=True
+        )
+        assert server.stdout is not None
+        url = server.stdout.readline().split()[-1].rstrip("/")
+        node = subprocess.Popen([*COMMAND, "node", f"--scene={scene}", f"--server={url}"])
+        try:
+            measure(url, server.pid, node.pid, seconds, Path(folder))
+        finally:
+            node.terminate()
+            node.wait(15)
+            server.terminate()
+            server.wait(15)
+            server.stdout.close()
+
+
+def measure(url: str, server: int, node: int, seconds: float, folder: Path) -> None:
+    api = httpx.Client(base_url=f"{url}/api/v1", trust_env=False)
+    while not any(n["tare"] for n in api.get("/nodes").json()["items"]):
+        time.sleep(0.2)
+    name = api.get("/nodes").json()["items"][0]["node"]
+    time.sleep(1.0)
+    # First without any screen
+    before = api.get(f"/nodes/{name}").json()
+    began_s, busy_s = time.monotonic(), cpu_s(server)
+    time.sleep(seconds / 2)
+    after = api.get(f"/nodes/{name}").json()
+    unseen_s, unseen = cpu_s(server) - busy_s, after["last_seq"] - before["last_seq"]
+    unseen_wall_s = time.monotonic() - began_s
+
+    session = api.post("/sessions", json={"node": name, "name": "benchmark"}).json()
+    before = api.get(f"/nodes/{name}").json()
+    latencies_ms, ages_ms, sizes, gaps_ms = [], [], [], []
+    busy_s, node_busy_s = cpu_s(server), sum(cpu_s(pid) for pid in [node, *children(node)])
+    end_s = time.monotonic() + seconds
+    last_ns = 0
+    with connect(url.replace("http", "ws") + "/api/v1/live", compression=None) as socket:
+        while time.monotonic() < end_s:
+            text = socket.recv(timeout=5)
+            now_ns = time.time_ns()
+            message = json.loads(text)
+            if message["type"] == "frame":
+                latencies_ms.append((now_ns - message["t_ns"]) * 1e-6)
+                ages_ms.append(message["age_ms"])
+                sizes.append(len(text))
+                gaps_ms.append((now_ns - last_ns) * 1e-6)
+                last_ns = now_ns
+    after = api.get(f"/nodes/{name}").json()
+    frames = after["last_seq"] - before["last_seq"]
+    server_s = cpu_s(server) - busy_s
+    node_s = sum(cpu_s(pid) for pid in [node, *children(node)]) - node_busy_s
+    sealed = api.post(f"/sessions/{session['id']}/stop", timeout=60).json()
+    journal = sum(path.stat().st_size for path in (folder / "journal").rglob("*.arrows"))
+    table = np.percentile(latencies_ms, [50, 99, 100])
+    print(
+        f"frames: {frames} in {seconds:g} s, {frames / seconds:.1f} Hz held, "
+        f"{after['lost_frames']} lost; nominal {after['nominal_rate_hz']:.1f} Hz"
+    )
+    print(
+        f"sample to client: p50 {table[0]:.1f}, p99 {table[1]:.1f}, max {table[2]:.1f} ms "
+        f"({len(latencies_ms)} messages; the server's own age_ms differs by "
+        f"{np.median(np.subtract(latencies_ms, ages_ms)):.2f} ms)"
+    )
+    print(
+        f"between messages: p50 {np.median(gaps_ms[1:]):.1f}, "
+        f"p99 {np.percentile(gaps_ms[1:], 99):.1f} ms"
+    )
+    print(
+        f"server: {1e6 * server_s / frames:.0f} us CPU a frame recording with one screen "
+        f"({100 * server_s / seconds:.1f} % of a core); "
+        f"{1e6 * unseen_s / unseen:.0f} us without ({100 * unseen_s / unseen_wall_s:.1f} %)"
+    )
+    print(f"node, emulated world included: {100 * node_s / seconds:.1f} % of a core")
+    print(
+        f"message {np.mean(sizes):.0f} bytes; journal {journal / after['last_seq']:.0f} B a frame; "
+        f"sealed {sealed['bytes'] / sealed['frames']:.1f} B a frame of {sealed['frames']}, "
+        f"state {sealed['state']}, complete {sealed['complete']}"
+    )
+
+
+if __name__ == "__main__":
+    main()

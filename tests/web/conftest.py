@@ -1,0 +1,140 @@
+"""A real server, a real node on emulated tiles, and a real browser."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
+
+CHROMIUM = next(
+    (
+        path
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (path := shutil.which(name))
+    ),
+    None,
+)
+# The last ones keep it from calling home, which no test should wait for.
+CHROMIUM_OPTIONS = [
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+]
+
+
+def wait_until(true: Callable[[], bool], what: str, timeout_s: float = 30.0) -> None:
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        if true():
+            return
+        time.sleep(0.05)
+    pytest.fail(f"waited {timeout_s} s in vain for {what}")
+
+
+@dataclass
+class Field:
+    """Server and node as processes of their own, on one machine."""
+
+    folder: Path
+    environment: dict[str, str]
+    port: int = 0
+    server: subprocess.Popen[str] | None = None
+    others: list[subprocess.Popen[str]] = field(default_factory=list)
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def serve(self) -> None:
+        options = ["serve", "--port", str(self.port), "--data", str(self.folder / "data")]
+        self.server = subprocess.Popen(
+            COMMAND + options, env=self.environment, stdout=subprocess.PIPE, text=True
+        )
+        assert self.server.stdout is not None
+        line = self.server.stdout.readline()
+        self.port = int(line.strip().rstrip("/").rsplit(":", 1)[1])
+
+    def start_node(self, scene: str, *options: str) -> None:
+        node = ["node", "--scene", scene, "--server", self.url, *options]
+        self.others.append(subprocess.Popen(COMMAND + node, env=self.environment))
+
+    def get(self, path: str) -> Any:
+        return httpx.get(f"{self.url}/api/v1{path}", timeout=5, trust_env=False).json()
+
+    def is_tared(self) -> bool:
+        return any(node["tare"] for node in self.get("/nodes")["items"])
+
+    def kill_server(self) -> None:
+        assert self.server is not None
+        self.server.kill()
+        self._reap(self.server)
+
+    def close(self) -> None:
+        for process in (*self.others, *([self.server] if self.server else [])):
+            process.terminate()
+        for process in (*self.others, *([self.server] if self.server else [])):
+            self._reap(process)
+
+    @staticmethod
+    def _reap(process: subprocess.Popen[str]) -> None:
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait(10)
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+@pytest.fixture(scope="session")
+def field_environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    return {**os.environ, "XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium; on Debian: sudo apt-get install chromium")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=CHROMIUM_OPTIONS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
+    """Opens the page at a size; fails the test if the page complains in its console."""
+    complaints: list[str] = []
+    contexts = []
+
+    def open_(url: str, width: int = 1366, height: int = 768) -> Page:
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, accept_downloads=True
+        )
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on(
+            "console",
+            lambda m: complaints.append(m.text) if m.type in ("error", "warning") else None,
+        )
+        page.goto(url)
+        return page
+
+    yield open_
+    for context in contexts:
+        context.close()
+    # A server that was killed on purpose, or refuses, shows up there: that is not the page's fault.
+    ours = [c for c in complaints if "ERR_" not in c and "WebSocket" not in c and "409" not in c]
+    assert ours == []
