@@ -1,0 +1,31 @@
+# One image for both services: `foottile serve` and `foottile node`.
+#
+#   docker build -t foottile .
+#
+# Works on amd64 and arm64 (Raspberry Pi OS, 64 bit).
+
+FROM python:3.12-slim-bookworm AS build
+WORKDIR /src
+COPY requirements.lock ./
+# Every download is compared with its hash here; what follows takes nothing from anywhere else.
+RUN pip download --no-cache-dir --require-hashes -r requirements.lock -d /wheels
+COPY pyproject.toml README.md ./
+COPY devices devices
+COPY storage storage
+COPY service service
+COPY web web
+RUN pip install --no-index --find-links /wheels hatchling \
+    && pip wheel --no-deps --no-build-isolation -w /dist . \
+    && python -m venv /opt/foottile \
+    && /opt/foottile/bin/pip install --no-index --find-links /wheels /dist/foottile-*.whl
+
+FROM python:3.12-slim-bookworm
+COPY --from=build /opt/foottile /opt/foottile
+COPY scripts/container-node /usr/local/bin/foottile-node
+RUN useradd --create-home --uid 1000 foottile && install -d -o foottile -g foottile /data /home/foottile/.cache
+ENV PATH=/opt/foottile/bin:$PATH PYTHONUNBUFFERED=1
+USER foottile
+VOLUME /data
+EXPOSE 8000
+STOPSIGNAL SIGTERM
+CMD ["foottile", "serve", "--host", "0.0.0.0", "--data", "/data"]
