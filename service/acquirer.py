@@ -84,7 +84,7 @@ class AcquisitionProcess:
         self.stop()
         self._process.join(_END_S)
         if self._process.is_alive():
-            self._process.terminate()
+            self._process.kill()
             self._process.join(_END_S)
         self._thread.join(_END_S)
         self._connection.close()
@@ -110,8 +110,9 @@ class AcquisitionProcess:
 
 def _run(options: RigOptions, connection: Connection) -> None:
     """Body of the child process."""
-    # Ctrl-C goes to the whole group; the parent decides when this ends.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C and a service manager's stop go to the whole group; the parent decides when this ends.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     stop = threading.Event()
     threading.Thread(target=_await_stop, args=(connection, stop), daemon=True).start()
     with suppress(OSError):  # a parent that died wants no more messages
