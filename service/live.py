@@ -208,13 +208,21 @@ class Hub:
         """Frames of a node with their estimates."""
         for frames, columns in due:
             node.shown_t_ns = int(frames.t_ns[-1])
-            piece = sum_up(node, frames, columns)
+            piece = sum_up(node.live.range_kpa, frames, columns)
             for subscriber in self._subscribers:
                 subscriber.add(node, piece)
 
 
-def sum_up(node: Node, frames: FrameBatch, columns: Mapping[str, npt.NDArray[Any]]) -> Piece:
-    """Frames and their estimates, which may be none, as a piece."""
+def sum_up(
+    range_kpa: Floats | None, frames: FrameBatch, columns: Mapping[str, npt.NDArray[Any]]
+) -> Piece:
+    """Frames and their estimates, which may be none, as a piece.
+
+    Args:
+        range_kpa: end of each tile's calibrated range, above which it is saturated.
+        frames: n frames.
+        columns: their estimates by name.
+    """
     tiles = frames.tile_count
     newest: dict[str, Any] = {
         "status": frames.status[-1].tolist(),
@@ -231,7 +239,11 @@ def sum_up(node: Node, frames: FrameBatch, columns: Mapping[str, npt.NDArray[Any
     newest["estimate_status"] = (
         int(columns["estimate_status"][-1]) if "estimate_status" in columns else 0
     )
-    newest["saturated"] = _saturated(node, columns)
+    newest["saturated"] = (
+        (columns["gauge_kpa"][-1] > range_kpa).tolist()
+        if range_kpa is not None and "gauge_kpa" in columns
+        else [False] * tiles
+    )
     gauge_kpa = columns.get("gauge_kpa", unknown)
     force_n = columns.get("force_n", unknown)
     grf_n = columns.get("grf_n", unknown[:, 0])
@@ -269,14 +281,6 @@ def min_of(a: float, b: float) -> float:
 def dumps(message: Mapping[str, Any]) -> str:
     """Compact JSON; NaN has no place in it."""
     return json.dumps(message, separators=(",", ":"), allow_nan=False)
-
-
-def _saturated(node: Node, columns: Mapping[str, npt.NDArray[Any]]) -> list[bool]:
-    high_kpa = node.live.range_kpa
-    if "gauge_kpa" not in columns or high_kpa is None:
-        return [False] * len(node.info.tiles)
-    saturated: list[bool] = (columns["gauge_kpa"][-1] > high_kpa).tolist()
-    return saturated
 
 
 def _frames_in_summary(node: Node) -> int:

@@ -7,6 +7,7 @@ import fcntl
 import logging
 import time
 from pathlib import Path
+from typing import TextIO
 
 from devices.errors import FootTileError, StorageError
 from service.link import Ack, Close
@@ -58,20 +59,16 @@ class Server:
         self.data = data
         with storage_errors(data, "Choose another folder with --data"):
             data.mkdir(parents=True, exist_ok=True)
-            # Two servers on one folder would each undo what the other writes.
-            self._lock = (data / ".lock").open("w")
-            try:
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise StorageError(
-                    "another foottile server uses this data folder",
-                    where=str(data),
-                    remedy="Stop it, or choose another folder with --data",
-                ) from error
-        self.check_storage()
-        self.hub = Hub()
-        self.nodes = Nodes(data)
-        self.recorder = Recorder(SessionFolder(data / "sessions"), self.nodes, self._tell_session)
+        self._lock = _locked(data)
+        try:
+            self.check_storage()
+            self.hub = Hub()
+            self.nodes = Nodes(data)
+            folder = SessionFolder(data / "sessions")
+            self.recorder = Recorder(folder, self.nodes, self._tell_session)
+        except FootTileError:
+            self._lock.close()
+            raise
         self.links: dict[str, Link] = {}
 
     async def run(self) -> None:
@@ -172,3 +169,19 @@ class Server:
             return
         link.node.storage_problem = None
         link.end(Close.RESTART, "the server can write again; send what it lacks")
+
+
+def _locked(data: Path) -> TextIO:
+    """The folder's lock: two servers on one folder would each undo what the other writes."""
+    with storage_errors(data):
+        lock = (data / ".lock").open("w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            lock.close()
+            raise StorageError(
+                "another foottile server uses this data folder",
+                where=str(data),
+                remedy="Stop it, or choose another folder with --data",
+            ) from error
+    return lock

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
+import os
 from pathlib import Path
-from typing import get_args
+from tempfile import TemporaryDirectory
+from typing import Any, get_args
 
+import numpy as np
 import pytest
 import typer.main
 from pydantic import BaseModel
 
+from devices.frames import FRAME_COLUMNS, FrameBatch
 from devices.scene import (
     ArrayScene,
     EmulationScene,
@@ -19,13 +25,19 @@ from devices.scene import (
     TileScene,
     builtin_scenes,
 )
+from service.app import make_app
 from service.cli.main import app
 from service.estimation.calibration import TileCalibration
 from service.estimation.estimates import EstimateStatus
+from service.link import Close
+from service.live import Encoder, sum_up
+from service.server import Server
+from service.settings import Settings
 from storage.schema import KNOWN
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = (ROOT / "docs" / "scenes.md").read_text("utf-8")
+API = (ROOT / "docs" / "api.md").read_text("utf-8")
 FORMATS = (ROOT / "docs" / "formats.md").read_text("utf-8")
 README = (ROOT / "README.md").read_text("utf-8")
 
@@ -112,3 +124,49 @@ def test_the_calibration_file_is_described() -> None:
     for name in ("r2", "rmse_n", "cv_rmse_n", "hysteresis_n"):
         assert name in TileCalibration.model_fields
         assert f"`{name}" in FORMATS
+
+
+def openapi() -> dict[str, Any]:
+    with TemporaryDirectory() as folder:
+        server = Server(Path(folder))
+        described = make_app(server).openapi()
+        asyncio.run(server.close())
+    return json.loads(json.dumps(described))
+
+
+def test_the_api_description_in_the_repository_is_the_one_that_is_served() -> None:
+    # After a change on purpose: FOOTTILE_WRITE_OPENAPI=1 sh scripts/test tests/test_docs.py
+    kept = ROOT / "docs" / "openapi.json"
+    if os.environ.get("FOOTTILE_WRITE_OPENAPI"):
+        kept.write_text(json.dumps(openapi(), indent=1, sort_keys=True) + "\n")
+    assert json.loads(kept.read_text("utf-8")) == openapi()
+
+
+def test_every_route_is_documented() -> None:
+    for path, operations in openapi()["paths"].items():
+        for method in operations:
+            if method != "head":
+                assert f"`{method.upper()} {path.removeprefix('/api/v1')}`" in API, (method, path)
+
+
+def test_every_live_message_field_is_documented() -> None:
+    one_tile = {
+        name: np.zeros((1, 1) if per_tile else 1, dtype)
+        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
+    }
+    piece = sum_up(None, FrameBatch(**one_tile), {})
+    frame = json.loads(Encoder().encode("node", piece, 1.0))
+    for name in frame:
+        assert f"`{name}`" in API, name
+
+
+def test_every_close_code_is_documented() -> None:
+    for code in Close:
+        if code not in (Close.GOING_AWAY, Close.UNAUTHORISED):
+            assert str(code.value) in API, code
+
+
+def test_every_setting_can_be_given_on_the_command_line() -> None:
+    serve = typer.main.get_command(app).commands["serve"]
+    options = {parameter.name for parameter in serve.params}
+    assert set(Settings.model_fields) - {"token"} <= options

@@ -19,15 +19,33 @@ def test_a_wheel_holds_the_scenes_and_the_packages_and_no_tests(tmp_path: Path) 
     names = zipfile.ZipFile(wheel).namelist()
     for scene in (ROOT / "devices" / "scenes").glob("*.toml"):
         assert f"devices/scenes/{scene.name}" in names
+    for path in (ROOT / "web").iterdir():
+        assert f"service/web/{path.name}" in names
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {
         *("devices", "storage", "service")
     }
 
 
+def test_an_installed_wheel_and_a_checkout_both_find_the_page(tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
+    (wheel,) = tmp_path.glob("*.whl")
+    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
+    code = "import service.page; print(service.page.page_folder())"
+    for root, page in (
+        (tmp_path / "installed", tmp_path / "installed" / "service" / "web"),
+        (ROOT, ROOT / "web"),
+    ):
+        found = subprocess.run(
+            [sys.executable, "-c", code], cwd=root, check=True, capture_output=True, timeout=60
+        )
+        assert Path(found.stdout.decode().strip()) == page
+
+
 def test_help_does_not_wait_for_heavy_libraries() -> None:
     code = (
         "import sys; import service.cli.main; "
-        "print([m for m in ('scipy', 'pyarrow', 'matplotlib') if m in sys.modules])"
+        "print([m for m in ('scipy', 'pyarrow', 'matplotlib', 'fastapi') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
     assert done.stdout.decode().strip() == "[]"

@@ -4,7 +4,7 @@ import { byId, setText } from "./text.js";
 
 const WINDOW_S = 10;
 const MOST_POINTS = 2000; // 10 s at 30 Hz are 300; the rest guards against a server gone wild
-const STEPS_N = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000];
+const STEPS_N = [1, 2, 3, 4, 5, 10, 15, 20, 30, 50, 100, 200, 500, 1000, 2000, 5000, 10000];
 const SHRINK_AFTER_MS = 4000; // a scale that follows every step of the robot cannot be read
 
 export class Trace {

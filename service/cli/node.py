@@ -51,7 +51,9 @@ def node_command(
     lead_s: LeadOption = 1.0,
     seed: SeedOption = 0,
     parts_seed: PartsSeedOption = 0,
-    end_with_parent: Annotated[bool, typer.Option("--end-with-parent", hidden=True)] = False,
+    end_with_parent: Annotated[
+        bool, typer.Option("--end-with-parent", hidden=True, help="End when its parent dies.")
+    ] = False,
 ) -> None:
     """Take frames from an array and publish them to a server.
 

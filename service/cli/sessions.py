@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,21 +42,24 @@ def sessions_command(
     if as_json:
         print_json({"items": found})
         return
-    table = Table(title_justify="left")
-    for heading in ("session", "name", "node", "started (UTC)", "s", "frames", "state", "complete"):
-        table.add_column(heading, no_wrap=heading == "session", overflow="fold")
+    table = Table(box=None, pad_edge=False)
+    for heading in ("session", "name", "node", "s", "frames", "state"):
+        right = heading in ("s", "frames")
+        table.add_column(
+            heading,
+            justify="right" if right else "left",
+            no_wrap=heading != "name",
+            overflow="fold",
+        )
     for session in found:
-        started = datetime.fromtimestamp(session["started_t_ns"] // 10**9, UTC)
-        complete = session["complete"]
+        lossy = ", lossy" if session["complete"] == "lossy" else ""
         table.add_row(
             session["id"],
             escape(session["name"]),
             session["node"],
-            f"{started:%Y-%m-%d %H:%M:%S}",
             f"{session['duration_s']:.1f}",
             str(session["frames"]),
-            session["state"],
-            complete if complete == "lossy" else "yes" if complete else "no",
+            session["state"] + lossy,
         )
     stdout.print(table)
 

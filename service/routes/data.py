@@ -67,9 +67,9 @@ class DataQuery(BaseModel):
         return f"{self.format}|{part.start_s}|{part.end_s}|{','.join(part.columns)}"
 
 
-@router.api_route(
+@router.head("/{session_id}/data", include_in_schema=False)
+@router.get(
     "/{session_id}/data",
-    methods=["GET", "HEAD"],
     operation_id="getData",
     summary="Download",
     response_class=Response,
