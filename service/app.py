@@ -16,7 +16,7 @@ from service.guard import Guard
 from service.ingest import ingest
 from service.link import INGEST_PATH
 from service.page import page_folder
-from service.routes import data, health, nodes, sessions
+from service.routes import access, data, health, nodes, sessions
 from service.routes.live import live
 from service.server import Server
 from service.version import SOFTWARE
@@ -63,7 +63,14 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
     )
     app.state.server = server
     problems.install(app)
-    api = APIRouter(prefix=API)
+    api = APIRouter(
+        prefix=API,
+        responses=access.problems(
+            _401="Off loopback a change needs the token.",
+            _403="The Host header, or the Origin of a change, is not this server's.",
+            _422="A parameter or the body is not as described.",
+        ),
+    )
     for module in (health, nodes, sessions, data):
         api.include_router(module.router)
     app.include_router(api)

@@ -50,10 +50,13 @@ class Backlog:
 
     def acknowledge(self, seq_first: int, seq_last: int) -> None:
         """Forget batches that lie within `seq_first` to `seq_last`."""
-        while self._batches and (
-            seq_first <= self._batches[0].seq_first and self._batches[0].seq_last <= seq_last
-        ):
-            self._drop_oldest()
+        kept: list[EncodedBatch] = []
+        while self._batches and self._batches[0].seq_first <= seq_last:
+            oldest = self._drop_oldest()
+            if oldest.seq_first < seq_first or oldest.seq_last > seq_last:
+                kept.append(oldest)
+        self._batches.extendleft(reversed(kept))
+        self._bytes += sum(len(batch.payload) for batch in kept)
 
     def since(self, seq: int) -> Iterator[EncodedBatch]:
         """Batches with frames from `seq` on, oldest first."""

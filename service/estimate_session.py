@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy.typing as npt
 
-from devices.errors import CalibrationError, FileFormatError, UsageError
+from devices.errors import CalibrationError, FileFormatError, TareError, UsageError
 from devices.frames import ArrayInfo
 from devices.scene import Scene, load_scene
 from service.accuracy import JUDGED, Accuracy, judge
 from service.calibrations import BENCH, find_calibration
 from service.estimation.calibration import Calibration
 from service.estimation.plan import EstimationPlan
+from service.estimation.tare import Tare
 from service.pipeline import EstimateOptions, EstimateStream, notes_of
 from service.simulate import joined
-from storage.schema import MILL, TRUTH
+from storage.schema import MILL, PARTS, TRUTH
 from storage.session_file import SessionReader, SessionWriter
 
 
@@ -55,8 +56,9 @@ def estimate_session(
             models=models or (the_scene.models if the_scene else info.models),
             lag_ms=lag_ms,
             tare_s=tare_s,
+            tares=_recorded_tares(session) if tare_s is None else (),
         )
-        kept = [c.name for c in (*TRUTH, *MILL) if session.has(c.name)]
+        kept = [c.name for c in (*PARTS, *TRUTH, *MILL) if session.has(c.name)]
         judging = all(c.name in kept for c in TRUTH)
         stream = EstimateStream(info, options)
         judged: list[Mapping[str, npt.NDArray[Any]]] = []
@@ -64,7 +66,7 @@ def estimate_session(
         with SessionWriter(out, info, session.notes) as writer:
             for batch, extra in stream.run(session.batches(*kept)):
                 if not frames and stream.plan is not None:
-                    writer.add_notes(notes_of(stream.plan))
+                    writer.add_notes(notes_of(stream.plan, options.tares))
                 writer.append(batch, extra)
                 frames += len(batch)
                 if judging:
@@ -73,6 +75,20 @@ def estimate_session(
     if stream.plan is None:
         raise FileFormatError("the session has no frames", where=str(source))
     return Estimated(frames, stream.plan, judge(joined(judged)) if judged else None)
+
+
+def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:
+    """Tares that were taken while the session was recorded, oldest first."""
+    recorded = session.notes.get("tares", [])
+    tiles = len(session.info.tiles)
+    try:
+        return tuple(Tare.from_dict(content, tiles=tiles) for content in recorded)
+    except (TareError, TypeError) as error:
+        raise FileFormatError(
+            f"its tares are not readable: {error}",
+            where=str(session.path),
+            remedy="Name an unloaded interval with --tare-s BEGIN,END",
+        ) from error
 
 
 def _placed(info: ArrayInfo, scene: Scene | None) -> ArrayInfo:

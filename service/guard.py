@@ -62,13 +62,13 @@ class Guard:
     def _refusal(self, scope: Scope) -> tuple[HTTPStatus, str] | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        if not self._is_ours(_hostname(f"//{host}")):
+        if len(headers.getlist("host")) != 1 or not self._is_ours(_hostname(f"//{host}")):
             what = f"Host {host[:80]!r} is not this server; name it with --allow-host"
             return HTTPStatus.FORBIDDEN, what
         websocket = scope["type"] == "websocket"
         changes = not websocket and scope["method"] not in SAFE_METHODS
         origin = headers.get("origin")
-        if (websocket or changes) and origin is not None and urlsplit(origin).netloc != host:
+        if (websocket or changes) and origin is not None and _netloc(origin) != host:
             what = f"Origin {origin[:80]!r} is another site than {host[:80]!r}"
             return HTTPStatus.FORBIDDEN, what
         length = headers.get("content-length", "0")
@@ -127,6 +127,13 @@ def _hardened(send: Send) -> Send:
         await send(message)
 
     return with_headers
+
+
+def _netloc(url: str) -> str | None:
+    try:
+        return urlsplit(url).netloc
+    except ValueError:
+        return None
 
 
 def _hostname(url: str) -> str | None:

@@ -23,13 +23,11 @@ from service.link import (
     Probe,
     Status,
     Welcome,
+    close_reason,
 )
-from service.nodes import Node
 from service.server import Link, Server
 
 log = logging.getLogger("foottile.ingest")
-
-_REASON_BYTES_MAX = 120  # RFC 6455: 125 with the code
 
 
 class _HangUp(Exception):  # noqa: N818  # no error: how a connection ends
@@ -80,12 +78,19 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
         other.end(Close.SUPERSEDED, "the same node has connected again")
     try:
         node = server.nodes.greet(hello)
-        _follow_restart(server, node, hello)
+        if node.boot_id == boot_id and node.info != hello.array_info:
+            raise _HangUp(Close.BAD_HELLO, f"stream {boot_id} was announced with another array")
+        if node.boot_id != boot_id:
+            server.recorder.node_restarts(node, hello.array_info)
         held = node.attach(hello)
     except (LinkError, StorageError) as error:
         code = Close.TRY_LATER if isinstance(error, StorageError) else Close.BAD_HELLO
         raise _HangUp(code, str(error)) from error
+    node.connected = True
     link = server.links[name] = Link(node)
+    # What is here but was never acknowledged, because the link broke before: acknowledge it now.
+    for first, last in held:
+        link.unsynced.add(first, last)
     lacks = [*held.missing(hello.first_seq, max(hello.first_seq, held.last or 0))]
     beyond = max(hello.first_seq, (held.last + 1) if held.last is not None else 0)
     closed = [(a, b) for a, b in lacks if b < beyond]
@@ -94,14 +99,6 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
     log.info("node %s connected, stream %s", name, boot_id)
     server.tell_node(node)
     return link
-
-
-def _follow_restart(server: Server, node: Node, hello: Hello) -> None:
-    """Tell the recorder if this is a new stream of a node it knows."""
-    if node.boot_id != hello.array_info.boot_id:
-        ended_boot_id, ended_t_ns = node.boot_id, node.last_seen_t_ns
-        node.attach(hello)
-        server.recorder.node_restarted(node, ended_boot_id, ended_t_ns)
 
 
 async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
@@ -190,10 +187,9 @@ def _parse(message: str | bytes, code: Close) -> Hello | Probe | ClockRow | Stat
 
 async def _close(socket: WebSocket, end: _HangUp) -> None:
     log.warning("link closed: %s", end.reason)
-    reason = end.reason.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")
     if socket.application_state is not WebSocketState.DISCONNECTED:
         with suppress(RuntimeError, WebSocketDisconnect):
-            await socket.close(end.code, reason)
+            await socket.close(end.code, close_reason(end.reason))
 
 
 def _leave(server: Server, link: Link) -> None:

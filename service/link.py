@@ -30,6 +30,7 @@ MESSAGE_BYTES_MAX = 1 << 20
 SILENCE_S = 5.0
 """A side that has heard nothing for so long takes the link for dead."""
 PROBES = 8
+_REASON_BYTES_MAX = 123
 
 _Seq = Annotated[int, Field(ge=0, lt=2**62)]
 _Ns = Annotated[int, Field(ge=-(2**63), lt=2**63)]
@@ -126,3 +127,8 @@ FromNode: TypeAdapter[Hello | Probe | ClockRow | Status] = TypeAdapter(
 FromServer: TypeAdapter[Welcome | Ack | Probe] = TypeAdapter(
     Annotated[Welcome | Ack | Probe, Field(discriminator="type")]
 )
+
+
+def close_reason(text: str) -> str:
+    """A reason as a close frame can carry it: 123 bytes (RFC 6455 5.5)."""
+    return text.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")

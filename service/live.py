@@ -48,6 +48,7 @@ class Piece:
     seq_first: int
     seq_last: int
     n: int
+    t_ns_first: int
     t_ns: int
     newest: Mapping[str, Any]
     gauge_min_kpa: Floats
@@ -63,6 +64,7 @@ class Piece:
             seq_first=self.seq_first,
             seq_last=later.seq_last,
             n=self.n + later.n,
+            t_ns_first=self.t_ns_first,
             t_ns=later.t_ns,
             newest=later.newest,
             gauge_min_kpa=np.fmin(self.gauge_min_kpa, later.gauge_min_kpa),
@@ -104,8 +106,9 @@ class Subscriber:
             self._drop(key, last_seq + 1, piece.seq_first - 1)
         self._last_seq[key] = (node.boot_id, piece.seq_last)
         before = self._pieces.get(key)
-        if before is not None and boot_id == node.boot_id:
-            if piece.t_ns - before.t_ns < SUMMARY_NS and before.n < _frames_in_summary(node):
+        if before is not None:
+            short = 0 <= piece.t_ns - before.t_ns_first < SUMMARY_NS
+            if short and boot_id == node.boot_id:
                 piece = before.joined(piece)
             else:
                 self._drop(key, before.seq_first, before.seq_last)
@@ -146,11 +149,12 @@ class Encoder:
     """Frame messages as text; subscribers that are told the same share one text."""
 
     def __init__(self) -> None:
-        self._last: dict[str, tuple[tuple[int, int, int], str]] = {}
+        self._last: dict[str, tuple[tuple[object, ...], str]] = {}
 
     def encode(self, node: str, piece: Piece, age_ms: float | None) -> str:
         """One frame message."""
-        key = (piece.seq_first, piece.seq_last, round(age_ms or -1.0))
+        age = None if age_ms is None else round(age_ms, 1)
+        key = (piece.seq_first, piece.seq_last, piece.t_ns, age)
         known = self._last.get(node)
         if known is not None and known[0] == key:
             return known[1]
@@ -168,7 +172,7 @@ class Encoder:
                 "force_max_n": rounded(piece.force_max_n, "n"),
                 "grf_min_n": one(piece.grf_min_n, "n"),
                 "grf_max_n": one(piece.grf_max_n, "n"),
-                "age_ms": None if age_ms is None else round(age_ms, 1),
+                "age_ms": age,
             }
         )
         self._last[node] = (key, text)
@@ -251,6 +255,7 @@ def sum_up(
         seq_first=int(frames.seq[0]),
         seq_last=int(frames.seq[-1]),
         n=len(frames),
+        t_ns_first=int(frames.t_ns[0]),
         t_ns=int(frames.t_ns[-1]),
         newest=newest,
         gauge_min_kpa=np.fmin.reduce(gauge_kpa, axis=0),
@@ -263,14 +268,13 @@ def sum_up(
 
 
 def rounded(values: npt.NDArray[Any], unit: str) -> list[float | None]:
-    """Numbers for a screen; NaN is null."""
-    digits = _DIGITS[unit]
-    return [None if math.isnan(v) else round(v, digits) for v in values.tolist()]
+    """Numbers for a screen; what is not finite is null."""
+    return [one(value, unit) for value in values.tolist()]
 
 
 def one(value: float, unit: str) -> float | None:
-    """One number for a screen; NaN is null."""
-    return None if math.isnan(value) else round(value, _DIGITS[unit])
+    """One number for a screen; what is not finite is null."""
+    return round(value, _DIGITS[unit]) if math.isfinite(value) else None
 
 
 def min_of(a: float, b: float) -> float:
@@ -281,7 +285,3 @@ def min_of(a: float, b: float) -> float:
 def dumps(message: Mapping[str, Any]) -> str:
     """Compact JSON; NaN has no place in it."""
     return json.dumps(message, separators=(",", ":"), allow_nan=False)
-
-
-def _frames_in_summary(node: Node) -> int:
-    return max(64, round(node.info.nominal_rate_hz * SUMMARY_NS * 1e-9))

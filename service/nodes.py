@@ -121,7 +121,6 @@ class Node:
         self.keep()
         if fresh:
             self.live = self._live_estimates()
-        self.connected = True
         journal = self.journal
         return journal.held if journal is not None else Intervals()
 
@@ -144,9 +143,13 @@ class Node:
             FileFormatError: it is not a message of this stream's frames.
         """
         frames = decode(payload, self._schema)
+        if (frames.t_ns - frames.t_mono_ns != self.info.utc_offset_ns).any():
+            raise FileFormatError(
+                f"frames {frames.seq[0]} to {frames.seq[-1]} are not t_mono_ns plus the offset",
+                expected=f"t_ns - t_mono_ns = {self.info.utc_offset_ns}, as announced in hello",
+            )
         try:
             self._journal_now().append(frames, payload)
-            self.storage_problem = None
         except StorageError as error:  # the live picture goes on; nothing is acknowledged
             self.storage_problem = str(error)
         first, last = int(frames.seq[0]), int(frames.seq[-1])

@@ -105,6 +105,8 @@ class EstimateStream:
         last_t_mono_ns = 0
         for frames, extra in pieces:
             rest, rest_of = frames, extra
+            if not len(rest):
+                continue
             if int(rest.t_mono_ns[0]) < last_t_mono_ns:  # the node was switched on anew
                 yield from run.finish()
             last_t_mono_ns = int(rest.t_mono_ns[-1])

@@ -70,6 +70,7 @@ class Publisher:
         self._headers = {"Authorization": f"Bearer {token}"} if token else {}
         self._report = report
         self._last_report = ""
+        self._connected = False
         self._news = asyncio.Event()
         self._probe_answers: asyncio.Queue[Probe] = asyncio.Queue(PROBES)
         self._utc_offset_ns = 0
@@ -98,14 +99,18 @@ class Publisher:
                     welcome = await self._greet(socket)
                     self._say(f"connected to {self._url}")
                     wait_s = _BACK_OFF_S[0]
+                    self._connected = True
                     await self._serve(socket, welcome)
             except* (OSError, TimeoutError, InvalidHandshake, ConnectionClosed, LinkError) as group:
                 self._say(f"not connected to {self._url}: {_reason(group)}; trying again")
+            self._connected = False
             await asyncio.sleep(wait_s * random.uniform(0.5, 1.0))  # noqa: S311  # no secret
             wait_s = min(2.0 * wait_s, _BACK_OFF_S[1])
 
     async def drain(self) -> None:
-        """Wait a moment for the server to acknowledge everything; give up quietly."""
+        """Wait a moment for the server, if it is there, to acknowledge everything."""
+        if not self._connected:
+            return
         with suppress(TimeoutError):
             async with asyncio.timeout(_DRAIN_S):
                 while self._backlog.first_seq < self._backlog.next_seq:
@@ -209,16 +214,15 @@ def ingest_url(server: str) -> str:
     Raises:
         UsageError: `server` is no address.
     """
-    parts = urlsplit(server)
-    scheme = {"http": "ws", "https": "wss", "ws": "ws", "wss": "wss"}.get(parts.scheme)
+    expected = "one such as http://192.168.4.1:8000"
     try:
-        known = scheme is not None and parts.hostname is not None and parts.port != 0
-    except ValueError:  # a port that is no number
-        known = False
-    if not known or scheme is None:
-        raise UsageError(
-            f"{server!r} is no server address", expected="one such as http://192.168.4.1:8000"
-        )
+        parts = urlsplit(server)
+        known = parts.hostname is not None and parts.port != 0
+    except ValueError as error:
+        raise UsageError(f"{server!r} is no server address", expected=expected) from error
+    scheme = {"http": "ws", "https": "wss", "ws": "ws", "wss": "wss"}.get(parts.scheme)
+    if scheme is None or not known:
+        raise UsageError(f"{server!r} is no server address", expected=expected)
     return urlunsplit((scheme, parts.netloc, parts.path.rstrip("/") + INGEST_PATH, "", ""))
 
 

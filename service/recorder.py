@@ -15,6 +15,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 
 from devices.errors import FootTileError, StateError, UnknownError
+from devices.frames import ArrayInfo
 from service.nodes import Node, Nodes
 from service.sealing import Sources, ledger_of, seal, write_events
 from storage.intervals import Intervals
@@ -147,6 +148,10 @@ class Recorder:
         stopped = session.model_copy(
             update={"stopped_t_ns": time.time_ns(), "state": "pending", "problem": None}
         )
+        node = self._nodes.get(session.node)
+        if node.connected and node.clock is None and node.last_seq is not None:
+            # Its instants cannot be compared with ours: end with the newest frame there is.
+            stopped = _ended(stopped, max(node.last_seq, stopped.parts[-1].seq_first))
         self._keep(stopped)
         self.settle()
         return self._sessions[session_id]
@@ -179,16 +184,20 @@ class Recorder:
             write_events(session, self.folder.path(session_id))
         return event
 
-    def node_restarted(self, node: Node, ended_boot_id: str, ended_t_ns: int | None) -> None:
-        """The node has begun a new stream: its recording goes on in a new part.
+    def node_restarts(self, node: Node, new: ArrayInfo) -> None:
+        """The node is about to begin a new stream: its recording goes on in a new part.
 
         Frames of the old stream that were not sent are gone; how many there may have been is noted.
+
+        Raises:
+            StorageError: that cannot be written down.
         """
         for session in list(self._sessions.values()):
-            open_here = session.parts[-1].boot_id == ended_boot_id and session.node == node.name
+            open_here = session.parts[-1].boot_id == node.boot_id and session.node == node.name
             if open_here and session.state in ("recording", "pending"):
-                ended = self._end_part(session, node, ended_t_ns)
-                self._keep(_continued(ended, node) if ended.state == "recording" else ended)
+                ended = self._end_part(session, node)
+                recording = ended.state == "recording"
+                self._keep(_continued(ended, node.info, new) if recording else ended)
 
     def note_clock(self, node: Node) -> None:
         """Keep a new measurement of a node's clock with its recordings."""
@@ -255,7 +264,9 @@ class Recorder:
         node = self._nodes.get(session.node)
         first = node.journals.get(session.parts[0].boot_id)
         info = first.info if first is not None else node.info
-        begin_ns = node.node_t_ns(session.started_t_ns)
+        frames = first.read(session.parts[0].seq_first, 2**62) if first is not None else iter(())
+        begun = next(frames, None)
+        begin_ns = node.node_t_ns(session.started_t_ns) if begun is None else int(begun.t_ns[0])
         end_ns = node.node_t_ns(session.stopped_t_ns or time.time_ns())
         return Sources(
             session=session,
@@ -284,12 +295,14 @@ class Recorder:
         journal = node.journals.get(part.boot_id)
         if part.seq_last is not None or journal is None or session.stopped_t_ns is None:
             return session
+        if node.clock is None:
+            return session
         last = journal.last_seq_until(node.node_t_ns(session.stopped_t_ns), at_least=part.seq_first)
         if last is None:
             return session
         return self._keep(_ended(session, last))
 
-    def _end_part(self, session: Session, node: Node, ended_t_ns: int | None) -> Session:
+    def _end_part(self, session: Session, node: Node) -> Session:
         """End the last part where its stream ended; note how many frames may be missing."""
         part = session.parts[-1]
         if part.seq_last is not None:
@@ -297,10 +310,11 @@ class Recorder:
         journal = node.journals.get(part.boot_id)
         last = journal.held.last if journal is not None else None
         until_t_ns = min(session.stopped_t_ns or time.time_ns(), time.time_ns())
-        silent_s = 0.0 if ended_t_ns is None else max(0.0, (until_t_ns - ended_t_ns) * 1e-9)
+        seen_t_ns = node.last_seen_t_ns
+        silent_s = 0.0 if seen_t_ns is None else max(0.0, (until_t_ns - seen_t_ns) * 1e-9)
         tail = round(silent_s * node.info.nominal_rate_hz) + 1
         tails = {**session.unsynced_tail_max, part.boot_id: tail}
-        ended = _ended(session, part.seq_first - 1 if last is None else max(last, part.seq_first))
+        ended = _ended(session, max(part.seq_first - 1, last if last is not None else -1))
         return ended.model_copy(update={"unsynced_tail_max": tails})
 
     async def _seal(self, session_id: str) -> None:
@@ -342,15 +356,14 @@ def _ended(session: Session, seq_last: int) -> Session:
     return session.model_copy(update={"parts": parts})
 
 
-def _continued(session: Session, node: Node) -> Session:
+def _continued(session: Session, before: ArrayInfo, new: ArrayInfo) -> Session:
     """The session with a part for the node's new stream, if that has the same tiles."""
-    before = node.journals.get(session.parts[-1].boot_id)
-    if before is not None and before.info.serials != node.info.serials:
+    if before.tiles != new.tiles:
         problem = "the node came back with other tiles: recording ended"
         return session.model_copy(
             update={"state": "pending", "stopped_t_ns": time.time_ns(), "problem": problem}
         )
-    part = Part(boot_id=node.boot_id, seq_first=0)
+    part = Part(boot_id=new.boot_id, seq_first=0)
     return session.model_copy(update={"parts": (*session.parts, part)})
 
 

@@ -187,7 +187,8 @@ def ledger_of(
     parts = []
     for part in session.parts:
         here = held.get(part.boot_id, Intervals())
-        last = part.seq_last if part.seq_last is not None else (here.last or part.seq_first - 1)
+        newest = -1 if here.last is None else here.last
+        last = part.seq_last if part.seq_last is not None else max(newest, part.seq_first - 1)
         gaps = here.missing(part.seq_first, last) if last >= part.seq_first else Intervals()
         lost: dict[str, int] = {}
         if part.boot_id == open_boot_id:
@@ -208,6 +209,7 @@ def ledger_of(
                 unsynced_tail_max=session.unsynced_tail_max.get(part.boot_id, 0),
             )
         )
+    finished = finished and all(part.seq_last is not None for part in session.parts)
     lossy = any(part.lost or part.unsynced_tail_max for part in parts)
     return Ledger(
         complete=finished and not lossy and not any(part.pending for part in parts),

@@ -16,7 +16,7 @@ from fastapi import FastAPI
 from devices.errors import LinkError
 from service.guard import is_loopback
 from service.link import MESSAGE_BYTES_MAX
-from storage.durable import storage_errors
+from storage.durable import storage_errors, write_whole
 
 _BACKLOG = 128
 _GRACE_S = 3
@@ -61,15 +61,16 @@ def token_for(host: str, given: str | None, data: Path) -> str | None:
     Raises:
         StorageError: it cannot be kept.
     """
-    if given is not None or is_loopback(host):
-        return given
+    if given or is_loopback(host):
+        return given or None
     path = data / "token"
     with storage_errors(path):
-        if not path.exists():
+        kept = path.read_text().strip() if path.exists() else ""
+        if not kept:
             data.mkdir(parents=True, exist_ok=True)
-            path.touch(mode=0o600)
-            path.write_text(secrets.token_urlsafe(18) + "\n")
-        return path.read_text().strip()
+            kept = secrets.token_urlsafe(18)
+            write_whole(path, kept.encode() + b"\n", mode=0o600)
+    return kept
 
 
 @asynccontextmanager

@@ -97,6 +97,12 @@ class Server:
         for link in list(self.links.values()):
             link.end(Close.RESTART, "the server is going down; connect again")
         await self.recorder.close()
+        for node in self.nodes:
+            for journal in node.journals.values():
+                try:
+                    journal.close()
+                except StorageError as error:
+                    log.warning("%s", error)
         self._lock.close()
 
     def check_storage(self) -> None:
@@ -154,6 +160,8 @@ class Server:
             await asyncio.to_thread(journal.sync)
         except StorageError as error:
             link.node.storage_problem = str(error)
+            for first, last in waiting:
+                link.unsynced.add(first, last)
             return
         for first, last in waiting:
             try:

@@ -53,6 +53,7 @@ class TareHistory:
         serves from the beginning on.
         """
         fitting = [recorded.tare for recorded in self._of(info) if recorded.tare.t_ns <= end_t_ns]
+        fitting.sort(key=lambda tare: tare.t_ns)
         before = [tare for tare in fitting if tare.t_ns <= begin_t_ns][-1:]
         return tuple(before + [tare for tare in fitting if tare.t_ns > begin_t_ns])
 
@@ -96,6 +97,8 @@ class TareHistory:
 def _read(path: Path) -> list[RecordedTare]:
     try:
         content = json.loads(path.read_bytes())
+        if not isinstance(content, list):
+            raise TypeError("it is no list")  # noqa: TRY301
         return [
             RecordedTare(
                 str(entry["id"]),
@@ -105,7 +108,7 @@ def _read(path: Path) -> list[RecordedTare]:
             )
             for entry in content
         ]
-    except (ValueError, KeyError, TypeError, TareError) as error:
+    except (OSError, ValueError, KeyError, TypeError, TareError) as error:
         raise FileFormatError(
             f"the node's tares are not readable: {error}",
             where=str(path),

@@ -98,6 +98,8 @@ def _tables(
     }
     begin_t_ns: int | None = None
     for frames, extra in pieces:
+        if not len(frames):
+            continue
         if begin_t_ns is None:
             begin_t_ns = int(frames.t_ns[0])
         values = {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)

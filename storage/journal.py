@@ -79,6 +79,7 @@ class Journal:
         self._file: BinaryIO | None = None
         self._end = 0
         self._tidy = True
+        self._sync_failed: StorageError | None = None
         with storage_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             for path in sorted(folder.glob("*" + SUFFIX)):
@@ -107,7 +108,8 @@ class Journal:
             payload: the batch as it came over the wire; else it is encoded here.
 
         Raises:
-            StorageError: the disk is full or not writable. Nothing of the batch is held then.
+            StorageError: the disk is full or not writable. What of the batch could not be written
+                is not held then.
         """
         first, last = int(batch.seq[0]), int(batch.seq[-1])
         new = self.held.missing(first, last)
@@ -118,15 +120,26 @@ class Journal:
         return new
 
     def sync(self) -> None:
-        """Return when everything appended is on the disk.
+        """Return when everything appended before is on the disk; may run in another thread.
 
         Raises:
-            StorageError: the disk refused.
+            StorageError: the disk refused, now or when a segment was closed since the last sync.
         """
+        failed, self._sync_failed = self._sync_failed, None
+        if failed is not None:
+            raise failed
         file = self._file
-        if file is not None:
-            with storage_errors(self.folder):
-                os.fsync(file.fileno())
+        if file is None:
+            return
+        with storage_errors(self.folder):
+            try:
+                descriptor = os.dup(file.fileno())
+            except ValueError:  # closed meanwhile, and synced before that
+                return
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
 
     def read(self, seq_first: int, seq_last: int) -> Iterator[FrameBatch]:
         """Frames from `seq_first` to `seq_last` that are held, in order, a batch at a time.
@@ -145,7 +158,13 @@ class Journal:
             with storage_errors(path), path.open("rb") as file:
                 for _, _, entry in found:
                     payload = os.pread(file.fileno(), entry.length, entry.offset)
-                    batch = decode(payload, self._schema)
+                    try:
+                        batch = decode(payload, self._schema)
+                    except FileFormatError as error:
+                        raise FileFormatError(
+                            f"the batch at byte {entry.offset} is damaged: {error.what}",
+                            where=str(path),
+                        ) from error
                     if int(batch.seq[0]) != entry.seq_first or len(batch) != entry.frames:
                         raise FileFormatError(
                             f"the batch at byte {entry.offset} is not the one that was written",
@@ -173,20 +192,21 @@ class Journal:
     def last_seq_until(self, t_ns: int, *, at_least: int) -> int | None:
         """The last number taken at `t_ns` or before, if frames after `t_ns` are held too.
 
-        None while the stream has not passed `t_ns`. Batches before `at_least` are not looked at.
+        None while the stream has not passed `t_ns`. Batches before `at_least` are not looked at;
+        `at_least` - 1 if all of them were taken later.
         """
         entries = [e for s in self._segments for e in s.entries if e.seq_last >= at_least]
         if all(entry.t_ns_last <= t_ns for entry in entries):
             return None
         before = [entry for entry in entries if entry.t_ns_first <= t_ns]
         if not before:
-            return at_least
+            return at_least - 1
         newest = max(before, key=lambda entry: entry.seq_last)
         rows = sum(
             int(np.searchsorted(batch.t_ns, t_ns, side="right"))
             for batch in self.read(newest.seq_first, newest.seq_last)
         )
-        return max(at_least, newest.seq_first + rows - 1)
+        return max(at_least - 1, newest.seq_first + rows - 1)
 
     def prune(self, before_t_ns: int, keep: Intervals) -> int:
         """Delete segments that end before `before_t_ns` and hold nothing of `keep`; how many.
@@ -230,8 +250,10 @@ class Journal:
         if self._file is not None and (
             not self._tidy or t_ns - self._segments[-1].entries[0].t_ns_first >= SEGMENT_NS
         ):
-            with suppress(StorageError):
+            try:
                 self.close()
+            except StorageError as error:
+                self._sync_failed = error  # whoever waits for these frames to be safe is told
         file = self._file if self._file is not None else self._begin(first)
         segment = self._segments[-1]
         self._tidy = False
@@ -269,18 +291,18 @@ class Journal:
         """Index a segment; cut off what is not a whole message."""
         segment = _Segment(path)
         size = path.stat().st_size
-        with pa.OSFile(str(path), "r") as file:
+        with pa.OSFile(str(path), "r") as arrow_file:
             try:
-                pa.ipc.read_schema(pa.ipc.read_message(file))
+                pa.ipc.read_schema(pa.ipc.read_message(arrow_file))
             except (pa.ArrowException, EOFError, OSError):
                 path.unlink()  # not even its schema was written
                 return
-            end = file.tell()
+            end = arrow_file.tell()
             while end < size:
                 try:
-                    pa.ipc.read_message(file)
-                    length = file.tell() - end
-                    payload = os.pread(file.fileno(), length, end)
+                    pa.ipc.read_message(arrow_file)
+                    length = arrow_file.tell() - end
+                    payload = os.pread(arrow_file.fileno(), length, end)
                     batch = decode(payload, self._schema)
                 except (pa.ArrowException, EOFError, OSError, FileFormatError):
                     break
@@ -296,11 +318,18 @@ class Journal:
                 )
                 self.held.add(int(batch.seq[0]), int(batch.seq[-1]))
                 end += length
+        if end < size:
+            # What cannot be read is set aside, not thrown away: it may be more than a cut message.
+            with path.open("rb") as file:
+                file.seek(end)
+                path.with_suffix(".unread").write_bytes(file.read())
+            os.truncate(path, end)
         if not segment.entries:
             path.unlink()
             return
-        if end < size:
-            os.truncate(path, end)
+        # A killed process leaves frames that only the kernel holds; from now on they are promised.
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
         self._segments.append(segment)
 
 

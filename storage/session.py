@@ -19,7 +19,7 @@ from devices.errors import FileFormatError, UnknownError
 from storage.durable import storage_errors, write_whole
 
 FRAMES_NAME = "frames.parquet"
-_ID = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{6}")
+_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
 
 State = Literal["recording", "pending", "sealing", "sealed"]
 

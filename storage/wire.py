@@ -37,22 +37,32 @@ def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
             f"no Arrow message of frames: {error}",
             expected="a record batch of the schema announced in hello",
         ) from error
+    for column in record.columns:
+        # What is left over would be dealt out to the wrong rows.
+        if isinstance(column, pa.FixedSizeListArray) and (
+            len(column.values) != len(record) * column.type.list_size
+        ):
+            raise FileFormatError(
+                f"lists of {len(column.values) / max(1, len(record)):g} values",
+                expected=f"one value for each of {column.type.list_size} tiles",
+            )
     batch = from_record_batch(record)
     if not 0 < len(batch) <= FRAMES_MAX:
         raise FileFormatError(
             f"a message of {len(batch)} frames", expected=f"1 to {FRAMES_MAX} frames"
         )
-    # Unsigned: a step back wraps to a huge one.
-    if (np.diff(batch.seq) != 1).any():
+    first, last = int(batch.seq[0]), int(batch.seq[-1])
+    # A difference of unsigned numbers wraps, so both ends are looked at as well.
+    if (np.diff(batch.seq) != 1).any() or last - first != len(batch) - 1:
         raise FileFormatError(
-            f"frames {batch.seq[0]} to {batch.seq[-1]} do not follow one another",
+            f"frames {first} to {last} do not follow one another",
             expected="seq rising by one within a message",
         )
-    if int(batch.seq[-1]) >= 2**62:
-        raise FileFormatError(f"frame number {batch.seq[-1]}", expected="less than 2^62")
-    if (np.diff(batch.t_mono_ns) < 0).any():
+    if last >= 2**62:
+        raise FileFormatError(f"frame number {last}", expected="less than 2^62")
+    if (batch.t_mono_ns[1:] < batch.t_mono_ns[:-1]).any():
         raise FileFormatError(
-            f"time runs backwards within frames {batch.seq[0]} to {batch.seq[-1]}",
+            f"time runs backwards within frames {first} to {last}",
             expected="t_mono_ns rising",
         )
     return batch

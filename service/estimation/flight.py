@@ -58,11 +58,17 @@ def tare_in_flight(
             f"tile {', '.join(silent)} gave no readings in the last seconds",
             remedy="Plug it in, or take it out of the scene",
         )
+    if len(frames) < FRAMES_MIN:
+        raise TareError(f"only {len(frames)} frames have come", expected=f"at least {FRAMES_MIN}")
     entries = [calibration.of(serial) for serial in serials]
     bench_kpa = np.array([np.nan if e.baseline_kpa is None else e.baseline_kpa for e in entries])
     usual_kpa = np.array([np.nan if e.noise_kpa is None else e.noise_kpa for e in entries])
     if present is not None:
         usual_kpa = np.where(np.isnan(usual_kpa), present.noise_kpa, usual_kpa)
+    # Else from what changes between two frames, which a slow motion hardly does.
+    steps_kpa = np.nanstd(np.diff(kpa, axis=0), axis=0) / np.sqrt(2.0)
+    floor_kpa = compensation.rounding_kpa(np.nanmedian(frames.tadc, axis=0))
+    usual_kpa = np.where(np.isnan(usual_kpa), np.maximum(steps_kpa, floor_kpa), usual_kpa)
     since_ns = frames.t_ns - frames.t_ns[0]
     windows = []
     for begin_ns in range(int(since_ns[-1]) - WINDOW_NS, -1, -WINDOW_NS // 4):
@@ -71,10 +77,9 @@ def tare_in_flight(
         if n < FRAMES_MIN or not np.isfinite(kpa[rows]).all():
             continue
         mean_kpa, noise_kpa = kpa[rows].mean(axis=0), kpa[rows].std(axis=0, ddof=1)
-        expected_kpa = np.where(np.isnan(usual_kpa), noise_kpa, usual_kpa)
         drift_kpa = kpa[rows][: n // 2].mean(axis=0) - kpa[rows][n // 2 :].mean(axis=0)
-        mean_sigma_kpa = expected_kpa / np.sqrt(n)
-        quiet = noise_kpa < QUIET * expected_kpa
+        mean_sigma_kpa = usual_kpa / np.sqrt(n)
+        quiet = noise_kpa < QUIET * usual_kpa
         still = np.abs(drift_kpa) < STILL_SIGMAS * 2.0 * mean_sigma_kpa
         if (quiet & still).all():
             windows.append((rows, mean_kpa, mean_sigma_kpa))

@@ -78,19 +78,16 @@ class Tare:
             TareError: it is no tare, or of another number of tiles.
         """
         try:
-            values = {f.name: content[f.name] for f in fields(cls)}
+            values: dict[str, Any] = {"source": str(content["source"])}
+            values |= {name: int(content[name]) for name in ("t_ns", "frames")}
+            values |= {name: float(content[name]) for name in ("begin_s", "end_s")}
             for name in ("baseline_kpa", "baseline_sigma_kpa", "noise_kpa"):
-                values[name] = np.array(values[name], dtype=np.float64)
-            tare = cls(**values)
-            finite = np.isfinite(tare.baseline_kpa + tare.baseline_sigma_kpa + tare.noise_kpa)
-        except (KeyError, TypeError, ValueError) as error:
+                values[name] = np.array(content[name], dtype=np.float64)
+                if values[name].shape != (tiles,) or not np.isfinite(values[name]).all():
+                    raise ValueError(f"{name} is not that of {tiles} tiles")  # noqa: TRY301
+            return cls(**values)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise TareError(f"a recorded tare is not readable: {error}") from error
-        if finite.shape != (tiles,) or not finite.all():
-            raise TareError(
-                "a recorded tare is not of this array",
-                expected=f"a baseline for each of {tiles} tiles",
-            )
-        return tare
 
 
 def take_tare(

@@ -42,10 +42,10 @@ class DataQuery(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Format = "parquet"
-    start_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = Field(
+    start_s: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = Field(
         default=None, description="Seconds after the first frame."
     )
-    end_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = Field(
+    end_s: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)] | None = Field(
         default=None, description="Up to, not including, so many seconds after the first frame."
     )
     columns: str | None = Field(

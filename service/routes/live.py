@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from service.link import PROTOCOL, SUBPROTOCOL, Close
+from service.link import PROTOCOL, SUBPROTOCOL, Close, close_reason
 from service.live import Subscriber, dumps
 from service.server import Server
 from service.version import SOFTWARE
@@ -54,7 +54,7 @@ async def live(socket: WebSocket, server: Server) -> None:
         if socket.application_state is not WebSocketState.DISCONNECTED:
             with suppress(RuntimeError, WebSocketDisconnect, TimeoutError):
                 async with asyncio.timeout(1.0):
-                    await socket.close(end.code, end.reason[:120])
+                    await socket.close(end.code, close_reason(end.reason))
     except (WebSocketDisconnect, RuntimeError):  # it went away, perhaps while we were sending
         pass
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from http import HTTPStatus
 from typing import Annotated
 
@@ -177,4 +178,5 @@ def _mentions(session: object, q: str) -> bool:
 
 def _key_of(cursor: str) -> tuple[int, str]:
     t_ns, _, session_id = cursor.partition(".")
-    return (int(t_ns), session_id) if t_ns.isdigit() and len(t_ns) < 20 else (0, "")
+    number = re.fullmatch(r"[0-9]{1,19}", t_ns)
+    return (int(t_ns), session_id) if number else (0, "")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -10,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.clock import VirtualClock
+from devices.clock import SystemClock, VirtualClock
 from devices.dynamixel import PositionReading, open_servo
 from devices.emulation.dynamixel import EmulatedServo
 from devices.errors import ServoError, ServoPacketError, ServoStatusError, ServoTimeoutError
-from devices.servo import PolledServo
+from devices.servo import PolledServo, ServoReader
 
 MS = 1_000_000
 ANSWER_NS = 600_000
@@ -161,3 +163,83 @@ def test_a_servo_of_another_id_is_counted_as_failing() -> None:
         assert source.latest(1_000 * MS) is None
         assert source.failures == 1
         assert line_clock.now_ns() >= 1_010 * MS, "the time-out passes on the virtual clock"
+
+
+# On a real clock
+
+
+def soon(true: Callable[[], bool]) -> bool:
+    end = time.monotonic() + 10.0
+    while not true() and time.monotonic() < end:
+        time.sleep(0.001)
+    return true()
+
+
+class Counting:
+    """A servo whose n-th reading is n; it fails or hangs when it is told to."""
+
+    def __init__(self) -> None:
+        self.readings = 0
+        self.error: ServoError | None = None
+        self.hangs = threading.Event()
+        self.goes_on = threading.Event()
+
+    def read_position(self) -> PositionReading:
+        if self.hangs.is_set():
+            self.goes_on.wait(10.0)
+        if self.error is not None:
+            raise self.error
+        self.readings += 1
+        now_ns = time.monotonic_ns()
+        return PositionReading(self.readings, now_ns, 0, now_ns)
+
+
+def test_a_reader_on_a_real_clock_has_ever_newer_positions() -> None:
+    servo: Any = Counting()
+    with ServoReader(servo, SystemClock(), rate_hz=500.0) as source:
+        assert soon(lambda: source.latest(time.monotonic_ns()) is not None)
+        first = source.latest(time.monotonic_ns())
+        assert first is not None
+        assert soon(lambda: (source.latest(time.monotonic_ns()) or (0, 0))[0] > first[0] + 5)
+        newest = source.latest(time.monotonic_ns())
+        assert newest is not None
+        assert newest[1] > first[1]
+    assert "servo" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_position_sampled_while_the_frame_was_taken_has_no_negative_age() -> None:
+    servo: Any = Counting()
+    with ServoReader(servo, SystemClock(), rate_hz=500.0) as source:
+        assert soon(lambda: source.latest(time.monotonic_ns()) is not None)
+        reading = source.latest(0)
+    assert reading is not None
+    assert reading[1] == 0
+
+
+def test_a_hanging_servo_costs_the_frames_nothing_and_grows_old() -> None:
+    servo: Any = Counting()
+    with ServoReader(servo, SystemClock(), rate_hz=500.0) as source:
+        assert soon(lambda: servo.readings > 3)
+        servo.hangs.set()
+        begin_s = time.monotonic()
+        assert soon(
+            lambda: (
+                time.monotonic_ns() - (source.latest(time.monotonic_ns()) or (0, 0))[1]
+                > source.stale_after_ns
+            )
+        )
+        for _ in range(1000):
+            source.latest(time.monotonic_ns())
+        assert time.monotonic() - begin_s < 5.0
+        servo.hangs.clear()
+        servo.goes_on.set()
+
+
+def test_failed_readings_are_counted_and_it_goes_on_when_the_servo_does() -> None:
+    servo: Any = Counting()
+    servo.error = ServoTimeoutError("no answer")
+    with ServoReader(servo, SystemClock(), rate_hz=500.0) as source:
+        assert soon(lambda: source.failures > 2)
+        assert source.latest(time.monotonic_ns()) is None
+        servo.error = None
+        assert soon(lambda: source.latest(time.monotonic_ns()) is not None)

@@ -226,6 +226,7 @@ def test_every_column_on_disk_says_its_unit() -> None:
         values[column.name] = np.zeros(shape, dtype=column.type.to_pandas_dtype())
     for column in MILL:
         values[column.name] = np.array(["a", "b", "c"])
+    values["part"] = np.zeros(3, dtype=np.uint16)
     fields_made = [field for field, _ in flat_columns(tuple(KNOWN.values()), values)]
     assert len(fields_made) == len(KNOWN) + sum(c.per_tile for c in KNOWN.values())
     for field in fields_made:

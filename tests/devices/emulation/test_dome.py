@@ -7,6 +7,7 @@ two lags in series) and from hardware.md 9, not from the emulation's own numbers
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -562,3 +563,45 @@ def test_a_dome_does_not_feel_its_neighbours() -> None:
     np.testing.assert_allclose(kpa_at(beside, t_s, dome=0), alone, atol=1e-6)
     swapped = domes_of(tap, other, PART, **ALL)
     np.testing.assert_allclose(kpa_at(swapped, t_s, dome=1), alone, atol=1e-6)
+
+
+# A real clock
+
+
+def test_computing_ahead_changes_no_pressure() -> None:
+    def force(t_s: Floats) -> Floats:
+        return np.where(t_s > 0.3, 8.0, 0.0)
+
+    t_s = np.linspace(0.0, 2.5, 400)
+    expected = kpa_at(domes_of(force, **ALL), t_s)
+    ahead = domes_of(force, **ALL)
+    got = []
+    for t in t_s:
+        ahead.foresee(float(t) + 0.4)
+        got.append(ahead.pressure_kpa(0, float(t)))
+    assert np.array(got).tobytes() == expected.tobytes()
+
+
+def test_threads_that_ask_and_compute_ahead_at_once_see_the_same_pressures() -> None:
+    def force(t_s: Floats) -> Floats:
+        return np.where(t_s > 0.3, 8.0, 0.0)
+
+    t_s = np.linspace(0.0, 4.0, 3000)
+    expected = kpa_at(domes_of(force, **ALL), t_s)
+    domes = domes_of(force, **ALL)
+    ahead_of = [0.0]
+    done = threading.Event()
+
+    def look_ahead() -> None:
+        while not done.is_set():
+            domes.foresee(ahead_of[0] + 0.4)
+
+    thread = threading.Thread(target=look_ahead)
+    thread.start()
+    got = []
+    for t in t_s:
+        ahead_of[0] = float(t)
+        got.append(domes.pressure_kpa(0, float(t)))
+    done.set()
+    thread.join()
+    assert np.array(got).tobytes() == expected.tobytes()

@@ -260,6 +260,23 @@ def test_a_recorded_load_without_an_angle_has_none() -> None:
     assert TraceLoad(trace).angle_rad(at(1.5)) is None
 
 
+def test_a_looped_load_comes_again_after_a_second_in_the_air() -> None:
+    trace = PressedTrace(
+        at(1.0, 2.0, 3.0), np.array([[5.0], [6.0], [7.0]]), at(0.1, 0.2, 0.3), 0, 0
+    )
+    made = TraceLoad(trace, 1.0, looped=True)
+    assert made.duration_s is None
+    t_s = at(0.5, 1.0, 1.5, 2.0, 2.999, 3.2, 3.9)
+    once = made.forces_n(t_s)
+    np.testing.assert_allclose(once[:, 0], [0.0, 5.0, 5.5, 6.0, 6.999, 0.0, 0.0])
+    for round_s in (3.0, 300.0):  # two seconds of load, one in the air
+        again = t_s[1:] + round_s
+        np.testing.assert_allclose(made.forces_n(again), once[1:], atol=1e-9)
+        angle, before = made.angle_rad(again), made.angle_rad(t_s[1:])
+        assert angle is not None
+        np.testing.assert_allclose(angle, before)
+
+
 # The mill
 
 

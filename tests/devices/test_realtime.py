@@ -1,0 +1,74 @@
+"""What is asked of the kernel, and that a refusal is no failure."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from devices import realtime
+
+PR_GET_TIMERSLACK = 30
+
+
+def in_a_thread(body: object) -> object:
+    """Settings of a thread end with it."""
+    result: list[object] = []
+    thread = threading.Thread(target=lambda: result.append(body()))  # type: ignore[operator]
+    thread.start()
+    thread.join()
+    return result[0]
+
+
+def test_timers_are_as_sharp_as_asked_for() -> None:
+    def slack_ns() -> int:
+        assert realtime.sharpen_timers(2_000)
+        return int(ctypes.CDLL(None).prctl(PR_GET_TIMERSLACK, 0, 0, 0, 0))
+
+    assert in_a_thread(slack_ns) == 2_000
+
+
+def test_a_priority_that_is_not_permitted_is_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    assert in_a_thread(realtime.run_before_others) is False
+
+
+@pytest.mark.parametrize(("state", "is_set"), [(0, True), (1, True), (5, False), (-1, False)])
+def test_the_clock_is_set_unless_the_kernel_says_otherwise(
+    monkeypatch: pytest.MonkeyPatch, state: int, is_set: bool
+) -> None:
+    class Libc:
+        @staticmethod
+        def adjtimex(buffer: object) -> int:
+            return state
+
+    monkeypatch.setattr(realtime, "_libc", Libc)
+    assert realtime.clock_is_set() is is_set
+
+
+def test_a_process_ends_with_its_parent_even_if_that_is_killed() -> None:
+    child = (
+        "import sys, time; from devices.realtime import end_with_parent; end_with_parent(); "
+        "print(1, flush=True); time.sleep(60)"
+    )
+    parent = (
+        "import subprocess, sys, time; "
+        f"p = subprocess.Popen([sys.executable, '-c', {child!r}], stdout=subprocess.PIPE); "
+        "p.stdout.readline(); print(p.pid, flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        with os.fdopen(os.pidfd_open(pid)) as child_end:
+            process.send_signal(signal.SIGKILL)
+            ended, _, _ = select.select([child_end], [], [], 10.0)
+    assert ended

@@ -1,0 +1,312 @@
+"""`serve`, `node`, `demo`, `sessions`, `pull`, `export` as a user types them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+import pytest
+
+COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
+
+
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, **environment},
+    )
+
+
+@dataclass
+class Demo:
+    url: str
+    data: Path
+    process: subprocess.Popen[str]
+
+    def get(self, path: str) -> httpx.Response:
+        return httpx.get(f"{self.url}/api/v1{path}", trust_env=False)
+
+    def post(self, path: str, body: object = None) -> httpx.Response:
+        return httpx.post(f"{self.url}/api/v1{path}", json=body, trust_env=False)
+
+
+def tiny_scene(folder: Path) -> Path:
+    """Two tiles that bear a standing load, with a preset: no bench has to be pressed."""
+    text = (
+        'name = "tiny"\ncalibration = "paper-eq2-shape"\n[ground]\nkind = "plate"\nload_n = 10.0\n'
+    )
+    for i in range(2):
+        text += f'[[tile]]\nserial = "T0{i + 1}"\nmux = 0x70\nchannel = {i}\n'
+        text += f"x_m = {0.02 * i}\ny_m = 0\nz_m = -0.15\n"
+    path = folder / "tiny.toml"
+    path.write_text(text)
+    return path
+
+
+def start_demo(folder: Path, *options: str) -> Demo:
+    arguments = ["demo", f"--scene={tiny_scene(folder)}", "--port=0", f"--data={folder / 'data'}"]
+    with (folder / "stderr.txt").open("w") as stderr:
+        process = subprocess.Popen(
+            [*COMMAND, *arguments, *options], stdout=subprocess.PIPE, stderr=stderr, text=True
+        )
+    assert process.stdout is not None
+    url = process.stdout.readline().split()[-1].rstrip("/")
+    demo = Demo(url, folder / "data", process)
+    end = time.monotonic() + 30
+    while not any(node["tare"] for node in demo.get("/nodes").json()["items"]):
+        assert time.monotonic() < end, (folder / "stderr.txt").read_text()
+        time.sleep(0.1)
+    return demo
+
+
+def ended(process: subprocess.Popen[str]) -> int:
+    code = process.wait(30)
+    assert process.stdout is not None
+    process.stdout.close()
+    return code
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Demo]:
+    demo = start_demo(tmp_path_factory.mktemp("demo"))
+    yield demo
+    demo.process.send_signal(signal.SIGINT)
+    assert ended(demo.process) == 0
+
+
+@pytest.fixture(scope="module")
+def session(demo: Demo) -> str:
+    """Id of a sealed session of about two seconds."""
+    started = demo.post("/sessions", {"node": "demo", "name": "=1+1 [b]"}).json()
+    end = time.monotonic() + 30
+    while demo.get(f"/sessions/{started['id']}").json()["frames"] < 300:
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    stopped = demo.post(f"/sessions/{started['id']}/stop").json()
+    assert stopped["state"] == "sealed"
+    return str(stopped["id"])
+
+
+def test_sessions_lists_what_the_server_has_and_what_the_folder_has(
+    demo: Demo, session: str
+) -> None:
+    asked = json.loads(run("sessions", "--server", demo.url, "--json").stdout)["items"]
+    found = json.loads(run("sessions", "--data", str(demo.data), "--json").stdout)["items"]
+    assert [s["id"] for s in asked] == [s["id"] for s in found] == [session]
+    assert asked[0]["complete"] is found[0]["complete"] is True
+    table = run("sessions", "--server", demo.url)
+    assert session in table.stdout
+    assert "=1+1 [b]" in table.stdout
+
+
+def test_pull_brings_the_file_verified_and_at_once_the_second_time(
+    demo: Demo, session: str, tmp_path: Path
+) -> None:
+    first = run("pull", session, "--server", demo.url, "--out", str(tmp_path), "--json")
+    assert first.returncode == 0, first.stderr
+    pulled = json.loads(first.stdout)
+    table = pq.read_table(pulled["path"])
+    assert (np.diff(table["seq"].to_numpy()) == 1).all()
+    assert len(table) == pulled["frames"]
+    folder = tmp_path / session
+    assert {path.name for path in folder.iterdir()} == {
+        *("frames.parquet", "session.json", "events.json", "ledger.json")
+    }
+    before = (folder / "frames.parquet").stat().st_mtime_ns
+    assert run("pull", session, "--server", demo.url, "--out", str(tmp_path)).returncode == 0
+    assert (folder / "frames.parquet").stat().st_mtime_ns == before
+
+
+def test_pull_of_what_is_not_there_says_so(demo: Demo, tmp_path: Path) -> None:
+    done = run("pull", "../../etc", "--server", demo.url, "--out", str(tmp_path))
+    assert done.returncode == 1
+    assert "404" in done.stderr
+    done = run("pull", "20200101T000000Z-000000", "--server", demo.url, "--out", str(tmp_path))
+    assert done.returncode == 1
+    assert "no session" in done.stderr
+
+
+def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path: Path) -> None:
+    tables = {}
+    for name in ("parquet", "arrow", "csv"):
+        out = tmp_path / f"session.{name}"
+        done = run(
+            *("export", session, "--data", str(demo.data), "--format", name, "--out", str(out)),
+            *("--columns", "seq,t_ns,force_n,contact", "--start-s", "0.2", "--end-s", "0.9"),
+        )
+        assert done.returncode == 0, done.stderr
+        tables[name] = {
+            "parquet": pq.read_table,
+            "arrow": lambda out: pa.ipc.open_stream(out.read_bytes()).read_all(),
+            "csv": pacsv.read_csv,
+        }[name](out)
+    names = ["seq", "t_ns", "force_n_0", "force_n_1", "contact"]
+    for table in tables.values():
+        assert table.column_names == names
+        assert table["seq"].to_pylist() == tables["parquet"]["seq"].to_pylist()
+        assert np.allclose(table["force_n_0"], tables["parquet"]["force_n_0"], rtol=1e-6)
+    t_s = (tables["csv"]["t_ns"].to_numpy() - tables["csv"]["t_ns"][0].as_py()) * 1e-9
+    assert 0.6 < t_s[-1] < 0.7
+    assert tables["arrow"].schema.field("force_n_0").metadata[b"unit"] == b"N"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--format", "xlsx"), "parquet or arrow or csv"),
+        (("--format", "csv", "--columns", "nonsense"), "no column 'nonsense'"),
+    ],
+)
+def test_an_export_that_cannot_be_leaves_nothing(
+    demo: Demo, session: str, tmp_path: Path, options: tuple[str, ...], said: str
+) -> None:
+    out = tmp_path / "out.csv"
+    done = run("export", session, "--data", str(demo.data), "--out", str(out), *options)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_server_on_the_same_port_or_folder_is_refused(demo: Demo, tmp_path: Path) -> None:
+    port = demo.url.rsplit(":", 1)[1]
+    done = run("serve", "--port", port, "--data", str(tmp_path / "other"))
+    assert done.returncode == 1
+    assert f"port {port}" in done.stderr
+    assert "--port" in done.stderr
+    done = run("serve", "--port", "0", "--data", str(demo.data))
+    assert done.returncode == 1
+    assert "another foottile server uses this data folder" in done.stderr
+
+
+def test_a_second_node_of_the_same_name_is_told_why_it_is_not_let_in(
+    demo: Demo, tmp_path: Path
+) -> None:
+    node = subprocess.Popen(
+        [
+            *COMMAND,
+            "node",
+            f"--scene={tiny_scene(tmp_path)}",
+            f"--server={demo.url}",
+            "--name=demo",
+        ],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert node.stderr is not None
+    said = ""
+    while "already" not in said:
+        line = node.stderr.readline()
+        assert line, said
+        said += line
+    node.terminate()
+    node.wait(20)
+    node.stderr.close()
+    assert "--name" in said
+    assert demo.get("/nodes/demo").json()["connected"]
+
+
+def test_ctrl_c_seals_what_is_being_recorded(tmp_path: Path) -> None:
+    demo = start_demo(tmp_path)
+    started = demo.post("/sessions", {"node": "demo", "name": "cut short"}).json()
+    demo.process.send_signal(signal.SIGINT)
+    assert ended(demo.process) == 0
+    (found,) = json.loads(run("sessions", "--data", str(demo.data), "--json").stdout)["items"]
+    assert (found["id"], found["state"], found["complete"]) == (started["id"], "sealed", True)
+    with pytest.raises(httpx.ConnectError):
+        demo.get("/health")
+
+
+def test_a_demo_ends_by_itself_after_its_seconds(tmp_path: Path) -> None:
+    demo = start_demo(tmp_path, "--seconds", "6")
+    assert ended(demo.process) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("node", "--scene", "nonsense"), 2, "no scene 'nonsense'"),
+        (("node", "--scene", "standing", "--server", "nonsense"), 2, "no server address"),
+        (("node", "--scene", "standing", "--name", "../x"), 2, "--name"),
+        (("node", "--scene", "standing", "--servo", "/dev/ttyUSB9"), 2, "has no servo"),
+        (("node", "--scene", "insole"), 2, "--load"),
+        (("node", "--scene", "standing", "--bus", "/dev/i2c-99"), 1, "/dev/i2c-99"),
+        (("demo", "--scene", "nonsense"), 2, "no scene 'nonsense'"),
+        (("sessions", "--server", "http://127.0.0.1:1"), 1, "no answer"),
+        (("sessions", "--server", "ftp://x"), 2, "no server address"),
+        (("sessions", "--data", "/nowhere"), 2, "no data folder"),
+        (("serve", "--config", "/nowhere.toml"), 2, "no settings file"),
+        (("serve", "--host", "192.0.2.1", "--port", "0"), 1, "192.0.2.1"),
+    ],
+)
+def test_wrong_options_are_refused_with_the_reason(
+    arguments: tuple[str, ...], code: int, said: str, tmp_path: Path
+) -> None:
+    done = run(*arguments, XDG_DATA_HOME=str(tmp_path))
+    assert done.returncode == code, done.stderr
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_settings_come_from_option_environment_and_file_in_that_order(tmp_path: Path) -> None:
+    config = tmp_path / "foottile.toml"
+    config.write_text(f'port = 1\ndata = "{tmp_path / "from-file"}"\n')
+    serve = subprocess.Popen(
+        [*COMMAND, "serve", "--config", str(config), "--port", "0"],
+        env={**os.environ, "FOOTTILE_PORT": "2", "FOOTTILE_DATA": str(tmp_path / "from-env")},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert serve.stdout is not None
+    assert "http://127.0.0.1:" in serve.stdout.readline()
+    serve.terminate()
+    assert ended(serve) == 0
+    assert (tmp_path / "from-env").is_dir()
+    assert not (tmp_path / "from-file").exists()
+    config.write_text("prot = 1\n")
+    done = run("serve", "--config", str(config))
+    assert done.returncode == 2
+    assert "prot" in done.stderr
+
+
+def test_off_loopback_a_token_is_made_kept_and_asked_for(tmp_path: Path) -> None:
+    serve = subprocess.Popen(
+        [*COMMAND, "serve", "--host=0.0.0.0", "--port", "0", "--data", str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert serve.stdout is not None
+    url, token = serve.stdout.readline().split()[-1].split("/#token=")
+    assert (tmp_path / "token").stat().st_mode & 0o077 == 0
+    refused = httpx.post(f"{url}/api/v1/nodes/x/tare", trust_env=False)
+    allowed = httpx.post(
+        f"{url}/api/v1/nodes/x/tare", headers={"Authorization": f"Bearer {token}"}, trust_env=False
+    )
+    assert (refused.status_code, allowed.status_code) == (401, 404)
+    by_name = httpx.get(f"{url}/api/v1/nodes", headers={"Host": "evil.example"}, trust_env=False)
+    assert by_name.status_code == 403
+    serve.terminate()
+    assert ended(serve) == 0
+
+
+def test_a_port_that_is_taken_by_somebody_else_is_named(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = run("demo", "--scene", str(tiny_scene(tmp_path)), "--port", str(port))
+    assert done.returncode == 1
+    assert f"port {port}" in done.stderr

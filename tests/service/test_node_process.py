@@ -1,0 +1,119 @@
+"""`foottile node` as a process, with emulated tiles, against a real server."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+Running = Any
+Until = Callable[..., Any]
+Foottile = Callable[..., Any]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """The built-in scene with a calibration that need not be pressed on the bench first."""
+    text = (resources.files("devices") / "scenes" / "standing.toml").read_text("utf-8")
+    path = tmp_path / "standing.toml"
+    path.write_text('calibration = "paper-eq2-shape"\n' + text)
+    return path
+
+
+def children(pid: int) -> list[int]:
+    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(word) for word in text.split()]
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"
+
+
+def test_an_emulated_node_streams_tares_and_ends_without_loss(
+    running: Running, foottile: Foottile, scene: Path, until: Until
+) -> None:
+    process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
+    process.said("connected to")
+    until(lambda: (running.node("demo")["last_seq"] or 0) > 600, 15.0)
+    until(lambda: running.node("demo")["tare"], 10.0)
+    node = running.node("demo")
+    assert node["emulated"] is True
+    assert node["tare"]["source"] == "lead"
+    assert node["calibration"]["name"] == "paper-eq2-shape"
+    assert node["calibration"]["absolute_scale"] == "assumed"
+    assert node["rate_hz"] > 100.0
+    assert node["lost_frames"] == 0
+    assert node["clock"] is not None
+    process.process.send_signal(signal.SIGTERM)
+    assert process.ended(8.0) == 0, process.err
+    assert not any("never acknowledged" in line for line in process.err)
+    until(lambda: not running.node("demo")["connected"])
+    node = running.node("demo")
+    seqs = np.concatenate([b.seq for b in running.journal(node["boot_id"], "demo").read(0, 2**61)])
+    np.testing.assert_array_equal(seqs, np.arange(node["last_seq"] + 1))
+
+
+def test_a_tile_that_does_not_answer_is_named(
+    running: Running, foottile: Foottile, scene: Path
+) -> None:
+    fault = '\n[[fault]]\ntile = "T03"\nkind = "no_answer"\nt_s = 0.0\nduration_s = 1000.0\n'
+    scene.write_text(scene.read_text() + fault)
+    process = foottile("node", "--scene", scene, "--server", running.url)
+    assert process.ended(20.0) == 1
+    assert any("T03" in line for line in process.err), process.err
+    assert not any("Traceback" in line for line in process.err)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--scene", "nothing"),
+        ("--scene", "standing", "--server", "nowhere"),
+        ("--scene", "standing", "--name", "../x"),
+    ],
+    ids=str,
+)
+def test_a_node_that_cannot_be_started_says_so(
+    foottile: Foottile, arguments: tuple[str, ...]
+) -> None:
+    process = foottile("node", *arguments)
+    assert process.ended(20.0) == 2
+    assert process.err
+    assert not any("Traceback" in line for line in process.err)
+
+
+def test_acquisition_ends_when_its_node_is_killed(
+    running: Running, foottile: Foottile, scene: Path, until: Until
+) -> None:
+    process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
+    process.said("connected to")
+    begun = children(process.pid)
+    assert begun
+    os.kill(process.pid, signal.SIGKILL)
+    # Its pipes stay open as long as a child has them: that they end is what is waited for.
+    until(lambda: not any(is_alive(pid) for pid in begun), 8.0)
+    assert process.ended(5.0) == -signal.SIGKILL
+    until(lambda: not running.node("demo")["connected"], 8.0)
+
+
+def test_a_node_without_a_server_takes_frames_and_says_that_they_were_not_sent(
+    running: Running, foottile: Foottile, scene: Path
+) -> None:
+    running.stop()
+    process = foottile("node", "--scene", scene, "--server", running.url)
+    assert "trying again" in process.said("not connected to")
+    process.process.send_signal(signal.SIGINT)
+    assert process.ended(12.0) == 3
+    said = [line for line in process.err if "never acknowledged" in line]
+    assert re.match(r"\d+ frames", said[0])

@@ -1,0 +1,168 @@
+"""Files that are whole or not there, and errors that name the file."""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError, StorageError
+from storage.durable import storage_errors, sync_folder, write_whole
+
+
+@contextmanager
+def disk_with_room_for(size: int) -> Iterator[None]:
+    """No file may grow beyond `size` bytes: a write fails as it does on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.binary(max_size=5000), min_size=1, max_size=4))
+def test_a_file_holds_what_was_written_last_and_nothing_lies_beside_it(
+    tmp_path_factory: pytest.TempPathFactory, contents: list[bytes]
+) -> None:
+    folder = tmp_path_factory.mktemp("whole")
+    for content in contents:
+        write_whole(folder / "file.json", content)
+        assert files_in(folder) == {"file.json": content}
+
+
+def test_what_is_secret_is_never_readable_by_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    modes, fsync = set[int](), os.fsync
+
+    def watched(descriptor: int) -> None:
+        modes.update(p.stat().st_mode & 0o077 for p in tmp_path.iterdir())
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    write_whole(tmp_path / "token", b"secret", mode=0o600)
+    assert modes == {0}
+    assert (tmp_path / "token").stat().st_mode & 0o777 == 0o600
+
+
+def test_the_content_is_on_the_disk_before_the_name_and_the_name_before_it_returns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, events, fsync = tmp_path / "file", [], os.fsync
+
+    def watched(descriptor: int) -> None:
+        target = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        size = target.stat().st_size if target.is_file() else None
+        events.append(("folder" if target == tmp_path else "file", size, path.exists()))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    write_whole(path, b"12345")
+    assert events == [("file", 5, False), ("folder", None, True)]
+
+
+@pytest.mark.parametrize("room", [0, 1, 4095])
+@pytest.mark.parametrize("before", [None, b"what was there"])
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, room: int, before: bytes | None
+) -> None:
+    path = tmp_path / "file"
+    if before is not None:
+        path.write_bytes(before)
+    with (
+        pytest.raises(StorageError, match=r"[Ff]ile too large") as caught,
+        disk_with_room_for(room),
+    ):
+        write_whole(path, b"x" * 4096)
+    assert caught.value.where == str(path)
+    assert caught.value.remedy
+    assert files_in(tmp_path) == ({} if before is None else {"file": before})
+
+
+def test_a_disk_that_does_not_sync_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(descriptor: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    write_whole(tmp_path / "file", b"old")
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(StorageError, match="Input/output error"):
+        write_whole(tmp_path / "file", b"new")
+    assert files_in(tmp_path) == {"file": b"old"}
+
+
+def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(descriptor: int) -> None:
+        raise KeyboardInterrupt
+
+    write_whole(tmp_path / "file", b"old")
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "file", b"new")
+    assert files_in(tmp_path) == {"file": b"old"}
+
+
+def test_a_folder_that_is_not_there_or_is_no_folder_is_an_error_that_names_the_file(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    for path in (tmp_path / "missing" / "x", tmp_path / "file" / "x", tmp_path / ("n" * 300)):
+        with pytest.raises(StorageError) as caught:
+            write_whole(path, b"content")
+        assert caught.value.where == str(path)
+    assert files_in(tmp_path) == {"file": b""}
+
+
+def test_a_folder_in_place_of_the_file_is_an_error_and_stays(tmp_path: Path) -> None:
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(StorageError):
+        write_whole(tmp_path / "taken", b"content")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_only_a_folder_can_be_synced_as_one(tmp_path: Path) -> None:
+    sync_folder(tmp_path)
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(NotADirectoryError):
+        sync_folder(tmp_path / "file")
+    descriptors = len(os.listdir("/proc/self/fd"))
+    sync_folder(tmp_path)
+    assert len(os.listdir("/proc/self/fd")) == descriptors
+
+
+def test_an_error_of_the_system_becomes_one_that_names_the_path() -> None:
+    with pytest.raises(StorageError, match="No space left") as caught:  # noqa: SIM117
+        with storage_errors(Path("/data/x")):
+            raise OSError(28, "No space left on device")
+    assert caught.value.where == "/data/x"
+    assert "Free space" in caught.value.remedy
+    assert isinstance(caught.value.__cause__, OSError)
+
+
+def test_a_remedy_may_be_given() -> None:
+    with pytest.raises(StorageError, match="Plug it in"), storage_errors(Path("x"), "Plug it in"):
+        raise OSError(5, "Input/output error")
+
+
+@pytest.mark.parametrize(
+    "error", [StorageError("the inner one", where="inner"), FileFormatError("no"), KeyError("k")]
+)
+def test_errors_that_say_enough_pass_as_they_are(error: Exception) -> None:
+    with pytest.raises(type(error)) as caught, storage_errors(Path("outer")):
+        raise error
+    assert caught.value is error

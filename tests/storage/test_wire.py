@@ -1,0 +1,217 @@
+"""Messages of frames: the same bits at the other end, and nothing else is taken for one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError
+from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
+from storage.schema import wire_schema
+from storage.wire import FRAMES_MAX, decode, encode
+
+
+def schema_of(tiles: int) -> pa.Schema:
+    return wire_schema(
+        ArrayInfo(
+            node="bench",
+            boot_id="0" * 32,
+            tiles=tuple(
+                TileInfo(
+                    serial=f"T{i + 1:02}",
+                    mux=0x70,
+                    channel=i,
+                    coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
+                    x_m=0.014 * i,
+                    y_m=0.0,
+                    z_m=-0.15,
+                    reference=False,
+                    conversion_ms=1.6,
+                )
+                for i in range(tiles)
+            ),
+            servo=None,
+            schedule="simultaneous",
+            nominal_rate_hz=500.0,
+            utc_offset_ns=10**18,
+            clock_set=True,
+            software="test",
+            scene="test",
+            models=("unwrap", "static"),
+        )
+    )
+
+
+def frames(rows: int, tiles: int = 2, seed: int = 0, *, first: int = 0) -> FrameBatch:
+    """Any bits at all in columns without a law; `seq` and time rise."""
+    rng = np.random.default_rng(seed)
+    columns: dict[str, Any] = {}
+    for name, (dtype, per_tile) in FRAME_COLUMNS.items():
+        size = rows * tiles if per_tile else rows
+        bits = rng.integers(0, 256, size * np.dtype(dtype).itemsize, dtype=np.uint8)
+        columns[name] = bits.view(dtype).reshape((rows, tiles) if per_tile else (rows,))
+    columns["seq"] = np.arange(first, first + rows, dtype=np.uint64)
+    columns["t_mono_ns"] = np.sort(rng.integers(-(2**61), 2**61, rows))
+    return FrameBatch(**columns)
+
+
+def same(one: FrameBatch, other: FrameBatch) -> None:
+    for f in fields(FrameBatch):
+        a, b = getattr(one, f.name), getattr(other, f.name)
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), f.name
+        assert a.tobytes() == b.tobytes(), f.name
+
+
+def refused(batch: FrameBatch, match: str) -> None:
+    schema = schema_of(batch.tile_count)
+    with pytest.raises(FileFormatError, match=match):
+        decode(encode(batch, schema), schema)
+
+
+# --- the same at both ends ------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(
+    rows=st.integers(1, 40),
+    tiles=st.integers(1, 9),
+    seed=st.integers(0, 2**32 - 1),
+    first=st.sampled_from([0, 1, 10**12, 2**62 - 40]),
+)
+def test_frames_survive_the_wire_bit_by_bit(rows: int, tiles: int, seed: int, first: int) -> None:
+    batch, schema = frames(rows, tiles, seed, first=first), schema_of(tiles)
+    payload = encode(batch, schema)
+    same(decode(payload, schema), batch)
+    same(decode(memoryview(bytearray(payload)), schema), batch)
+
+
+@given(start=st.integers(0, 19), stop=st.integers(1, 20))
+def test_some_rows_of_a_message_are_a_message_again(start: int, stop: int) -> None:
+    schema, stop = schema_of(2), max(stop, start + 1)
+    received = decode(encode(frames(20), schema), schema)
+    part = received.rows(start, stop)
+    same(decode(encode(part, schema), schema), frames(20).rows(start, stop))
+
+
+def test_the_same_frames_are_the_same_bytes_and_know_nothing_of_their_neighbours() -> None:
+    schema, batch = schema_of(2), frames(20)
+    alone = replace(batch.rows(5, 9), seq=np.arange(5, 9, dtype=np.uint64))
+    assert encode(batch.rows(5, 9), schema) == encode(alone, schema)
+
+
+def test_messages_behind_the_schema_are_a_stream_that_arrow_reads_alone() -> None:
+    schema, batch = schema_of(3), frames(20, 3)
+    stream = schema.serialize().to_pybytes() + b"".join(
+        encode(batch.rows(a, a + 5), schema) for a in range(0, 20, 5)
+    )
+    table = pa.ipc.open_stream(stream).read_all()
+    assert table.column("seq").to_pylist() == list(range(20))
+    assert table.column("padc").to_pylist() == batch.padc.tolist()
+
+
+def test_frames_of_one_instant_and_the_longest_message_are_taken() -> None:
+    schema = schema_of(1)
+    batch = replace(frames(FRAMES_MAX, 1), t_mono_ns=np.full(FRAMES_MAX, 7, dtype=np.int64))
+    same(decode(encode(batch, schema), schema), batch)
+
+
+# --- refused --------------------------------------------------------------------------------------
+
+
+def test_a_message_that_is_cut_off_anywhere_is_refused() -> None:
+    schema = schema_of(2)
+    payload = encode(frames(3), schema)
+    for length in range(len(payload)):
+        with pytest.raises(FileFormatError):
+            decode(payload[:length], schema)
+
+
+def test_no_damage_does_more_than_be_refused() -> None:
+    """Flipped, overwritten, removed and repeated bytes, most of them where Arrow keeps lengths."""
+    rng, schema = np.random.default_rng(1), schema_of(2)
+    payload = encode(frames(5), schema)
+    refusals = 0
+    for _ in range(4000):
+        damaged = bytearray(payload)
+        for _ in range(int(rng.integers(1, 4))):
+            begin = 0 if rng.random() < 0.1 else 8
+            at = int(rng.integers(begin, len(damaged) if rng.random() < 0.2 else 600))
+            kind = rng.integers(5)
+            if kind == 0:
+                damaged[at] ^= 1 << int(rng.integers(8))
+            elif kind == 1:
+                damaged[at] = int(rng.choice([0, 1, 127, 128, 255]))
+            elif kind == 2:
+                damaged[at : at + 8] = rng.bytes(8)
+            elif kind == 3:
+                del damaged[at : at + int(rng.integers(1, 9))]
+            else:
+                damaged[at:at] = damaged[at : at + int(rng.integers(1, 9))]
+        try:
+            batch = decode(bytes(damaged), schema)
+        except FileFormatError:
+            refusals += 1
+        else:  # what is taken can be used: every row is there and its numbers rise
+            assert batch.padc.shape == batch.status.shape == (len(batch), 2)
+            assert (np.diff(batch.seq) == 1).all()
+            assert int(batch.padc.sum()) >= 0
+    assert refusals > 1000
+
+
+@settings(max_examples=200)
+@given(st.binary(max_size=400))
+def test_bytes_of_anything_else_are_refused(content: bytes) -> None:
+    with pytest.raises(FileFormatError):
+        decode(content, schema_of(2))
+
+
+def test_a_message_that_is_no_batch_of_records_is_refused() -> None:
+    schema = schema_of(2)
+    for payload in (schema.serialize().to_pybytes(), b"\xff\xff\xff\xff\0\0\0\0", b"PAR1" * 50):
+        with pytest.raises(FileFormatError, match="no Arrow message of frames"):
+            decode(payload, schema)
+
+
+@pytest.mark.parametrize(("sent", "known"), [(1, 2), (2, 1), (3, 4), (9, 2)])
+def test_frames_of_another_number_of_tiles_are_refused(sent: int, known: int) -> None:
+    payload = encode(frames(20, sent), schema_of(sent))
+    with pytest.raises(FileFormatError):
+        decode(payload, schema_of(known))
+
+
+def test_a_message_without_frames_is_refused() -> None:
+    refused(frames(0), "a message of 0 frames")
+
+
+def test_a_message_of_too_many_frames_is_refused() -> None:
+    refused(frames(FRAMES_MAX + 1, 1), f"a message of {FRAMES_MAX + 1} frames.*{FRAMES_MAX}")
+
+
+@pytest.mark.parametrize(
+    "seq", [(0, 1, 3), (0, 0, 1), (2, 1, 0), (5, 6, 6), (0, 1, 0), (2**64 - 2, 2**64 - 1, 0)]
+)
+def test_numbers_that_do_not_rise_by_one_are_refused(seq: Sequence[int]) -> None:
+    batch = replace(frames(3), seq=np.array(seq, dtype=np.uint64))
+    refused(batch, "do not follow one another|less than 2")
+
+
+@pytest.mark.parametrize("first", [2**62, 2**62 - 1, 2**63 - 1, 2**64 - 2])
+def test_a_number_that_no_stream_reaches_is_refused(first: int) -> None:
+    refused(frames(2, first=first), r"less than 2\^62")
+
+
+@given(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=2, max_size=6))
+def test_time_that_runs_backwards_is_refused_however_far(times: list[int]) -> None:
+    batch = replace(frames(len(times)), t_mono_ns=np.array(times, dtype=np.int64))
+    if times == sorted(times):
+        schema = schema_of(2)
+        same(decode(encode(batch, schema), schema), batch)
+    else:
+        refused(batch, "time runs backwards")
