@@ -271,6 +271,10 @@ class Nodes:
     def __iter__(self) -> Iterator[Node]:
         return iter(self._nodes.values())
 
+    def find(self, name: str) -> Node | None:
+        """The node called `name`; None if there is none."""
+        return self._nodes.get(name)
+
     def get(self, name: str) -> Node:
         """The node called `name`.
 

@@ -16,18 +16,11 @@ from datetime import UTC, datetime
 
 from devices.errors import FootTileError, StateError, UnknownError
 from devices.frames import ArrayInfo
+from service import parts
 from service.nodes import Node, Nodes
 from service.sealing import Sources, ledger_of, seal, write_events
 from storage.intervals import Intervals
-from storage.session import (
-    ClockOffset,
-    Event,
-    Ledger,
-    Part,
-    Session,
-    SessionFolder,
-    new_session_id,
-)
+from storage.session import Event, Ledger, Session, SessionFolder, new_session_id
 
 log = logging.getLogger("foottile.recorder")
 
@@ -108,11 +101,6 @@ class Recorder:
                 f"({recording[0].name})",
                 remedy="Stop it first",
             )
-        seq_first = node.last_seq + 1
-        if pre_roll_s > 0 and node.journal is not None:
-            since_t_ns = node.last_t_ns - round(pre_roll_s * 1e9)
-            reached = node.journal.first_seq_since(since_t_ns)
-            seq_first = min(seq_first, reached if reached is not None else seq_first)
         now = datetime.now(UTC)
         session = Session(
             id=new_session_id(now),
@@ -120,13 +108,13 @@ class Recorder:
             node=node_name,
             state="recording",
             started_t_ns=time.time_ns(),
-            parts=(Part(boot_id=node.boot_id, seq_first=seq_first),),
+            parts=(parts.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s),),
             subject=subject,
             notes=notes,
             tags=tags,
             scene=node.info.scene,
             missed_slots_at_start=node.missed_slots,
-            clock=_clock_rows(node),
+            clock=parts.clock_rows(node),
         )
         self._keep(session)
         return session
@@ -145,14 +133,7 @@ class Recorder:
                 f"session {session_id} was stopped already and is {session.state}",
                 expected="a session that is recording",
             )
-        stopped = session.model_copy(
-            update={"stopped_t_ns": time.time_ns(), "state": "pending", "problem": None}
-        )
-        node = self._nodes.get(session.node)
-        if node.connected and node.clock is None and node.last_seq is not None:
-            # Its instants cannot be compared with ours: end with the newest frame there is.
-            stopped = _ended(stopped, max(node.last_seq, stopped.parts[-1].seq_first))
-        self._keep(stopped)
+        self._keep(parts.stopped(session, self._nodes.find(session.node)))
         self.settle()
         return self._sessions[session_id]
 
@@ -195,29 +176,21 @@ class Recorder:
         for session in list(self._sessions.values()):
             open_here = session.parts[-1].boot_id == node.boot_id and session.node == node.name
             if open_here and session.state in ("recording", "pending"):
-                ended = self._end_part(session, node)
-                recording = ended.state == "recording"
-                self._keep(_continued(ended, node.info, new) if recording else ended)
+                self._keep(parts.after_restart(session, node, new))
 
     def note_clock(self, node: Node) -> None:
         """Keep a new measurement of a node's clock with its recordings."""
         for session in self.recording_on(node.name):
-            self._keep(session.model_copy(update={"clock": session.clock + _clock_rows(node)[-1:]}))
+            clock = session.clock + parts.clock_rows(node)
+            self._keep(session.model_copy(update={"clock": clock}))
 
     def settle(self) -> None:
         """Find the end of stopped sessions, and seal those whose frames are all there."""
-        for session in list(self._sessions.values()):
-            if session.state == "pending":
-                ended = self._with_end(session)
-                ledger = self.ledger(session.id)
-                if ended.parts[-1].seq_last is not None and not any(
-                    p.pending for p in ledger.parts
-                ):
-                    self._keep(ended.model_copy(update={"state": "sealing"}))
-            now = self._sessions[session.id]
-            due = time.monotonic() >= self._seal_after.get(session.id, 0.0)
-            if now.state == "sealing" and session.id not in self._sealing and due:
-                self._sealing[session.id] = asyncio.create_task(self._seal(session.id))
+        for session_id in list(self._sessions):
+            try:
+                self._settle(session_id)
+            except FootTileError as error:  # one that cannot be must not hold up the others
+                log.warning("session %s: %s", session_id, error)
 
     async def settled(self, session_id: str, timeout_s: float) -> Session:
         """The session once it is sealed, or as it is after `timeout_s`."""
@@ -239,20 +212,23 @@ class Recorder:
         session = self.get(session_id)
         if session.state == "sealed" and session.ledger is not None:
             return session.ledger
-        node = self._nodes.get(session.node)
-        ends = session.stopped_t_ns is not None
+        node = self._nodes.find(session.node)
+        missed = node.missed_slots - session.missed_slots_at_start if node is not None else 0
         return ledger_of(
             session,
-            {boot_id: journal.held for boot_id, journal in node.journals.items()},
-            open_boot_id=node.boot_id,
-            node_first_seq=node.node_first_seq,
-            missed_slots=max(0, node.missed_slots - session.missed_slots_at_start),
-            finished=ends,
+            {boot_id: journal.held for boot_id, journal in node.journals.items()} if node else {},
+            open_boot_id=node.boot_id if node is not None else None,
+            node_first_seq=node.node_first_seq if node is not None else 0,
+            missed_slots=max(0, missed),
+            finished=session.stopped_t_ns is not None,
         )
 
-    def nominal_rate_hz(self, session: Session) -> float:
-        """Rate of the stream it is recorded from."""
-        return self._nodes.get(session.node).info.nominal_rate_hz
+    def duration_s(self, session: Session, frames: int) -> float:
+        """How long it is: of a sealed one exactly, else by the stream's nominal rate."""
+        node = self._nodes.find(session.node)
+        if session.state == "sealed" or node is None:
+            return session.duration_s
+        return frames / node.info.nominal_rate_hz
 
     def sources(self, session_id: str) -> Sources:
         """What a session is made from, sealed or given away before.
@@ -279,43 +255,22 @@ class Recorder:
 
     def needed(self, node: str) -> dict[str, Intervals]:
         """Numbers by boot_id that unsealed sessions of a node still need in its journals."""
-        needed: dict[str, Intervals] = {}
-        for session in self._sessions.values():
-            if session.node == node and session.state != "sealed":
-                for part in session.parts:
-                    last = part.seq_last if part.seq_last is not None else 2**62
-                    if last >= part.seq_first:
-                        needed.setdefault(part.boot_id, Intervals()).add(part.seq_first, last)
-        return needed
+        return parts.needed(
+            s for s in self._sessions.values() if s.node == node and s.state != "sealed"
+        )
 
-    def _with_end(self, session: Session) -> Session:
-        """The session with the end of its last part, if the stream has passed the stop."""
-        part = session.parts[-1]
-        node = self._nodes.get(session.node)
-        journal = node.journals.get(part.boot_id)
-        if part.seq_last is not None or journal is None or session.stopped_t_ns is None:
-            return session
-        if node.clock is None:
-            return session
-        last = journal.last_seq_until(node.node_t_ns(session.stopped_t_ns), at_least=part.seq_first)
-        if last is None:
-            return session
-        return self._keep(_ended(session, last))
-
-    def _end_part(self, session: Session, node: Node) -> Session:
-        """End the last part where its stream ended; note how many frames may be missing."""
-        part = session.parts[-1]
-        if part.seq_last is not None:
-            return session
-        journal = node.journals.get(part.boot_id)
-        last = journal.held.last if journal is not None else None
-        until_t_ns = min(session.stopped_t_ns or time.time_ns(), time.time_ns())
-        seen_t_ns = node.last_seen_t_ns
-        silent_s = 0.0 if seen_t_ns is None else max(0.0, (until_t_ns - seen_t_ns) * 1e-9)
-        tail = round(silent_s * node.info.nominal_rate_hz) + 1
-        tails = {**session.unsynced_tail_max, part.boot_id: tail}
-        ended = _ended(session, max(part.seq_first - 1, last if last is not None else -1))
-        return ended.model_copy(update={"unsynced_tail_max": tails})
+    def _settle(self, session_id: str) -> None:
+        session = self._sessions[session_id]
+        if session.state == "pending":
+            session = parts.with_end(session, self._nodes.get(session.node))
+            if session is not self._sessions[session_id]:
+                self._keep(session)
+            unknown = session.parts[-1].seq_last is None
+            if not unknown and not any(p.pending for p in self.ledger(session_id).parts):
+                session = self._keep(session.model_copy(update={"state": "sealing"}))
+        due = time.monotonic() >= self._seal_after.get(session_id, 0.0)
+        if session.state == "sealing" and session_id not in self._sealing and due:
+            self._sealing[session_id] = asyncio.create_task(self._seal(session_id))
 
     async def _seal(self, session_id: str) -> None:
         try:
@@ -349,32 +304,3 @@ class Recorder:
         self._sessions[session.id] = session
         self._changed(session)
         return session
-
-
-def _ended(session: Session, seq_last: int) -> Session:
-    parts = (*session.parts[:-1], session.parts[-1].model_copy(update={"seq_last": seq_last}))
-    return session.model_copy(update={"parts": parts})
-
-
-def _continued(session: Session, before: ArrayInfo, new: ArrayInfo) -> Session:
-    """The session with a part for the node's new stream, if that has the same tiles."""
-    if before.tiles != new.tiles:
-        problem = "the node came back with other tiles: recording ended"
-        return session.model_copy(
-            update={"state": "pending", "stopped_t_ns": time.time_ns(), "problem": problem}
-        )
-    part = Part(boot_id=new.boot_id, seq_first=0)
-    return session.model_copy(update={"parts": (*session.parts, part)})
-
-
-def _clock_rows(node: Node) -> tuple[ClockOffset, ...]:
-    if node.clock is None:
-        return ()
-    return (
-        ClockOffset(
-            boot_id=node.boot_id,
-            t_mono_ns=node.clock.t_mono_ns,
-            server_minus_node_ns=node.clock.server_minus_node_ns,
-            uncertainty_ns=node.clock.uncertainty_ns,
-        ),
-    )

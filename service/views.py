@@ -191,15 +191,12 @@ class SessionView(View):
         """Of a session as it is now."""
         ledger = recorder.ledger(session.id)
         frames = sum(part.recorded for part in ledger.parts)
-        duration_s = session.duration_s
-        if session.state != "sealed" and frames:
-            duration_s = frames / recorder.nominal_rate_hz(session)
         content = session.model_dump(include=set(cls.model_fields) - {"frames", "duration_s"})
         return cls(
             **content,
             complete="lossy" if ledger.lossy else ledger.complete,
             frames=frames,
-            duration_s=duration_s,
+            duration_s=recorder.duration_s(session, frames),
         )
 
 

@@ -12,7 +12,6 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import BinaryIO
@@ -25,40 +24,11 @@ from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import storage_errors, sync_folder
 from storage.intervals import Intervals
 from storage.schema import array_info, wire_schema
+from storage.segment import SUFFIX, Entry, Segment, recover, write_all
 from storage.wire import decode, encode
 
-SUFFIX = ".arrows"
 SEGMENT_NS = 60_000_000_000
 """A segment is closed after a minute of frames: what is not needed is deleted by segments."""
-
-
-@dataclass(frozen=True, order=True)
-class _Entry:
-    """One batch in a segment."""
-
-    seq_first: int
-    seq_last: int
-    t_ns_first: int
-    t_ns_last: int
-    offset: int
-    length: int
-
-    @property
-    def frames(self) -> int:
-        return self.seq_last - self.seq_first + 1
-
-
-@dataclass
-class _Segment:
-    path: Path
-    entries: list[_Entry] = field(default_factory=list)
-
-    @property
-    def t_ns_last(self) -> int:
-        return max((entry.t_ns_last for entry in self.entries), default=0)
-
-    def holds_any(self, wanted: Intervals) -> bool:
-        return any(wanted.within(e.seq_first, e.seq_last) for e in self.entries)
 
 
 class Journal:
@@ -75,7 +45,7 @@ class Journal:
         self.held = Intervals()
         """Numbers that were appended, synced or not."""
         self._schema = wire_schema(info)
-        self._segments: list[_Segment] = []
+        self._segments: list[Segment] = []
         self._file: BinaryIO | None = None
         self._end = 0
         self._tidy = True
@@ -83,7 +53,11 @@ class Journal:
         with storage_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             for path in sorted(folder.glob("*" + SUFFIX)):
-                self._recover(path)
+                segment = recover(path, self._schema)
+                if segment is not None:
+                    self._segments.append(segment)
+                    for entry in segment.entries:
+                        self.held.add(entry.seq_first, entry.seq_last)
 
     @classmethod
     def open(cls, folder: Path) -> Journal:
@@ -258,10 +232,10 @@ class Journal:
         segment = self._segments[-1]
         self._tidy = False
         with storage_errors(segment.path):
-            _write_all(file, payload)
+            write_all(file, payload)
         self._tidy = True
         segment.entries.append(
-            _Entry(first, int(rows.seq[-1]), t_ns, int(rows.t_ns[-1]), self._end, len(payload))
+            Entry(first, int(rows.seq[-1]), t_ns, int(rows.t_ns[-1]), self._end, len(payload))
         )
         self._end += len(payload)
         self.held.add(first, int(rows.seq[-1]))
@@ -277,71 +251,12 @@ class Journal:
         with storage_errors(path):
             file = path.open("xb", buffering=0)
             try:
-                _write_all(file, header)
+                write_all(file, header)
                 sync_folder(self.folder)
             except OSError:
                 file.close()
                 path.unlink(missing_ok=True)
                 raise
         self._file, self._end = file, len(header)
-        self._segments.append(_Segment(path))
+        self._segments.append(Segment(path))
         return file
-
-    def _recover(self, path: Path) -> None:
-        """Index a segment; cut off what is not a whole message."""
-        segment = _Segment(path)
-        size = path.stat().st_size
-        with pa.OSFile(str(path), "r") as arrow_file:
-            try:
-                pa.ipc.read_schema(pa.ipc.read_message(arrow_file))
-            except (pa.ArrowException, EOFError, OSError):
-                path.unlink()  # not even its schema was written
-                return
-            end = arrow_file.tell()
-            while end < size:
-                try:
-                    pa.ipc.read_message(arrow_file)
-                    length = arrow_file.tell() - end
-                    payload = os.pread(arrow_file.fileno(), length, end)
-                    batch = decode(payload, self._schema)
-                except (pa.ArrowException, EOFError, OSError, FileFormatError):
-                    break
-                segment.entries.append(
-                    _Entry(
-                        int(batch.seq[0]),
-                        int(batch.seq[-1]),
-                        int(batch.t_ns[0]),
-                        int(batch.t_ns[-1]),
-                        end,
-                        length,
-                    )
-                )
-                self.held.add(int(batch.seq[0]), int(batch.seq[-1]))
-                end += length
-        if end < size:
-            # What cannot be read is set aside, not thrown away: it may be more than a cut message.
-            with path.open("rb") as file:
-                file.seek(end)
-                path.with_suffix(".unread").write_bytes(file.read())
-            os.truncate(path, end)
-        if not segment.entries:
-            path.unlink()
-            return
-        # A killed process leaves frames that only the kernel holds; from now on they are promised.
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-        self._segments.append(segment)
-
-
-def _write_all(file: BinaryIO, data: bytes) -> None:
-    """Write all of `data`, or leave the file as long as it was."""
-    begin = file.tell()
-    view = memoryview(data)
-    try:
-        while view:
-            view = view[file.write(view) :]
-    except OSError:
-        with suppress(OSError):
-            file.truncate(begin)
-            file.seek(begin)
-        raise

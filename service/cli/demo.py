@@ -7,7 +7,7 @@ import os
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -28,6 +28,9 @@ from service.cli.emulation import (
 from service.cli.node import calibration_of
 from service.cli.options import remark
 from service.cli.serve import announce
+
+if TYPE_CHECKING:
+    from service.server import Server
 
 NODE = "demo"
 _SEAL_S = 20.0
@@ -144,11 +147,7 @@ async def _start_node(
     )
 
 
-async def _stop_recording(server: object) -> None:
-    from service.server import Server
-
-    if not isinstance(server, Server):
-        return
+async def _stop_recording(server: Server) -> None:
     for session in server.recorder.recording_on(NODE):
         server.recorder.stop(session.id)
         sealed = await server.recorder.settled(session.id, _SEAL_S)

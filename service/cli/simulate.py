@@ -9,6 +9,17 @@ import typer
 
 from devices.errors import UsageError
 from devices.scene import Scene, ScheduleName, load_scene
+from service.cli.emulation import (
+    CopAxesOption,
+    CopOffsetOption,
+    CopScaleOption,
+    LeadOption,
+    LoadOption,
+    LoadScaleOption,
+    PartsSeedOption,
+    SeedOption,
+    check_load,
+)
 from service.cli.options import (
     JsonOption,
     output_path,
@@ -36,28 +47,20 @@ def simulate_command(
         float | None,
         typer.Option(help="Length, lead included; default: that of the load or programme."),
     ] = None,
-    load: Annotated[
-        Path | None, typer.Option(help="Recorded load to press instead of the scene's ground.")
-    ] = None,
-    load_scale: Annotated[float, typer.Option(help="Factor on every force of the load.")] = 1.0,
-    cop_scale: Annotated[
-        float, typer.Option(help="Factor on the load's COP about its mean.")
-    ] = 1.0,
-    cop_offset_m: Annotated[
-        str, typer.Option(metavar="X,Y", help="Where the load's mean COP comes to lie.")
-    ] = "0,0",
-    cop_axes: Annotated[
-        str, typer.Option(help="Axes of the load that become x and y: xy, yx, -yx, ...")
-    ] = "xy",
-    lead_s: Annotated[float, typer.Option(help="Seconds without load first: the tare.")] = 1.0,
+    load: LoadOption = None,
+    load_scale: LoadScaleOption = 1.0,
+    cop_scale: CopScaleOption = 1.0,
+    cop_offset_m: CopOffsetOption = "0,0",
+    cop_axes: CopAxesOption = "xy",
+    lead_s: LeadOption = 1.0,
     schedule: Annotated[
         str | None, typer.Option(help="sequential or simultaneous; default: the scene's.")
     ] = None,
     tiles: Annotated[
         str | None, typer.Option(help="Indentation only: serials to press, T01,T02,...")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Draws noise and ground, not the parts.")] = 0,
-    parts_seed: Annotated[int, typer.Option(min=0, help="Draws other parts.")] = 0,
+    seed: SeedOption = 0,
+    parts_seed: PartsSeedOption = 0,
     truth: Annotated[
         bool, typer.Option("--truth", help="Add the true_* columns and print the error.")
     ] = False,
@@ -179,11 +182,6 @@ def _check(
             "emulates",
             remedy='Set servo.port = "emulated"',
         )
-    for option, value, least in (
-        ("--seconds", 1.0 if seconds is None else seconds, 0.0),
-        ("--load-scale", load_scale, 0.0),
-        ("--cop-scale", cop_scale, None),
-        ("--lead-s", lead_s, -1e-9),
-    ):
-        if not abs(value) < 1e9 or (least is not None and value <= least):
-            raise UsageError(f"{option} {value:g}", expected="a sensible positive number")
+    if seconds is not None and not 0.0 < seconds < 1e9:
+        raise UsageError(f"--seconds {seconds:g}", expected="a sensible positive number")
+    check_load(load_scale, cop_scale, lead_s)

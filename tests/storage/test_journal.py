@@ -498,14 +498,14 @@ def test_a_disk_that_neither_takes_nor_gives_back_leaves_all_whole_messages(
 ) -> None:
     """A write that stops halfway and cannot be taken back: the next begins another segment."""
     journal = filled(tmp_path, (0, 9))
-    whole = journal_module._write_all
+    whole = journal_module.write_all
 
     def halfway(file: Any, data: bytes) -> None:
         whole(file, data[: len(data) // 2])
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(journal_module, "_write_all", halfway)
+        patch.setattr(journal_module, "write_all", halfway)
         with pytest.raises(StorageError, match="No space left"):
             journal.append(part(10, 19))
     assert_holds(journal, set(range(10)))
@@ -523,7 +523,7 @@ def test_a_disk_that_fills_between_the_gaps_of_a_batch_holds_what_was_written_an
 ) -> None:
     """A batch that fills three gaps is three writes."""
     journal, held = filled(tmp_path, (5, 9), (15, 19)), {*range(5, 10), *range(15, 20)}
-    whole, writes = journal_module._write_all, 0
+    whole, writes = journal_module.write_all, 0
 
     def full(file: Any, data: bytes) -> None:
         nonlocal writes
@@ -533,7 +533,7 @@ def test_a_disk_that_fills_between_the_gaps_of_a_batch_holds_what_was_written_an
         whole(file, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr(journal_module, "_write_all", full)
+        patch.setattr(journal_module, "write_all", full)
         with pytest.raises(StorageError):
             journal.append(part(0, 29))
     assert_holds(journal, held | set(range(10 * written)))
