@@ -28,6 +28,9 @@ from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 BATCH_NS = 25_000_000
 """Length of a batch: at 10 ms two fifths of a message would be header (performance.md)."""
 
+STALLED_AFTER = 3
+"""Without a rate of its own, a loop that takes so many periods more than usual has been stalled."""
+
 _BATCH_FRAMES_MAX = 64
 _AGE_MAX_US = 2**31 - 1
 
@@ -51,7 +54,18 @@ class ReferenceSource(Protocol):
 
 
 class Acquisition:
-    """One stream of frames: `seq` counts from 0, `t_ns` is `t_mono_ns` plus one fixed anchor."""
+    """One stream of frames: `seq` counts from 0, `t_ns` is `t_mono_ns` plus one fixed anchor.
+
+    Args:
+        array: what is scanned.
+        tiles: as it identified them.
+        clock: virtual or real.
+        anchor: the stream's UTC.
+        rate_hz: frames a second; 0: as fast as the schedule allows.
+        expected_hz: what rate that is, to tell when the loop was stalled; 0: do not tell.
+        servo: its position goes with the frames.
+        reference: its force goes with the frames.
+    """
 
     def __init__(
         self,
@@ -61,6 +75,7 @@ class Acquisition:
         anchor: UtcAnchor,
         *,
         rate_hz: float = 0.0,
+        expected_hz: float = 0.0,
         servo: ServoSource | None = None,
         reference: ReferenceSource | None = None,
     ) -> None:
@@ -70,6 +85,7 @@ class Acquisition:
         self._clock = clock
         self._anchor = anchor
         self._period_ns = round(1e9 / rate_hz) if rate_hz else 0
+        self._expected_ns = round(1e9 / expected_hz) if expected_hz else 0
         self._servo = servo
         self._reference = reference
         self._compensation = Compensation(tiles)
@@ -99,6 +115,13 @@ class Acquisition:
                         frame_status |= FrameStatus.OVERRUN
                     self._clock.sleep_until_ns(slot_ns)
                     slot_ns += self._period_ns
+                elif self._expected_ns:
+                    now_ns = self._clock.now_ns()
+                    missed = (now_ns - slot_ns) // self._expected_ns - 1
+                    if missed >= STALLED_AFTER:
+                        self.missed_slots += missed
+                        frame_status |= FrameStatus.OVERRUN
+                    slot_ns = now_ns
                 self._fill(columns, row, self._array.scan(), frame_status)
                 row += 1
             if row:

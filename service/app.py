@@ -14,7 +14,7 @@ from starlette.websockets import WebSocket
 from service import problems
 from service.guard import Guard
 from service.ingest import ingest
-from service.link import INGEST_PATH
+from service.link import INGEST_PATH, LIVE_PATH
 from service.page import page_folder
 from service.routes import access, data, health, nodes, sessions
 from service.routes.live import live
@@ -75,7 +75,7 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
         api.include_router(module.router)
     app.include_router(api)
 
-    @app.websocket(f"{API}/live")
+    @app.websocket(LIVE_PATH)
     async def live_socket(socket: WebSocket) -> None:
         await live(socket, server)
 

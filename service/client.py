@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -76,6 +77,10 @@ class Client:
             StateError: the session is not sealed.
             StorageError: it cannot be written.
         """
+        if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
+            raise UsageError(
+                f"{session_id!r} is no session id", remedy="List them with `foottile sessions`"
+            )
         session = self._get(f"/sessions/{session_id}")
         if session["sha256"] is None:
             raise StateError(

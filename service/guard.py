@@ -16,7 +16,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.link import INGEST_PATH
+from service.link import LIVE_PATH
 from service.problems import problem
 
 BODY_BYTES_MAX = 64 << 10
@@ -67,15 +67,18 @@ class Guard:
             return HTTPStatus.FORBIDDEN, what
         websocket = scope["type"] == "websocket"
         changes = not websocket and scope["method"] not in SAFE_METHODS
-        origin = headers.get("origin")
-        if (websocket or changes) and origin is not None and _netloc(origin) != host:
-            what = f"Origin {origin[:80]!r} is another site than {host[:80]!r}"
-            return HTTPStatus.FORBIDDEN, what
+        for origin in headers.getlist("origin") if websocket or changes else ():
+            if _netloc(origin) != host:
+                what = f"Origin {origin[:80]!r} is another site than {host[:80]!r}"
+                return HTTPStatus.FORBIDDEN, what
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > BODY_BYTES_MAX:
             what = f"A body of {length[:20]} bytes; at most {BODY_BYTES_MAX} are taken"
             return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, what
-        needs_token = changes or scope["path"] == INGEST_PATH
+        if any(ord(character) < ord(" ") for character in scope["path"]):
+            return HTTPStatus.BAD_REQUEST, "The path has control characters in it"
+        # Every websocket but the live one, so that no other way of writing a path is a way in.
+        needs_token = changes or (websocket and scope["path"] != LIVE_PATH)
         if needs_token and self._token is not None and not self._has_token(headers):
             what = "This needs the server's token: Authorization: Bearer TOKEN"
             return HTTPStatus.UNAUTHORIZED, what

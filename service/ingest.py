@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from contextlib import suppress
 
 from pydantic import ValidationError
@@ -26,6 +25,7 @@ from service.link import (
     close_reason,
 )
 from service.server import Link, Server
+from service.steady import utc_ns
 
 log = logging.getLogger("foottile.ingest")
 
@@ -95,7 +95,11 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
     beyond = max(hello.first_seq, (held.last + 1) if held.last is not None else 0)
     closed = [(a, b) for a, b in lacks if b < beyond]
     welcome = Welcome(protocol=PROTOCOL, lacks=(*closed, (beyond, None)))
-    await socket.send_text(welcome.model_dump_json())
+    try:
+        await socket.send_text(welcome.model_dump_json())
+    except BaseException:  # it went away before it was welcomed
+        _leave(server, link)
+        raise
     log.info("node %s connected, stream %s", name, boot_id)
     server.tell_node(node)
     return link
@@ -126,7 +130,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
         if isinstance(message, bytes):
             tare_before = node.live.tare
             try:
-                seq_first, seq_last, due = node.take(message, time.time_ns())
+                seq_first, seq_last, due = node.take(message, utc_ns())
             except FileFormatError as error:
                 raise _HangUp(Close.MALFORMED, f"node {node.name!r}: {error}") from error
             if node.storage_problem is None:
@@ -138,7 +142,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
         said = _parse(message, Close.MALFORMED)
         match said:
             case Probe(id=number):
-                answer = Probe(id=number, server_t_ns=time.time_ns())
+                answer = Probe(id=number, server_t_ns=utc_ns())
                 await socket.send_text(answer.model_dump_json())
             case ClockRow():
                 node.clock = said

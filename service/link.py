@@ -25,6 +25,7 @@ from service.estimation.calibration import Calibration
 SUBPROTOCOL = "foottile.v1"
 PROTOCOL = 1
 INGEST_PATH = "/api/v1/ingest"
+LIVE_PATH = "/api/v1/live"
 MESSAGE_BYTES_MAX = 1 << 20
 """Longest message either side takes. A batch of 64 tiles is 0.1 MB."""
 SILENCE_S = 5.0

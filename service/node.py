@@ -68,6 +68,7 @@ async def run_node(
             report=report,
         )
         publishing = asyncio.create_task(publisher.run())
+        publishing.add_done_callback(lambda task: _tell_failure(task, messages))
         stopping.add_done_callback(lambda _: acquisition.stop())
         while not isinstance(message := await messages.get(), Failed):
             if isinstance(message, Batch):
@@ -84,6 +85,12 @@ async def run_node(
             await asyncio.gather(task, return_exceptions=True)
         await asyncio.to_thread(acquisition.close)
     return backlog.next_seq - backlog.first_seq
+
+
+def _tell_failure(task: asyncio.Task[None], messages: asyncio.Queue[Message]) -> None:
+    """A publisher that failed for good ends the node: better that than to go on in silence."""
+    if not task.cancelled() and task.exception() is not None:
+        messages.put_nowait(Failed(task.exception()))
 
 
 async def _started(

@@ -103,24 +103,22 @@ class Node:
         )
 
     def attach(self, hello: Hello) -> Intervals:
-        """The node has connected; gives what the server holds of its stream.
-
-        Raises:
-            StorageError: what it said cannot be kept.
-        """
+        """The node has connected; gives what the server holds of its stream."""
         if hello.array_info.boot_id != self.boot_id or self.last_seq is None:
             self.last_seq = self.last_t_ns = None
             self.lost_frames = 0
             self.clock = None
             self._pace.clear()
         known = (self.hello.array_info, self.hello.calibration)
-        self._schema = wire_schema(hello.array_info)
-        fresh = (hello.array_info, hello.calibration) != known
         self.hello = hello
         self.node_first_seq = hello.first_seq
-        self.keep()
-        if fresh:
+        if known != (hello.array_info, hello.calibration):
+            self._schema = wire_schema(hello.array_info)
             self.live = self._live_estimates()
+        try:
+            self.keep()
+        except StorageError as error:  # the picture goes on; what is sent is not acknowledged
+            self.storage_problem = str(error)
         journal = self.journal
         return journal.held if journal is not None else Intervals()
 

@@ -6,11 +6,12 @@ was stopped, by the server's clock; a node that is switched on anew adds a part.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 
 from devices.frames import ArrayInfo
+from service.estimation.tare import Tare
 from service.nodes import Node
+from service.steady import utc_ns
 from storage.intervals import Intervals
 from storage.session import ClockOffset, Part, Session
 
@@ -34,7 +35,7 @@ def ended(session: Session, seq_last: int) -> Session:
 
 def stopped(session: Session, node: Node | None) -> Session:
     """The session, stopped at this instant; its end is open until the stream has passed it."""
-    update = {"stopped_t_ns": time.time_ns(), "state": "pending", "problem": None}
+    update = {"stopped_t_ns": utc_ns(), "state": "pending", "problem": None}
     session = session.model_copy(update=update)
     comparable = node is None or node.clock is not None or not node.connected
     if comparable or node is None or node.last_seq is None:
@@ -67,7 +68,7 @@ def after_restart(session: Session, node: Node, new: ArrayInfo) -> Session:
     if node.info.tiles != new.tiles:
         problem = "the node came back with other tiles: recording ended"
         return session.model_copy(
-            update={"state": "pending", "stopped_t_ns": time.time_ns(), "problem": problem}
+            update={"state": "pending", "stopped_t_ns": utc_ns(), "problem": problem}
         )
     part = Part(boot_id=new.boot_id, seq_first=0)
     return session.model_copy(update={"parts": (*session.parts, part)})
@@ -84,6 +85,31 @@ def needed(sessions: Iterable[Session]) -> dict[str, Intervals]:
     return numbers
 
 
+def tares_of(session: Session, node: Node, info: ArrayInfo) -> tuple[tuple[Tare, ...], str | None]:
+    """Tares that were in force while it was recorded, by the frames' own instants.
+
+    Returns:
+        The tares, oldest first; none, and a reason, if there are tares, but none of that time.
+    """
+    first, last = session.parts[0], session.parts[-1]
+    begin = _instant(node, first.boot_id, first.seq_first, newest=False)
+    end = _instant(node, last.boot_id, last.seq_last, newest=True)
+    if begin is None or end is None:
+        return (), None
+    tares = node.tares.during(info, begin, end)
+    if not tares and node.tares.in_force(info) is not None:
+        return (), "all tares of the node were taken after this session"
+    return tares, None
+
+
+def _instant(node: Node, boot_id: str, seq: int | None, *, newest: bool) -> int | None:
+    """Node's UTC of a frame, or of the nearest one that is held."""
+    journal = node.journals.get(boot_id)
+    if journal is None:
+        return None
+    return journal.t_ns_near(seq if seq is not None else _NO_END, newest=newest)
+
+
 def clock_rows(node: Node) -> tuple[ClockOffset, ...]:
     """The newest measurement of a node's clock, if there is one."""
     if node.clock is None:
@@ -98,8 +124,13 @@ def _end_of_stream(session: Session, node: Node) -> Session:
         return session
     journal = node.journals.get(part.boot_id)
     last = journal.held.last if journal is not None else None
-    until_t_ns = min(session.stopped_t_ns or time.time_ns(), time.time_ns())
+    until_t_ns = min(session.stopped_t_ns or utc_ns(), utc_ns())
     seen_t_ns = node.last_seen_t_ns
+    if seen_t_ns is None and journal is not None and last is not None:
+        # The server was restarted since: what it still knows is when the newest frame was taken.
+        taken_t_ns = journal.t_ns_near(last, newest=True)
+        offset_ns = session.clock[-1].server_minus_node_ns if session.clock else 0
+        seen_t_ns = None if taken_t_ns is None else taken_t_ns + offset_ns
     silent_s = 0.0 if seen_t_ns is None else max(0.0, (until_t_ns - seen_t_ns) * 1e-9)
     tail = round(silent_s * node.info.nominal_rate_hz) + 1
     tails = {**session.unsynced_tail_max, part.boot_id: tail}

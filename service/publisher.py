@@ -15,7 +15,7 @@ from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import ValidationError
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
 from devices.errors import LinkError, UsageError
 from service.backlog import Backlog
@@ -39,6 +39,7 @@ PROBE_EVERY_S = 10.0
 STATUS_EVERY_S = 1.0
 _BACK_OFF_S = (0.2, 3.0)
 _DRAIN_S = 3.0
+_UNAUTHORISED = 401
 
 
 class Publisher:
@@ -101,7 +102,7 @@ class Publisher:
                     wait_s = _BACK_OFF_S[0]
                     self._connected = True
                     await self._serve(socket, welcome)
-            except* (OSError, TimeoutError, InvalidHandshake, ConnectionClosed, LinkError) as group:
+            except* (OSError, ValueError, WebSocketException) as group:
                 self._say(f"not connected to {self._url}: {_reason(group)}; trying again")
             self._connected = False
             await asyncio.sleep(wait_s * random.uniform(0.5, 1.0))  # noqa: S311  # no secret
@@ -243,6 +244,8 @@ def _reason(group: BaseExceptionGroup[Exception]) -> str:
         error = error.exceptions[0]
     if isinstance(error, ConnectionClosed) and error.rcvd is not None:
         return error.rcvd.reason or f"closed with code {error.rcvd.code}"
+    if isinstance(error, InvalidStatus) and error.response.status_code == _UNAUTHORISED:
+        return "the server wants its token: set FOOTTILE_TOKEN to the one `foottile serve` prints"
     if isinstance(error, InvalidStatus):
         said = error.response.body.decode(errors="replace")[:300] if error.response.body else ""
         return f"HTTP {error.response.status_code} {said}".strip()

@@ -17,14 +17,17 @@ from datetime import UTC, datetime
 from devices.errors import FootTileError, StateError, UnknownError
 from devices.frames import ArrayInfo
 from service import parts
+from service.estimation.calibration import Calibration
 from service.nodes import Node, Nodes
 from service.sealing import Sources, ledger_of, seal, write_events
+from service.steady import utc_ns
 from storage.intervals import Intervals
 from storage.session import Event, Ledger, Session, SessionFolder, new_session_id
 
 log = logging.getLogger("foottile.recorder")
 
 _SEAL_AGAIN_S = 10.0
+BEHIND_S = 2.0
 
 
 class Recorder:
@@ -47,7 +50,8 @@ class Recorder:
         self._changed = changed
         self._sessions: dict[str, Session] = {}
         self._sealing: dict[str, asyncio.Task[None]] = {}
-        self._seal_after: dict[str, float] = {}
+        self._again_after: dict[str, float] = {}
+        self._not_sealed: dict[str, str] = {}
         for session_id in folder.ids():
             try:
                 self._sessions[session_id] = folder.load(session_id)
@@ -95,24 +99,34 @@ class Recorder:
             raise StateError(
                 f"node {node_name!r} is not sending", remedy="Record when it is connected"
             )
+        behind_s = (node.node_t_ns(utc_ns()) - node.last_t_ns) * 1e-9
+        if node.clock is not None and behind_s > BEHIND_S:
+            raise StateError(
+                f"node {node_name!r} is {behind_s:.1f} s behind: it is sending what it took while "
+                "the link was down",
+                remedy="Record when it has caught up, in a few seconds",
+            )
         if recording := self.recording_on(node_name):
             raise StateError(
                 f"node {node_name!r} is being recorded already: session {recording[0].id} "
                 f"({recording[0].name})",
                 remedy="Stop it first",
             )
+        calibration = node.live.calibration
         now = datetime.now(UTC)
         session = Session(
             id=new_session_id(now),
             name=name,
             node=node_name,
             state="recording",
-            started_t_ns=time.time_ns(),
+            started_t_ns=utc_ns(),
             parts=(parts.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s),),
             subject=subject,
             notes=notes,
             tags=tags,
             scene=node.info.scene,
+            scene_content=node.hello.scene,
+            calibration=calibration.model_dump(mode="json") if calibration is not None else None,
             missed_slots_at_start=node.missed_slots,
             clock=parts.clock_rows(node),
         )
@@ -157,7 +171,7 @@ class Recorder:
         """
         session = self.get(session_id)
         event = Event(
-            id=uuid.uuid4().hex[:12], label=label, t_ns=time.time_ns() if t_ns is None else t_ns
+            id=uuid.uuid4().hex[:12], label=label, t_ns=utc_ns() if t_ns is None else t_ns
         )
         session = session.model_copy(update={"events": (*session.events, event)})
         self._keep(session)
@@ -187,10 +201,13 @@ class Recorder:
     def settle(self) -> None:
         """Find the end of stopped sessions, and seal those whose frames are all there."""
         for session_id in list(self._sessions):
+            if time.monotonic() < self._again_after.get(session_id, 0.0):
+                continue
             try:
                 self._settle(session_id)
             except FootTileError as error:  # one that cannot be must not hold up the others
                 log.warning("session %s: %s", session_id, error)
+                self._again_after[session_id] = time.monotonic() + _SEAL_AGAIN_S
 
     async def settled(self, session_id: str, timeout_s: float) -> Session:
         """The session once it is sealed, or as it is after `timeout_s`."""
@@ -223,6 +240,10 @@ class Recorder:
             finished=session.stopped_t_ns is not None,
         )
 
+    def problem_of(self, session: Session) -> str | None:
+        """What a person should know of a session as it is now."""
+        return self._not_sealed.get(session.id, session.problem)
+
     def duration_s(self, session: Session, frames: int) -> float:
         """How long it is: of a sealed one exactly, else by the stream's nominal rate."""
         node = self._nodes.find(session.node)
@@ -240,17 +261,20 @@ class Recorder:
         node = self._nodes.get(session.node)
         first = node.journals.get(session.parts[0].boot_id)
         info = first.info if first is not None else node.info
-        frames = first.read(session.parts[0].seq_first, 2**62) if first is not None else iter(())
-        begun = next(frames, None)
-        begin_ns = node.node_t_ns(session.started_t_ns) if begun is None else int(begun.t_ns[0])
-        end_ns = node.node_t_ns(session.stopped_t_ns or time.time_ns())
+        tares, problem = parts.tares_of(session, node, info)
+        calibration = None
+        if session.calibration is None:
+            problem = "the node had no calibration"
+        elif problem is None:
+            calibration = Calibration.model_validate(session.calibration)
         return Sources(
             session=session,
             info=info,
             journals=dict(node.journals),
-            calibration=node.hello.calibration,
-            tares=node.tares.during(info, begin_ns, end_ns),
-            notes={"scene": node.hello.scene, "emulated": node.hello.emulated},
+            calibration=calibration,
+            problem=problem,
+            tares=tares,
+            notes={"scene": session.scene_content, "emulated": node.hello.emulated},
         )
 
     def needed(self, node: str) -> dict[str, Intervals]:
@@ -268,8 +292,7 @@ class Recorder:
             unknown = session.parts[-1].seq_last is None
             if not unknown and not any(p.pending for p in self.ledger(session_id).parts):
                 session = self._keep(session.model_copy(update={"state": "sealing"}))
-        due = time.monotonic() >= self._seal_after.get(session_id, 0.0)
-        if session.state == "sealing" and session_id not in self._sealing and due:
+        if session.state == "sealing" and session_id not in self._sealing:
             self._sealing[session_id] = asyncio.create_task(self._seal(session_id))
 
     async def _seal(self, session_id: str) -> None:
@@ -285,16 +308,14 @@ class Recorder:
             people = {n: getattr(now, n) for n in ("name", "subject", "notes", "tags", "events")}
             if now.events != sealed.events:
                 write_events(now, self.folder.path(session_id))
+            self._not_sealed.pop(session_id, None)
             self._keep(sealed.model_copy(update=people))
         except Exception as error:
             if not isinstance(error, FootTileError):
                 log.exception("session %s: this is a bug", session_id)
             log.warning("session %s cannot be sealed: %s", session_id, error)
-            self._seal_after[session_id] = time.monotonic() + _SEAL_AGAIN_S
-            now = self._sessions[session_id]
-            self._sessions[session_id] = now.model_copy(
-                update={"problem": f"cannot be sealed yet, and is tried again: {error}"}
-            )
+            self._again_after[session_id] = time.monotonic() + _SEAL_AGAIN_S
+            self._not_sealed[session_id] = f"cannot be sealed yet, and is tried again: {error}"
             self._changed(self._sessions[session_id])
         finally:
             del self._sealing[session_id]

@@ -97,6 +97,7 @@ class Rig:
             self._clock,
             anchor,
             rate_hz=scene.rate_hz,
+            expected_hz=bus_hz,
             servo=servo,
             reference=world.mill if world is not None and options.emulated else None,
         )

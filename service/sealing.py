@@ -40,6 +40,7 @@ class Sources:
         info: description of the array in its first part.
         journals: by boot_id.
         calibration: to estimate with; None: raw frames only.
+        problem: why there is none.
         tares: that were in force, oldest first.
         notes: more for the file's metadata.
     """
@@ -48,6 +49,7 @@ class Sources:
     info: ArrayInfo
     journals: Mapping[str, Journal]
     calibration: Calibration | None
+    problem: str | None
     tares: tuple[Tare, ...]
     notes: Mapping[str, object]
 
@@ -67,7 +69,7 @@ class SessionFrames:
     def __iter__(self) -> Iterator[tuple[FrameBatch, Columns]]:
         sources = self._sources
         if sources.calibration is None:
-            self.problem = "no estimates: the node named no calibration"
+            self.problem = f"no estimates: {sources.problem}"
             yield from self._raw()
             return
         options = EstimateOptions(
@@ -147,7 +149,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
     return session.model_copy(
         update={
             "state": "sealed",
-            "problem": frames.problem,
+            "problem": "; ".join(filter(None, (session.problem, frames.problem))) or None,
             "ledger": ledger,
             "frames": count,
             "duration_s": duration_ns * 1e-9,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 import signal
 import socket
@@ -48,11 +49,24 @@ def listen(host: str, port: int) -> socket.socket:
     return listening
 
 
-def url_of(listening: socket.socket, host: str) -> str:
-    """Address for a browser on this machine."""
+def urls_of(listening: socket.socket, host: str) -> list[str]:
+    """Addresses under which it is reached, from other machines first if they can."""
     port = listening.getsockname()[1]
-    name = "127.0.0.1" if host in ("0.0.0.0", "::", "") else host  # noqa: S104  # compared only
-    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
+    names = [host]
+    if host in ("0.0.0.0", "::", ""):  # noqa: S104  # compared only
+        names = [*_own_addresses(), "127.0.0.1"]
+    return [f"http://[{n}]:{port}" if ":" in n else f"http://{n}:{port}" for n in names]
+
+
+def _own_addresses() -> list[str]:
+    """This machine's address towards other networks, if it is in one."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            # Nothing is sent: connecting a datagram socket only chooses the way out.
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return []
+        return [name for name in (probe.getsockname()[0],) if not is_loopback(name)]
 
 
 def token_for(host: str, given: str | None, data: Path) -> str | None:
@@ -88,6 +102,7 @@ async def serving(app: FastAPI, listening: socket.socket) -> AsyncIterator[None]
         ws_ping_timeout=20.0,
         timeout_graceful_shutdown=_GRACE_S,
     )
+    logging.getLogger("uvicorn.error").addFilter(_is_news)
     server = _Server(config)
     task = asyncio.create_task(server.serve([listening]))
     try:
@@ -99,6 +114,11 @@ async def serving(app: FastAPI, listening: socket.socket) -> AsyncIterator[None]
     finally:
         server.should_exit = True
         await task
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    # We refuse a handshake with an HTTP answer that says why; uvicorn takes that for a mistake.
+    return "without completing handshake" not in record.getMessage()
 
 
 class _Server(uvicorn.Server):

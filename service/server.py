@@ -14,6 +14,7 @@ from service.link import Ack, Close
 from service.live import Hub
 from service.nodes import Node, Nodes
 from service.recorder import Recorder
+from service.steady import utc_ns
 from service.views import NodeView, SessionView
 from storage.durable import storage_errors, write_whole
 from storage.intervals import Intervals
@@ -25,6 +26,7 @@ TICK_S = 0.2
 """How often frames are synced and acknowledged: a server that is killed has not promised more."""
 _SLOW_TICK_S = 1.0
 _PRUNE_EVERY_S = 30.0
+_PROBE_BYTES = 64 << 10
 
 
 class Link:
@@ -111,7 +113,8 @@ class Server:
         Raises:
             StorageError: it cannot.
         """
-        write_whole(self.data / ".writable", b"")
+        # As much as some seconds of frames: on a full disk an empty file can still be written.
+        write_whole(self.data / ".writable", bytes(_PROBE_BYTES))
 
     def tell_node(self, node: Node) -> None:
         """Tell every screen how a node is."""
@@ -127,7 +130,7 @@ class Server:
         self.hub.notice(
             {
                 "type": "heartbeat",
-                "t_ns": time.time_ns(),
+                "t_ns": utc_ns(),
                 "last_seq": max(last, default=None),
                 "nodes": {
                     node.name: {
@@ -162,6 +165,9 @@ class Server:
             link.node.storage_problem = str(error)
             for first, last in waiting:
                 link.unsynced.add(first, last)
+            # The kernel may forget what it could not write: the node has to send it again.
+            journal.disown(link.unsynced)
+            link.unsynced = Intervals()
             return
         for first, last in waiting:
             try:

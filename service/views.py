@@ -191,11 +191,14 @@ class SessionView(View):
         """Of a session as it is now."""
         ledger = recorder.ledger(session.id)
         frames = sum(part.recorded for part in ledger.parts)
-        content = session.model_dump(include=set(cls.model_fields) - {"frames", "duration_s"})
+        content = session.model_dump(
+            include=set(cls.model_fields) - {"frames", "duration_s", "problem"}
+        )
         return cls(
             **content,
             complete="lossy" if ledger.lossy else ledger.complete,
             frames=frames,
+            problem=recorder.problem_of(session),
             duration_s=recorder.duration_s(session, frames),
         )
 

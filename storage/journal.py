@@ -55,9 +55,7 @@ class Journal:
             for path in sorted(folder.glob("*" + SUFFIX)):
                 segment = recover(path, self._schema)
                 if segment is not None:
-                    self._segments.append(segment)
-                    for entry in segment.entries:
-                        self.held.add(entry.seq_first, entry.seq_last)
+                    self._index(segment)
 
     @classmethod
     def open(cls, folder: Path) -> Journal:
@@ -115,6 +113,18 @@ class Journal:
             finally:
                 os.close(descriptor)
 
+    def disown(self, numbers: Intervals) -> None:
+        """Hold batches within `numbers` no longer: they could not be synced, and may be lost."""
+        for segment in self._segments:
+            segment.entries = [
+                entry
+                for entry in segment.entries
+                if numbers.missing(entry.seq_first, entry.seq_last)
+            ]
+        left = (entry for segment in self._segments for entry in segment.entries)
+        self.held = Intervals((entry.seq_first, entry.seq_last) for entry in left)
+        self._tidy = False  # go on in a new segment
+
     def read(self, seq_first: int, seq_last: int) -> Iterator[FrameBatch]:
         """Frames from `seq_first` to `seq_last` that are held, in order, a batch at a time.
 
@@ -162,6 +172,18 @@ class Journal:
             if entry.t_ns_last >= t_ns
         ]
         return min(young, default=None)
+
+    def t_ns_near(self, seq: int, *, newest: bool) -> int | None:
+        """Node's UTC of the newest frame held up to `seq`, or of the oldest from `seq` on.
+
+        By whole batches; None if there is no such frame.
+        """
+        entries = [entry for segment in self._segments for entry in segment.entries]
+        if newest:
+            found = [entry for entry in entries if entry.seq_first <= seq]
+            return max(found, key=lambda e: e.seq_last).t_ns_last if found else None
+        found = [entry for entry in entries if entry.seq_last >= seq]
+        return min(found, key=lambda e: e.seq_first).t_ns_first if found else None
 
     def last_seq_until(self, t_ns: int, *, at_least: int) -> int | None:
         """The last number taken at `t_ns` or before, if frames after `t_ns` are held too.
@@ -217,6 +239,16 @@ class Journal:
                 finally:
                     self._file.close()
                     self._file = None
+
+    def _index(self, segment: Segment) -> None:
+        """Take in a segment that was there; what was disowned once may be in two of them."""
+        new = []
+        for entry in segment.entries:
+            if self.held.missing(entry.seq_first, entry.seq_last).count == entry.frames:
+                self.held.add(entry.seq_first, entry.seq_last)
+                new.append(entry)
+        segment.entries = new
+        self._segments.append(segment)
 
     def _write(self, rows: FrameBatch, payload: bytes | None) -> None:
         payload = encode(rows, self._schema) if payload is None else payload

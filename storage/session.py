@@ -11,7 +11,7 @@ import secrets
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -92,6 +92,10 @@ class Session(_Record):
     notes: str = ""
     tags: tuple[str, ...] = ()
     scene: str
+    scene_content: dict[str, Any] = Field(default_factory=dict)
+    """The scene file of the node when it was started."""
+    calibration: dict[str, Any] | None = None
+    """The calibration in use when it was started; a later one does not change a recording."""
     events: tuple[Event, ...] = ()
     clock: tuple[ClockOffset, ...] = ()
     missed_slots_at_start: int = 0

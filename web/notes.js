@@ -71,7 +71,8 @@ function standing(node, frame, serverNowMs) {
     if (node.tare_problem) notes.push(`Tare: ${node.tare_problem}`);
     if (bits & ESTIMATE.TARE_OLD) notes.push(`Tare is old (${tareAge(tare, serverNowMs)}): lift the foot, press Tare.`);
   }
-  if (node.clock_set === false) notes.push("Clock of the node not set: dates may be wrong.");
+  // An emulated node runs on this machine, and its date is nobody's concern.
+  if (node.clock_set === false && !node.emulated) notes.push("Clock of the node not set: dates may be wrong.");
   return notes;
 }
 

@@ -104,7 +104,7 @@ async def _demo(
     host: str, port: int, data: Path, seconds: float | None, node_arguments: list[str]
 ) -> None:
     from service.app import make_app
-    from service.serve import listen, serving, stop_on_signals, token_for, url_of
+    from service.serve import listen, serving, stop_on_signals, token_for, urls_of
     from service.server import Server
 
     stop = stop_on_signals()
@@ -112,10 +112,11 @@ async def _demo(
         server = Server(data)
         token = token_for(host, os.environ.get("FOOTTILE_TOKEN"), data)
         async with serving(make_app(server, token=token), listening):
-            url = url_of(listening, host)
-            node = await _start_node(url, token, node_arguments)
+            urls = urls_of(listening, host)
+            node = await _start_node(urls[-1], token, node_arguments)
             try:
-                announce(url, data, token)
+                announce(urls, data, token)
+                remark(f"what was recorded: foottile sessions --server {urls[-1]}")
                 ended = asyncio.create_task(node.wait())
                 stopped = asyncio.create_task(stop.wait())
                 done, _ = await asyncio.wait(
@@ -128,6 +129,8 @@ async def _demo(
                         remedy="What it said stands above",
                     )
                 await _stop_recording(server)
+                if not stop.is_set():
+                    remark(f"ended after {seconds:g} s; data in {data}")
             finally:
                 await _end(node)
 

@@ -114,10 +114,12 @@ def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]
         return None, "the scene names no calibration"
     if scene.calibration == BENCH and not options.emulated:
         # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
-        return None, (
+        problem = (
             "the emulated bench knows emulated tiles only: press the tiles on a real bench, run "
             "`foottile calibrate`, and name its file in the scene"
         )
+        remark(f"no calibration, so no forces: {problem}")
+        return None, problem
     try:
         calibration = find_calibration(
             scene.calibration,

@@ -43,7 +43,7 @@ def serve_command(
 
 async def _serve(settings: Settings) -> None:
     from service.app import make_app
-    from service.serve import listen, serving, stop_on_signals, token_for, url_of
+    from service.serve import listen, serving, stop_on_signals, token_for, urls_of
     from service.server import Server
 
     stop = stop_on_signals()
@@ -52,13 +52,14 @@ async def _serve(settings: Settings) -> None:
         token = token_for(settings.host, settings.token, settings.data)
         app = make_app(server, hosts=settings.allow_host, token=token)
         async with serving(app, listening):
-            announce(url_of(listening, settings.host), settings.data, token)
+            announce(urls_of(listening, settings.host), settings.data, token)
             await stop.wait()
 
 
-def announce(url: str, data: Path, token: str | None) -> None:
-    """Say where the page is, and the token if there is one."""
-    say(f"FootTile is at {url}/" + (f"#token={token}" if token else ""))
+def announce(urls: list[str], data: Path, token: str | None) -> None:
+    """Say where the page is, and how a node gets there."""
+    for url in urls:
+        say(f"FootTile is at {url}/" + (f"#token={token}" if token else ""))
     remark(f"data in {data}; Ctrl-C ends it")
     if token:
-        remark("nodes need the token: FOOTTILE_TOKEN=... foottile node ...")
+        remark(f"a node: FOOTTILE_TOKEN={token} foottile node --scene FILE --server {urls[0]}")

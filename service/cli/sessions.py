@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 SERVER = "http://127.0.0.1:8000"
 
+_LONG = {"ledger", "events", "clock", "calibration", "scene_content"}
+"""What a list of sessions leaves out."""
+
 ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
 
 
@@ -150,7 +153,7 @@ def _in_folder(data: Path) -> list[dict[str, Any]]:
     for session_id in folder.ids():
         session = folder.load(session_id)
         ledger = session.ledger
-        content = session.model_dump(mode="json", exclude={"ledger", "events", "clock"})
+        content = session.model_dump(mode="json", exclude=_LONG)
         complete = False if ledger is None else "lossy" if ledger.lossy else ledger.complete
         found.append({**content, "complete": complete})
     return found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from contextlib import suppress
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
@@ -12,6 +11,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from service.link import PROTOCOL, SUBPROTOCOL, Close, close_reason
 from service.live import Subscriber, dumps
 from service.server import Server
+from service.steady import utc_ns
 from service.version import SOFTWARE
 from service.views import NodeView, SessionView
 
@@ -87,7 +87,7 @@ def _hello(server: Server, node: str | None) -> dict[str, object]:
         "type": "hello",
         "protocol": PROTOCOL,
         "software": SOFTWARE,
-        "t_ns": time.time_ns(),
+        "t_ns": utc_ns(),
         "nodes": [
             NodeView.of(known, recorder).model_dump(mode="json")
             for known in server.nodes
@@ -107,7 +107,7 @@ async def _send(socket: WebSocket, server: Server, subscriber: Subscriber, rate_
     while True:
         await subscriber.news.wait()
         due_s = max(due_s + 1.0 / rate_hz, loop.time())
-        now_t_ns = time.time_ns()
+        now_t_ns = utc_ns()
         ages_ms = {
             known.name: (now_t_ns - known.server_t_ns(known.shown_t_ns)) * 1e-6
             for known in server.nodes
@@ -136,6 +136,6 @@ async def _read(socket: WebSocket, subscriber: Subscriber) -> None:
         if not isinstance(said, dict) or said.get("type") != "ping":
             raise _HangUp(Close.POLICY, 'only {"type":"ping","t_ms":NUMBER} is understood here')
         t_ms = said.get("t_ms")
-        if not isinstance(t_ms, int | float) or not abs(t_ms) < 1e18:
+        if isinstance(t_ms, bool) or not isinstance(t_ms, int | float) or not abs(t_ms) < 1e18:
             raise _HangUp(Close.POLICY, "ping needs t_ms, a number")
-        subscriber.answer({"type": "pong", "t_ms": t_ms, "t_ns": time.time_ns()})
+        subscriber.answer({"type": "pong", "t_ms": t_ms, "t_ns": utc_ns()})

@@ -25,6 +25,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+import service.recorder
 import service.server
 from devices.frames import (
     NO_SERVO_AGE,
@@ -534,6 +535,7 @@ def serve_with(
 ) -> Iterator[Callable[..., Running]]:
     """A server with this token and these names; its ticks are quick, and so the tests are."""
     monkeypatch.setattr(service.server, "TICK_S", TICK_S)
+    monkeypatch.setattr(service.recorder, "BEHIND_S", 1e9)  # its frames are long ago
     started: list[Running] = []
 
     def start(**options: Any) -> Running:

@@ -307,7 +307,7 @@ def test_an_odd_id_is_not_found(sealed: Sealed) -> None:
     ):
         for rest in ("", "/data", "/events", "/ledger"):
             answer = sealed.running.http.get(f"/sessions/{odd}{rest}")
-            assert answer.status_code == 404, odd
+            assert answer.status_code in (400, 404), odd
             assert answer.headers["content-type"] == "application/problem+json"
 
 

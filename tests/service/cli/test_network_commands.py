@@ -135,8 +135,8 @@ def test_pull_brings_the_file_verified_and_at_once_the_second_time(
 
 def test_pull_of_what_is_not_there_says_so(demo: Demo, tmp_path: Path) -> None:
     done = run("pull", "../../etc", "--server", demo.url, "--out", str(tmp_path))
-    assert done.returncode == 1
-    assert "404" in done.stderr
+    assert done.returncode == 2
+    assert "foottile sessions" in done.stderr
     done = run("pull", "20200101T000000Z-000000", "--server", demo.url, "--out", str(tmp_path))
     assert done.returncode == 1
     assert "no session" in done.stderr
