@@ -91,4 +91,4 @@ def say(message: str) -> None:
 
 def remark(message: str) -> None:
     """A line on stderr that a user should see, wherever it goes."""
-    stderr.print(message, style="dim", highlight=False, markup=False)
+    stderr.print(message, style="dim", highlight=False, markup=False, soft_wrap=True)

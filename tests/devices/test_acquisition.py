@@ -528,3 +528,22 @@ def test_the_same_scene_gives_the_same_frames_to_the_bit(scene_of: SceneOf) -> N
     np.testing.assert_array_equal(first.tadc, second.tadc)
     np.testing.assert_array_equal(first.t_mono_ns, second.t_mono_ns)
     assert len(set(first.padc[:, 0].tolist())) > 3, "noise and all"
+
+
+# A loop without a rate of its own
+
+
+def test_a_loop_that_was_stalled_says_how_many_frames_it_missed(scene_of: SceneOf) -> None:
+    one = foot(scene_of(array=TYPICAL))
+    stream = Acquisition(
+        one.array, one.array.identify(), one.clock, ANCHOR, expected_hz=1e9 / FRAME_NS
+    )
+    batches = stream.run(lambda: False)
+    before = next(batches)
+    assert stream.missed_slots == 0
+    one.clock.sleep_until_ns(one.clock.now_ns() + 100 * FRAME_NS)
+    after = next(batches)
+    assert stream.missed_slots == 100
+    assert after.frame_status[0] & FrameStatus.OVERRUN
+    assert not (after.frame_status[1:] & FrameStatus.OVERRUN).any()
+    assert after.seq[0] == before.seq[-1] + 1  # what was not taken never had a number

@@ -38,7 +38,7 @@ from devices.frames import (
 from service.app import make_app
 from service.estimation.calibration import Calibration, TileCalibration
 from service.link import INGEST_PATH, PROTOCOL, SUBPROTOCOL, ClockRow, FromServer, Hello
-from service.serve import listen, serving, url_of
+from service.serve import listen, serving, urls_of
 from service.server import Server
 from storage.intervals import Intervals
 from storage.journal import Journal
@@ -244,7 +244,7 @@ class Running:
             self.server = Server(self.data)
             app = make_app(self.server, hosts=self._hosts, token=self._token)
             async with serving(app, listening):
-                self.port = int(url_of(listening, "127.0.0.1").rsplit(":", 1)[1])
+                self.port = int(urls_of(listening, "127.0.0.1")[-1].rsplit(":", 1)[1])
                 ready.set()
                 await self._stop.wait()
         self.open_journals = []

@@ -203,3 +203,13 @@ def test_a_token_file_that_is_empty_is_no_token(tmp_path: Path) -> None:
     # As after a cut of power between its creation and its writing.
     (tmp_path / "token").touch(mode=0o600)
     assert token_for("0.0.0.0", None, tmp_path)  # noqa: S104  # nothing listens
+
+
+@pytest.mark.parametrize("path", ["/api/v1/ingest%0A", "/api/v1/ingest/", "/api/v1//ingest", "/x"])
+def test_no_other_way_of_writing_the_path_gets_past_the_token(
+    serve_with: Callable[..., Running], path: str
+) -> None:
+    running = serve_with(token=TOKEN)
+    with pytest.raises(InvalidStatus) as refused, running.socket(path):
+        pytest.fail("it was let in")
+    assert refused.value.response.status_code in (400, 401)

@@ -20,6 +20,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 import service.ingest
+import service.nodes
 import service.server
 import storage.journal
 from devices.frames import FRAME_COLUMNS, FrameBatch
@@ -693,3 +694,83 @@ def test_what_was_held_at_a_restart_is_acknowledged_at_the_next_connection(
         node.send_again(node.sent[-1].rows(first, 20))
     node.send(10)
     node.acknowledged(29)
+
+
+# What a hostile tester found
+
+
+def test_a_node_that_goes_before_it_is_welcomed_leaves_its_name_free(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, until: Until
+) -> None:
+    from starlette.websockets import WebSocket
+
+    send_text = WebSocket.send_text
+    gone = threading.Event()
+
+    async def failing(socket: WebSocket, data: str) -> None:
+        if '"welcome"' in data and not gone.is_set():
+            gone.set()
+            raise RuntimeError("the peer has gone")
+        await send_text(socket, data)
+
+    monkeypatch.setattr(WebSocket, "send_text", failing)
+    node.open()
+    node.socket.send(node.hello().model_dump_json())
+    until(gone.is_set)
+    until(lambda: not running.node()["connected"])
+    node.reboot()
+    assert node.connect() == [(0, None)]
+
+
+def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, until: Until
+) -> None:
+    from devices.errors import StorageError
+
+    node.connect()
+    node.send(10)
+    node.acknowledged(9)
+    node.leave()
+    node.reboot()
+    node.tiles += 1
+    full = threading.Event()
+    full.set()
+    keep = service.nodes.Node.keep
+
+    def refusing(kept: object) -> None:
+        if full.is_set():
+            raise StorageError("No space left on device")
+        keep(kept)
+
+    monkeypatch.setattr(service.nodes.Node, "keep", refusing)
+    node.connect()
+    shown = running.node()
+    assert len(shown["tiles"]) == node.tiles
+    assert shown["calibration"]["id"] == node.hello().calibration.id
+    full.clear()
+
+
+def test_what_could_not_be_synced_is_sent_again(
+    running: Running, node: FakeNode, closing: Closing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node.connect()
+    node.send(10)
+    node.acknowledged(9)
+    broken = threading.Event()
+    broken.set()
+    fsync = os.fsync
+
+    def failing(descriptor: int) -> None:
+        if broken.is_set() and "arrows" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            broken.clear()
+            raise OSError(5, "Input/output error")
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", failing)
+    lost = node.send(10)
+    assert closing(node.socket)[0] == 1012
+    assert node.connect() == [(10, None)]
+    node.send_again(lost)
+    node.acknowledged(19)
+    running.restart()
+    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())

@@ -188,7 +188,7 @@ def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
             return publishing.reports
 
     [reason] = asyncio.run(scenario())
-    assert "401" in reason
+    assert "FOOTTILE_TOKEN" in reason
     assert running.http.get("/nodes").json()["items"] == []
 
 
@@ -303,3 +303,27 @@ def test_a_drain_waits_for_the_last_acknowledgement(running: Running, node: Fake
             assert publishing.backlog.first_seq == publishing.backlog.next_seq
 
     asyncio.run(scenario())
+
+
+def test_a_redirect_is_no_end(node: FakeNode) -> None:
+    asked: list[int] = []
+
+    async def redirect(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        location = b"Location: http://login.example/portal\r\n"
+        writer.write(b"HTTP/1.1 302 Found\r\n" + location + b"Content-Length: 0\r\n\r\n")
+        await writer.drain()
+        writer.close()
+        await writer.wait_closed()
+        asked.append(1)
+
+    async def scenario() -> list[str]:
+        portal = await asyncio.start_server(redirect, "127.0.0.1", 0)
+        port = portal.sockets[0].getsockname()[1]
+        async with Publishing(node, f"http://127.0.0.1:{port}") as publishing:
+            await publishing.until(lambda: len(asked) > 1)
+        portal.close()
+        await portal.wait_closed()
+        return publishing.reports
+
+    assert "trying again" in asyncio.run(scenario())[0]

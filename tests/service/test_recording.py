@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+import service.recorder
 import service.routes.sessions
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.session_file import SessionReader
@@ -657,3 +658,74 @@ def test_a_session_is_sealed_again_when_the_disk_was_full(
     sealed = running.sealed(session["id"])
     assert sealed["frames"] == 20
     assert sealed["problem"] is None
+
+
+# What a hostile tester found
+
+
+def test_tares_count_by_the_frames_own_time_however_wrong_the_nodes_date_is(
+    running: Running, node: FakeNode, until: Until
+) -> None:
+    years_ns = 4 * 365 * 86_400 * 1_000_000_000
+    node.utc_offset_ns += years_ns
+    node.connect()
+    row = {"type": "clock", "t_mono_ns": 5, "uncertainty_ns": 7}
+    node.socket.send(json.dumps(row | {"server_minus_node_ns": -years_ns}))
+    node.tared()
+    taken_in(running, node, until)
+    session = start(running)
+    node.send(300, [10.0, 10.0])
+    taken_in(running, node, until)
+    node.leave()
+    stop(running, session)
+    node.reboot()  # and its clock's offset is not known when the session is sealed
+    node.connect()
+    sealed = running.sealed(session["id"])
+    assert sealed["problem"] is None
+    np.testing.assert_allclose(column(running, session, "force_n_0"), 10.0, atol=0.1)
+
+
+def test_a_recording_keeps_the_calibration_it_was_begun_with(
+    running: Running, tared: FakeNode, until: Until
+) -> None:
+    session = start(running)
+    tared.send(200, [10.0, 10.0])
+    taken_in(running, tared, until)
+    tared.leave()
+    stop(running, session)
+    tared.reboot()
+    tripled = tared.hello().calibration.tiles
+    tripled = tuple(t.model_copy(update={"f_scale_n": 3.0 * t.f_scale_n}) for t in tripled)
+    tared.calibration = tared.hello().calibration.model_copy(update={"tiles": tripled})
+    tared.connect()
+    sealed = running.sealed(session["id"])
+    assert sealed["calibration_id"] != tared.calibration.id
+    np.testing.assert_allclose(column(running, session, "force_n_0"), 10.0, atol=0.1)
+
+
+def test_a_node_that_is_still_catching_up_is_not_recorded(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service.recorder, "BEHIND_S", 2.0)
+    answer = running.http.post("/sessions", json={"node": "bench", "name": "too early"})
+    assert answer.status_code == 409
+    assert "behind" in answer.json()["detail"]
+
+
+def test_why_a_recording_ended_is_said_together_with_why_it_has_no_estimates(
+    running: Running, node_of: Callable[..., FakeNode], until: Until
+) -> None:
+    node = node_of(running, calibration=None)
+    node.connect()
+    node.send(50)
+    taken_in(running, node, until)
+    session = start(running)
+    node.send(50)
+    taken_in(running, node, until)
+    node.leave()
+    node.reboot()
+    node.tiles += 1
+    node.connect()
+    problem = running.sealed(session["id"])["problem"]
+    assert "other tiles" in problem
+    assert "no estimates" in problem

@@ -604,3 +604,13 @@ def test_names_of_segments_sort_as_their_frames(tmp_path: Path) -> None:
     names = [path.name for path in segments(tmp_path)]
     assert all(int(one.split(".")[0]) < int(other.split(".")[0]) for one, other in pairwise(names))
     assert {len(name) for name in names} == {20 + len(".arrows")}
+
+
+def test_what_was_disowned_is_asked_for_again_and_held_once(tmp_path: Path) -> None:
+    journal = filled(tmp_path, (0, 9), (10, 19))
+    journal.disown(Intervals([(10, 19)]))
+    assert journal.held == Intervals([(0, 9)])
+    journal.append(part(10, 19))
+    assert_holds(journal, set(range(20)))
+    journal.close()
+    assert_holds(reopened(tmp_path), set(range(20)))

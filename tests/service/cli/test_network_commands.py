@@ -292,6 +292,7 @@ def test_off_loopback_a_token_is_made_kept_and_asked_for(tmp_path: Path) -> None
     )
     assert serve.stdout is not None
     url, token = serve.stdout.readline().split()[-1].split("/#token=")
+    url = f"http://127.0.0.1:{url.rsplit(':', 1)[1]}"
     assert (tmp_path / "token").stat().st_mode & 0o077 == 0
     refused = httpx.post(f"{url}/api/v1/nodes/x/tare", trust_env=False)
     allowed = httpx.post(
