@@ -59,7 +59,7 @@ def tiny_scene(folder: Path) -> Path:
     return path
 
 
-def start_demo(folder: Path, *options: str) -> Demo:
+def start_demo(folder: Path, *options: str, tared: bool = True) -> Demo:
     arguments = ["demo", f"--scene={tiny_scene(folder)}", "--port=0", f"--data={folder / 'data'}"]
     with (folder / "stderr.txt").open("w") as stderr:
         process = subprocess.Popen(
@@ -69,7 +69,7 @@ def start_demo(folder: Path, *options: str) -> Demo:
     url = process.stdout.readline().split()[-1].rstrip("/")
     demo = Demo(url, folder / "data", process)
     end = time.monotonic() + 30
-    while not any(node["tare"] for node in demo.get("/nodes").json()["items"]):
+    while tared and not any(node["tare"] for node in demo.get("/nodes").json()["items"]):
         assert time.monotonic() < end, (folder / "stderr.txt").read_text()
         time.sleep(0.1)
     return demo
@@ -233,8 +233,9 @@ def test_ctrl_c_seals_what_is_being_recorded(tmp_path: Path) -> None:
 
 
 def test_a_demo_ends_by_itself_after_its_seconds(tmp_path: Path) -> None:
-    demo = start_demo(tmp_path, "--seconds", "6")
+    demo = start_demo(tmp_path, "--seconds", "3", tared=False)
     assert ended(demo.process) == 0
+    assert "ended after 3 s" in (tmp_path / "stderr.txt").read_text()
 
 
 @pytest.mark.parametrize(
