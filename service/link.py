@@ -40,14 +40,12 @@ _Ns = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 class Close(IntEnum):
     """Close codes of foottile's websockets (4000 to 4999 are private to the application)."""
 
-    GOING_AWAY = 1001
     POLICY = 1008
     TOO_BIG = 1009
     RESTART = 1012
     TRY_LATER = 1013
     BAD_HELLO = 4001
     WRONG_VERSION = 4002
-    UNAUTHORISED = 4003
     MALFORMED = 4004
     SILENT = 4005
     TOO_SLOW = 4008

@@ -84,7 +84,7 @@ async def run_node(
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
         await asyncio.to_thread(acquisition.close)
-    return backlog.next_seq - backlog.first_seq
+    return backlog.next_seq - backlog.first_seq + backlog.evicted_frames
 
 
 def _tell_failure(task: asyncio.Task[None], messages: asyncio.Queue[Message]) -> None:
