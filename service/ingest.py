@@ -18,6 +18,7 @@ from service.link import (
     ClockRow,
     Close,
     FromNode,
+    HangUp,
     Hello,
     Probe,
     Status,
@@ -30,13 +31,6 @@ from service.steady import utc_ns
 log = logging.getLogger("foottile.ingest")
 
 
-class _HangUp(Exception):  # noqa: N818  # no error: how a connection ends
-    def __init__(self, code: Close, reason: str) -> None:
-        super().__init__(reason)
-        self.code = code
-        self.reason = reason
-
-
 async def ingest(socket: WebSocket, server: Server) -> None:
     """Serve one node's connection until it ends."""
     offered = socket.scope.get("subprotocols", [])
@@ -45,7 +39,7 @@ async def ingest(socket: WebSocket, server: Server) -> None:
     try:
         link = await _greet(socket, server, offered)
         await _serve(socket, server, link)
-    except _HangUp as end:
+    except HangUp as end:
         await _close(socket, end)
     except (WebSocketDisconnect, RuntimeError):  # it went away, perhaps while we were sending
         pass
@@ -56,22 +50,22 @@ async def ingest(socket: WebSocket, server: Server) -> None:
 
 async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
     if SUBPROTOCOL not in offered:
-        raise _HangUp(
+        raise HangUp(
             Close.WRONG_VERSION,
             f"subprotocol {', '.join(offered) or 'none'} offered; this server speaks {SUBPROTOCOL}",
         )
     hello = _parse(await _receive(socket), Close.BAD_HELLO)
     if not isinstance(hello, Hello):
-        raise _HangUp(Close.BAD_HELLO, "the first message has to be hello")
+        raise HangUp(Close.BAD_HELLO, "the first message has to be hello")
     if hello.protocol != PROTOCOL:
-        raise _HangUp(
+        raise HangUp(
             Close.WRONG_VERSION, f"protocol {hello.protocol}; this server speaks {PROTOCOL}"
         )
     name, boot_id = hello.array_info.node, hello.array_info.boot_id
     other = server.links.get(name)
     if other is not None:
         if other.node.boot_id != boot_id:
-            raise _HangUp(
+            raise HangUp(
                 Close.NAME_TAKEN,
                 f"a node {name!r} is connected already; give this one another name (--name)",
             )
@@ -79,13 +73,13 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
     try:
         node = server.nodes.greet(hello)
         if node.boot_id == boot_id and node.info != hello.array_info:
-            raise _HangUp(Close.BAD_HELLO, f"stream {boot_id} was announced with another array")
+            raise HangUp(Close.BAD_HELLO, f"stream {boot_id} was announced with another array")
         if node.boot_id != boot_id:
             server.recorder.node_restarts(node, hello.array_info)
         held = node.attach(hello)
     except (LinkError, StorageError) as error:
         code = Close.TRY_LATER if isinstance(error, StorageError) else Close.BAD_HELLO
-        raise _HangUp(code, str(error)) from error
+        raise HangUp(code, str(error)) from error
     node.connected = True
     link = server.links[name] = Link(node)
     # What is here but was never acknowledged, because the link broke before: acknowledge it now.
@@ -116,7 +110,7 @@ async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
         for task in done:
             task.result()
         if link.closing is not None:
-            raise _HangUp(*link.closing)
+            raise HangUp(*link.closing)
     finally:
         for task in tasks:
             task.cancel()
@@ -132,7 +126,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
             try:
                 seq_first, seq_last, due = node.take(message, utc_ns())
             except FileFormatError as error:
-                raise _HangUp(Close.MALFORMED, f"node {node.name!r}: {error}") from error
+                raise HangUp(Close.MALFORMED, f"node {node.name!r}: {error}") from error
             if node.storage_problem is None:
                 link.unsynced.add(seq_first, seq_last)
             server.hub.publish(node, due)
@@ -153,7 +147,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
                 node.node_first_seq = max(node.node_first_seq, said.first_seq)
                 server.tell_node(node)
             case Hello():
-                raise _HangUp(Close.MALFORMED, "hello was said before")
+                raise HangUp(Close.MALFORMED, "hello was said before")
 
 
 async def _acknowledge(socket: WebSocket, link: Link) -> None:
@@ -167,29 +161,29 @@ async def _receive(socket: WebSocket) -> str | bytes:
         async with asyncio.timeout(SILENCE_S):
             message = await socket.receive()
     except TimeoutError as error:
-        raise _HangUp(Close.SILENT, f"nothing was heard for {SILENCE_S:g} s") from error
+        raise HangUp(Close.SILENT, f"nothing was heard for {SILENCE_S:g} s") from error
     if message["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(message.get("code", 1005))
     data: str | bytes | None = message.get("bytes")
     if data is None:
         data = message["text"]
     if len(data) > MESSAGE_BYTES_MAX:
-        raise _HangUp(Close.TOO_BIG, f"a message of {len(data)} bytes")
+        raise HangUp(Close.TOO_BIG, f"a message of {len(data)} bytes")
     return data
 
 
 def _parse(message: str | bytes, code: Close) -> Hello | Probe | ClockRow | Status:
     try:
         if isinstance(message, bytes):
-            raise _HangUp(code, "a text message was expected, and a binary one came")
+            raise HangUp(code, "a text message was expected, and a binary one came")
         return FromNode.validate_json(message)
     except ValidationError as error:
         complaint = error.errors()[0]
         where = ".".join(str(part) for part in complaint["loc"])
-        raise _HangUp(code, f"message not understood: {where}: {complaint['msg']}") from error
+        raise HangUp(code, f"message not understood: {where}: {complaint['msg']}") from error
 
 
-async def _close(socket: WebSocket, end: _HangUp) -> None:
+async def _close(socket: WebSocket, end: HangUp) -> None:
     log.warning("link closed: %s", end.reason)
     if socket.application_state is not WebSocketState.DISCONNECTED:
         with suppress(RuntimeError, WebSocketDisconnect):

@@ -53,6 +53,15 @@ class Close(IntEnum):
     SUPERSEDED = 4010
 
 
+class HangUp(Exception):  # noqa: N818  # no error: how a connection ends
+    """Raised by whoever serves a connection to end it with a code and a reason."""
+
+    def __init__(self, code: Close, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason
+
+
 class _Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -80,9 +80,9 @@ async def run_node(
         await publisher.drain()
     finally:
         stopping.cancel()
-        for task in filter(None, (publishing,)):
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+        if publishing is not None:
+            publishing.cancel()
+            await asyncio.gather(publishing, return_exceptions=True)
         await asyncio.to_thread(acquisition.close)
     return backlog.next_seq - backlog.first_seq + backlog.evicted_frames
 

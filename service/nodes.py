@@ -5,6 +5,7 @@ What has to outlive the server is on disk: the journals, each node's last hello 
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import deque
 from collections.abc import Iterator
@@ -31,6 +32,8 @@ from storage.intervals import Intervals
 from storage.journal import Journal
 from storage.schema import wire_schema
 from storage.wire import decode
+
+log = logging.getLogger("foottile.nodes")
 
 RING_NS = 600_000_000_000
 """Frames of no session are kept so long, for pre-roll and for what was not recorded in time."""
@@ -73,8 +76,10 @@ class Node:
         self._pace: deque[tuple[int, int]] = deque()
         for path in sorted(journals.glob("*")):
             if _BOOT_ID.fullmatch(path.name):
-                with suppress(FileFormatError):
+                try:
                     self.journals[path.name] = Journal.open(path)
+                except FileFormatError as error:
+                    log.warning("a journal is left out: %s", error)
         self.live = self._live_estimates()
 
     @property

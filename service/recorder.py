@@ -299,9 +299,6 @@ class Recorder:
         try:
             sources = self.sources(session_id)
             ledger = self.ledger(session_id)
-            for part in sources.session.parts:
-                if part.boot_id in sources.journals:
-                    sources.journals[part.boot_id].sync()
             sealed = await asyncio.to_thread(seal, sources, self.folder.path(session_id), ledger)
             # Name, notes and events may have changed meanwhile.
             now = self._sessions[session_id]

@@ -150,11 +150,11 @@ class Server:
 
     async def _sync(self, link: Link) -> None:
         """Have the journal on disk, then acknowledge what was in it before."""
+        if link.node.storage_problem is not None:  # perhaps not even a journal could be begun
+            await self._try_again(link)
+            return
         journal = link.node.journal
         if journal is None:
-            return
-        if link.node.storage_problem is not None:
-            await self._try_again(link)
             return
         waiting, link.unsynced = link.unsynced, Intervals()
         if not waiting:
@@ -178,7 +178,7 @@ class Server:
     async def _try_again(self, link: Link) -> None:
         """After a full disk: once it can be written again, have the node send what is missing."""
         try:
-            self.check_storage()
+            await asyncio.to_thread(self.check_storage)
         except StorageError:
             return
         link.node.storage_problem = None

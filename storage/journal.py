@@ -68,7 +68,8 @@ class Journal:
         with storage_errors(folder):
             for path in sorted(folder.glob("*" + SUFFIX)):
                 with suppress(pa.ArrowException, EOFError, FileFormatError):
-                    schema = pa.ipc.open_stream(pa.OSFile(str(path), "r")).schema
+                    with pa.OSFile(str(path), "r") as file:
+                        schema = pa.ipc.open_stream(file).schema
                     return cls(folder, array_info(schema, where=str(path)))
         raise FileFormatError("no readable journal segment", where=str(folder))
 

@@ -47,8 +47,8 @@ async def health() -> Health:
     summary="Can it record?",
     responses=problems(_507="The data folder cannot be written."),
 )
-async def ready(server: ServerState) -> Ready:
-    """Writes a byte to the data folder and counts who is there."""
+def ready(server: ServerState) -> Ready:
+    """Writes some bytes to the data folder and counts who is there."""
     server.check_storage()
     return Ready(
         ready=True,

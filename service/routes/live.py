@@ -8,7 +8,7 @@ from contextlib import suppress
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from service.link import PROTOCOL, SUBPROTOCOL, Close, close_reason
+from service.link import PROTOCOL, SUBPROTOCOL, Close, HangUp, close_reason
 from service.live import Subscriber, dumps
 from service.server import Server
 from service.steady import utc_ns
@@ -21,13 +21,6 @@ SEND_TIMEOUT_S = 10.0
 """A client that does not read for so long is let go; it may come back."""
 _PARAMETERS = {"node", "rate_hz", "format", "policy"}
 _TEXT_MAX = 1000
-
-
-class _HangUp(Exception):  # noqa: N818  # no error: how a connection ends
-    def __init__(self, code: Close, reason: str) -> None:
-        super().__init__(reason)
-        self.code = code
-        self.reason = reason
 
 
 async def live(socket: WebSocket, server: Server) -> None:
@@ -50,7 +43,7 @@ async def live(socket: WebSocket, server: Server) -> None:
             sending.cancel()
             reading.cancel()
             await asyncio.gather(sending, reading, return_exceptions=True)
-    except _HangUp as end:
+    except HangUp as end:
         if socket.application_state is not WebSocketState.DISCONNECTED:
             with suppress(RuntimeError, WebSocketDisconnect, TimeoutError):
                 async with asyncio.timeout(1.0):
@@ -65,19 +58,19 @@ async def live(socket: WebSocket, server: Server) -> None:
 def _query(socket: WebSocket, server: Server) -> tuple[str | None, float]:
     given = socket.query_params
     if unknown := set(given) - _PARAMETERS:
-        raise _HangUp(Close.POLICY, f"unknown parameter {sorted(unknown)[0]!r}")
+        raise HangUp(Close.POLICY, f"unknown parameter {sorted(unknown)[0]!r}")
     for name, only in (("format", "json"), ("policy", "latest")):
         if given.get(name, only) != only:
-            raise _HangUp(Close.POLICY, f"{name}={given[name]!r} is not offered; {only!r} is")
+            raise HangUp(Close.POLICY, f"{name}={given[name]!r} is not offered; {only!r} is")
     try:
         rate_hz = float(given.get("rate_hz", RATE_HZ))
     except ValueError:
         rate_hz = float("nan")
     if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
-        raise _HangUp(Close.POLICY, f"rate_hz has to be {RATES_HZ[0]:g} to {RATES_HZ[1]:g}")
+        raise HangUp(Close.POLICY, f"rate_hz has to be {RATES_HZ[0]:g} to {RATES_HZ[1]:g}")
     node = given.get("node")
     if node is not None and all(known.name != node for known in server.nodes):
-        raise _HangUp(Close.POLICY, f"no node {node[:60]!r}")
+        raise HangUp(Close.POLICY, f"no node {node[:60]!r}")
     return node, rate_hz
 
 
@@ -119,7 +112,7 @@ async def _send(socket: WebSocket, server: Server, subscriber: Subscriber, rate_
                 for text in texts:
                     await socket.send_text(text)
         except TimeoutError as error:
-            raise _HangUp(Close.TOO_SLOW, "this client does not read") from error
+            raise HangUp(Close.TOO_SLOW, "this client does not read") from error
         await asyncio.sleep(due_s - loop.time())
 
 
@@ -134,8 +127,8 @@ async def _read(socket: WebSocket, subscriber: Subscriber) -> None:
             with suppress(ValueError, RecursionError):
                 said = json.loads(text)
         if not isinstance(said, dict) or said.get("type") != "ping":
-            raise _HangUp(Close.POLICY, 'only {"type":"ping","t_ms":NUMBER} is understood here')
+            raise HangUp(Close.POLICY, 'only {"type":"ping","t_ms":NUMBER} is understood here')
         t_ms = said.get("t_ms")
         if isinstance(t_ms, bool) or not isinstance(t_ms, int | float) or not abs(t_ms) < 1e18:
-            raise _HangUp(Close.POLICY, "ping needs t_ms, a number")
+            raise HangUp(Close.POLICY, "ping needs t_ms, a number")
         subscriber.answer({"type": "pong", "t_ms": t_ms, "t_ns": utc_ns()})

@@ -774,3 +774,26 @@ def test_what_could_not_be_synced_is_sent_again(
     node.acknowledged(19)
     running.restart()
     assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
+
+
+def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
+    running: Running,
+    node: FakeNode,
+    closing: Closing,
+    monkeypatch: pytest.MonkeyPatch,
+    until: Until,
+) -> None:
+    from devices.errors import StorageError
+
+    def refuse(*_: object) -> None:
+        raise StorageError("No space left on device")
+
+    monkeypatch.setattr(service.nodes, "Journal", refuse)  # not even its folder can be made
+    monkeypatch.setattr(running.server, "check_storage", refuse)
+    node.connect()
+    node.send(10)
+    until(lambda: running.node()["storage_problem"] is not None)
+    monkeypatch.setattr(service.nodes, "Journal", Journal)
+    monkeypatch.setattr(running.server, "check_storage", lambda: None)
+    assert closing(node.socket)[0] == 1012
+    assert node.connect() == [(0, None)]
