@@ -18,12 +18,14 @@ from devices.frames import (
     FRAME_COLUMNS,
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,
+    NOT_READ,
     FrameBatch,
     FrameStatus,
     TileInfo,
     TileStatus,
 )
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
+from devices.temperature import HeldTemperature, hold_temperature
 
 BATCH_NS = 25_000_000
 """Length of a batch: at 10 ms two fifths of a message would be header (performance.md)."""
@@ -46,13 +48,6 @@ class ServoSource(Protocol):
         """Age from which a position is older than it should be."""
 
 
-class ReferenceSource(Protocol):
-    """The calibration rig's force sensor, sampled with the tiles."""
-
-    def force_n(self, t_mono_ns: int) -> float:
-        """Reference force at an instant, in newtons; NaN where nothing is pressed."""
-
-
 class Acquisition:
     """One stream of frames: `seq` counts from 0, `t_ns` is `t_mono_ns` plus one fixed anchor.
 
@@ -64,7 +59,7 @@ class Acquisition:
         rate_hz: frames a second; 0: as fast as the schedule allows.
         expected_hz: what rate that is, to tell when the loop was stalled; 0: do not tell.
         servo: its position goes with the frames.
-        reference: its force goes with the frames.
+        is_new: the array was identified anew in a running node: the first frame says so.
     """
 
     def __init__(
@@ -77,7 +72,7 @@ class Acquisition:
         rate_hz: float = 0.0,
         expected_hz: float = 0.0,
         servo: ServoSource | None = None,
-        reference: ReferenceSource | None = None,
+        is_new: bool = False,
     ) -> None:
         self.missed_slots = 0
         """Slots in which no frame was begun, because the loop was late."""
@@ -87,9 +82,11 @@ class Acquisition:
         self._period_ns = round(1e9 / rate_hz) if rate_hz else 0
         self._expected_ns = round(1e9 / expected_hz) if expected_hz else 0
         self._servo = servo
-        self._reference = reference
+        self._is_new = is_new
         self._compensation = Compensation(tiles)
         self._next_seq = 0
+        self._last_t_mono_ns = 0
+        self._temperature: HeldTemperature | None = None
 
     def run(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
         """Take frames until `stop()` is true, which is asked before every frame.
@@ -137,8 +134,19 @@ class Acquisition:
     def _fill(
         self, columns: dict[str, np.ndarray], row: int, scan: Scan, frame_status: int
     ) -> None:
-        first_stop_ns = scan.convert_stop_ns[0]
-        t_mono_ns = first_stop_ns + self._array.sample_delay_ns
+        samples_ns = [
+            stop_ns + delay_ns
+            for stop_ns, delay_ns in zip(
+                scan.convert_stop_ns, self._array.sample_delay_ns, strict=True
+            )
+        ]
+        first = next((i for i, padc in enumerate(scan.padc) if padc != NOT_READ), 0)
+        # Never back: a tile that was left out for a frame has its sample from before that.
+        t_mono_ns = max(samples_ns[first], self._last_t_mono_ns + 1)
+        self._last_t_mono_ns = t_mono_ns
+        if self._is_new:
+            frame_status |= FrameStatus.NEW_ARRAY_INFO
+            self._is_new = False
         if scan.bus_fault:
             frame_status |= FrameStatus.BUS_FAULT
         servo_counts, servo_age_us = NO_SERVO_COUNTS, NO_SERVO_AGE
@@ -155,15 +163,13 @@ class Acquisition:
         columns["padc"][row] = scan.padc
         columns["tadc"][row] = scan.tadc
         columns["sample_offset_us"][row] = [
-            (stop_ns - first_stop_ns) // 1000 for stop_ns in scan.convert_stop_ns
+            (sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns
         ]
         columns["servo_counts"][row] = servo_counts
         columns["servo_age_us"][row] = servo_age_us
         columns["status"][row] = scan.status
         columns["frame_status"][row] = frame_status
-        columns["reference_force_n"][row] = (
-            np.nan if self._reference is None else self._reference.force_n(t_mono_ns)
-        )
+        columns["reference_force_n"][row] = scan.reference_n
         self._next_seq += 1
 
     def _batch(self, columns: dict[str, np.ndarray], rows: int) -> FrameBatch:
@@ -174,6 +180,7 @@ class Acquisition:
     def _flag_over_range(self, batch: FrameBatch) -> None:
         # Raw counts are kept as read. A part pressed past its range falls through zero and comes
         # back near full count (hardware.md 1.3), so both ends are out of range.
-        kpa = self._compensation.readable_kpa(batch)
+        held, self._temperature = hold_temperature(batch, self._temperature)
+        kpa = self._compensation.readable_kpa(held)
         outside = (kpa > PRESSURE_MAX_KPA) | (kpa < PRESSURE_MIN_KPA) | (batch.padc <= 1)
         batch.status[outside & ~np.isnan(kpa)] |= np.uint8(TileStatus.OVER_RANGE)

@@ -1,18 +1,21 @@
-"""An array of tiles behind multiplexers, and the schedules by which one frame of it is taken.
+"""An array of tiles behind multiplexers: takes frames, whatever happens on the bus.
 
-A schedule is one function: it runs the transfers of one frame and notes in a `Scan` what came back.
-Rates on the wire are those of `bus_budget.py` in the design's companion (hardware.md 4): with four
-tiles at 400 kHz and a wait of 1.6 ms `sequential` takes 132 frames/s, `simultaneous` 395.
+The order of a frame's transfers is a schedule's (`devices.schedules`); here is what a transfer does
+and what becomes of it when it fails. A fault is a bit of `TileStatus` in the frame in which the bus
+shows it, never an exception. The bad tile is left alone so that the others keep their rate: second
+attempts share a budget of time in each frame, and a tile that has fallen silent is looked for now
+and then. Before it is believed again its coefficients are read: it may be another part.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import reduce
-from operator import or_
+from collections.abc import Callable, Sequence
 
+from devices.budget import BusTiming, check_broadcast, frame_s
+from devices.bus_recovery import BusRecovery
+from devices.bus_watch import BusWatch
 from devices.clock import Clock
+from devices.conversion_watch import ConversionWatch
 from devices.errors import (
     BusMisuseError,
     BusSetupError,
@@ -21,97 +24,91 @@ from devices.errors import (
     TileSetupError,
 )
 from devices.frames import NOT_READ, TileInfo, TileStatus
+from devices.health import TileHealth
 from devices.i2c import I2cBus
-from devices.mpl115a2 import (
-    CONVERSION_TYPICAL_NS,
-    COUNTS_MAX,
-    SAMPLE_PART_OF_CONVERSION,
-    Mpl115a2,
-)
-from devices.scene import ScheduleName, TileScene
-from devices.tca9548a import MuxRouter
+from devices.judge import Judge
+from devices.mpl115a2 import SAMPLE_PART_OF_CONVERSION
+from devices.scan import Scan
+from devices.scene import ScheduleName
+from devices.tile_ports import TilePorts
 
-STALE_AFTER = 24
-"""Identical readings in a row after which a part counts as stale. With the noise of a real part
-(1.3 counts of pressure, half a count of temperature) two readings agree by chance in about one of
-ten, so 24 in a row do not happen; with noise correlated over 10 ms still less than once a year."""
-
-
-@dataclass
-class Scan:
-    """What one frame's transfers gave, one entry per tile."""
-
-    padc: list[int]
-    tadc: list[int]
-    convert_stop_ns: list[int]
-    """CLOCK_MONOTONIC at the STOP of each tile's CONVERT."""
-    status: list[int]
-    bus_fault: bool = False
-
-
-Schedule = Callable[["TileArray"], Scan]
+_BUDGET_PART = 8
+_BUDGET_MIN_NS = 500_000
+"""Second attempts may take an eighth of a frame, but always one reading and a look at who it is."""
 
 
 class TileArray:
-    """Tiles of one bus, addressed by their index in the frame."""
+    """Tiles of one bus, addressed by their index in the frame.
+
+    Args:
+        bus: what they hang on.
+        tiles: as identified at start-up (`devices.startup`).
+        clock: virtual or real.
+        schedule: the order of transfers.
+        timing: of bus and parts, for the length of a frame.
+        temperature_every: temperature is read in every so many frames.
+        broadcast_channels: how many channels may be open at once.
+        recovery: frees a stuck bus; None: nobody can.
+        beside: called once in a frame at the first tile's sample instant, while the bus waits; what
+            it gives is the frame's reference force in newtons.
+
+    Raises:
+        SceneError: the schedule would open more channels than allowed.
+    """
 
     def __init__(
         self,
         bus: I2cBus,
-        tiles: Sequence[TileScene],
+        tiles: Sequence[TileInfo],
         clock: Clock,
         *,
         schedule: ScheduleName,
-        wait_ms: float,
+        timing: BusTiming,
+        temperature_every: int = 1,
+        broadcast_channels: int = 8,
+        recovery: BusRecovery | None = None,
+        beside: Callable[[], float] | None = None,
     ) -> None:
+        # Here, because schedules are written in terms of arrays.
+        from devices.schedules import SCHEDULES
+
+        muxes = [tile.mux for tile in tiles]
+        check_broadcast(schedule, muxes, broadcast_channels)
         self.tiles = tuple(tiles)
-        self.clock = clock
-        self.wait_ns = round(wait_ms * 1e6)
-        self.chip = Mpl115a2(bus)
-        self.router = MuxRouter(bus, (tile.mux for tile in tiles))
-        self.all_channels = {
-            mux: reduce(or_, (1 << tile.channel for tile in tiles if tile.mux == mux))
-            for mux in self.router.addresses
-        }
+        self.indices = range(len(tiles))
+        self.by_mux = tuple(
+            tuple(i for i in self.indices if muxes[i] == mux) for mux in sorted(set(muxes))
+        )
         self.schedule_name = schedule
+        self.sample_delay_ns = tuple(
+            round(tile.conversion_ms * 1e6) // SAMPLE_PART_OF_CONVERSION for tile in tiles
+        )
+        """From the STOP of a tile's CONVERT to the instant its pressure is taken to be sampled."""
+        self.health = tuple(TileHealth(tile) for tile in tiles)
+        self._clock = clock
+        self._ports = TilePorts(bus, tiles)
+        self.bus = BusWatch(self._ports.router, clock, recovery)
+        self._judge = Judge(self._ports, clock, self.health, self.bus)
+        self._watch = ConversionWatch(
+            self._ports, clock, self.health, [round(wait_s * 1e9) for wait_s in timing.conversions_s]
+        )
         self._schedule = SCHEDULES[schedule]
-        self._last_words = [(-1, -1)] * len(tiles)
-        self._repeats = [0] * len(tiles)
-        self._answered = [True] * len(tiles)
+        self._waits_for_slow_ones = schedule != "pipelined" or len(tiles) == 1
+        self._temperature_every = temperature_every
+        self._beside = beside
+        self._frame_ns = round(frame_s(schedule, timing) * 1e9)
+        self._budget_ns = max(_BUDGET_MIN_NS, self._frame_ns // _BUDGET_PART)
+        self._started_ns = [clock.now_ns()] * len(tiles)
+        self._running = [False] * len(tiles)
+        self._frames = 0
 
-    def identify(self) -> tuple[TileInfo, ...]:
-        """Find every tile, one channel at a time, and read its coefficients.
-
-        One at a time, because in a broadcast the acknowledge is a wired AND: a missing tile does
-        not show (hardware.md 2).
-
-        Raises:
-            TileSetupError: a tile or its mux does not answer, or its coefficients are implausible.
-            BusFaultError: the bus itself fails.
-        """
-        return tuple(self._identify(tile) for tile in self.tiles)
-
-    def _identify(self, tile: TileScene) -> TileInfo:
-        where = f"tile {tile.serial} (mux 0x{tile.mux:02x} channel {tile.channel})"
-        try:
-            self.router.connect_only(tile.mux, tile.channel)
-            words = self.chip.read_coefficient_words(where=where)
-        except NoAcknowledgeError as error:
-            raise TileSetupError(
-                f"does not answer: {error}",
-                where=where,
-                remedy="Plug it in, or take it out of the scene file",
-            ) from error
-        return TileInfo(
-            serial=tile.serial,
-            mux=tile.mux,
-            channel=tile.channel,
-            coefficient_words=words,
-            x_m=tile.x_m,
-            y_m=tile.y_m,
-            z_m=tile.z_m,
-            reference=tile.reference,
-            conversion_ms=CONVERSION_TYPICAL_NS / 1e6,
+    @property
+    def replaced(self) -> tuple[str, ...]:
+        """Serials of the tiles in whose place another part answers than the one identified."""
+        return tuple(
+            tile.serial
+            for tile, health in zip(self.tiles, self.health, strict=True)
+            if health.replaced
         )
 
     def scan(self) -> Scan:
@@ -121,113 +118,185 @@ class TileArray:
             BusMisuseError: the adapter refuses our transfers: a bug, not a fault of the field.
             BusSetupError: the bus went away.
         """
-        begin_ns = self.clock.now_ns()
-        scan = self._schedule(self)
+        begin_ns = self._clock.now_ns()
+        scan = Scan.blank(len(self.tiles), begin_ns, self._budget_ns)
+        if not self.bus.is_down or self._bus_comes_back(scan):
+            self._schedule(self, scan)
+            if self._watch.is_due(begin_ns) and not scan.bus_fault:
+                self._audit(scan)
+        self._conclude(scan)
         if all(padc == NOT_READ for padc in scan.padc):
             # Nobody answers, so nothing was waited for: do not run the faster for it.
-            self.clock.sleep_until_ns(begin_ns + self.wait_ns)
-        self._note_stale(scan)
+            self._clock.sleep_until_ns(begin_ns + self._frame_ns)
+        self._frames += 1
         return scan
 
-    @property
-    def sample_delay_ns(self) -> int:
-        """From the STOP of a CONVERT to the instant the pressure is taken to be sampled."""
-        return CONVERSION_TYPICAL_NS // SAMPLE_PART_OF_CONVERSION
+    # What schedules are made of
 
-    def blank_scan(self) -> Scan:
-        """A scan in which nothing has been read."""
-        n = len(self.tiles)
-        return Scan([NOT_READ] * n, [NOT_READ] * n, [self.clock.now_ns()] * n, [0] * n)
+    def convert(self, scan: Scan, tiles: Sequence[int]) -> None:
+        """Start a conversion in all `tiles` at once."""
+        if len(tiles) == 1:
+            if self._running[tiles[0]]:
+                return  # of a slow part, which is not waited for and not to be disturbed
+            if not self.health[tiles[0]].present:
+                self._started_ns[tiles[0]] = self._clock.now_ns()
+                return
+        started = self._attempt(scan, tiles, lambda: self._ports.convert(tiles))
+        now_ns = self._clock.now_ns()
+        for i in tiles:
+            self._started_ns[i] = now_ns
+            # One that is not known to be there may have missed a broadcast.
+            self._running[i] = started and self.health[i].present
 
-    def attempt(self, scan: Scan, tiles: Sequence[int], transfers: Callable[[], None]) -> bool:
-        """Run `transfers` for `tiles`, once more if they fail, and note the outcome in `scan`.
+    def collect(self, scan: Scan, tile: int) -> None:
+        """Read the conversion of a tile as soon as it is finished."""
+        health = self.health[tile]
+        scan.convert_stop_ns[tile] = self._started_ns[tile]
+        if scan.given_up:
+            scan.flag(tile, TileStatus.NO_ANSWER)
+            return
+        if not health.present:
+            self._look_for(scan, tile)
+            return
+        ready_ns = self._started_ns[tile] + self._watch.wait_ns[tile]
+        if not self._running[tile] or (
+            health.slow and not self._waits_for_slow_ones and self._clock.now_ns() < ready_ns
+        ):
+            scan.flag(tile, TileStatus.NOT_CONVERTED)
+            return
+        with_temperature = self._frames % self._temperature_every == 0 or health.wants_temperature
+        words = (NOT_READ, NOT_READ)
 
-        Only tiles that answered in the previous frame are worth the second attempt: one bad plug
-        must not cost the others their rate at every frame.
-        """
+        def transfers() -> None:
+            nonlocal words
+            self._ports.connect(tile)
+            self._wait(scan, ready_ns)
+            words = self._ports.read(with_temperature)
+
+        answers = self._attempt(scan, [tile], transfers)
+        self._running[tile] = False
+        if answers:
+            may_ask = self._may_spend(scan, tile)
+            self._judge.judge(
+                scan, tile, words, with_temperature=with_temperature, may_ask=may_ask
+            )
+        else:
+            health.lose(self._clock.now_ns())
+
+    # What becomes of a transfer
+
+    def _attempt(self, scan: Scan, tiles: Sequence[int], transfers: Callable[[], None]) -> bool:
+        """Run `transfers` for `tiles`, a second time if the frame's budget allows."""
         for attempt in range(2):
+            begin_ns = self._clock.now_ns()
             try:
+                if scan.given_up:
+                    break
                 transfers()
             except (BusMisuseError, BusSetupError):
                 raise
-            except I2cError as error:
-                self.router.forget()
-                # A silent tile is that tile's fault; anything else is the bus's.
-                scan.bus_fault |= not isinstance(error, NoAcknowledgeError)
-                if not any(self._answered[i] for i in tiles):
-                    break
-                continue
-            if attempt:
-                for i in tiles:
-                    scan.status[i] |= TileStatus.RETRIED
-            return True
+            except NoAcknowledgeError:
+                self._ports.forget(tiles)
+                scan.budget_ns -= self._clock.now_ns() - begin_ns
+            except I2cError:
+                self._ports.router.forget()
+                scan.note_bus_fault()
+            else:
+                if attempt:
+                    for i in tiles:
+                        scan.flag(i, TileStatus.RETRIED)
+                return True
+            if not self._may_spend(scan, tiles[0]):
+                break
         for i in tiles:
-            scan.status[i] |= TileStatus.NO_ANSWER
+            scan.flag(i, TileStatus.NO_ANSWER)
         return False
 
-    def read_into(self, scan: Scan, tile: int) -> None:
-        """Read the finished conversion of the one tile that is connected."""
-        padc, tadc = self.chip.read_counts()
-        scan.padc[tile] = padc
-        scan.tadc[tile] = tadc
-        if padc == tadc == 0:
-            scan.status[tile] |= TileStatus.NOT_CONVERTED
-        elif padc == tadc == COUNTS_MAX:
-            scan.status[tile] |= TileStatus.IMPLAUSIBLE
+    def _may_spend(self, scan: Scan, tile: int) -> bool:
+        """Is there time left in this frame for more than one reading of a tile?
 
-    def _note_stale(self, scan: Scan) -> None:
-        for i, words in enumerate(zip(scan.padc, scan.tadc, strict=True)):
-            answered = words[0] != NOT_READ
-            self._answered[i] = answered
-            self._repeats[i] = self._repeats[i] + 1 if words == self._last_words[i] else 0
-            self._last_words[i] = words
-            if answered and self._repeats[i] >= STALE_AFTER:
-                scan.status[i] |= TileStatus.STALE
+        Each tile in turn has a frame in which there always is, or the first ones would use up what
+        the last ones need.
+        """
+        return scan.budget_ns > 0 or tile == self._frames % len(self.tiles)
 
+    def _wait(self, scan: Scan, ready_ns: int) -> None:
+        """Sleep until a conversion is finished, and do what is to be done at the sample instant."""
+        if self._beside is not None and scan.reference_ns is None:
+            scan.reference_ns = self._started_ns[0] + self.sample_delay_ns[0]
+            self._clock.sleep_until_ns(scan.reference_ns)
+            scan.reference_n = self._beside()
+        self._clock.sleep_until_ns(ready_ns)
 
-def sequential(array: TileArray) -> Scan:
-    """Tile by tile: select, convert, wait, read. The slow and plain reference."""
-    scan = array.blank_scan()
-    for i, tile in enumerate(array.tiles):
+    def _look_for(self, scan: Scan, tile: int) -> None:
+        """See whether a tile that was lost is back; its sample comes with the next frame."""
+        health = self.health[tile]
+        begin_ns = self._clock.now_ns()
+        scan.flag(tile, TileStatus.IMPLAUSIBLE if health.replaced else TileStatus.NO_ANSWER)
+        if health.replaced or not health.is_probe_due(begin_ns):
+            return
+        if not self._may_spend(scan, tile):
+            return
+        try:
+            self._ports.connect(tile)
+            if self._ports.read_coefficients() == health.coefficient_bytes:
+                health.find()
+            elif self._ports.read_coefficient_words(tile) == health.coefficient_words:
+                health.find()  # the first reading was disturbed
+            else:
+                # Three times the same and plausible: a part, but not the one that was here.
+                health.replaced = True
+        except (BusMisuseError, BusSetupError):
+            raise
+        except TileSetupError:
+            scan.flag(tile, TileStatus.IMPLAUSIBLE)
+            health.lose(self._clock.now_ns())
+        except NoAcknowledgeError:
+            self._ports.forget([tile])
+            health.lose(self._clock.now_ns())
+        except I2cError:
+            scan.note_bus_fault()
+        scan.budget_ns -= self._clock.now_ns() - begin_ns
 
-        def transfers(i: int = i, tile: TileScene = tile) -> None:
-            array.router.connect_only(tile.mux, tile.channel)
-            array.chip.convert()
-            scan.convert_stop_ns[i] = array.clock.now_ns()
-            array.clock.sleep_until_ns(scan.convert_stop_ns[i] + array.wait_ns)
-            array.read_into(scan, i)
+    # Frame by frame
 
-        array.attempt(scan, [i], transfers)
-    return scan
+    def _bus_comes_back(self, scan: Scan) -> bool:
+        if self.bus.comes_back():
+            for health in self.health:
+                if not health.replaced:
+                    health.doubt(self._clock.now_ns())
+            return True
+        scan.bus_fault = True
+        for i in self.indices:
+            scan.flag(i, TileStatus.NO_ANSWER)
+        return False
 
+    def _audit(self, scan: Scan) -> None:
+        try:
+            tile = self._watch.audit()
+        except (BusMisuseError, BusSetupError):
+            raise
+        except NoAcknowledgeError:  # the next frame will see who it is
+            self._ports.router.forget()
+        except I2cError:
+            scan.note_bus_fault()
+        else:
+            if tile is not None:
+                self._running[tile] = False
+                self.convert(scan, [tile])
 
-def simultaneous(array: TileArray) -> Scan:
-    """Open all channels, one CONVERT for all tiles, wait once, then read each: no skew."""
-    scan = array.blank_scan()
-    everyone = range(len(array.tiles))
-
-    def broadcast() -> None:
-        array.router.connect(array.all_channels)
-        array.chip.convert()
-
-    if not array.attempt(scan, everyone, broadcast):
-        return scan
-    convert_stop_ns = array.clock.now_ns()
-    scan.convert_stop_ns = [convert_stop_ns] * len(array.tiles)
-
-    for i, tile in enumerate(array.tiles):
-
-        def transfers(i: int = i, tile: TileScene = tile) -> None:
-            # The first select is hidden in the wait.
-            array.router.connect_only(tile.mux, tile.channel)
-            array.clock.sleep_until_ns(convert_stop_ns + array.wait_ns)
-            array.read_into(scan, i)
-
-        array.attempt(scan, [i], transfers)
-    return scan
-
-
-SCHEDULES: Mapping[ScheduleName, Schedule] = {
-    "sequential": sequential,
-    "simultaneous": simultaneous,
-}
+    def _conclude(self, scan: Scan) -> None:
+        """What this frame says of the tiles' freshness and of the bus."""
+        for i, health in enumerate(self.health):
+            if health.is_stale(scan.padc[i], scan.tadc[i]):
+                scan.flag(i, TileStatus.STALE)
+                self._watch.slow_down(i)
+            if scan.status[i]:
+                health.note(scan.status[i])
+        if self.bus.is_down:
+            return
+        if not scan.given_up and not any(h.present or h.replaced for h in self.health):
+            self.bus.look(scan)
+        if scan.given_up:
+            self.bus.fall()
+            self._running = [False] * len(self.tiles)

@@ -41,8 +41,18 @@ class I2cAdapter(Protocol):
     def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
         """One I2C_RDWR transaction: START, repeated STARTs between messages, one STOP."""
 
+    def set_timeout(self, units_10ms: int) -> None:
+        """How long a wedged transfer lasts before it fails (ioctl I2C_TIMEOUT)."""
+
     def close(self) -> None:
         """Release the adapter."""
+
+
+class _Smbus(SMBus):  # type: ignore[misc]  # smbus2 has no types
+    """smbus2's adapter, with the one call that it lacks."""
+
+    def set_timeout(self, units_10ms: int) -> None:
+        fcntl.ioctl(self.fd, I2C_TIMEOUT, units_10ms)
 
 
 class I2cBus:
@@ -122,15 +132,14 @@ def open_bus(name: str, emulated: I2cAdapter | None = None) -> I2cBus:
     if name == "emulated":
         if emulated is None:
             raise UsageError("bus 'emulated' needs an emulated world, and none was given")
-        return I2cBus(emulated, name)
+        adapter = emulated
+    else:
+        try:
+            adapter = _Smbus(name)
+        except OSError as error:
+            raise _classified(error, name, ()) from error
     try:
-        adapter = SMBus(name)
-    except OSError as error:
-        raise _classified(error, name, ()) from error
-    try:
-        if adapter.fd is not None:
-            # smbus2 has no call of its own for it.
-            fcntl.ioctl(adapter.fd, I2C_TIMEOUT, TIMEOUT_10MS)
+        adapter.set_timeout(TIMEOUT_10MS)
     except OSError as error:
         adapter.close()
         raise _classified(error, name, ()) from error

@@ -143,6 +143,7 @@ class Mpl115a2:
         self._convert = i2c_msg.write(ADDRESS, [REGISTER_CONVERT, 0x00])
         self._point_at_counts = i2c_msg.write(ADDRESS, [REGISTER_PADC])
         self._counts = i2c_msg.read(ADDRESS, 4)
+        self._padc = i2c_msg.read(ADDRESS, 2)
         self._point_at_coefficients = i2c_msg.write(ADDRESS, [REGISTER_COEFFICIENTS])
         self._coefficients = i2c_msg.read(ADDRESS, 8)
 
@@ -156,6 +157,16 @@ class Mpl115a2:
         padc, tadc = _UNSIGNED_WORDS.unpack(bytes(self._counts))
         return padc >> 6, tadc >> 6
 
+    def read_padc(self) -> int:
+        """`padc` alone, which saves 18 bits on the wire."""
+        self._bus.transfer(self._point_at_counts, self._padc)
+        return int.from_bytes(bytes(self._padc), "big") >> 6
+
+    def read_coefficient_bytes(self) -> bytes:
+        """The eight coefficient registers, read once, as they are."""
+        self._bus.transfer(self._point_at_coefficients, self._coefficients)
+        return bytes(self._coefficients)
+
     def read_coefficient_words(self, *, where: str, reads: int = 3) -> tuple[int, int, int, int]:
         """The four coefficient registers as unsigned words, read `reads` times in agreement.
 
@@ -168,8 +179,7 @@ class Mpl115a2:
         """
         readings = set()
         for _ in range(reads):
-            self._bus.transfer(self._point_at_coefficients, self._coefficients)
-            readings.add(bytes(self._coefficients))
+            readings.add(self.read_coefficient_bytes())
         if len(readings) > 1:
             raise TileSetupError(
                 f"{reads} readings of the coefficients differ: "

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -22,9 +22,20 @@ from devices.tca9548a import ADDRESSES, CHANNELS
 EMULATED = "emulated"
 """Name of a bus or port that is emulated."""
 
-ScheduleName = Literal["simultaneous", "sequential"]
+ScheduleName = Literal["simultaneous", "pipelined", "per_mux", "sequential"]
 ReadDuringConversion = Literal["stale", "abort", "torn"]
-FaultKind = Literal["no_answer", "stale"]
+
+TileFault = Literal[
+    "no_answer", "unplugged", "replaced", "stale", "slow", "all_ones", "over_range"
+]
+MuxFault = Literal["brown_out", "mux_reset"]
+BusFault = Literal[
+    "sda_low", "sda_high", "scl_low", "adapter_timeout", "nack_storm", "bit_errors"
+]
+FaultKind = TileFault | MuxFault | BusFault
+
+BUS = "bus"
+"""Target of a fault that is no tile's and no multiplexer's."""
 
 # No quantity here is meant beyond a million; what is, is a slip of the keyboard or of the unit.
 _Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
@@ -47,10 +58,16 @@ class ArrayScene(_Section):
     """A device such as /dev/i2c-1, or "emulated"."""
     scl_hz: Annotated[float, Field(ge=10_000, le=1_000_000)] = 400_000.0
     """Bus clock of the emulation; on hardware it is set in config.txt. The bounds catch kHz."""
-    schedule: ScheduleName = "simultaneous"
-    wait_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 3.0
-    """How long the driver waits for a conversion. The default is the data sheet's maximum; shorter
-    only where the parts are known to be faster, else results are stale."""
+    schedule: ScheduleName | Literal["auto"] = "auto"
+    """How the bus is asked (`devices.schedules`); "auto": whatever is best for these tiles."""
+    wait_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """How long the driver waits for a conversion. Absent: as long as each part is measured to take
+    at start-up. Too short gives stale results."""
+    temperature_every: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Temperature is read in every so many frames; the others save two bytes a tile."""
+    broadcast_channels: Annotated[int, Field(ge=1, le=64)] = 8
+    """How many channels may be open at once: the pull-ups of all of them have to be sunk by one
+    part (TCA9548A data sheet 9.2.1)."""
     conversion_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
     """Emulation only: conversion time of every part. Absent: drawn for each part."""
 
@@ -198,15 +215,38 @@ class EmulationScene(_Section):
     clip_kpa: _NotNegative = 0.0
     """Analogue clip of the chips; 0: none, they wrap (as real parts do)."""
     read_during_conversion: ReadDuringConversion = "stale"
+    scl_part: Annotated[float, Field(gt=0, le=4)] = 1.0
+    """What the bus clock really is, relative to `array.scl_hz`: 0.625 is the Raspberry Pi whose
+    core idles at 250 MHz (hardware.md 3.2)."""
 
 
 class FaultScene(_Section):
-    """`[[fault]]`: something fails at `t_s` after power-up, for `duration_s`."""
+    """`[[fault]]`: something fails `t_s` after the scene began, for `duration_s`."""
 
     kind: FaultKind
-    tile: str
+    tile: str | None = None
+    """Which tile; for faults of a tile."""
+    mux: int | None = None
+    """Which multiplexer; for faults of one."""
     t_s: _NotNegative
     duration_s: _Positive
+    rate: Annotated[float, Field(gt=0, le=1)] = 0.01
+    """How often, for what comes by chance: of the bytes for `nack_storm` and `bit_errors`, of the
+    transfers for `adapter_timeout`."""
+
+    @property
+    def target(self) -> str:
+        """What fails: a tile's serial, a mux as "0x70", or the bus."""
+        return self.tile or (BUS if self.mux is None else f"0x{self.mux:02x}")
+
+    @model_validator(mode="after")
+    def _names_what_fails(self) -> Self:
+        needs_tile, needs_mux = self.kind in get_args(TileFault), self.kind in get_args(MuxFault)
+        if needs_tile != (self.tile is not None):
+            raise ValueError(f"{self.kind} is {'' if needs_tile else 'no '}fault of a tile")
+        if needs_mux != (self.mux is not None):
+            raise ValueError(f"{self.kind} is {'' if needs_mux else 'no '}fault of a mux")
+        return self
 
 
 class Scene(_Section):
@@ -237,10 +277,12 @@ class Scene(_Section):
         if all(tile.reference for tile in self.tile):
             raise ValueError("every tile is a reference tile; at least one has to bear load")
         for fault in self.fault:
-            if fault.tile not in serials:
+            if fault.tile is not None and fault.tile not in serials:
                 raise ValueError(
                     f"a fault names tile {fault.tile!r}, but there are only {', '.join(serials)}"
                 )
+            if fault.mux is not None and fault.mux not in {tile.mux for tile in self.tile}:
+                raise ValueError(f"a fault names mux 0x{fault.mux:02x}, and no tile is behind it")
         return self
 
 

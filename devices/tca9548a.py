@@ -6,13 +6,15 @@ select and the access behind it can never share a transaction; every method here
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
-from devices.errors import I2cError
+from devices.errors import NoAcknowledgeError
 from devices.i2c import I2cBus, i2c_msg
 
 ADDRESSES = range(0x70, 0x78)
 CHANNELS = range(8)
+
+_REFUSALS_MAX = 2
 
 
 class Tca9548a:
@@ -40,45 +42,104 @@ class MuxRouter:
 
     All tiles share one address, so a channel left open on another mux would answer too: reads would
     return the AND of two tiles, plausible and wrong. The state is cached, because a select costs
-    50 us, and the cache is forgotten after any error, because then nothing is known.
+    50 us; what is not known is written anew before anything else is connected.
     """
 
     def __init__(self, bus: I2cBus, addresses: Iterable[int]) -> None:
         self._muxes = {address: Tca9548a(bus, address) for address in sorted(set(addresses))}
         self._masks: dict[int, int | None] = dict.fromkeys(self._muxes)
+        self._refusals = dict.fromkeys(self._muxes, 0)
+        self.silent: set[int] = set()
+        """Muxes that did not let themselves be closed. They are taken to be without supply, which
+        connects nothing; whoever reads a tile of another mux has to make sure of that."""
 
     @property
     def addresses(self) -> tuple[int, ...]:
         """Addresses of the multiplexers, ascending."""
         return tuple(self._muxes)
 
-    def connect(self, masks: dict[int, int]) -> None:
+    def connect(self, masks: Mapping[int, int]) -> None:
         """Connect exactly the channels of `masks` (address to mask); all other muxes are closed.
 
         Muxes are closed before others are opened, so that no two overlap in between.
 
         Raises:
-            I2cError: a mux did not answer; nothing is known of the routing then.
+            I2cError: a mux did not answer. One that refuses to be closed twice in a row is
+                `silent` from then on, and in nobody's way.
         """
-        try:
-            for address, mask in self._masks.items():
-                if mask != 0 and not masks.get(address):
-                    self._write(address, 0)
-            for address, mask in masks.items():
-                if self._masks[address] != mask:
-                    self._write(address, mask)
-        except I2cError:
-            self.forget()
-            raise
+        for address, mask in self._masks.items():
+            if mask != 0 and not masks.get(address):
+                self._close(address)
+        for address, mask in masks.items():
+            if self._masks[address] != mask:
+                self._write(address, mask)
 
     def connect_only(self, address: int, channel: int) -> None:
         """Connect one channel of one mux and nothing else."""
         self.connect({address: 1 << channel})
 
-    def forget(self) -> None:
-        """Drop the cached state: the next `connect` writes every mux again."""
+    def forget(self, address: int | None = None) -> None:
+        """Drop the cached state of one mux, or of all: the next `connect` writes it again."""
+        if address is not None:
+            self._masks[address] = None
+            return
         self._masks = dict.fromkeys(self._muxes)
+        self._refusals = dict.fromkeys(self._muxes, 0)
+        self.silent.clear()
+
+    def audit(self) -> bool:
+        """Read back what every mux connects; True if it is what it should be.
+
+        A mux that was reset behind our back is forgotten, and so is one that does not answer.
+
+        Raises:
+            BusFaultError: the bus itself failed.
+        """
+        sound = True
+        for address, mask in self._masks.items():
+            if mask is None or address in self.silent:
+                continue
+            try:
+                found: int | None = self._muxes[address].read_mask()
+            except NoAcknowledgeError:
+                found = None
+            if found != mask:
+                self._masks[address] = None
+                sound = False
+        return sound
+
+    def echoes(self) -> bool:
+        """Does a mux keep what is written to it? Of a bus whose SDA is stuck low none seems to.
+
+        Such a bus acknowledges everything and reads as zeros (hardware.md 3.2), so one bit that
+        comes back is proof that the wires move. Tries the muxes one after another.
+
+        Raises:
+            BusFaultError: the bus itself failed.
+        """
+        self.forget()
+        for mux in self._muxes.values():
+            try:
+                mux.write_mask(1)
+                if mux.read_mask() == 1:
+                    return True
+            except NoAcknowledgeError:
+                continue
+        return False
+
+    def _close(self, address: int) -> None:
+        try:
+            self._write(address, 0)
+        except NoAcknowledgeError:
+            self._refusals[address] += 1
+            if self._refusals[address] < _REFUSALS_MAX:
+                raise
+            self.silent.add(address)
+            self._masks[address] = 0
 
     def _write(self, address: int, mask: int) -> None:
+        self._masks[address] = None  # until the STOP nobody knows
         self._muxes[address].write_mask(mask)
         self._masks[address] = mask
+        self._refusals[address] = 0
+        self.silent.discard(address)

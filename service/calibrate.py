@@ -11,6 +11,7 @@ import numpy as np
 from devices.compensation import Compensation
 from devices.errors import CalibrationError
 from devices.frames import FrameBatch
+from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration
 from service.estimation.fit import fit_tile
 from service.estimation.indentation import Indentation
@@ -72,7 +73,8 @@ def read_indentations(session: SessionReader) -> list[Indentation]:
     frames = FrameBatch.concatenate([frames for frames, _ in pieces])
     pressed = np.concatenate([extra["pressed_tile"] for _, extra in pieces])
     phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
-    kpa = Compensation(session.info.tiles).readable_kpa(frames)
+    held, _ = hold_temperature(frames)
+    kpa = Compensation(session.info.tiles).readable_kpa(held)
     tiles = [
         Indentation(
             serial=serial,

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from devices.acquisition import Acquisition
-from devices.array import TileArray
 from devices.clock import SystemClock, UtcAnchor
 from devices.dynamixel import open_servo
 from devices.emulation.ground import press_on
@@ -22,6 +21,7 @@ from devices.i2c import open_bus
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
 from devices.scene import EMULATED, Scene, ServoScene
 from devices.servo import ServoReader
+from devices.startup import make_ready
 from service.describe import describe
 
 if TYPE_CHECKING:
@@ -71,35 +71,32 @@ class Rig:
         world = self._world(options, stack)
         bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
         stack.callback(bus.close)
-        array = TileArray(
+        ready = make_ready(
             bus,
-            scene.tile,
+            scene,
             self._clock,
-            schedule=scene.array.schedule,
-            wait_ms=scene.array.wait_ms,
+            beside=self._mill_force_n if world is not None and world.mill is not None else None,
         )
-        tiles = array.identify()
         servo = self._servo(scene.servo, world, stack) if scene.servo is not None else None
         anchor = UtcAnchor.now(clock_set=clock_is_set())
-        bus_hz = self._bus_hz(array)
+        bus_hz = self._bus_hz(ready.array)
         self.info: ArrayInfo = describe(
             scene,
-            tiles,
+            ready.tiles,
             anchor,
             node=options.node,
             boot_id=uuid.uuid4().hex,
-            schedule=scene.array.schedule,
+            schedule=ready.choice.schedule,
             rate_hz=min(scene.rate_hz or bus_hz, bus_hz),
         )
         self.acquisition = Acquisition(
-            array,
-            tiles,
+            ready.array,
+            ready.tiles,
             self._clock,
             anchor,
             rate_hz=scene.rate_hz,
             expected_hz=bus_hz,
             servo=servo,
-            reference=world.mill if world is not None and options.emulated else None,
         )
         if not options.emulated:
             # Last, and only this thread: an emulated world would starve the rest of the machine.

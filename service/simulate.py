@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.acquisition import Acquisition
-from devices.array import TileArray
 from devices.clock import UtcAnchor, VirtualClock
 from devices.dynamixel import open_servo
 from devices.emulation.ground import press_on
@@ -28,13 +27,14 @@ from devices.frames import FrameBatch, FrameStatus
 from devices.i2c import open_bus
 from devices.scene import Scene, ScheduleName, ServoScene
 from devices.servo import PolledServo
+from devices.startup import make_ready
 from service.accuracy import JUDGED, Accuracy, judge
 from service.describe import describe
 from service.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
 from storage.session_file import SessionWriter
 
 START_NS = 1_577_836_800_000_000_000
-"""2020-01-01T00:00:00Z, at which every emulated machine is switched on."""
+"""2020-01-01T00:00:00Z, at which every emulated session begins."""
 
 NODE = "emulated"
 
@@ -94,48 +94,47 @@ class Simulation:
             parts_seed=options.parts_seed,
             lead_s=options.lead_s,
             pressed=self.pressed,
+            begun=False,
         )
-        self._end_ns = _end_ns(options, self._world.ground.duration_s)
-        schedule = options.schedule or scene.array.schedule
-        array = TileArray(
+        duration_ns = _duration_ns(options, self._world.ground.duration_s)
+        ready = make_ready(
             open_bus("emulated", self._world.i2c_adapter),
-            scene.tile,
+            scene,
             self._clock,
-            schedule=schedule,
-            wait_ms=scene.array.wait_ms,
+            schedule=options.schedule,
+            beside=self._mill_force_n if scene.ground.kind == "indentation" else None,
         )
-        tiles = array.identify()
-        anchor = UtcAnchor.of(0, START_NS, clock_set=True)
+        self.choice = ready.choice
+        self._array = ready.array
+        # The machine was switched on earlier, the session and its scene begin now.
+        self._world.begin()
+        self._begin_ns = self._clock.now_ns()
+        self._end_ns = self._begin_ns + duration_ns
+        anchor = UtcAnchor.of(self._begin_ns, START_NS, clock_set=True)
         servo = None
         if scene.servo is not None:
-            servo = _polled_servo(self._world, scene.servo, self._clock.now_ns(), stack)
-        # One frame before the stream tells what rate this bus gives.
-        begin_ns = self._clock.now_ns()
-        array.scan()
-        bus_hz = 1e9 / (self._clock.now_ns() - begin_ns)
-        self.rate_hz = min(scene.rate_hz or bus_hz, bus_hz)
+            servo = _polled_servo(self._world, scene.servo, self._begin_ns, stack)
+        self.rate_hz = min(scene.rate_hz or ready.predicted_hz, ready.predicted_hz)
         self.info = describe(
             scene,
-            tiles,
+            ready.tiles,
             anchor,
             node=NODE,
             boot_id=f"{options.seed:032x}",
-            schedule=schedule,
+            schedule=ready.choice.schedule,
             rate_hz=self.rate_hz,
         )
         self.acquisition = Acquisition(
-            array,
-            tiles,
-            self._clock,
-            anchor,
-            rate_hz=scene.rate_hz,
-            servo=servo,
-            reference=self._world.mill,
+            ready.array, ready.tiles, self._clock, anchor, rate_hz=scene.rate_hz, servo=servo
         )
+
+    def _mill_force_n(self) -> float:
+        mill = self._world.mill
+        return float("nan") if mill is None else mill.force_n(self._clock.now_ns())
 
     def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
         """Frames with what the emulation adds: truth if asked for, the mill's notes."""
-        lead_ns = round(self._options.lead_s * 1e9)
+        lead_ns = self._begin_ns + round(self._options.lead_s * 1e9)
         mill = self._world.mill
         batches = self.acquisition.run(lambda: self._clock.now_ns() >= self._end_ns)
         # Nobody watches, so frames may gather: batching does not change a bit of the result.
@@ -205,7 +204,7 @@ def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArra
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
-def _end_ns(options: SimulateOptions, ground_s: float | None) -> int:
+def _duration_ns(options: SimulateOptions, ground_s: float | None) -> int:
     seconds = options.seconds if options.seconds is not None else ground_s
     if seconds is None:
         raise UsageError(

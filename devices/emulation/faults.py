@@ -1,23 +1,44 @@
-"""Faults of single parts, by scene key at a time of the scene, or as context managers at will.
+"""Faults of parts, multiplexers and wires, by scene key at a time of the scene, or at will.
 
-`no_answer`: the part does not acknowledge, as when its plug is pulled (its registers survive, which
-a real unplugged part's would not). `stale`: it acknowledges, but a conversion never ends.
+What each kind does to the silicon is told where it happens: `mpl115a2` and `front_end` for tiles,
+`tca9548a` for multiplexers, `line` for the two wires. Here is only when.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
-from devices.scene import FaultScene
+from devices.scene import BUS, FaultKind, FaultScene
 
 
 class Fault:
-    """One kind of fault of one part: is it there at a given time?"""
+    """One kind of fault of one target: is it there at a given time?
 
-    def __init__(self, windows_ns: Sequence[tuple[int, int]] = ()) -> None:
-        self._windows_ns = tuple(windows_ns)
+    Args:
+        windows_s: begins and ends, in seconds of the scene.
+        rate: how often, for faults that come and go by chance while they are there.
+    """
+
+    def __init__(self, windows_s: Sequence[tuple[float, float]] = (), rate: float = 0.0) -> None:
+        self.rate = rate
+        self._windows_s = tuple(windows_s)
+        self._windows_ns: tuple[tuple[int, int], ...] = ()
         self._depth = 0
+        self._was_injected = False
+        self._is_new = False
+
+    @property
+    def possible(self) -> bool:
+        """May it have been there, or come?"""
+        return bool(self._depth or self._windows_ns or self._was_injected)
+
+    def begin(self, epoch_ns: int) -> None:
+        """The scene's time begins at this instant of the clock."""
+        self._windows_ns = tuple(
+            (epoch_ns + round(begin * 1e9), epoch_ns + round(end * 1e9))
+            for begin, end in self._windows_s
+        )
 
     def __call__(self, t_ns: int) -> bool:
         """Is the fault there at `t_ns`?"""
@@ -27,22 +48,72 @@ class Fault:
             return False
         return any(begin <= t_ns < end for begin, end in self._windows_ns)
 
+    def struck(self, since_ns: int, t_ns: int) -> bool:
+        """Was it there at any time after `since_ns` and not after `t_ns`?"""
+        if self._depth or self._was_injected:
+            self._was_injected = False
+            return True
+        return any(begin <= t_ns and end > since_ns for begin, end in self._windows_ns)
+
+    def set_in(self, since_ns: int, t_ns: int) -> bool:
+        """Did it begin after `since_ns` and not after `t_ns`? By hand: once for every block."""
+        if self._is_new:
+            self._is_new = False
+            return True
+        return any(since_ns < begin <= t_ns for begin, _ in self._windows_ns)
+
+    def clear(self, t_ns: int) -> None:
+        """End what is there at `t_ns`: somebody mended it."""
+        self._windows_ns = tuple(
+            (begin, min(end, t_ns) if begin <= t_ns else end) for begin, end in self._windows_ns
+        )
+        self._depth = 0
+
     @contextmanager
     def injected(self) -> Iterator[None]:
-        """The fault is there while the block runs, whatever the time."""
+        """The fault is there while the block runs, whatever the time, unless it is cleared."""
         self._depth += 1
+        self._is_new = True
         try:
             yield
         finally:
-            self._depth -= 1
+            self._depth = max(0, self._depth - 1)
+            self._was_injected = True
 
 
-def scene_fault(faults: Sequence[FaultScene], kind: str, serial: str, epoch_ns: int) -> Fault:
-    """The fault of one kind and part with the windows that the scene gives it."""
-    return Fault(
-        [
-            (epoch_ns + round(f.t_s * 1e9), epoch_ns + round((f.t_s + f.duration_s) * 1e9))
-            for f in faults
-            if f.kind == kind and f.tile == serial
-        ]
-    )
+class Faults:
+    """All faults that a scene may show, found by kind and target."""
+
+    def __init__(self, scenes: Sequence[FaultScene]) -> None:
+        self.possible = bool(scenes)
+        """May any of them be there, ever? Asked at every transfer before all else."""
+        self._scenes = scenes
+        self._faults: dict[tuple[FaultKind, str], Fault] = {}
+        self._epoch_ns: int | None = None
+
+    def of(self, kind: FaultKind, target: str = BUS) -> Fault:
+        """The fault of one kind and target: a tile's serial, a mux as "0x70", or the bus."""
+        if (kind, target) not in self._faults:
+            mine = [f for f in self._scenes if f.kind == kind and f.target == target]
+            fault = Fault([(f.t_s, f.t_s + f.duration_s) for f in mine], _rate(kind, mine))
+            if self._epoch_ns is not None:
+                fault.begin(self._epoch_ns)
+            self._faults[kind, target] = fault
+        return self._faults[kind, target]
+
+    def injected(self, kind: FaultKind, target: str) -> AbstractContextManager[None]:
+        """A fault by hand, while the block runs."""
+        self.possible = True
+        return self.of(kind, target).injected()
+
+    def begin(self, epoch_ns: int) -> None:
+        """The scene's time begins at this instant of the clock."""
+        self._epoch_ns = epoch_ns
+        for fault in self._faults.values():
+            fault.begin(epoch_ns)
+
+
+def _rate(kind: FaultKind, scenes: Sequence[FaultScene]) -> float:
+    if scenes:
+        return scenes[0].rate
+    return FaultScene.model_fields["rate"].default

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from devices.emulation.dome import Domes, Surroundings
+from devices.emulation.faults import Fault
 from devices.emulation.parts import ChipPart, DomePart, random_of
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.scene import EmulationScene
@@ -25,10 +26,15 @@ _OUTLIER_RATE = 0.012
 _OUTLIER_KPA = (0.5, 1.2)
 _OUTLIERS_LOW = 0.85
 _DRAWN_AT_ONCE = 1024
+_FAR_OVER_RANGE_KPA = 45.0
 
 
 class FrontEnd:
-    """Samples one dome: a `Sense` for the emulated chip."""
+    """Samples one dome: a `Sense` for the emulated chip.
+
+    Before `begin` its dome is at rest at the scene's first instant. Fault `over_range`: it is
+    pressed 45 kPa harder, past the end of its counts.
+    """
 
     def __init__(
         self,
@@ -37,8 +43,8 @@ class FrontEnd:
         pressure_kpa: Callable[[float], float],
         surroundings: Surroundings,
         scene: EmulationScene,
-        epoch_ns: int,
         label: str,
+        over_range: Fault | None = None,
     ) -> None:
         self._c = chip.coefficients
         self._tadc_at_25 = chip.tadc_at_25_degc
@@ -46,7 +52,8 @@ class FrontEnd:
         self._pressure_kpa = pressure_kpa
         self._surroundings = surroundings
         self._clip_kpa = scene.clip_kpa or math.inf
-        self._epoch_ns = epoch_ns
+        self._epoch_ns: int | None = None
+        self._over_range = over_range if over_range is not None else Fault()
         self._noise = _noise(scene, self._lsb_kpa(), random_of(label))
         self._correlated_s = scene.correlated_ms * 1e-3
         self._core_kpa = 0.0
@@ -54,12 +61,19 @@ class FrontEnd:
         self._steady = surroundings.steady
         self._steady_tadc = self._true_tadc(0.0)
 
+    def begin(self, epoch_ns: int) -> None:
+        """The scene's time begins at this instant of the clock."""
+        self._epoch_ns = epoch_ns
+
     def __call__(self, t_ns: int) -> tuple[int, int]:
         """Words `padc`, `tadc` of a conversion that samples at `t_ns`."""
-        t_s = (t_ns - self._epoch_ns) * 1e-9
+        # A conversion that was under way when the scene began saw its first instant.
+        t_s = 0.0 if self._epoch_ns is None else max(0.0, (t_ns - self._epoch_ns) * 1e-9)
         core_kpa, outlier_kpa, tadc_noise = next(self._noise)
         kpa = min(self._pressure_kpa(t_s), self._clip_kpa)
-        kpa += self._correlate(core_kpa, t_s) + outlier_kpa
+        if self._over_range(t_ns):
+            kpa += _FAR_OVER_RANGE_KPA
+        kpa += self._correlate(core_kpa, t_ns * 1e-9) + outlier_kpa
         # The transducer feels the true temperature; the word reported for it is a noisy one.
         tadc = self._steady_tadc if self._steady else self._true_tadc(t_s)
         c = self._c
@@ -82,29 +96,6 @@ class FrontEnd:
         self._core_kpa = keep * self._core_kpa + math.sqrt(1.0 - keep * keep) * white_kpa
         self._last_s = t_s
         return self._core_kpa
-
-
-def front_ends(
-    chips: list[ChipPart],
-    parts: list[DomePart],
-    serials: list[str],
-    domes: Domes,
-    surroundings: Surroundings,
-    scene: EmulationScene,
-    epoch_ns: int,
-    label: str,
-) -> list[FrontEnd]:
-    """One front end per tile, each with noise of its own, drawn from `label` and its serial."""
-
-    def pressure_of(index: int) -> Callable[[float], float]:
-        return lambda t_s: domes.pressure_kpa(index, t_s)
-
-    return [
-        FrontEnd(
-            chip, part, pressure_of(i), surroundings, scene, epoch_ns, f"noise/{label}/{serial}"
-        )
-        for i, (chip, part, serial) in enumerate(zip(chips, parts, serials, strict=True))
-    ]
 
 
 def _noise(

@@ -18,11 +18,16 @@ from operator import and_
 from typing import Protocol
 
 from devices.clock import Clock
+from devices.emulation.faults import Faults
+from devices.emulation.line import Line
 from devices.i2c import i2c_msg
 
 I2C_RDWR_IOCTL_MAX_MSGS = 42
 MESSAGE_BYTES_MAX = 8192
 _FLAG_READ = 0x0001
+_TIMEOUT_UNIT_NS = 10_000_000
+_TIMEOUT_DEFAULT = 100  # the i2c core's second
+_NOT_ACKNOWLEDGED_BITS = 11  # START, address with direction and missing acknowledge, STOP
 
 
 class I2cDevice(Protocol):
@@ -55,15 +60,36 @@ class MuxDevice(I2cDevice, Protocol):
     def connected(self) -> Iterable[I2cDevice]:
         """Devices on the channels that are in force now."""
 
+    def suffer(self, t_ns: int) -> None:
+        """Let happen what has befallen it since it was last asked."""
+
+    def reset(self) -> None:
+        """Its RESET line was low."""
+
 
 class EmulatedI2cAdapter:
     """The bus of an emulated Raspberry Pi: multiplexers on the trunk, chips behind them."""
 
-    def __init__(self, muxes: Sequence[MuxDevice], clock: Clock, scl_hz: float) -> None:
+    def __init__(
+        self, muxes: Sequence[MuxDevice], clock: Clock, scl_hz: float, line: Line | None = None
+    ) -> None:
+        self.line = line if line is not None else Line(Faults(()), "")
         self._muxes = muxes
+        self._mux_addresses = frozenset(mux.address for mux in muxes)
         self._clock = clock
         self._ns_per_bit = 1e9 / scl_hz
+        self._timeout_ns = _TIMEOUT_DEFAULT * _TIMEOUT_UNIT_NS
         self._wires: dict[tuple[int, ...], dict[int, list[I2cDevice]]] = {}
+        self._wire = self._devices_by_address()
+
+    def set_timeout(self, units_10ms: int) -> None:
+        """How long a wedged transfer lasts, as by the ioctl I2C_TIMEOUT."""
+        self._timeout_ns = units_10ms * _TIMEOUT_UNIT_NS
+
+    def reset_muxes(self) -> None:
+        """The RESET line of all multiplexers, pulsed."""
+        for mux in self._muxes:
+            mux.reset()
         self._wire = self._devices_by_address()
 
     def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
@@ -71,38 +97,80 @@ class EmulatedI2cAdapter:
 
         Raises:
             OSError: EINVAL and EOPNOTSUPP for what the kernel or the adapter refuses before it
-                touches the bus, EREMOTEIO for a missing acknowledge.
+                touches the bus, EREMOTEIO for a missing acknowledge, ETIMEDOUT if SCL is stuck.
         """
         _refuse_unsupported(i2c_msgs)
         begin_ns = self._clock.now_ns()
+        disturbed = None if self.line.sound else self.line
+        if disturbed is not None:
+            for mux in self._muxes:
+                mux.suffer(begin_ns)
+            self._wire = self._devices_by_address()
+            if self._is_stuck(i2c_msgs, begin_ns):
+                return
         addressed: list[I2cDevice] = []
         bits = 0
+        routed = disturbed is not None
         try:
             for message in i2c_msgs:
                 bits += 10  # START or repeated START, address with direction, acknowledge
                 reading = bool(message.flags & _FLAG_READ)
                 t_ns = begin_ns + round(bits * self._ns_per_bit)
-                called = self._wire.get(message.addr, ())
+                called = (
+                    self._wire.get(message.addr, ())
+                    if disturbed is None
+                    else self._called(message.addr, reading, t_ns, disturbed)
+                )
                 listeners = [device for device in called if device.start(reading, t_ns)]
-                if not listeners:
-                    raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
                 addressed += listeners
+                routed |= message.addr in self._mux_addresses
+                _expect_acknowledge(listeners, t_ns, disturbed)
+                bits += 9 * message.len
                 if reading:
-                    bits += 9 * message.len
-                    _read(message, listeners)
+                    _read(message, listeners, t_ns, disturbed)
                 else:
-                    for value in bytes(message):
-                        bits += 9
-                        acknowledges = [device.write(value) for device in listeners]
-                        if True not in acknowledges:
-                            raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+                    written = _write(message, listeners, t_ns, disturbed)
+                    if written < message.len:
+                        bits -= 9 * (message.len - written - 1)
+                        raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
         finally:
             stop_ns = begin_ns + round((bits + 1) * self._ns_per_bit)
             for device in addressed:
                 device.stop(stop_ns)
-            # Routing changes at STOP and at no other time.
-            self._wire = self._devices_by_address()
+            # Routing changes at STOP and at no other time, and only if a mux was written to.
+            if routed:
+                self._wire = self._devices_by_address()
             self._clock.sleep_until_ns(stop_ns)
+
+    def _called(
+        self, address: int, reading: bool, t_ns: int, disturbed: Line | None
+    ) -> Sequence[I2cDevice]:
+        """Who hears the address byte as his own."""
+        if disturbed is not None:
+            heard = disturbed.disturbed(address << 1 | reading, t_ns)
+            if heard & 1 != reading:
+                return ()  # one side reads where the other does: nobody gets on with it
+            address = heard >> 1
+        return self._wire.get(address, ())
+
+    def _is_stuck(self, messages: Sequence[i2c_msg], begin_ns: int) -> bool:
+        """Go through a transaction on wires that do not move; True if that looks like success."""
+        if self.line.wedged(begin_ns):
+            self._clock.sleep_until_ns(begin_ns + self._timeout_ns)
+            raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
+        if self.line.sda_high(begin_ns):
+            self._pass(begin_ns, _NOT_ACKNOWLEDGED_BITS)
+            raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+        if self.line.sda_low(begin_ns):
+            for message in messages:
+                if message.flags & _FLAG_READ:
+                    ctypes.memset(message.buf, 0, message.len)
+            self._pass(begin_ns, sum(10 + 9 * message.len for message in messages) + 1)
+            return True
+        return False
+
+    def _pass(self, begin_ns: int, bits: int) -> None:
+        self._clock.sleep_until_ns(begin_ns + round(bits * self._ns_per_bit))
 
     def close(self) -> None:
         """Nothing to release."""
@@ -129,10 +197,40 @@ def _refuse_unsupported(messages: Sequence[i2c_msg]) -> None:
             raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
 
 
-def _read(message: i2c_msg, listeners: list[I2cDevice]) -> None:
+def _expect_acknowledge(
+    listeners: list[I2cDevice], t_ns: int, disturbed: Line | None
+) -> None:
+    if not listeners or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
+        raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+
+
+def _write(
+    message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: Line | None
+) -> int:
+    """Give the bytes of a message to who listens; how many were acknowledged."""
+    sent = bytes(message)
+    if disturbed is None and len(listeners) == 1:
+        write = listeners[0].write
+        for count, value in enumerate(sent, start=1):
+            if not write(value):
+                return count - 1
+        return len(sent)
+    for count, value in enumerate(sent, start=1):
+        heard = value if disturbed is None else disturbed.disturbed(value, t_ns)
+        acknowledged = True in [device.write(heard) for device in listeners]
+        if not acknowledged or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
+            return count - 1
+    return len(sent)
+
+
+def _read(
+    message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: Line | None
+) -> None:
     given = [device.read(message.len) for device in listeners]
     # Open drain: a bit is low if anybody pulls it low.
     values = (
         given[0] if len(given) == 1 else bytes(map(partial(reduce, and_), zip(*given, strict=True)))
     )
+    if disturbed is not None:
+        values = bytes([disturbed.disturbed(value, t_ns) for value in values])
     ctypes.memmove(message.buf, values, message.len)

@@ -8,20 +8,57 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from devices.emulation.faults import Fault, Faults
 from devices.scene import ReadDuringConversion
 
 _CONVERT = 0x12
 _REGISTERS = 0x80
 _SAMPLE_QUARTER = 4
+_SLOW_NS = 2_900_000
 
 Sense = Callable[[int], tuple[int, int]]
 """Sample instant in ns -> the 10-bit words `padc`, `tadc` of a conversion that samples then."""
 
+Witness = Callable[[int, tuple[int, int]], None]
+"""Told of every conversion: the instant of its CONVERT's STOP and its words. Only for who judges a
+driver; no driver has it."""
 
-def _never(t_ns: int) -> bool:
-    return False
+
+@dataclass
+class PartFaults:
+    """What may be wrong with one part.
+
+    `no_answer`: it does not acknowledge, as with RST low; its registers and conversion go on.
+    `unplugged`: it has no supply; plugged in again its registers are zero. `replaced`: the same,
+    and what is plugged in again is another part. `stale`: a conversion never ends. `slow`: it takes
+    2.9 ms, still within the data sheet. `all_ones`: it is lost between address and data, so that
+    nobody drives the line.
+    """
+
+    no_answer: Fault = field(default_factory=Fault)
+    unplugged: Fault = field(default_factory=Fault)
+    replaced: Fault = field(default_factory=Fault)
+    stale: Fault = field(default_factory=Fault)
+    slow: Fault = field(default_factory=Fault)
+    all_ones: Fault = field(default_factory=Fault)
+    scene: Faults | None = None
+    """All faults of the scene; while none of them is possible, none of these is asked."""
+
+    @property
+    def possible(self) -> bool:
+        """May any of them be there, or have been?"""
+        return self.scene is None or self.scene.possible
+
+
+@dataclass(frozen=True)
+class Silicon:
+    """What is soldered in: fixed for one part."""
+
+    coefficient_words: tuple[int, int, int, int]
+    conversion_ns: int
+    sense: Sense
 
 
 @dataclass
@@ -43,34 +80,50 @@ class EmulatedMpl115a2:
 
     def __init__(
         self,
-        coefficient_words: tuple[int, int, int, int],
-        conversion_ns: int,
-        sense: Sense,
+        silicon: Silicon,
         read_during_conversion: ReadDuringConversion = "stale",
+        faults: PartFaults | None = None,
+        spare: Callable[[], Silicon] | None = None,
     ) -> None:
-        self._registers = bytearray(_REGISTERS)
-        self._registers[0x04:0x0C] = struct.pack(">4H", *coefficient_words)
-        self._conversion_ns = conversion_ns
-        self._sense = sense
+        self.witness: Witness | None = None
+        self._silicon = silicon
         self._mode = read_during_conversion
+        self._faults = faults if faults is not None else PartFaults()
+        self._spare = spare
+        self._seen_ns = 0
+        self._t_ns = 0
+        self._power_up()
+
+    def _power_up(self) -> None:
+        self._registers = bytearray(_REGISTERS)
+        self._registers[0x04:0x0C] = struct.pack(">4H", *self._silicon.coefficient_words)
         self._pointer = 0
         self._expects_register = False
         self._convert_at_stop = False
         self._conversion: _Conversion | None = None
-        self.silent: Callable[[int], bool] = _never
-        """Fault hook: does the part fail to acknowledge at this time?"""
-        self.frozen: Callable[[int], bool] = _never
-        """Fault hook: does a conversion started at this time never end?"""
 
     def start(self, reading: bool, t_ns: int) -> bool:
         """Acknowledge, unless the part is silent."""
-        if self.silent(t_ns):
+        if self._faults.possible and not self._lives(t_ns):
             return False
+        self._t_ns = t_ns
         self._settle(t_ns)
         if reading:
             self._disturb(t_ns)
         self._expects_register = not reading
         return True
+
+    def _lives(self, t_ns: int) -> bool:
+        """Does it acknowledge? What befell it since it was last called is made up for first."""
+        since_ns, self._seen_ns = self._seen_ns, t_ns
+        faults = self._faults
+        if faults.replaced.possible and faults.replaced.struck(since_ns, t_ns):
+            if self._spare is not None:
+                self._silicon, self._spare = self._spare(), None
+            self._power_up()
+        if faults.unplugged.possible and faults.unplugged.struck(since_ns, t_ns):
+            self._power_up()
+        return not (faults.no_answer(t_ns) or faults.unplugged(t_ns) or faults.replaced(t_ns))
 
     def write(self, value: int) -> bool:
         """Take the register address, then data; only CONVERT heeds its data, whatever it is."""
@@ -86,6 +139,8 @@ class EmulatedMpl115a2:
         """Give the bytes from the pointer on, which moves with them."""
         begin = self._pointer
         self._pointer = (begin + count) % _REGISTERS
+        if self._faults.all_ones(self._t_ns):
+            return b"\xff" * count
         if begin + count <= _REGISTERS:
             return bytes(self._registers[begin : begin + count])
         return bytes(self._registers[(begin + i) % _REGISTERS] for i in range(count))
@@ -96,12 +151,14 @@ class EmulatedMpl115a2:
             self._convert_at_stop = False
             self._settle(t_ns)
             self._conversion = None
-            if not self.frozen(t_ns):
-                tc = self._conversion_ns
+            words = self._silicon.sense(t_ns + self._silicon.conversion_ns // _SAMPLE_QUARTER)
+            if self.witness is not None:
+                self.witness(t_ns, words)
+            if not self._faults.stale(t_ns):
+                slow = self._faults.slow(t_ns)
+                tc = _SLOW_NS if slow else self._silicon.conversion_ns
                 self._conversion = _Conversion(
-                    p_ready_ns=t_ns + tc // 2,
-                    done_ns=t_ns + tc,
-                    words=self._sense(t_ns + tc // _SAMPLE_QUARTER),
+                    p_ready_ns=t_ns + tc // 2, done_ns=t_ns + tc, words=words
                 )
 
     def _settle(self, t_ns: int) -> None:

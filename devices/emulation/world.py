@@ -11,6 +11,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import partial
+from typing import get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -18,16 +20,17 @@ import numpy.typing as npt
 from devices.clock import Clock
 from devices.emulation.dome import Domes, Surroundings
 from devices.emulation.dynamixel import EmulatedServo
-from devices.emulation.faults import Fault, scene_fault
-from devices.emulation.front_end import front_ends
+from devices.emulation.faults import Faults
+from devices.emulation.front_end import FrontEnd
 from devices.emulation.ground import Rolling, make_ground, tile_positions_m
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
+from devices.emulation.line import Line
 from devices.emulation.load_trace import Floats, PressedTrace
 from devices.emulation.mill import Indentation, Mill
-from devices.emulation.mpl115a2 import EmulatedMpl115a2
+from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
 from devices.emulation.parts import draw_chip, draw_dome, random_of
 from devices.emulation.tca9548a import EmulatedTca9548a
-from devices.scene import FaultKind, Scene, ServoScene
+from devices.scene import BUS, FaultKind, Scene, ServoScene, TileFault
 
 _COUNTS_PER_TURN = 4096
 _FORESIGHT_S = 0.4
@@ -65,6 +68,8 @@ class World:
         lead_s: seconds without load before the ground begins.
         pressed: a recorded load instead of the scene's ground.
         looped: press it over and over again.
+        begun: the scene's time begins now; else at `begin`, and until then all is as at its first
+            instant.
     """
 
     def __init__(
@@ -77,54 +82,87 @@ class World:
         lead_s: float = 1.0,
         pressed: PressedTrace | None = None,
         looped: bool = False,
+        begun: bool = True,
     ) -> None:
         self.scene = scene
         self._clock = clock
-        self.epoch_ns = clock.now_ns()
+        self._begun = False
+        self.epoch_ns = 0
+        """Instant of the clock at which the scene's time began."""
         self.ground = make_ground(scene, seed=seed, lead_s=lead_s, pressed=pressed, looped=looped)
         self._positions_m = tile_positions_m(scene.tile)
         serials = [tile.serial for tile in scene.tile]
-        chips = [draw_chip(serial, parts_seed) for serial in serials]
-        parts = [draw_dome(serial, parts_seed) for serial in serials]
+        domes = [draw_dome(serial, parts_seed) for serial in serials]
         surroundings = self._surroundings()
         # By scene too: a tile on the bench and in the field must not see the same noise again.
         draw = f"{scene.name}/{seed}"
-        domes = self._domes = Domes(
-            parts, serials, self.ground, scene.emulation, surroundings, draw
-        )
-        senses = front_ends(
-            chips, parts, serials, domes, surroundings, scene.emulation, self.epoch_ns, draw
-        )
-        fixed_ms = scene.array.conversion_ms
-        self._faults: dict[tuple[FaultKind, str], Fault] = {}
-        emulated = []
-        for chip, sense, serial in zip(chips, senses, serials, strict=True):
-            part = EmulatedMpl115a2(
-                chip.coefficients.to_words(),
-                chip.conversion_ns if fixed_ms is None else round(fixed_ms * 1e6),
-                sense,
-                scene.emulation.read_during_conversion,
+        self._domes = Domes(domes, serials, self.ground, scene.emulation, surroundings, draw)
+        self._faults = Faults(scene.fault)
+        self._front_ends: list[FrontEnd] = []
+
+        def silicon(index: int, serial: str) -> Silicon:
+            """The chip of a serial under a dome of this foot."""
+            chip = draw_chip(serial, parts_seed)
+            fixed_ms = scene.array.conversion_ms
+            sense = FrontEnd(
+                chip,
+                domes[index],
+                lambda t_s: self._domes.pressure_kpa(index, t_s),
+                surroundings,
+                scene.emulation,
+                f"noise/{draw}/{serial}",
+                self._faults.of("over_range", serials[index]),
             )
-            part.silent = self._fault("no_answer", serial)
-            part.frozen = self._fault("stale", serial)
-            emulated.append(part)
+            if self._begun:
+                sense.begin(self.epoch_ns)
+            self._front_ends.append(sense)
+            conversion_ns = chip.conversion_ns if fixed_ms is None else round(fixed_ms * 1e6)
+            return Silicon(chip.coefficients.to_words(), conversion_ns, sense)
+
+        self.parts = [
+            EmulatedMpl115a2(
+                silicon(index, serial),
+                scene.emulation.read_during_conversion,
+                self._part_faults(serial),
+                spare=partial(silicon, index, f"{serial}.spare"),
+            )
+            for index, serial in enumerate(serials)
+        ]
+        """The chips. For who judges a driver; a driver has its bus."""
         muxes = [
             EmulatedTca9548a(
                 address,
                 {
                     tile.channel: part
-                    for tile, part in zip(scene.tile, emulated, strict=True)
+                    for tile, part in zip(scene.tile, self.parts, strict=True)
                     if tile.mux == address
                 },
+                self._faults.of("brown_out", f"0x{address:02x}"),
+                self._faults.of("mux_reset", f"0x{address:02x}"),
             )
             for address in sorted({tile.mux for tile in scene.tile})
         ]
-        self.i2c_adapter = EmulatedI2cAdapter(muxes, clock, scene.array.scl_hz)
+        self.i2c_adapter = EmulatedI2cAdapter(
+            muxes,
+            clock,
+            scene.array.scl_hz * scene.emulation.scl_part,
+            Line(self._faults, f"line/{draw}"),
+        )
         self._mill_rng = random_of(f"mill/{draw}")
+        if begun:
+            self.begin()
 
-    def fault(self, kind: FaultKind, serial: str) -> AbstractContextManager[None]:
-        """Inject a fault into one part while the block runs."""
-        return self._faults[kind, serial].injected()
+    def begin(self) -> None:
+        """Let the scene's time begin now: ground, faults, temperature."""
+        self.epoch_ns = self._clock.now_ns()
+        self._begun = True
+        for front_end in self._front_ends:
+            front_end.begin(self.epoch_ns)
+        self._faults.begin(self.epoch_ns)
+
+    def fault(self, kind: FaultKind, target: str = BUS) -> AbstractContextManager[None]:
+        """Inject a fault into a tile, a mux ("0x70") or the bus while the block runs."""
+        return self._faults.injected(kind, target)
 
     @contextmanager
     def servo(self, servo: ServoScene, clock: Clock) -> Iterator[EmulatedServo]:
@@ -148,7 +186,8 @@ class World:
 
         def look_ahead() -> None:
             while not stop.wait(_FORESIGHT_S / 4):
-                self._domes.foresee((self._clock.now_ns() - self.epoch_ns) * 1e-9 + _FORESIGHT_S)
+                passed_ns = self._clock.now_ns() - self.epoch_ns if self._begun else 0
+                self._domes.foresee(passed_ns * 1e-9 + _FORESIGHT_S)
 
         thread = threading.Thread(target=look_ahead, name="physics", daemon=True)
         thread.start()
@@ -186,10 +225,10 @@ class World:
             return Mill(self.ground, self.epoch_ns, self._mill_rng)
         return None
 
-    def _fault(self, kind: FaultKind, serial: str) -> Fault:
-        fault = scene_fault(self.scene.fault, kind, serial, self.epoch_ns)
-        self._faults[kind, serial] = fault
-        return fault
+    def _part_faults(self, serial: str) -> PartFaults:
+        kinds = get_args(TileFault)
+        own = {kind: self._faults.of(kind, serial) for kind in kinds if kind != "over_range"}
+        return PartFaults(**own, scene=self._faults)
 
     def _surroundings(self) -> Surroundings:
         emulation = self.scene.emulation
@@ -203,7 +242,9 @@ class World:
         return Surroundings(emulation)
 
     def _seconds(self, t_ns: npt.NDArray[np.int64]) -> Floats:
-        return np.asarray((t_ns - self.epoch_ns) * 1e-9)
+        if not self._begun:
+            return np.zeros(len(t_ns))
+        return np.asarray(np.maximum(t_ns - self.epoch_ns, 0) * 1e-9)
 
     def _servo_counts(self, servo: ServoScene, t_ns: int) -> int:
         angle = self.ground.angle_rad(self._seconds(np.array([t_ns])))

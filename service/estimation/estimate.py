@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.frames import FrameBatch
+from devices.temperature import HeldTemperature, hold_temperature
 from service.estimation.contact import UNKNOWN, UNLOADED, RunState, believed, seeming
 from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.instant import estimate_instants
@@ -51,6 +52,7 @@ class EstimationState:
     """What `step` hands on to the next `step`. Begin with `EstimationState()`."""
 
     pending: _Pending | None = None
+    temperature: HeldTemperature | None = None
     run: RunState = UNLOADED
     contact: int = 0
     last_seq: int | None = None
@@ -73,12 +75,14 @@ def step(
     if not len(frames):
         return estimate_instants(plan, frames, np.zeros(0, dtype=np.bool_)), state
     broken = _after_gap(plan, frames, state)
+    frames, temperature = hold_temperature(frames, state.temperature)
     now = estimate_instants(plan, frames, broken)
     loaded, since_ns, run = seeming(plan.contact, now.grf_n, frames.t_mono_ns, broken, state.run)
     known = _append(state.pending, _Pending(now, loaded, since_ns, frames.t_mono_ns))
     due = int(np.searchsorted(known.t_ns, known.t_ns[-1] - plan.lag_ns, side="right"))
     state = replace(
         state,
+        temperature=temperature,
         run=run,
         last_seq=int(frames.seq[-1]),
         last_t_ns=int(frames.t_mono_ns[-1]),

@@ -12,6 +12,7 @@ import numpy as np
 from devices.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch
+from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration
 from service.estimation.tare import (
     FRAMES_MIN,
@@ -51,6 +52,7 @@ def tare_in_flight(
     Raises:
         TareError: the foot was loaded or moved all the time, or a tile gave no readings.
     """
+    frames, _ = hold_temperature(frames)
     kpa = compensation.readable_kpa(frames)
     silent = [s for s, column in zip(serials, kpa.T, strict=True) if not np.isfinite(column).any()]
     if silent:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from devices.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch, FrameStatus
+from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration
 
 Floats = npt.NDArray[np.float64]
@@ -110,6 +111,7 @@ def take_tare(
     Raises:
         TareError: the interval holds too few readable frames, or none can be recognised.
     """
+    frames, _ = hold_temperature(frames)
     t_s = (frames.t_ns - frames.t_ns[0]) * 1e-9
     if interval_s is not None:
         begin_s, end_s = interval_s

@@ -1,0 +1,135 @@
+"""From a scene and a bus to an array that is ready to take frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from devices.array import TileArray
+from devices.budget import BusTiming, Choice, choose, frame_s
+from devices.bus_recovery import BusRecovery
+from devices.clock import Clock
+from devices.errors import SceneError
+from devices.frames import TileInfo
+from devices.i2c import I2cBus
+from devices.mpl115a2 import CONVERSION_MAX_NS, CONVERSION_TYPICAL_NS
+from devices.scene import Scene, ScheduleName
+from devices.self_test import identify, measure_conversion_ns, measure_wires
+
+
+@dataclass(frozen=True)
+class Ready:
+    """An array that was identified and measured.
+
+    Attributes:
+        array: takes frames.
+        tiles: as identified, with the conversion times measured.
+        timing: of the bus and the parts.
+        choice: the schedule, and why.
+        predicted_hz: frames a second that it should give.
+        unmeasured: serials whose conversion time could not be measured.
+    """
+
+    array: TileArray
+    tiles: tuple[TileInfo, ...]
+    timing: BusTiming
+    choice: Choice
+    predicted_hz: float
+    unmeasured: tuple[str, ...]
+
+
+def make_ready(
+    bus: I2cBus,
+    scene: Scene,
+    clock: Clock,
+    *,
+    schedule: ScheduleName | None = None,
+    recovery: BusRecovery | None = None,
+    beside: Callable[[], float] | None = None,
+) -> Ready:
+    """Identify the tiles of a scene, measure bus and parts, and choose how to ask them.
+
+    Args:
+        bus: what they hang on.
+        scene: what should be there.
+        clock: virtual or real.
+        schedule: instead of the scene's.
+        recovery: frees a stuck bus.
+        beside: as for `TileArray`.
+
+    Raises:
+        TileSetupError, I2cError: a tile or the bus does not work.
+        SceneError: the schedule does not suit the tiles.
+    """
+    tiles, timing, unmeasured = measured(bus, scene, clock)
+    asked = schedule or scene.array.schedule
+    if beside is not None:
+        choice = _beside_reference(asked)
+    elif asked == "auto":
+        channels_max = scene.array.broadcast_channels
+        choice = choose(timing, asked_hz=scene.rate_hz, channels_max=channels_max)
+    else:
+        choice = Choice(asked, "as the scene says" if schedule is None else "as asked for")
+    array = TileArray(
+        bus,
+        tiles,
+        clock,
+        schedule=choice.schedule,
+        timing=timing,
+        temperature_every=scene.array.temperature_every,
+        broadcast_channels=scene.array.broadcast_channels,
+        recovery=recovery,
+        beside=beside,
+    )
+    # Schedules that read what the frame before has started have to be started once.
+    array.scan()
+    return Ready(array, tiles, timing, choice, 1.0 / frame_s(choice.schedule, timing), unmeasured)
+
+
+def _beside_reference(asked: ScheduleName | Literal["auto"]) -> Choice:
+    if asked in ("auto", "simultaneous"):
+        return Choice("simultaneous", "the reference force is read while all tiles convert at once")
+    if asked == "sequential":
+        return Choice(asked, "as the scene says")
+    raise SceneError(
+        f"schedule {asked!r} beside a reference sensor: its tiles are sampled one after another",
+        where="array.schedule",
+        expected='"simultaneous" or "sequential", in which the reference is read with the tiles',
+    )
+
+
+def measured(
+    bus: I2cBus, scene: Scene, clock: Clock
+) -> tuple[tuple[TileInfo, ...], BusTiming, tuple[str, ...]]:
+    """The tiles of a scene as found, the timing of bus and parts, and who could not be measured.
+
+    With `array.wait_ms` the parts are not measured. A part whose words do not tell is given the
+    data sheet's longest time.
+
+    Raises:
+        TileSetupError, I2cError: as for `make_ready`.
+    """
+    tiles = list(identify(bus, scene.tile))
+    wires = measure_wires(bus, clock, tiles[0])
+    unmeasured = []
+    waits_ns = []
+    for index, tile in enumerate(tiles):
+        if scene.array.wait_ms is not None:
+            waits_ns.append(round(scene.array.wait_ms * 1e6))
+            continue
+        wait_ns = measure_conversion_ns(bus, clock, tile, wires)
+        if wait_ns is None:
+            unmeasured.append(tile.serial)
+        waits_ns.append(CONVERSION_MAX_NS if wait_ns is None else wait_ns)
+        conversion_ms = (CONVERSION_TYPICAL_NS if wait_ns is None else wait_ns) / 1e6
+        tiles[index] = tile.model_copy(update={"conversion_ms": conversion_ms})
+    every = scene.array.temperature_every
+    timing = BusTiming(
+        scl_hz=wires.scl_hz,
+        conversions_s=tuple(wait_ns * 1e-9 for wait_ns in waits_ns),
+        muxes=tuple(tile.mux for tile in tiles),
+        bytes_read=2.0 + 2.0 / every,
+        transaction_s=wires.transaction_s,
+    )
+    return tuple(tiles), timing, tuple(unmeasured)

@@ -1,0 +1,67 @@
+"""The temperature of frames that did not read it: that of the frame before, for a second.
+
+An array may read `tadc` in every k-th frame only. The conversion is worth nothing without it, but
+a chip's temperature does not change in a second by what a count of it matters (0.04 kPa). The
+frames keep `NOT_READ`, so its age is always known; only who computes pressures fills it in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.frames import NOT_READ, FrameBatch, TileStatus
+
+HELD_NS = 1_000_000_000
+"""An older temperature is no temperature."""
+
+
+@dataclass(frozen=True)
+class HeldTemperature:
+    """The last temperature of each tile and when it was read; `NOT_READ` for none.
+
+    Attributes:
+        tadc: uint16[tiles].
+        t_mono_ns: int64[tiles].
+    """
+
+    tadc: npt.NDArray[np.uint16]
+    t_mono_ns: npt.NDArray[np.int64]
+
+
+def hold_temperature(
+    frames: FrameBatch, held: HeldTemperature | None = None
+) -> tuple[FrameBatch, HeldTemperature]:
+    """Frames in which every tile has the newest temperature that is not too old.
+
+    Any split of a stream into batches gives the same, if `held` is handed on.
+
+    Args:
+        frames: n frames in order, at least one.
+        held: from the frames before.
+    """
+    tiles = frames.tile_count
+    if held is None:
+        held = HeldTemperature(
+            np.full(tiles, NOT_READ, dtype=np.uint16), np.zeros(tiles, dtype=np.int64)
+        )
+    unusable = (frames.status & np.uint8(TileStatus.UNUSABLE)) != 0
+    known = (frames.tadc != NOT_READ) & ~unusable
+    # Row 0 is what came before; every row then looks up the last one that is known.
+    tadc = np.concatenate([held.tadc[None], frames.tadc])
+    t_mono_ns = np.concatenate(
+        [held.t_mono_ns[None], np.broadcast_to(frames.t_mono_ns[:, None], frames.tadc.shape)]
+    )
+    rows = np.where(known, np.arange(1, len(frames) + 1)[:, None], 0)
+    newest = np.maximum.accumulate(rows, axis=0)
+    columns = np.arange(tiles)
+    last = HeldTemperature(tadc[newest[-1], columns], t_mono_ns[newest[-1], columns])
+    missing = frames.tadc == NOT_READ
+    if not missing.any():
+        return frames, last
+    found = tadc[newest, columns]
+    too_old = frames.t_mono_ns[:, None] - t_mono_ns[newest, columns] > HELD_NS
+    filled = np.where(missing & ~too_old, found, frames.tadc)
+    return replace(frames, tadc=filled), last
