@@ -115,6 +115,41 @@ class ServoScene(_Section):
         return ratio
 
 
+class ReferenceScene(_Section):
+    """`[reference]`: the force sensor of a calibration rig, read through an MCP3208 on SPI.
+
+    Force is (volts - zero_v) * n_per_v. Neither has a default: nobody knows them but whoever has
+    measured this sensor with this amplifier.
+    """
+
+    port: str = EMULATED
+    """A device such as /dev/spidev0.0, or "emulated"."""
+    channel: Annotated[int, Field(ge=0, le=7)] = 0
+    """Input of the converter."""
+    vref_v: Annotated[float, Field(ge=0.25, le=5.5)] = 3.3
+    """Voltage at the converter's VREF, which is its full scale."""
+    zero_v: _Number
+    """Voltage without a force. At either rail it could not be told from a broken wire."""
+    n_per_v: _Number
+    """Newtons per volt; negative if a push lowers the voltage."""
+
+    @field_validator("n_per_v")
+    @classmethod
+    def _a_volt_is_a_force(cls, n_per_v: float) -> float:
+        if n_per_v == 0.0:
+            raise ValueError("0 would make every voltage 0 N")
+        return n_per_v
+
+    @model_validator(mode="after")
+    def _zero_can_be_read(self) -> Self:
+        if not 0.0 < self.zero_v < self.vref_v:
+            raise ValueError(
+                f"zero_v = {self.zero_v:g} is not between the rails, 0 and vref_v = "
+                f"{self.vref_v:g}; shift the amplifier's output off the rail"
+            )
+        return self
+
+
 class _Ground(_Section):
     pass
 
@@ -222,6 +257,7 @@ class Scene(_Section):
     array: ArrayScene = ArrayScene()
     tile: Annotated[tuple[TileScene, ...], Field(min_length=1, strict=False)]
     servo: ServoScene | None = None
+    reference: ReferenceScene | None = None
     ground: GroundScene = NoGround(kind="none")
     emulation: EmulationScene = EmulationScene()
     fault: tuple[FaultScene, ...] = Field(default=(), strict=False)
