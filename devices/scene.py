@@ -32,6 +32,7 @@ _NotNegative = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 _Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 _Load = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
 _Kelvin = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
+_GpioLine = Annotated[int, Field(ge=0, le=511)]
 _Position = Annotated[float, Field(gt=-1.0, lt=1.0)]  # a tile 50 m away was meant in millimetres
 
 
@@ -150,6 +151,24 @@ class ReferenceScene(_Section):
         return self
 
 
+class RecoveryScene(_Section):
+    """`[recovery]`: GPIO lines of a Raspberry Pi that free a stuck bus."""
+
+    gpiochip: str = "/dev/gpiochip0"
+    scl_line: _GpioLine = 3
+    sda_line: _GpioLine = 2
+    reset_line: _GpioLine | None = None
+    """RESET of all multiplexers; absent: not wired."""
+    i2c_function: Annotated[str, Field(pattern=r"^a[0-8]$")] = "a0"
+    """What SDA and SCL are to be again, in words of `pinctrl`; on a Pi 5 "a3"."""
+
+    @model_validator(mode="after")
+    def _lines_differ(self) -> Self:
+        if len({self.scl_line, self.sda_line, self.reset_line}) < 3:
+            raise ValueError("scl_line, sda_line and reset_line have to be different lines")
+        return self
+
+
 class _Ground(_Section):
     pass
 
@@ -258,6 +277,7 @@ class Scene(_Section):
     tile: Annotated[tuple[TileScene, ...], Field(min_length=1, strict=False)]
     servo: ServoScene | None = None
     reference: ReferenceScene | None = None
+    recovery: RecoveryScene | None = None
     ground: GroundScene = NoGround(kind="none")
     emulation: EmulationScene = EmulationScene()
     fault: tuple[FaultScene, ...] = Field(default=(), strict=False)

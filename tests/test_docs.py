@@ -20,6 +20,7 @@ from devices.scene import (
     EmulationScene,
     FaultScene,
     GroundScene,
+    RecoveryScene,
     ReferenceScene,
     Scene,
     ServoScene,
@@ -43,14 +44,14 @@ FORMATS = (ROOT / "docs" / "formats.md").read_text("utf-8")
 README = (ROOT / "README.md").read_text("utf-8")
 
 GROUNDS = get_args(get_args(GroundScene)[0])
-SECTIONS = {"array", "tile", "servo", "reference", "ground", "emulation", "fault"}
+SECTIONS = {"array", "tile", "servo", "reference", "recovery", "ground", "emulation", "fault"}
 
 
 @pytest.mark.parametrize(
     "section",
     [
-        *(Scene, ArrayScene, TileScene, ServoScene, ReferenceScene, EmulationScene, FaultScene),
-        *GROUNDS,
+        *(Scene, ArrayScene, TileScene, ServoScene, ReferenceScene, RecoveryScene),
+        *(EmulationScene, FaultScene, *GROUNDS),
     ],
 )
 def test_every_scene_key_is_documented(section: type[BaseModel]) -> None:
@@ -72,6 +73,7 @@ def test_every_ground_and_builtin_scene_is_documented() -> None:
         ("[array]", ArrayScene),
         ("[servo]", ServoScene),
         ("[reference]", ReferenceScene),
+        ("[recovery]", RecoveryScene),
         ("[emulation]", EmulationScene),
     ],
 )

@@ -142,6 +142,15 @@ def test_a_reference_force_needs_its_scale_and_nothing_else() -> None:
     assert scene().reference is None
 
 
+def test_recovery_is_by_the_pins_of_a_raspberry_pi() -> None:
+    recovery = scene(sections="[recovery]").recovery
+    assert recovery is not None
+    assert recovery.gpiochip == "/dev/gpiochip0"
+    assert (recovery.scl_line, recovery.sda_line, recovery.reset_line) == (3, 2, None)
+    assert recovery.i2c_function == "a0"
+    assert scene().recovery is None
+
+
 # What is refused
 
 
@@ -356,6 +365,23 @@ def test_a_zero_on_a_rail_is_refused(zero_v: str) -> None:
 
 def test_a_scale_that_would_make_every_voltage_no_force_is_refused() -> None:
     assert "0 would make every voltage 0 N" in reference_refused(n_per_v="0")
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [
+        ("scl_line = 2", "recovery: scl_line, sda_line and reset_line have to be different"),
+        ("reset_line = 3", "recovery: scl_line, sda_line and reset_line have to be different"),
+        ("reset_line = -1", "recovery.reset_line"),
+        ("sda_line = '2'", "recovery.sda_line"),
+        ("reset_line = true", "recovery.reset_line"),
+        ("i2c_function = 'op'", "recovery.i2c_function"),
+        ("i2c_function = 'a0 dl'", "recovery.i2c_function"),
+        ("reset = 17", "unknown key 'recovery.reset'"),
+    ],
+)
+def test_lines_that_make_no_sense_are_refused(line: str, key: str) -> None:
+    assert key in refused(sections=f"[recovery]\n{line}")
 
 
 def test_true_is_no_sign() -> None:
