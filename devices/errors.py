@@ -10,6 +10,9 @@
      |    +-- BusMisuseError                   the adapter cannot do what we asked: our bug
      |    +-- BusSetupError                    no such bus, no permission
      +-- TileSetupError                        a tile's coefficients are absent or implausible
+     +-- SpiError              (OSError)       a transfer over SPI failed
+     |    +-- SpiSetupError                    no such SPI device, no permission, no spidev
+     |    +-- AdcSilentError                   no converter drives the line
      +-- ServoError
      |    +-- ServoSetupError                  no such serial port
      |    +-- ServoTimeoutError (TimeoutError) a servo did not answer in time
@@ -126,6 +129,18 @@ class BusSetupError(I2cError):
 
 class TileSetupError(FootTileError):
     """A tile does not answer at start-up, or its coefficients are no MPL115A2's."""
+
+
+class SpiError(FootTileError, OSError):
+    """A transfer over SPI failed."""
+
+
+class SpiSetupError(SpiError):
+    """The SPI device cannot be opened, or the library for it is not installed."""
+
+
+class AdcSilentError(SpiError):
+    """The null bit before a conversion's result is not low: nobody drives the line."""
 
 
 class ServoError(FootTileError):

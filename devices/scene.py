@@ -43,6 +43,7 @@ _NotNegative = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 _Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 _Load = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
 _Kelvin = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
+_GpioLine = Annotated[int, Field(ge=0, le=511)]
 _Position = Annotated[float, Field(gt=-1.0, lt=1.0)]  # a tile 50 m away was meant in millimetres
 
 
@@ -130,6 +131,59 @@ class ServoScene(_Section):
         if ratio == 0.0:
             raise ValueError("0 would never turn the segment")
         return ratio
+
+
+class ReferenceScene(_Section):
+    """`[reference]`: the force sensor of a calibration rig, read through an MCP3208 on SPI.
+
+    Force is (volts - zero_v) * n_per_v. Neither has a default: nobody knows them but whoever has
+    measured this sensor with this amplifier.
+    """
+
+    port: str = EMULATED
+    """A device such as /dev/spidev0.0, or "emulated"."""
+    channel: Annotated[int, Field(ge=0, le=7)] = 0
+    """Input of the converter."""
+    vref_v: Annotated[float, Field(ge=0.25, le=5.5)] = 3.3
+    """Voltage at the converter's VREF, which is its full scale."""
+    zero_v: _Number
+    """Voltage without a force. At either rail it could not be told from a broken wire."""
+    n_per_v: _Number
+    """Newtons per volt; negative if a push lowers the voltage."""
+
+    @field_validator("n_per_v")
+    @classmethod
+    def _a_volt_is_a_force(cls, n_per_v: float) -> float:
+        if n_per_v == 0.0:
+            raise ValueError("0 would make every voltage 0 N")
+        return n_per_v
+
+    @model_validator(mode="after")
+    def _zero_can_be_read(self) -> Self:
+        if not 0.0 < self.zero_v < self.vref_v:
+            raise ValueError(
+                f"zero_v = {self.zero_v:g} is not between the rails, 0 and vref_v = "
+                f"{self.vref_v:g}; shift the amplifier's output off the rail"
+            )
+        return self
+
+
+class RecoveryScene(_Section):
+    """`[recovery]`: GPIO lines of a Raspberry Pi that free a stuck bus."""
+
+    gpiochip: str = "/dev/gpiochip0"
+    scl_line: _GpioLine = 3
+    sda_line: _GpioLine = 2
+    reset_line: _GpioLine | None = None
+    """RESET of all multiplexers; absent: not wired."""
+    i2c_function: Annotated[str, Field(pattern=r"^a[0-8]$")] = "a0"
+    """What SDA and SCL are to be again, in words of `pinctrl`; on a Pi 5 "a3"."""
+
+    @model_validator(mode="after")
+    def _lines_differ(self) -> Self:
+        if len({self.scl_line, self.sda_line, self.reset_line}) < 3:
+            raise ValueError("scl_line, sda_line and reset_line have to be different lines")
+        return self
 
 
 class _Ground(_Section):
@@ -262,6 +316,8 @@ class Scene(_Section):
     array: ArrayScene = ArrayScene()
     tile: Annotated[tuple[TileScene, ...], Field(min_length=1, strict=False)]
     servo: ServoScene | None = None
+    reference: ReferenceScene | None = None
+    recovery: RecoveryScene | None = None
     ground: GroundScene = NoGround(kind="none")
     emulation: EmulationScene = EmulationScene()
     fault: tuple[FaultScene, ...] = Field(default=(), strict=False)

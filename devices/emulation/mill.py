@@ -12,8 +12,10 @@ from bisect import bisect_right
 import numpy as np
 import numpy.typing as npt
 
+from devices.clock import Clock
 from devices.emulation.load_trace import Floats
-from devices.scene import IndentationGround, TileScene
+from devices.emulation.mcp3208 import EmulatedMcp3208, amplifier_volts
+from devices.scene import IndentationGround, ReferenceScene, TileScene
 
 _MILL_NOISE_N = 0.02
 _MILL_COUNT_N = 100.0 / 4096  # 12 bits over +-50 N (hardware.md 6)
@@ -112,7 +114,11 @@ class Indentation:
 
 
 class Mill:
-    """The reference force sensor of the indentation rig, with its own noise and 12-bit steps."""
+    """The reference force sensor of the indentation rig, with its own noise.
+
+    A scene with a `[reference]` reads it through the converter that `adc` makes, in whose steps and
+    scale; without one, `force_n` has 12-bit steps of its own.
+    """
 
     def __init__(self, ground: Indentation, epoch_ns: int, rng: np.random.Generator) -> None:
         self._ground = ground
@@ -124,8 +130,21 @@ class Mill:
         spindle_n = self._ground.spindle_n((t_mono_ns - self._epoch_ns) * 1e-9)
         if spindle_n is None:
             return math.nan
-        noisy_n = spindle_n + _MILL_NOISE_N * float(self._rng.standard_normal())
-        return round(noisy_n / _MILL_COUNT_N) * _MILL_COUNT_N
+        return round((spindle_n + self._noise_n()) / _MILL_COUNT_N) * _MILL_COUNT_N
+
+    def adc(self, reference: ReferenceScene, clock: Clock) -> EmulatedMcp3208:
+        """A converter with the sensor's amplifier at the input that `reference` names.
+
+        Where the spindle presses no tile the sensor bears nothing, and reads about zero.
+        """
+        volts = amplifier_volts(self._borne_n, reference, noise_n=self._noise_n)
+        return EmulatedMcp3208(volts, clock, vref_v=reference.vref_v)
+
+    def _borne_n(self, t_mono_ns: int) -> float:
+        return self._ground.spindle_n((t_mono_ns - self._epoch_ns) * 1e-9) or 0.0
+
+    def _noise_n(self) -> float:
+        return _MILL_NOISE_N * float(self._rng.standard_normal())
 
     def notes(self, t_mono_ns: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[np.object_]]:
         """What the mill's operator notes at each instant.

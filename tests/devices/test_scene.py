@@ -134,6 +134,23 @@ def test_every_channel_of_every_mux_can_hold_a_tile(plugs: list[tuple[int, int]]
     assert [(t.mux, t.channel) for t in scene(tiles=tiles).tile] == plugs
 
 
+def test_a_reference_force_needs_its_scale_and_nothing_else() -> None:
+    reference = scene(sections="[reference]\nzero_v = 1.6\nn_per_v = -12").reference
+    assert reference is not None
+    assert (reference.zero_v, reference.n_per_v) == (1.6, -12.0)
+    assert (reference.port, reference.channel, reference.vref_v) == ("emulated", 0, 3.3)
+    assert scene().reference is None
+
+
+def test_recovery_is_by_the_pins_of_a_raspberry_pi() -> None:
+    recovery = scene(sections="[recovery]").recovery
+    assert recovery is not None
+    assert recovery.gpiochip == "/dev/gpiochip0"
+    assert (recovery.scl_line, recovery.sda_line, recovery.reset_line) == (3, 2, None)
+    assert recovery.i2c_function == "a0"
+    assert scene().recovery is None
+
+
 # What is refused
 
 
@@ -150,6 +167,7 @@ def test_an_unknown_key_is_named(head: str, key: str) -> None:
     [
         ("[array]\nscl = 400000", "array.scl"),
         ("[servo]\nbaud = 57600", "servo.baud"),
+        ("[reference]\nzero_v = 1\nn_per_v = 1\noffset_n = 1", "reference.offset_n"),
         ("[ground]\nkind = 'rolling'\nload_kg = 1", "load_kg"),
         ("[ground]\nkind = 'none'\nload_n = 1", "load_n"),
         ("[emulation]\nnoise = 1", "emulation.noise"),
@@ -314,6 +332,56 @@ def test_a_number_that_is_none_is_refused_in_a_position_or_a_fault(value: str) -
 )
 def test_a_number_that_makes_no_sense_is_refused(head: str, sections: str, key: str) -> None:
     assert key in refused(head, sections=sections)
+
+
+def reference_refused(**changes: str) -> str:
+    keys = {"zero_v": "1.65", "n_per_v": "30.0"} | changes
+    lines = "\n".join(f"{key} = {value}" for key, value in keys.items() if value)
+    return refused(sections=f"[reference]\n{lines}")
+
+
+@pytest.mark.parametrize("key", ["zero_v", "n_per_v"])
+def test_nobody_but_the_user_knows_the_scale_of_a_reference_force(key: str) -> None:
+    assert f"key 'reference.{key}' is missing" in reference_refused(**{key: ""})
+
+
+@pytest.mark.parametrize("value", [*NOT_FINITE, "'3.3'", "true"])
+@pytest.mark.parametrize("key", ["vref_v", "zero_v", "n_per_v"])
+def test_a_scale_that_is_no_number_is_refused(key: str, value: str) -> None:
+    assert f"reference.{key} = " in reference_refused(**{key: value})
+
+
+@pytest.mark.parametrize("channel", ["8", "-1", "true", "'0'"])
+def test_an_input_that_no_converter_has_is_refused(channel: str) -> None:
+    assert "reference.channel = " in reference_refused(channel=channel)
+
+
+@pytest.mark.parametrize("zero_v", ["0.0", "-0.1", "3.3", "5.0"])
+def test_a_zero_on_a_rail_is_refused(zero_v: str) -> None:
+    text = reference_refused(zero_v=zero_v)
+    assert f"zero_v = {float(zero_v):g} is not between the rails" in text
+    assert "vref_v = 3.3" in text
+
+
+def test_a_scale_that_would_make_every_voltage_no_force_is_refused() -> None:
+    assert "0 would make every voltage 0 N" in reference_refused(n_per_v="0")
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [
+        ("scl_line = 2", "recovery: scl_line, sda_line and reset_line have to be different"),
+        ("reset_line = 3", "recovery: scl_line, sda_line and reset_line have to be different"),
+        ("reset_line = -1", "recovery.reset_line"),
+        ("sda_line = '2'", "recovery.sda_line"),
+        ("reset_line = true", "recovery.reset_line"),
+        ("i2c_function = 'op'", "recovery.i2c_function"),
+        ("i2c_function = 'a0 dl'", "recovery.i2c_function"),
+        ("reset = 17", "unknown key 'recovery.reset'"),
+    ],
+)
+def test_lines_that_make_no_sense_are_refused(line: str, key: str) -> None:
+    assert key in refused(sections=f"[recovery]\n{line}")
 
 
 def test_true_is_no_sign() -> None:
