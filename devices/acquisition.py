@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from devices.array import Scan, TileArray
+from devices.array import TileArray
 from devices.clock import Clock, UtcAnchor
 from devices.compensation import Compensation
 from devices.frames import (
@@ -25,6 +25,7 @@ from devices.frames import (
     TileStatus,
 )
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
+from devices.scan import Scan
 from devices.temperature import HeldTemperature, hold_temperature
 
 BATCH_NS = 25_000_000

@@ -90,7 +90,10 @@ class TileArray:
         self.bus = BusWatch(self._ports.router, clock, recovery)
         self._judge = Judge(self._ports, clock, self.health, self.bus)
         self._watch = ConversionWatch(
-            self._ports, clock, self.health, [round(wait_s * 1e9) for wait_s in timing.conversions_s]
+            self._ports,
+            clock,
+            self.health,
+            [round(wait_s * 1e9) for wait_s in timing.conversions_s],
         )
         self._schedule = SCHEDULES[schedule]
         self._waits_for_slow_ones = schedule != "pipelined" or len(tiles) == 1
@@ -110,6 +113,19 @@ class TileArray:
             for tile, health in zip(self.tiles, self.health, strict=True)
             if health.replaced
         )
+
+    def troubles(self) -> dict[str, str]:
+        """What is wrong now, in words: by serial, and under "" what is wrong with the bus."""
+        found = {"": "the bus is stuck or cut"} if self.bus.is_down else {}
+        for tile, health in zip(self.tiles, self.health, strict=True):
+            where = f"tile {tile.serial} (mux 0x{tile.mux:02x} channel {tile.channel})"
+            if health.replaced:
+                found[tile.serial] = f"another part answers in place of {where}"
+            elif not health.present and not self.bus.is_down:
+                found[tile.serial] = f"{where} does not answer"
+            elif health.slow:
+                found[tile.serial] = f"{where} converts too slowly or not at all"
+        return found
 
     def scan(self) -> Scan:
         """Take one frame. A fault of a tile or the bus is a status bit in it, never an exception.
@@ -177,9 +193,7 @@ class TileArray:
         self._running[tile] = False
         if answers:
             may_ask = self._may_spend(scan, tile)
-            self._judge.judge(
-                scan, tile, words, with_temperature=with_temperature, may_ask=may_ask
-            )
+            self._judge.judge(scan, tile, words, with_temperature=with_temperature, may_ask=may_ask)
         else:
             health.lose(self._clock.now_ns())
 

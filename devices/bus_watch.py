@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from devices.bus_recovery import BusRecovery
 from devices.clock import Clock
-from devices.errors import BusFaultError
+from devices.errors import BusFaultError, I2cError
 from devices.scan import Scan
 from devices.tca9548a import MuxRouter
 
@@ -44,8 +46,9 @@ class BusWatch:
         back = self._moves()
         if not back and self._recovery is not None and self._clock.now_ns() >= self._due_ns:
             self.recoveries += 1
-            self._recovery.clock_out()
-            self._recovery.reset_muxes()
+            with suppress(I2cError):  # a line that cannot be had now may be had the next time
+                self._recovery.clock_out()
+                self._recovery.reset_muxes()
             back = self._moves()
             self._due_ns = self._clock.now_ns() + self._wait_ns
             self._wait_ns = min(2 * self._wait_ns, _RECOVERY_NS[1])

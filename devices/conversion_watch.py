@@ -84,5 +84,3 @@ class ConversionWatch:
         early = self._ports.read(with_temperature=True)
         self._clock.sleep_until_ns(stop_ns + CONVERSION_MAX_NS)
         return self._ports.read(with_temperature=True) != early
-
-

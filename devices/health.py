@@ -140,6 +140,4 @@ class TileHealth:
         return sorted(self._recent)[_RECENT // 2]
 
     def _is_hot(self, tadc: int) -> bool:
-        return (
-            tadc != NOT_READ and self._tadc is not None and abs(tadc - self._tadc) > JUMP_TADC
-        )
+        return tadc != NOT_READ and self._tadc is not None and abs(tadc - self._tadc) > JUMP_TADC

@@ -48,11 +48,12 @@ class I2cAdapter(Protocol):
         """Release the adapter."""
 
 
-class _Smbus(SMBus):  # type: ignore[misc]  # smbus2 has no types
+class _Smbus(SMBus):
     """smbus2's adapter, with the one call that it lacks."""
 
     def set_timeout(self, units_10ms: int) -> None:
-        fcntl.ioctl(self.fd, I2C_TIMEOUT, units_10ms)
+        if self.fd is not None:
+            fcntl.ioctl(self.fd, I2C_TIMEOUT, units_10ms)
 
 
 class I2cBus:

@@ -37,7 +37,13 @@ class Judge:
         self._disturbed_until_ns = clock.now_ns()
 
     def judge(
-        self, scan: Scan, tile: int, words: tuple[int, int], *, with_temperature: bool, may_ask: bool
+        self,
+        scan: Scan,
+        tile: int,
+        words: tuple[int, int],
+        *,
+        with_temperature: bool,
+        may_ask: bool,
     ) -> None:
         """Note a reading in `scan`, flagged if it is not to be believed.
 
@@ -81,7 +87,7 @@ class Judge:
     def _confirmed(
         self, scan: Scan, tile: int, words: tuple[int, int], with_temperature: bool
     ) -> tuple[int, int]:
-        """The reading that came twice: of two that differ one was disturbed, a third tells which."""
+        """The reading that came twice: if two differ, one was disturbed, and a third tells which."""
         again = self._again(scan, tile, with_temperature)
         if again == words:
             return words
@@ -135,7 +141,7 @@ class Judge:
         scan.budget_ns -= self._clock.now_ns() - begin_ns
 
     def _doubt_all_but(self, tile: int) -> None:
-        """A mux that could not be closed may still connect a tile, which would answer with others."""
+        """A mux that could not be closed may still connect a tile, which would answer too."""
         for i, health in enumerate(self._health):
             if i != tile and health.present:
                 health.doubt(self._clock.now_ns())

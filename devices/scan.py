@@ -1,4 +1,4 @@
-"""One frame while it is taken: what the transfers gave so far, and what may still be spent on it."""
+"""One frame while it is taken: what the transfers gave so far, and what may still be spent."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ class Scan:
     @classmethod
     def blank(cls, tiles: int, begin_ns: int, budget_ns: int) -> Scan:
         """A frame in which nothing has been read."""
-        return cls([NOT_READ] * tiles, [NOT_READ] * tiles, [begin_ns] * tiles, [0] * tiles, budget_ns)
+        return cls(
+            [NOT_READ] * tiles, [NOT_READ] * tiles, [begin_ns] * tiles, [0] * tiles, budget_ns
+        )
 
     @property
     def given_up(self) -> bool:

@@ -23,16 +23,16 @@ EMULATED = "emulated"
 """Name of a bus or port that is emulated."""
 
 ScheduleName = Literal["simultaneous", "pipelined", "per_mux", "sequential"]
+AnySchedule = Literal["auto", ScheduleName]
 ReadDuringConversion = Literal["stale", "abort", "torn"]
 
-TileFault = Literal[
-    "no_answer", "unplugged", "replaced", "stale", "slow", "all_ones", "over_range"
-]
+TileFault = Literal["no_answer", "unplugged", "replaced", "stale", "slow", "all_ones", "over_range"]
 MuxFault = Literal["brown_out", "mux_reset"]
-BusFault = Literal[
-    "sda_low", "sda_high", "scl_low", "adapter_timeout", "nack_storm", "bit_errors"
-]
-FaultKind = TileFault | MuxFault | BusFault
+BusFault = Literal["sda_low", "sda_high", "scl_low", "adapter_timeout", "nack_storm", "bit_errors"]
+FaultKind = Literal[TileFault, MuxFault, BusFault]
+
+RATE = 0.01
+"""How often a fault strikes that comes by chance, unless a scene says otherwise."""
 
 BUS = "bus"
 """Target of a fault that is no tile's and no multiplexer's."""
@@ -59,7 +59,7 @@ class ArrayScene(_Section):
     """A device such as /dev/i2c-1, or "emulated"."""
     scl_hz: Annotated[float, Field(ge=10_000, le=1_000_000)] = 400_000.0
     """Bus clock of the emulation; on hardware it is set in config.txt. The bounds catch kHz."""
-    schedule: ScheduleName | Literal["auto"] = "auto"
+    schedule: AnySchedule = "auto"
     """How the bus is asked (`devices.schedules`); "auto": whatever is best for these tiles."""
     wait_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
     """How long the driver waits for a conversion. Absent: as long as each part is measured to take
@@ -284,7 +284,7 @@ class FaultScene(_Section):
     """Which multiplexer; for faults of one."""
     t_s: _NotNegative
     duration_s: _Positive
-    rate: Annotated[float, Field(gt=0, le=1)] = 0.01
+    rate: Annotated[float, Field(gt=0, le=1)] = RATE
     """How often, for what comes by chance: of the bytes for `nack_storm` and `bit_errors`, of the
     transfers for `adapter_timeout`."""
 

@@ -235,4 +235,3 @@ def _bisected(finished_within: Callable[[int], int | None]) -> int | None:
         else:
             break  # sleeps of this machine are no finer than that
     return finished_ns
-

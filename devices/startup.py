@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
 from devices.array import TileArray
 from devices.budget import BusTiming, Choice, choose, frame_s
@@ -14,7 +13,7 @@ from devices.errors import SceneError
 from devices.frames import TileInfo
 from devices.i2c import I2cBus
 from devices.mpl115a2 import CONVERSION_MAX_NS, CONVERSION_TYPICAL_NS
-from devices.scene import Scene, ScheduleName
+from devices.scene import AnySchedule, Scene
 from devices.self_test import identify, measure_conversion_ns, measure_wires
 
 
@@ -44,7 +43,7 @@ def make_ready(
     scene: Scene,
     clock: Clock,
     *,
-    schedule: ScheduleName | None = None,
+    schedule: AnySchedule | None = None,
     recovery: BusRecovery | None = None,
     beside: Callable[[], float] | None = None,
 ) -> Ready:
@@ -62,21 +61,66 @@ def make_ready(
         TileSetupError, I2cError: a tile or the bus does not work.
         SceneError: the schedule does not suit the tiles.
     """
-    tiles, timing, unmeasured = measured(bus, scene, clock)
+    found = measured(bus, scene, clock)
     asked = schedule or scene.array.schedule
     if beside is not None:
         choice = _beside_reference(asked)
     elif asked == "auto":
         channels_max = scene.array.broadcast_channels
-        choice = choose(timing, asked_hz=scene.rate_hz, channels_max=channels_max)
+        choice = choose(found.timing, asked_hz=scene.rate_hz, channels_max=channels_max)
     else:
         choice = Choice(asked, "as the scene says" if schedule is None else "as asked for")
+    return _ready(bus, scene, clock, found, choice, recovery, beside)
+
+
+def renew(
+    bus: I2cBus,
+    scene: Scene,
+    clock: Clock,
+    before: Ready,
+    *,
+    recovery: BusRecovery | None = None,
+    beside: Callable[[], float] | None = None,
+) -> Ready:
+    """The array with the parts that are there now in place of those that were replaced.
+
+    Only the new parts are identified and measured, so that the others rest for a moment only.
+
+    Raises:
+        TileSetupError, I2cError: a new part has gone again, or is none.
+    """
+    replaced = before.array.replaced
+    new = [tile for tile in scene.tile if tile.serial in replaced]
+    found = measured(bus, scene.model_copy(update={"tile": tuple(new)}), clock)
+    waits_s = dict(zip((tile.serial for tile in new), found.timing.conversions_s, strict=True))
+    by_serial = {tile.serial: tile for tile in found.tiles}
+    serials = [tile.serial for tile in before.tiles]
+    old_s = dict(zip(serials, before.timing.conversions_s, strict=True))
+    parts = Measured(
+        tiles=tuple(by_serial.get(tile.serial, tile) for tile in before.tiles),
+        timing=replace(
+            before.timing, conversions_s=tuple((old_s | waits_s)[serial] for serial in serials)
+        ),
+        unmeasured=(*(s for s in before.unmeasured if s not in by_serial), *found.unmeasured),
+    )
+    return _ready(bus, scene, clock, parts, before.choice, recovery, beside)
+
+
+def _ready(
+    bus: I2cBus,
+    scene: Scene,
+    clock: Clock,
+    found: Measured,
+    choice: Choice,
+    recovery: BusRecovery | None,
+    beside: Callable[[], float] | None,
+) -> Ready:
     array = TileArray(
         bus,
-        tiles,
+        found.tiles,
         clock,
         schedule=choice.schedule,
-        timing=timing,
+        timing=found.timing,
         temperature_every=scene.array.temperature_every,
         broadcast_channels=scene.array.broadcast_channels,
         recovery=recovery,
@@ -84,10 +128,11 @@ def make_ready(
     )
     # Schedules that read what the frame before has started have to be started once.
     array.scan()
-    return Ready(array, tiles, timing, choice, 1.0 / frame_s(choice.schedule, timing), unmeasured)
+    predicted_hz = 1.0 / frame_s(choice.schedule, found.timing)
+    return Ready(array, found.tiles, found.timing, choice, predicted_hz, found.unmeasured)
 
 
-def _beside_reference(asked: ScheduleName | Literal["auto"]) -> Choice:
+def _beside_reference(asked: AnySchedule) -> Choice:
     if asked in ("auto", "simultaneous"):
         return Choice("simultaneous", "the reference force is read while all tiles convert at once")
     if asked == "sequential":
@@ -99,10 +144,17 @@ def _beside_reference(asked: ScheduleName | Literal["auto"]) -> Choice:
     )
 
 
-def measured(
-    bus: I2cBus, scene: Scene, clock: Clock
-) -> tuple[tuple[TileInfo, ...], BusTiming, tuple[str, ...]]:
-    """The tiles of a scene as found, the timing of bus and parts, and who could not be measured.
+@dataclass(frozen=True)
+class Measured:
+    """The tiles of a scene as found, the timing of bus and parts, and who could not be measured."""
+
+    tiles: tuple[TileInfo, ...]
+    timing: BusTiming
+    unmeasured: tuple[str, ...]
+
+
+def measured(bus: I2cBus, scene: Scene, clock: Clock) -> Measured:
+    """Identify the tiles of a scene and measure them.
 
     With `array.wait_ms` the parts are not measured. A part whose words do not tell is given the
     data sheet's longest time.
@@ -132,4 +184,4 @@ def measured(
         bytes_read=2.0 + 2.0 / every,
         transaction_s=wires.transaction_s,
     )
-    return tuple(tiles), timing, tuple(unmeasured)
+    return Measured(tuple(tiles), timing, tuple(unmeasured))

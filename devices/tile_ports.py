@@ -17,7 +17,9 @@ class TilePorts:
         self.tiles = tuple(tiles)
         self.router = MuxRouter(bus, [tile.mux for tile in tiles])
         self._chip = Mpl115a2(bus)
-        self._masks = {(i,): {tile.mux: 1 << tile.channel} for i, tile in enumerate(tiles)}
+        self._masks: dict[tuple[int, ...], dict[int, int]] = {
+            (i,): {tile.mux: 1 << tile.channel} for i, tile in enumerate(tiles)
+        }
 
     def connect(self, tile: int) -> None:
         """Connect one tile and nothing else."""

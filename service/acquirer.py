@@ -1,8 +1,9 @@
 """Acquisition in a process of its own, so that nothing else on the node disturbs its pace.
 
 The child opens the array, takes frames and encodes them; a thread of it sends them through a pipe.
-Whoever started it gets `Started`, then `Batch` after `Batch`; a `Failed` ends it. The child ends
-when it is told to, or when the pipe breaks because its parent died.
+Whoever started it gets `Started`, then `Batch` after `Batch`, and `Started` again when the array
+has become another one, with which a new stream begins; a `Failed` ends it. The child ends when it
+is told to, or when the pipe breaks because its parent died.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from multiprocessing.connection import Connection
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from service.backlog import EncodedBatch
+from service.news import News
 from service.rig import Rig, RigOptions
 from storage.schema import wire_schema
 from storage.wire import encode
@@ -27,6 +29,8 @@ _WAITING_MAX = 4096
 """Batches that may wait for a parent that does not read, 100 s; then frames are lost and counted
 as a gap in `seq`."""
 _END_S = 5.0
+_NEWS_NS = 500_000_000
+_Item = tuple[FrameBatch, int, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,8 @@ class Started:
     """The array was found; frames follow."""
 
     info: ArrayInfo
+    remarks: tuple[str, ...] = ()
+    """What a user should hear about it."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,8 @@ class Batch:
 
     batch: EncodedBatch
     missed_slots: int
+    news: tuple[str, ...] = ()
+    """What has become wrong with the array, or right again."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +126,9 @@ def _run(options: RigOptions, connection: Connection) -> None:
     with suppress(OSError):  # a parent that died wants no more messages
         try:
             with ExitStack() as stack:
-                _stream(Rig(options, stack), connection, stop)
+                rig = Rig(options, stack)
+                while not stop.is_set():  # a replaced part begins a new stream
+                    _stream(rig, connection, stop)
         except FootTileError as error:
             connection.send(Failed(error))
         else:
@@ -126,31 +136,37 @@ def _run(options: RigOptions, connection: Connection) -> None:
 
 
 def _stream(rig: Rig, connection: Connection, stop: threading.Event) -> None:
-    connection.send(Started(rig.info))
-    waiting: queue.Queue[tuple[FrameBatch, int] | None] = queue.Queue(_WAITING_MAX)
-    sender = threading.Thread(target=_send, args=(rig, waiting, connection, stop))
+    connection.send(Started(rig.info, tuple(rig.remarks)))
+    rig.remarks.clear()
+    news, news_due_ns = News(), 0
+    waiting: queue.Queue[_Item | None] = queue.Queue(_WAITING_MAX)
+    sender = threading.Thread(target=_send, args=(rig.info, waiting, connection, stop))
     sender.start()
     try:
         for batch in rig.batches(stop.is_set):
+            told: tuple[str, ...] = ()
+            if batch.t_mono_ns[-1] >= news_due_ns:
+                told = news.since(rig.troubles())
+                news_due_ns = int(batch.t_mono_ns[-1]) + _NEWS_NS
             with suppress(queue.Full):
-                waiting.put_nowait((batch, rig.acquisition.missed_slots))
+                waiting.put_nowait((batch, rig.acquisition.missed_slots, told))
     finally:
         waiting.put(None)
         sender.join()
 
 
 def _send(
-    rig: Rig,
-    waiting: queue.Queue[tuple[FrameBatch, int] | None],
+    info: ArrayInfo,
+    waiting: queue.Queue[_Item | None],
     connection: Connection,
     stop: threading.Event,
 ) -> None:
-    schema = wire_schema(rig.info)
+    schema = wire_schema(info)
     while (item := waiting.get()) is not None:
-        frames, missed_slots = item
+        frames, missed_slots, news = item
         encoded = EncodedBatch(int(frames.seq[0]), int(frames.seq[-1]), encode(frames, schema))
         try:
-            connection.send(Batch(encoded, missed_slots))
+            connection.send(Batch(encoded, missed_slots, news))
         except OSError:
             stop.set()
             return

@@ -75,7 +75,7 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
         if node.boot_id == boot_id and node.info != hello.array_info:
             raise HangUp(Close.BAD_HELLO, f"stream {boot_id} was announced with another array")
         if node.boot_id != boot_id:
-            server.recorder.node_restarts(node, hello.array_info)
+            server.recorder.node_restarts(node, hello)
         held = node.attach(hello)
     except (LinkError, StorageError) as error:
         code = Close.TRY_LATER if isinstance(error, StorageError) else Close.BAD_HELLO

@@ -66,6 +66,13 @@ class _Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class StreamEnd(_Message):
+    """Where a stream of this node ended in order: it was given to the server to its last frame."""
+
+    boot_id: str
+    next_seq: _Seq
+
+
 class Hello(_Message):
     """Who the node is, and what it can give."""
 
@@ -82,6 +89,8 @@ class Hello(_Message):
     calibration: Calibration | None
     calibration_problem: str | None
     """Why there is none."""
+    previous: StreamEnd | None = None
+    """The stream before, if the node is the same and its array has become another one."""
 
 
 class Welcome(_Message):

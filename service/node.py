@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import count
 
 from devices.frames import ArrayInfo
 from service.acquirer import AcquisitionProcess, Batch, Failed, Message, Started
 from service.backlog import Backlog
 from service.estimation.calibration import Calibration
-from service.link import PROTOCOL, Hello, Status
+from service.link import PROTOCOL, Hello, Status, StreamEnd
 from service.publisher import Publisher
 from service.rig import RigOptions
+
+_LOOK_S = 0.02
 
 
 async def run_node(
@@ -40,51 +44,112 @@ async def run_node(
     """
     loop = asyncio.get_running_loop()
     messages: asyncio.Queue[Message] = asyncio.Queue()
-    backlog = Backlog()
-    missed_slots = 0
+    streams: list[_Stream] = []
     stopping = asyncio.create_task(stop.wait())
     acquisition = AcquisitionProcess(options, lambda message: _hand_over(loop, messages, message))
     publishing: asyncio.Task[None] | None = None
-    try:
-        info = await _started(messages, stopping)
-        if info is None:
-            return 0
-        report(f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s, {info.schedule}")
-        publisher = Publisher(
-            server,
-            hello=lambda: Hello(
+
+    def publisher(stream: _Stream) -> Publisher:
+        def hello() -> Hello:
+            return Hello(
                 protocol=PROTOCOL,
-                array_info=info,
-                first_seq=backlog.first_seq,
-                next_seq=backlog.next_seq,
+                array_info=stream.info,
+                first_seq=stream.backlog.first_seq,
+                next_seq=stream.backlog.next_seq,
                 scene=options.scene.model_dump(mode="json"),
                 emulated=options.emulated,
                 calibration=calibration,
                 calibration_problem=calibration_problem,
-            ),
-            backlog=backlog,
-            status=lambda: Status(missed_slots=missed_slots, first_seq=backlog.first_seq),
-            token=token,
-            report=report,
+                previous=stream.previous,
+            )
+
+        def status() -> Status:
+            return Status(missed_slots=stream.missed_slots, first_seq=stream.backlog.first_seq)
+
+        return Publisher(
+            server, hello=hello, backlog=stream.backlog, status=status, token=token, report=report
         )
-        publishing = asyncio.create_task(publisher.run())
+
+    try:
+        started = await _started(messages, stopping)
+        if started is None:
+            return 0
+        streams.append(_begin(started, None, report))
+        publishing = asyncio.create_task(_publish(streams, publisher))
         publishing.add_done_callback(lambda task: _tell_failure(task, messages))
         stopping.add_done_callback(lambda _: acquisition.stop())
         while not isinstance(message := await messages.get(), Failed):
+            stream = streams[-1]
             if isinstance(message, Batch):
-                backlog.append(message.batch)
-                missed_slots = message.missed_slots
-                publisher.notify()
+                stream.backlog.append(message.batch)
+                stream.missed_slots = message.missed_slots
+                if stream.publisher is not None:
+                    stream.publisher.notify()
+                for news in message.news:
+                    report(news)
+            elif isinstance(message, Started):
+                stream.has_ended = True
+                streams.append(_begin(message, stream, report))
         if message.error is not None:
             raise message.error
-        await publisher.drain()
+        streams[-1].has_ended = True
+        for stream in streams:
+            if stream.publisher is not None and not stream.is_delivered:
+                await stream.publisher.drain()
     finally:
         stopping.cancel()
         if publishing is not None:
             publishing.cancel()
             await asyncio.gather(publishing, return_exceptions=True)
         await asyncio.to_thread(acquisition.close)
-    return backlog.next_seq - backlog.first_seq + backlog.evicted_frames
+    return sum(s.backlog.next_seq - s.backlog.first_seq + s.backlog.evicted_frames for s in streams)
+
+
+@dataclass
+class _Stream:
+    """One stream: it ends when the array becomes another one, and is given away to its end."""
+
+    info: ArrayInfo
+    previous: StreamEnd | None
+    backlog: Backlog = field(default_factory=Backlog)
+    missed_slots: int = 0
+    has_ended: bool = False
+    publisher: Publisher | None = None
+
+    @property
+    def is_delivered(self) -> bool:
+        """Has the server everything?"""
+        return self.has_ended and self.backlog.first_seq == self.backlog.next_seq
+
+
+def _begin(started: Started, before: _Stream | None, report: Callable[[str], None]) -> _Stream:
+    info = started.info
+    report(f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s")
+    for remark in started.remarks:
+        report(remark)
+    previous = None
+    if before is not None:
+        report("the tiles are described anew: a new stream begins")
+        previous = StreamEnd(boot_id=before.info.boot_id, next_seq=before.backlog.next_seq)
+    return _Stream(info, previous)
+
+
+async def _publish(streams: list[_Stream], publisher: Callable[[_Stream], Publisher]) -> None:
+    """Publish one stream after the other, each until the server has it to its end."""
+    for number in count():
+        while number >= len(streams):
+            await asyncio.sleep(_LOOK_S)
+        stream = streams[number]
+        stream.publisher = publisher(stream)
+        running = asyncio.create_task(stream.publisher.run())
+        try:
+            while not stream.is_delivered:
+                await asyncio.wait({running}, timeout=_LOOK_S)
+                if running.done():
+                    running.result()
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
 
 
 def _tell_failure(task: asyncio.Task[None], messages: asyncio.Queue[Message]) -> None:
@@ -95,7 +160,7 @@ def _tell_failure(task: asyncio.Task[None], messages: asyncio.Queue[Message]) ->
 
 async def _started(
     messages: asyncio.Queue[Message], stopping: asyncio.Task[bool]
-) -> ArrayInfo | None:
+) -> Started | None:
     """The array, once it is open; None if the node is stopped before."""
     first = asyncio.create_task(messages.get())
     await asyncio.wait({first, stopping}, return_when=asyncio.FIRST_COMPLETED)
@@ -103,8 +168,8 @@ async def _started(
         first.cancel()
         return None
     match first.result():
-        case Started(info):
-            return info
+        case Started() as started:
+            return started
         case Failed(error) if error is not None:
             raise error
         case _:

@@ -6,14 +6,17 @@ was stopped, by the server's clock; a node that is switched on anew adds a part.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+from datetime import UTC, datetime
 
 from devices.frames import ArrayInfo
 from service.estimation.tare import Tare
+from service.link import Hello
 from service.nodes import Node
 from service.steady import utc_ns
 from storage.intervals import Intervals
-from storage.session import ClockOffset, Part, Session
+from storage.session import ClockOffset, Part, Session, new_session_id
 
 _NO_END = 2**62
 
@@ -56,13 +59,18 @@ def with_end(session: Session, node: Node) -> Session:
     return session if last is None else ended(session, last)
 
 
-def after_restart(session: Session, node: Node, new: ArrayInfo) -> Session:
+def after_restart(session: Session, node: Node, hello: Hello) -> Session:
     """A session whose node is about to begin a new stream.
 
     Frames of the old stream that were not sent are gone; how many there may have been is noted. A
     recording goes on in a new part, if the tiles are the same.
     """
-    session = _end_of_stream(session, node)
+    new, previous = hello.array_info, hello.previous
+    if previous is not None and previous.boot_id == session.parts[-1].boot_id:
+        if session.parts[-1].seq_last is None:
+            session = ended(session, previous.next_seq - 1)  # in order: nothing is missing
+    else:
+        session = _end_of_stream(session, node)
     if session.state != "recording":
         return session
     if node.info.tiles != new.tiles:
@@ -72,6 +80,28 @@ def after_restart(session: Session, node: Node, new: ArrayInfo) -> Session:
         )
     part = Part(boot_id=new.boot_id, seq_first=0)
     return session.model_copy(update={"parts": (*session.parts, part)})
+
+
+def continued(session: Session, hello: Hello) -> Session:
+    """The session that takes up a recording whose node came back with other tiles."""
+    name, number = session.name, 2
+    if match := re.fullmatch(r"(.*) \((\d+)\)", name):
+        name, number = match[1], int(match[2]) + 1
+    calibration = hello.calibration
+    return Session(
+        id=new_session_id(datetime.now(UTC)),
+        name=f"{name} ({number})",
+        node=session.node,
+        state="recording",
+        started_t_ns=utc_ns(),
+        parts=(Part(boot_id=hello.array_info.boot_id, seq_first=0),),
+        subject=session.subject,
+        notes=session.notes,
+        tags=session.tags,
+        scene=hello.array_info.scene,
+        scene_content=hello.scene,
+        calibration=calibration.model_dump(mode="json") if calibration is not None else None,
+    )
 
 
 def needed(sessions: Iterable[Session]) -> dict[str, Intervals]:

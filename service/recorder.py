@@ -15,9 +15,9 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 
 from devices.errors import FootTileError, StateError, UnknownError
-from devices.frames import ArrayInfo
 from service import parts
 from service.estimation.calibration import Calibration
+from service.link import Hello
 from service.nodes import Node, Nodes
 from service.sealing import Sources, ledger_of, seal, write_events
 from service.steady import utc_ns
@@ -179,10 +179,12 @@ class Recorder:
             write_events(session, self.folder.path(session_id))
         return event
 
-    def node_restarts(self, node: Node, new: ArrayInfo) -> None:
+    def node_restarts(self, node: Node, hello: Hello) -> None:
         """The node is about to begin a new stream: its recording goes on in a new part.
 
         Frames of the old stream that were not sent are gone; how many there may have been is noted.
+        If its tiles are others now, a session of its own takes up the recording: a file describes
+        one array.
 
         Raises:
             StorageError: that cannot be written down.
@@ -190,7 +192,10 @@ class Recorder:
         for session in list(self._sessions.values()):
             open_here = session.parts[-1].boot_id == node.boot_id and session.node == node.name
             if open_here and session.state in ("recording", "pending"):
-                self._keep(parts.after_restart(session, node, new))
+                after = parts.after_restart(session, node, hello)
+                self._keep(after)
+                if session.state == "recording" and after.state != "recording":
+                    self._keep(parts.continued(after, hello))
 
     def note_clock(self, node: Node) -> None:
         """Keep a new measurement of a node's clock with its recordings."""

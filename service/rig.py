@@ -16,18 +16,22 @@ from devices.clock import SystemClock, UtcAnchor
 from devices.dynamixel import open_servo
 from devices.emulation.ground import press_on
 from devices.emulation.load_trace import CopTransform, LoadTrace
+from devices.errors import I2cError, TileSetupError
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from devices.i2c import open_bus
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
 from devices.scene import EMULATED, Scene, ServoScene
 from devices.servo import ServoReader
-from devices.startup import make_ready
+from devices.startup import make_ready, renew
+from service.beside import recovery_of, reference_of
 from service.describe import describe
 
 if TYPE_CHECKING:
+    from devices.array import TileArray
     from devices.emulation.world import World
 
 _TRIAL_FRAMES = 100
+_RENEW_AGAIN_NS = 2_000_000_000
 
 # Threads of an emulated world must not make the bus wait for Python's lock longer than a bit or so.
 _SWITCH_S = 0.0002
@@ -66,25 +70,45 @@ class Rig:
     def __init__(self, options: RigOptions, stack: ExitStack) -> None:
         scene = options.scene
         sharpen_timers()
+        self._options = options
         self._clock = SystemClock()
         self._lead_end_ns: int | None = None
         world = self._world(options, stack)
-        bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
-        stack.callback(bus.close)
-        ready = make_ready(
-            bus,
-            scene,
-            self._clock,
-            beside=self._mill_force_n if world is not None and world.mill is not None else None,
+        self._bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
+        stack.callback(self._bus.close)
+        self._recovery = recovery_of(scene, self._clock, world)
+        self._beside = reference_of(scene, self._clock, world, stack)
+        self._ready = make_ready(
+            self._bus, scene, self._clock, recovery=self._recovery, beside=self._beside
         )
-        servo = self._servo(scene.servo, world, stack) if scene.servo is not None else None
+        self.remarks = [f"schedule {self._ready.choice.schedule}: {self._ready.choice.reason}"]
+        """What a user should hear about it."""
+        self.remarks += [
+            f"the conversion time of tile {serial} could not be measured: it is given 3 ms"
+            for serial in self._ready.unmeasured
+        ]
+        self._servo_source = (
+            self._servo(scene.servo, world, stack) if scene.servo is not None else None
+        )
+        self._renew_at_ns = 0
+        if world is not None:
+            world.begin()
+            if options.emulated:
+                self._lead_end_ns = world.epoch_ns + round(options.lead_s * 1e9)
+        self._begin_stream(is_new=False)
+        if not options.emulated:
+            # Last, and only this thread: an emulated world would starve the rest of the machine.
+            run_before_others()
+
+    def _begin_stream(self, *, is_new: bool) -> None:
+        scene, ready = self._options.scene, self._ready
         anchor = UtcAnchor.now(clock_set=clock_is_set())
         bus_hz = self._bus_hz(ready.array)
         self.info: ArrayInfo = describe(
             scene,
             ready.tiles,
             anchor,
-            node=options.node,
+            node=self._options.node,
             boot_id=uuid.uuid4().hex,
             schedule=ready.choice.schedule,
             rate_hz=min(scene.rate_hz or bus_hz, bus_hz),
@@ -96,20 +120,48 @@ class Rig:
             anchor,
             rate_hz=scene.rate_hz,
             expected_hz=bus_hz,
-            servo=servo,
+            servo=self._servo_source,
+            is_new=is_new,
         )
-        if not options.emulated:
-            # Last, and only this thread: an emulated world would starve the rest of the machine.
-            run_before_others()
 
     def batches(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
-        """Frames until `stop()`; those before an emulated load begins are marked as lead."""
-        for batch in self.acquisition.run(stop):
-            if self._lead_end_ns is None or int(batch.t_mono_ns[0]) >= self._lead_end_ns:
-                yield batch
-                continue
-            lead = np.where(batch.t_mono_ns < self._lead_end_ns, FrameStatus.LEAD, 0)
-            yield replace(batch, frame_status=batch.frame_status | lead.astype(np.uint8))
+        """Frames until `stop()`; those before an emulated load begins are marked as lead.
+
+        Ends before that when another part was plugged in: then `info` describes a new stream, and
+        the next call goes on with it.
+        """
+        while not stop():
+            for batch in self.acquisition.run(lambda: stop() or self._is_renewal_due()):
+                if self._lead_end_ns is None or int(batch.t_mono_ns[0]) >= self._lead_end_ns:
+                    yield batch
+                    continue
+                lead = np.where(batch.t_mono_ns < self._lead_end_ns, FrameStatus.LEAD, 0)
+                yield replace(batch, frame_status=batch.frame_status | lead.astype(np.uint8))
+            if not stop() and self._renew():
+                return
+
+    def troubles(self) -> dict[str, str]:
+        """What is wrong now, in words, by what it is wrong with."""
+        return self._ready.array.troubles()
+
+    def _is_renewal_due(self) -> bool:
+        return bool(self._ready.array.replaced) and self._clock.now_ns() >= self._renew_at_ns
+
+    def _renew(self) -> bool:
+        try:
+            self._ready = renew(
+                self._bus,
+                self._options.scene,
+                self._clock,
+                self._ready,
+                recovery=self._recovery,
+                beside=self._beside,
+            )
+        except (I2cError, TileSetupError):  # it is being plugged: go on with the others
+            self._renew_at_ns = self._clock.now_ns() + _RENEW_AGAIN_NS
+            return False
+        self._begin_stream(is_new=True)
+        return True
 
     def _world(self, options: RigOptions, stack: ExitStack) -> World | None:
         scene = options.scene
@@ -136,9 +188,8 @@ class Rig:
             lead_s=options.lead_s,
             pressed=pressed,
             looped=True,
+            begun=False,
         )
-        if options.emulated:
-            self._lead_end_ns = world.epoch_ns + round(options.lead_s * 1e9)
         stack.enter_context(world.foresight())
         return world
 

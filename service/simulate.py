@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.acquisition import Acquisition
+from devices.budget import Choice
 from devices.clock import UtcAnchor, VirtualClock
 from devices.dynamixel import open_servo
 from devices.emulation.ground import press_on
@@ -25,10 +26,11 @@ from devices.emulation.world import World
 from devices.errors import UsageError
 from devices.frames import FrameBatch, FrameStatus
 from devices.i2c import open_bus
-from devices.scene import Scene, ScheduleName, ServoScene
+from devices.scene import AnySchedule, Scene, ServoScene
 from devices.servo import PolledServo
 from devices.startup import make_ready
 from service.accuracy import JUDGED, Accuracy, judge
+from service.beside import recovery_of, reference_of
 from service.describe import describe
 from service.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
 from storage.session_file import SessionWriter
@@ -47,7 +49,7 @@ class SimulateOptions:
 
     scene: Scene
     seconds: float | None = None
-    schedule: ScheduleName | None = None
+    schedule: AnySchedule | None = None
     seed: int = 0
     parts_seed: int = 0
     lead_s: float = 1.0
@@ -65,6 +67,9 @@ class Simulated:
     seconds: float
     rate_hz: float
     missed_slots: int
+    choice: Choice
+    replaced: tuple[str, ...]
+    """Serials in whose place another part answered."""
     pressed: PressedTrace | None
     accuracy: Accuracy | None
     wall_s: float
@@ -102,10 +107,11 @@ class Simulation:
             scene,
             self._clock,
             schedule=options.schedule,
-            beside=self._mill_force_n if scene.ground.kind == "indentation" else None,
+            recovery=recovery_of(scene, self._clock, self._world),
+            beside=reference_of(scene, self._clock, self._world, stack),
         )
         self.choice = ready.choice
-        self._array = ready.array
+        self.array = ready.array
         # The machine was switched on earlier, the session and its scene begin now.
         self._world.begin()
         self._begin_ns = self._clock.now_ns()
@@ -128,10 +134,6 @@ class Simulation:
             ready.array, ready.tiles, self._clock, anchor, rate_hz=scene.rate_hz, servo=servo
         )
 
-    def _mill_force_n(self) -> float:
-        mill = self._world.mill
-        return float("nan") if mill is None else mill.force_n(self._clock.now_ns())
-
     def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
         """Frames with what the emulation adds: truth if asked for, the mill's notes."""
         lead_ns = self._begin_ns + round(self._options.lead_s * 1e9)
@@ -144,9 +146,14 @@ class Simulation:
             extra: dict[str, npt.NDArray[Any]] = {}
             if self._options.truth:
                 extra |= asdict(self._world.truth(batch.t_mono_ns))
+            batch = replace(batch, frame_status=batch.frame_status | lead)
             if mill is not None:
                 extra |= mill.notes(batch.t_mono_ns)
-            yield replace(batch, frame_status=batch.frame_status | lead), extra
+                # What the sensor reads while nothing is pressed is no reference for any tile.
+                idle = np.array([tile is None for tile in extra["pressed_tile"]])
+                force_n = np.where(idle, np.float32(np.nan), batch.reference_force_n)
+                batch = replace(batch, reference_force_n=force_n)
+            yield batch, extra
 
 
 def simulate(
@@ -193,6 +200,8 @@ def simulate(
         seconds=seconds,
         rate_hz=(frames - 1) / seconds if seconds else float("nan"),
         missed_slots=simulation.acquisition.missed_slots,
+        choice=simulation.choice,
+        replaced=simulation.array.replaced,
         pressed=simulation.pressed,
         accuracy=judge(joined(judged)) if judged else None,
         wall_s=time.perf_counter() - began_s,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 
-from devices.scene import BUS, FaultKind, FaultScene
+from devices.scene import BUS, RATE, FaultKind, FaultScene
 
 
 class Fault:
@@ -95,7 +95,7 @@ class Faults:
         """The fault of one kind and target: a tile's serial, a mux as "0x70", or the bus."""
         if (kind, target) not in self._faults:
             mine = [f for f in self._scenes if f.kind == kind and f.target == target]
-            fault = Fault([(f.t_s, f.t_s + f.duration_s) for f in mine], _rate(kind, mine))
+            fault = Fault([(f.t_s, f.t_s + f.duration_s) for f in mine], _rate(mine))
             if self._epoch_ns is not None:
                 fault.begin(self._epoch_ns)
             self._faults[kind, target] = fault
@@ -113,7 +113,5 @@ class Faults:
             fault.begin(epoch_ns)
 
 
-def _rate(kind: FaultKind, scenes: Sequence[FaultScene]) -> float:
-    if scenes:
-        return scenes[0].rate
-    return FaultScene.model_fields["rate"].default
+def _rate(scenes: Sequence[FaultScene]) -> float:
+    return scenes[0].rate if scenes else RATE

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from devices.emulation.dome import Domes, Surroundings
+from devices.emulation.dome import Surroundings
 from devices.emulation.faults import Fault
 from devices.emulation.parts import ChipPart, DomePart, random_of
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA

@@ -197,16 +197,12 @@ def _refuse_unsupported(messages: Sequence[i2c_msg]) -> None:
             raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
 
 
-def _expect_acknowledge(
-    listeners: list[I2cDevice], t_ns: int, disturbed: Line | None
-) -> None:
+def _expect_acknowledge(listeners: list[I2cDevice], t_ns: int, disturbed: Line | None) -> None:
     if not listeners or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
         raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
 
 
-def _write(
-    message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: Line | None
-) -> int:
+def _write(message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: Line | None) -> int:
     """Give the bytes of a message to who listens; how many were acknowledged."""
     sent = bytes(message)
     if disturbed is None and len(listeners) == 1:
@@ -223,9 +219,7 @@ def _write(
     return len(sent)
 
 
-def _read(
-    message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: Line | None
-) -> None:
+def _read(message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: Line | None) -> None:
     given = [device.read(message.len) for device in listeners]
     # Open drain: a bit is low if anybody pulls it low.
     values = (

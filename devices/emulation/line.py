@@ -52,8 +52,3 @@ class Line:
         if self._bit_errors(t_ns) and self._rng.random() < self._bit_errors.rate:
             return value ^ 1 << self._rng.randrange(_ADDRESS_BITS)
         return value
-
-    def clock_out(self, t_ns: int) -> bool:
-        """Nine clocks and a STOP; True if SDA is high afterwards."""
-        self.sda_low.clear(t_ns)
-        return not self.scl_low(t_ns)

@@ -6,8 +6,8 @@ reference sensor, and the operator who notes what is being done.
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_right
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,6 @@ from devices.emulation.mcp3208 import EmulatedMcp3208, amplifier_volts
 from devices.scene import IndentationGround, ReferenceScene, TileScene
 
 _MILL_NOISE_N = 0.02
-_MILL_COUNT_N = 100.0 / 4096  # 12 bits over +-50 N (hardware.md 6)
 
 
 class Indentation:
@@ -114,23 +113,23 @@ class Indentation:
 
 
 class Mill:
-    """The reference force sensor of the indentation rig, with its own noise.
+    """The reference force sensor of the indentation rig, with its own noise, and the operator.
 
-    A scene with a `[reference]` reads it through the converter that `adc` makes, in whose steps and
-    scale; without one, `force_n` has 12-bit steps of its own.
+    Args:
+        ground: the programme.
+        seconds: time of the scene at instants of the clock in ns.
+        rng: draws the amplifier's noise.
     """
 
-    def __init__(self, ground: Indentation, epoch_ns: int, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        ground: Indentation,
+        seconds: Callable[[npt.NDArray[np.int64]], Floats],
+        rng: np.random.Generator,
+    ) -> None:
         self._ground = ground
-        self._epoch_ns = epoch_ns
+        self._seconds = seconds
         self._rng = rng
-
-    def force_n(self, t_mono_ns: int) -> float:
-        """Force under the spindle in newtons; NaN where it presses no tile."""
-        spindle_n = self._ground.spindle_n((t_mono_ns - self._epoch_ns) * 1e-9)
-        if spindle_n is None:
-            return math.nan
-        return round((spindle_n + self._noise_n()) / _MILL_COUNT_N) * _MILL_COUNT_N
 
     def adc(self, reference: ReferenceScene, clock: Clock) -> EmulatedMcp3208:
         """A converter with the sensor's amplifier at the input that `reference` names.
@@ -141,7 +140,7 @@ class Mill:
         return EmulatedMcp3208(volts, clock, vref_v=reference.vref_v)
 
     def _borne_n(self, t_mono_ns: int) -> float:
-        return self._ground.spindle_n((t_mono_ns - self._epoch_ns) * 1e-9) or 0.0
+        return self._ground.spindle_n(float(self._seconds(np.array([t_mono_ns]))[0])) or 0.0
 
     def _noise_n(self) -> float:
         return _MILL_NOISE_N * float(self._rng.standard_normal())
@@ -152,7 +151,7 @@ class Mill:
         Returns:
             `pressed_tile`, serial of the tile under the spindle or None, and `phase`.
         """
-        t_s = np.asarray((t_mono_ns - self._epoch_ns) * 1e-9)
+        t_s = self._seconds(t_mono_ns)
         serials = np.array([*self._ground.serials, None], dtype=object)
         phases = np.array(self._ground.PHASES, dtype=object)
         return {

@@ -222,7 +222,7 @@ class World:
     def mill(self) -> Mill | None:
         """The reference force sensor beside the spindle, if the ground is the mill."""
         if isinstance(self.ground, Indentation):
-            return Mill(self.ground, self.epoch_ns, self._mill_rng)
+            return Mill(self.ground, self._seconds, self._mill_rng)
         return None
 
     def _part_faults(self, serial: str) -> PartFaults:

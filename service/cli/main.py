@@ -11,6 +11,7 @@ import typer
 from devices.errors import FootTileError
 from service.cli.calibrate import calibrate_command
 from service.cli.demo import demo_command
+from service.cli.doctor import doctor_command
 from service.cli.estimate import estimate_command
 from service.cli.node import node_command
 from service.cli.serve import serve_command
@@ -37,6 +38,7 @@ app.command("export")(export_command)
 app.command("simulate")(simulate_command)
 app.command("estimate")(estimate_command)
 app.command("calibrate")(calibrate_command)
+app.command("doctor")(doctor_command)
 
 
 def _print_version(wanted: bool) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 import typer
 
 from devices.errors import UsageError
-from devices.scene import Scene, ScheduleName, load_scene
+from devices.scene import AnySchedule, Scene, ScheduleName, load_scene
 from service.cli.emulation import (
     CopAxesOption,
     CopOffsetOption,
@@ -54,7 +54,10 @@ def simulate_command(
     cop_axes: CopAxesOption = "xy",
     lead_s: LeadOption = 1.0,
     schedule: Annotated[
-        str | None, typer.Option(help="sequential or simultaneous; default: the scene's.")
+        str | None,
+        typer.Option(
+            help="auto, simultaneous, pipelined, per_mux or sequential; default: the scene's."
+        ),
     ] = None,
     tiles: Annotated[
         str | None, typer.Option(help="Indentation only: serials to press, T01,T02,...")
@@ -131,6 +134,7 @@ def _as_json(result: Simulated, path: Path) -> dict[str, object]:
         "frames": result.frames,
         "seconds": result.seconds,
         "rate_hz": result.rate_hz,
+        "schedule": result.choice.schedule,
         "missed_slots": result.missed_slots,
         "bytes": path.stat().st_size,
         "moved_to_edge": pressed.moved_to_edge if pressed else None,
@@ -148,6 +152,9 @@ def _print(result: Simulated, path: Path) -> None:
     remark(
         f"{result.wall_s:.1f} s of wall time, {result.seconds / result.wall_s:.1f} times real time"
     )
+    remark(f"schedule {result.choice.schedule}: {result.choice.reason}")
+    for serial in result.replaced:
+        say(f"tile {serial} was replaced by another part: its readings are flagged from then on")
     if result.missed_slots:
         say(f"{result.missed_slots} slots were missed: the bus cannot keep this rate")
     if result.pressed is not None:
@@ -159,13 +166,13 @@ def _print(result: Simulated, path: Path) -> None:
         stdout.print(accuracy_table(result.accuracy))
 
 
-def _schedule(name: str | None) -> ScheduleName | None:
+def _schedule(name: str | None) -> AnySchedule | None:
     if name is None:
         return None
-    names = get_args(ScheduleName)
+    names = ("auto", *get_args(ScheduleName))
     if name not in names:
         raise UsageError(f"--schedule {name!r}", expected=" or ".join(names))
-    return cast(ScheduleName, name)
+    return cast(AnySchedule, name)
 
 
 def _check(

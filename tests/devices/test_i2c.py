@@ -8,7 +8,13 @@ import pickle
 from pathlib import Path
 
 import pytest
-from smbus2 import i2c_msg
+from smbus2 import SMBus, i2c_msg
+
+from devices.clock import VirtualClock
+from devices.emulation.faults import Faults
+from devices.emulation.i2c_bus import EmulatedI2cAdapter
+from devices.emulation.line import Line
+from devices.emulation.tca9548a import EmulatedTca9548a
 
 from devices.errors import (
     BusFaultError,
@@ -30,6 +36,9 @@ class BrokenAdapter:
 
     def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
         raise self.error
+
+    def set_timeout(self, units_10ms: int) -> None:
+        pass
 
     def close(self) -> None:
         pass
@@ -96,33 +105,14 @@ def test_what_a_field_worker_can_do_is_said() -> None:
     assert "42 messages" in failure_of(OSError(22, ""), message).expected
 
 
-class FakeSmbus:
-    """`smbus2.SMBus` without a device."""
-
-    fd = 77
-
-    def __init__(self) -> None:
-        self.transactions: list[tuple[i2c_msg, ...]] = []
-        self.closed = False
-
-    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
-        self.transactions.append(i2c_msgs)
-
-    def close(self) -> None:
-        self.closed = True
-
-
 class Pi:
-    """A machine whose bus devices are all the same fake, and whose ioctls are noted."""
+    """A machine on which smbus2 opens any bus; transactions and ioctls are noted."""
 
     def __init__(self) -> None:
-        self.adapter = FakeSmbus()
         self.opened: list[str] = []
+        self.transactions: list[tuple[i2c_msg, ...]] = []
         self.ioctls: list[tuple[int, int, int]] = []
-
-    def smbus(self, name: str) -> FakeSmbus:
-        self.opened.append(name)
-        return self.adapter
+        self.closed = 0
 
     def ioctl(self, fd: int, request: int, value: int) -> int:
         self.ioctls.append((fd, request, value))
@@ -132,9 +122,39 @@ class Pi:
 @pytest.fixture
 def pi(monkeypatch: pytest.MonkeyPatch) -> Pi:
     pi = Pi()
-    monkeypatch.setattr("devices.i2c.SMBus", pi.smbus)
+
+    def open_(self: SMBus, name: str) -> None:
+        pi.opened.append(name)
+        self.fd = 77
+
+    def i2c_rdwr(self: SMBus, *i2c_msgs: i2c_msg) -> None:
+        pi.transactions.append(i2c_msgs)
+
+    def close(self: SMBus) -> None:
+        pi.closed += 1
+
+    monkeypatch.setattr(SMBus, "open", open_)
+    monkeypatch.setattr(SMBus, "i2c_rdwr", i2c_rdwr)
+    monkeypatch.setattr(SMBus, "close", close)
     monkeypatch.setattr("devices.i2c.fcntl.ioctl", pi.ioctl)
     return pi
+
+
+class FakeAdapter:
+    """An adapter that notes what it is asked."""
+
+    def __init__(self) -> None:
+        self.transactions: list[tuple[i2c_msg, ...]] = []
+        self.timeouts: list[int] = []
+
+    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
+        self.transactions.append(i2c_msgs)
+
+    def set_timeout(self, units_10ms: int) -> None:
+        self.timeouts.append(units_10ms)
+
+    def close(self) -> None:
+        pass
 
 
 def test_a_real_bus_gets_a_time_out_of_30_ms_at_opening(pi: Pi) -> None:
@@ -149,7 +169,7 @@ def test_messages_reach_the_adapter_unchanged_and_in_one_transaction(pi: Pi) -> 
     write, read = i2c_msg.write(0x60, [0x00]), i2c_msg.read(0x60, 4)
     bus.transfer(write, read)
     bus.transfer(write)
-    first, second = pi.adapter.transactions
+    first, second = pi.transactions
     assert len(first) == 2
     assert first[0] is write
     assert first[1] is read
@@ -160,16 +180,16 @@ def test_messages_reach_the_adapter_unchanged_and_in_one_transaction(pi: Pi) -> 
 
 def test_closing_a_bus_closes_its_adapter(pi: Pi) -> None:
     bus = open_bus("/dev/i2c-1")
-    assert not pi.adapter.closed
+    assert pi.closed == 0
     bus.close()
-    assert pi.adapter.closed
+    assert pi.closed == 1
 
 
 def test_a_world_is_not_asked_where_a_device_is_named(pi: Pi) -> None:
-    world = FakeSmbus()
+    world = FakeAdapter()
     open_bus("/dev/i2c-1", world).transfer(i2c_msg.write(0x70, [1]))
     assert world.transactions == []
-    assert len(pi.adapter.transactions) == 1
+    assert len(pi.transactions) == 1
 
 
 def test_a_device_that_is_not_there_is_a_setup_error(tmp_path: Path) -> None:
@@ -184,10 +204,10 @@ def test_a_device_that_is_not_there_is_a_setup_error(tmp_path: Path) -> None:
 def test_a_device_that_may_not_be_opened_is_a_setup_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def locked(name: str) -> FakeSmbus:
+    def locked(self: SMBus, name: str) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", name)
 
-    monkeypatch.setattr("devices.i2c.SMBus", locked)
+    monkeypatch.setattr(SMBus, "open", locked)
     with pytest.raises(BusSetupError, match=r"EACCES.*group i2c"):
         open_bus("/dev/i2c-1")
 
@@ -207,10 +227,39 @@ def test_an_emulated_bus_needs_a_world() -> None:
 
 
 def test_an_emulated_bus_sits_on_the_adapter_it_is_given() -> None:
-    adapter = FakeSmbus()
+    adapter = FakeAdapter()
     message = i2c_msg.write(0x70, [1])
     bus = open_bus("emulated", adapter)
     bus.transfer(message)
     assert bus.name == "emulated"
     assert len(adapter.transactions) == 1
     assert adapter.transactions[0][0] is message
+    assert adapter.timeouts == [3], "an emulated one waits as long as a real one"
+
+
+def test_a_wedged_transfer_costs_30_ms_and_not_a_second() -> None:
+    # Without the ioctl the i2c core waits for its second: 330 frames (hardware.md 3.2).
+    clock, faults = VirtualClock(), Faults(())
+    mux = EmulatedTca9548a(0x70, {})
+    adapter = EmulatedI2cAdapter([mux], clock, 400_000, Line(faults, "test"))
+    with faults.injected("scl_low", "bus"):
+        with pytest.raises(OSError):  # noqa: PT011  # any of the bus's
+            adapter.i2c_rdwr(i2c_msg.write(0x70, [1]))
+        assert clock.now_ns() == 1_000_000_000
+        bus = open_bus("emulated", adapter)
+        with pytest.raises(BusFaultError, match="ETIMEDOUT"):
+            bus.transfer(i2c_msg.write(0x70, [1]))
+    assert clock.now_ns() == 1_030_000_000
+    assert mux.mask == 0, "nothing got through"
+
+
+def test_an_adapter_that_knows_no_time_out_is_closed_again(
+    pi: Pi, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(fd: int, request: int, value: int) -> int:
+        raise OSError(errno.ENOTTY, "not a typewriter")
+
+    monkeypatch.setattr("devices.i2c.fcntl.ioctl", refuse)
+    with pytest.raises(BusSetupError, match="ENOTTY"):
+        open_bus("/dev/i2c-1")
+    assert pi.closed >= 1

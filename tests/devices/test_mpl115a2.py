@@ -17,7 +17,7 @@ from smbus2 import i2c_msg
 
 from devices.clock import VirtualClock
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
-from devices.emulation.mpl115a2 import EmulatedMpl115a2
+from devices.emulation.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.errors import NoAcknowledgeError, TileSetupError
 from devices.i2c import I2cBus, open_bus
@@ -54,7 +54,7 @@ def kpa_of(part: Coefficients, padc: int, tadc: int) -> float:
 def connected(registers: bytes, padc: int, tadc: int) -> tuple[Mpl115a2, VirtualClock]:
     """The driver of one emulated part that always measures the same."""
     clock = VirtualClock()
-    chip = EmulatedMpl115a2(words_of(registers), 1_600_000, lambda _: (padc, tadc))
+    chip = EmulatedMpl115a2(Silicon(words_of(registers), 1_600_000, lambda _: (padc, tadc)))
     mux = EmulatedTca9548a(0x70, {2: chip})
     bus = open_bus("emulated", EmulatedI2cAdapter([mux], clock, 400_000))
     bus.transfer(i2c_msg.write(0x70, [0b100]))

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import SceneError
-from devices.scene import Scene, builtin_scenes, load_scene, parse_scene
+from devices.scene import FaultKind, Scene, builtin_scenes, load_scene, parse_scene
 
 TILE = """
 [[tile]]
@@ -101,7 +102,11 @@ def test_what_a_scene_does_not_say_has_the_defaults_of_the_design() -> None:
     assert bare.array.bus == "emulated"
     assert bare.array.scl_hz == 400_000
     assert bare.array.conversion_ms is None
-    assert bare.array.wait_ms == 3.0  # data sheet table 10, maximum
+    assert bare.array.schedule == "auto"
+    assert bare.array.wait_ms is None, "measured"
+    assert bare.array.temperature_every == 1
+    assert bare.array.broadcast_channels == 8  # hardware.md 2: 8 channels want 10 kOhm
+    assert bare.emulation.scl_part == 1.0
     assert bare.servo is None
     assert bare.ground.kind == "none"
     assert (bare.emulation.noise_kpa, bare.emulation.correlated_ms) == (0.165, 0)
@@ -326,6 +331,12 @@ def test_a_number_that_is_none_is_refused_in_a_position_or_a_fault(value: str) -
         ("", "[ground]\nkind = 'plate'\nload_n = -3", "load_n"),
         ("", "[ground]\nkind = 'indentation'\nrepeats = 1", "repeats"),
         ("", "[emulation]\nnoise_kpa = -0.1", "emulation.noise_kpa"),
+        ("", "[array]\ntemperature_every = 0", "array.temperature_every"),
+        ("", "[array]\nbroadcast_channels = 0", "array.broadcast_channels"),
+        ("", "[array]\nbroadcast_channels = 65", "array.broadcast_channels"),
+        ("", "[emulation]\nscl_part = 0", "emulation.scl_part"),
+        ("", "[[fault]]\nkind='bit_errors'\nt_s=0\nduration_s=1\nrate=0", "fault.0.rate"),
+        ("", "[[fault]]\nkind='bit_errors'\nt_s=0\nduration_s=1\nrate=1.5", "fault.0.rate"),
         ("", "[[fault]]\nkind='stale'\ntile='T01'\nt_s=-1\nduration_s=1", "fault.0.t_s"),
         ("", "[[fault]]\nkind='stale'\ntile='T01'\nt_s=0\nduration_s=0", "fault.0.duration_s"),
     ],
@@ -413,6 +424,30 @@ def test_two_tiles_of_one_serial_are_refused() -> None:
 def test_a_fault_of_a_tile_that_is_not_there_is_refused() -> None:
     text = refused(sections="[[fault]]\nkind='stale'\ntile='T9'\nt_s=0\nduration_s=1")
     assert "a fault names tile 'T9', but there are only T01, T02" in text
+
+
+def test_a_fault_of_a_mux_that_is_not_there_is_refused() -> None:
+    text = refused(sections="[[fault]]\nkind='brown_out'\nmux=0x77\nt_s=0\nduration_s=1")
+    assert "a fault names mux 0x77" in text
+
+
+@pytest.mark.parametrize("kind", get_args(FaultKind))
+def test_every_fault_names_what_fails_and_nothing_else(kind: str) -> None:
+    line = f"[[fault]]\nkind='{kind}'\nt_s=0\nduration_s=1\n"
+    targets = {"tile": "tile='T01'", "mux": "mux=0x70", "bus": ""}
+    belongs_to = {
+        **dict.fromkeys(("brown_out", "mux_reset"), "mux"),
+        **dict.fromkeys(
+            ("sda_low", "sda_high", "scl_low", "adapter_timeout", "nack_storm", "bit_errors"), "bus"
+        ),
+    }.get(kind, "tile")
+    for target, key in targets.items():
+        if target == belongs_to:
+            fault = scene(sections=line + key).fault[0]
+            assert fault.target == {"tile": "T01", "mux": "0x70", "bus": "bus"}[target]
+        else:
+            assert kind in refused(sections=line + key)
+    assert kind in refused(sections=line + "tile='T01'\nmux=0x70")
 
 
 def test_a_missing_key_is_named() -> None:

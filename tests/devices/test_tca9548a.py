@@ -161,7 +161,7 @@ def test_a_forgotten_routing_is_written_afresh(protocol: Protocol) -> None:
     ("number", "kind"),
     [(NACK, NoAcknowledgeError), (TIMEOUT, BusFaultError), (REFUSED, BusMisuseError)],
 )
-def test_after_an_error_nothing_is_taken_as_known(
+def test_what_a_mux_connects_after_a_failed_write_is_not_taken_as_known(
     protocol: Protocol, number: int, kind: type[I2cError]
 ) -> None:
     muxes = router(protocol, 0x70, 0x71, 0x72)
@@ -169,7 +169,20 @@ def test_after_an_error_nothing_is_taken_as_known(
         muxes.connect_only(0x70, 0)
     with protocol.exchanged(f"70<02 {number}"), pytest.raises(kind):
         muxes.connect_only(0x70, 1)
+    # It may have heard it or not; the others were not spoken to.
+    with protocol.exchanged("70<01"):
+        muxes.connect_only(0x70, 0)
+    muxes.forget()  # what a user of the bus does after a fault of the bus itself
     with protocol.exchanged("71<00", "72<00", "70<01"):
+        muxes.connect_only(0x70, 0)
+
+
+def test_one_mux_alone_can_be_forgotten(protocol: Protocol) -> None:
+    muxes = router(protocol, 0x70, 0x71, 0x72)
+    with protocol.exchanged("71<00", "72<00", "70<01"):
+        muxes.connect_only(0x70, 0)
+    muxes.forget(0x72)
+    with protocol.exchanged("72<00"):
         muxes.connect_only(0x70, 0)
 
 
@@ -181,6 +194,104 @@ def test_a_mux_that_does_not_close_keeps_the_others_shut(protocol: Protocol) -> 
         muxes.connect_only(0x71, 0)
     with protocol.exchanged("70<00", "71<01"):
         muxes.connect_only(0x71, 0)
+
+
+def test_a_mux_that_refuses_to_be_closed_twice_in_a_row_is_silent_and_in_nobodys_way(
+    protocol: Protocol,
+) -> None:
+    muxes = router(protocol)
+    with protocol.exchanged("71<00", "70<01"):
+        muxes.connect_only(0x70, 0)
+    with protocol.exchanged(f"70<00 {NACK}"), pytest.raises(NoAcknowledgeError):
+        muxes.connect_only(0x71, 0)
+    assert muxes.silent == set()
+    with protocol.exchanged(f"70<00 {NACK}", "71<01"):
+        muxes.connect_only(0x71, 0)
+    assert muxes.silent == {0x70}
+    with protocol.exchanged("71<02"):  # nor is it asked any more
+        muxes.connect_only(0x71, 1)
+    with protocol.exchanged("71<00", "70<04"):
+        muxes.connect_only(0x70, 2)
+    assert muxes.silent == set(), "it has answered"
+
+
+def test_a_mux_that_fails_with_the_bus_is_not_silent(protocol: Protocol) -> None:
+    muxes = router(protocol)
+    with protocol.exchanged("71<00", "70<01"):
+        muxes.connect_only(0x70, 0)
+    for _ in range(3):
+        with protocol.exchanged(f"70<00 {TIMEOUT}"), pytest.raises(BusFaultError):
+            muxes.connect_only(0x71, 0)
+    assert muxes.silent == set()
+
+
+# Are they what they should be?
+
+
+def test_an_audit_reads_back_every_mux_of_which_something_is_known(protocol: Protocol) -> None:
+    muxes = router(protocol, 0x70, 0x71, 0x72)
+    with protocol.exchanged("71<00", "72<00", "70<04"):
+        muxes.connect_only(0x70, 2)
+    with protocol.exchanged("70>04", "71>00", "72>00"):
+        assert muxes.audit()
+    muxes.forget(0x71)
+    with protocol.exchanged("70>04", "72>00"):
+        assert muxes.audit()
+
+
+def test_a_mux_that_was_reset_behind_our_back_is_found_by_an_audit(protocol: Protocol) -> None:
+    muxes = router(protocol)
+    with protocol.exchanged("71<00", "70<04"):
+        muxes.connect_only(0x70, 2)
+    with protocol.exchanged("70>00", "71>00"):
+        assert not muxes.audit()
+    with protocol.exchanged("70<04"):
+        muxes.connect_only(0x70, 2)
+
+
+def test_a_mux_that_somebody_opened_is_found_by_an_audit(protocol: Protocol) -> None:
+    muxes = router(protocol)
+    with protocol.exchanged("71<00", "70<04"):
+        muxes.connect_only(0x70, 2)
+    with protocol.exchanged("70>04", "71>01"):
+        assert not muxes.audit()
+    with protocol.exchanged("71<00"):
+        muxes.connect_only(0x70, 2)
+
+
+def test_a_mux_that_does_not_answer_an_audit_is_not_taken_as_known(protocol: Protocol) -> None:
+    muxes = router(protocol)
+    with protocol.exchanged("71<00", "70<04"):
+        muxes.connect_only(0x70, 2)
+    with protocol.exchanged(f"70>04 {NACK}", "71>00"):
+        assert not muxes.audit()
+    with protocol.exchanged("70<04"):
+        muxes.connect_only(0x70, 2)
+    with protocol.exchanged(f"70>04 {TIMEOUT}"), pytest.raises(BusFaultError):
+        muxes.audit()
+
+
+def test_one_mux_that_keeps_what_is_written_proves_that_the_wires_move(protocol: Protocol) -> None:
+    muxes = router(protocol, 0x70, 0x71, 0x72)
+    with protocol.exchanged(f"70<01 {NACK}", "71<01", "71>01"):
+        assert muxes.echoes()
+    # It was only a trial: nothing is taken as known afterwards.
+    with protocol.exchanged("71<00", "72<00", "70<01"):
+        muxes.connect_only(0x70, 0)
+
+
+def test_a_bus_on_which_everything_reads_as_zero_does_not_move(protocol: Protocol) -> None:
+    muxes = router(protocol)
+    with protocol.exchanged("70<01", "70>00", "71<01", "71>00"):
+        assert not muxes.echoes()
+
+
+def test_a_bus_on_which_nobody_answers_does_not_move(protocol: Protocol) -> None:
+    muxes = router(protocol)
+    with protocol.exchanged(f"70<01 {NACK}", f"71<01 {NACK}"):
+        assert not muxes.echoes()
+    with protocol.exchanged(f"70<01 {TIMEOUT}"), pytest.raises(BusFaultError):
+        muxes.echoes()
 
 
 class Watch:

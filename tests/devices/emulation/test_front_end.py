@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from devices.emulation.dome import Surroundings
+from devices.emulation.faults import Fault
 from devices.emulation.front_end import FrontEnd
 from devices.emulation.parts import ChipPart, DomePart
 from devices.mpl115a2 import Coefficients, compensate_kpa
@@ -45,7 +46,9 @@ def front_end(
 ) -> FrontEnd:
     scene = EmulationScene(**emulation)
     pressure_kpa = pressure if callable(pressure) else (lambda _: pressure)
-    return FrontEnd(CHIP, DOME, pressure_kpa, Surroundings(scene), scene, 7_000, label)
+    sense = FrontEnd(CHIP, DOME, pressure_kpa, Surroundings(scene), scene, label)
+    sense.begin(7_000)
+    return sense
 
 
 def words(sense: FrontEnd, n: int, step_ns: int = STEP_NS) -> tuple[Floats, Floats]:
@@ -211,3 +214,35 @@ def test_the_dome_is_asked_for_seconds_since_power_up() -> None:
     sense(7_000)
     sense(7_000 + 1_500_000_000)
     assert asked == pytest.approx([0.0, 1.5])
+
+
+def test_until_the_scene_begins_the_dome_is_at_its_first_instant() -> None:
+    asked: list[float] = []
+
+    def pressure(t_s: float) -> float:
+        asked.append(t_s)
+        return 100.0
+
+    scene = EmulationScene()
+    sense = FrontEnd(CHIP, DOME, pressure, Surroundings(scene), scene, "test")
+    sense(5_000_000_000)
+    sense.begin(6_000_000_000)
+    sense(5_999_999_000)  # a conversion that was under way
+    sense(8_000_000_000)
+    assert asked == pytest.approx([0.0, 0.0, 2.0])
+
+
+def test_a_tile_pressed_over_its_range_reads_45_kpa_more() -> None:
+    fault = Fault()
+    scene = EmulationScene(noise_kpa=0.0)
+    sense = FrontEnd(CHIP, DOME, lambda _: 100.0, Surroundings(scene), scene, "test", fault)
+    sense.begin(0)
+    assert kpa(*words_at(sense, 0))[0] == pytest.approx(100.0, abs=0.15)
+    with fault.injected():
+        assert kpa(*words_at(sense, 0))[0] == pytest.approx(145.0, abs=0.15)
+    assert kpa(*words_at(sense, 0))[0] == pytest.approx(100.0, abs=0.15)
+
+
+def words_at(sense: FrontEnd, t_ns: int) -> tuple[Floats, Floats]:
+    padc, tadc = sense(t_ns)
+    return np.array([float(padc)]), np.array([float(tadc)])

@@ -17,7 +17,8 @@ from smbus2 import i2c_msg
 
 from devices.clock import VirtualClock
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
-from devices.emulation.mpl115a2 import EmulatedMpl115a2
+from devices.emulation.faults import Faults
+from devices.emulation.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.scene import ReadDuringConversion
 
@@ -34,7 +35,7 @@ def chip(
 ) -> EmulatedMpl115a2:
     """A part whose conversions give `results`, one after another."""
     coming = iter(results)
-    return EmulatedMpl115a2(words, TC_NS, lambda _: next(coming), mode)
+    return EmulatedMpl115a2(Silicon(words, TC_NS, lambda _: next(coming)), mode)
 
 
 class Reader:
@@ -376,7 +377,7 @@ def test_a_broadcast_convert_reaches_all_open_tiles() -> None:
 
 
 def silent(part: EmulatedMpl115a2) -> EmulatedMpl115a2:
-    part.silent = lambda _: True
+    part.start = lambda reading, t_ns: False  # type: ignore[method-assign]
     return part
 
 
@@ -415,6 +416,12 @@ class Port:
 
     def connected(self) -> Iterable[Port]:
         return ()
+
+    def suffer(self, t_ns: int) -> None:
+        pass
+
+    def reset(self) -> None:
+        self.heard.append("reset")
 
 
 def test_a_data_byte_that_is_not_acknowledged_ends_the_transaction() -> None:
@@ -557,7 +564,7 @@ def test_a_conversion_begins_at_the_stop_of_its_convert() -> None:
         sampled_ns.append(t_ns)
         return 410, 507
 
-    reader = alone(EmulatedMpl115a2(DATA_SHEET, TC_NS, sense))
+    reader = alone(EmulatedMpl115a2(Silicon(DATA_SHEET, TC_NS, sense)))
     begin_ns = reader.clock.now_ns()
     reader.convert()
     # 29 periods of 2.5 us to the STOP; sampled a quarter into the conversion (hardware.md 1.4)

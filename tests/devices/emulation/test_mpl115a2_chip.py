@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devices.emulation.mpl115a2 import EmulatedMpl115a2, Sense
+from devices.emulation.faults import Fault
+from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
 from devices.scene import ReadDuringConversion
 
 WORDS = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
@@ -24,8 +27,20 @@ class Samples:
         return len(self.asked_ns), 100 + len(self.asked_ns)
 
 
-def part(sense: Sense | None = None, mode: ReadDuringConversion = "stale") -> EmulatedMpl115a2:
-    return EmulatedMpl115a2(WORDS, TC_NS, sense or Samples(), mode)
+def part(
+    sense: Sense | None = None,
+    mode: ReadDuringConversion = "stale",
+    faults: PartFaults | None = None,
+    spare: Callable[[], Silicon] | None = None,
+) -> EmulatedMpl115a2:
+    return EmulatedMpl115a2(Silicon(WORDS, TC_NS, sense or Samples()), mode, faults, spare)
+
+
+def between(begin_ns: int, end_ns: int) -> Fault:
+    """A fault that is there in one window of time."""
+    fault = Fault([(begin_ns * 1e-9, end_ns * 1e-9)])
+    fault.begin(0)
+    return fault
 
 
 def write(chip: EmulatedMpl115a2, t_ns: int, *values: int) -> None:
@@ -149,8 +164,7 @@ def test_two_reads_in_a_row_go_on_where_the_first_one_ended() -> None:
 
 def test_a_silent_part_acknowledges_nothing_and_hears_nothing() -> None:
     samples = Samples()
-    chip = part(samples)
-    chip.silent = lambda t_ns: 100 <= t_ns < 200
+    chip = part(samples, faults=PartFaults(no_answer=between(100, 200)))
     assert chip.start(False, 99)
     assert not chip.start(False, 100)
     assert not chip.start(True, 199)
@@ -158,22 +172,21 @@ def test_a_silent_part_acknowledges_nothing_and_hears_nothing() -> None:
 
 
 def test_a_conversion_that_ran_when_the_part_fell_silent_is_finished() -> None:
-    # Kinder than a pulled plug, and said so in devices.emulation.faults.
-    chip = part()
+    # RST does not disturb a conversion nor its result (hardware.md 1.4).
+    chip = part(faults=PartFaults(no_answer=between(1, TC_NS)))
     convert(chip, 0)
-    chip.silent = lambda t_ns: t_ns < TC_NS
+    assert not chip.start(False, TC_NS - 1)
     assert counts(chip, TC_NS) == (1, 101)
 
 
 def test_a_frozen_part_keeps_its_last_result_and_recovers() -> None:
-    chip = part()
+    chip = part(faults=PartFaults(stale=between(TC_NS, 50_000_000)))
     convert(chip, 0)
     assert counts(chip, TC_NS) == (1, 101)
-    chip.frozen = lambda t_ns: t_ns < 50_000_000
     convert(chip, 10_000_000)
     assert counts(chip, 40_000_000) == (1, 101)
     convert(chip, 50_000_000)
-    assert counts(chip, 50_000_000 + TC_NS) == (2, 102)
+    assert counts(chip, 50_000_000 + TC_NS) == (3, 103), "what it missed is gone"
 
 
 def test_torn_words_are_the_new_pressure_and_the_old_temperature() -> None:
@@ -197,3 +210,74 @@ def test_a_write_during_a_conversion_disturbs_nothing(mode: ReadDuringConversion
     convert(chip, 0)
     write(chip, TC_NS // 2, 0x00)
     assert counts(chip, TC_NS) == (1, 101)
+
+
+# Faults of a part
+
+
+def coefficients(chip: EmulatedMpl115a2, t_ns: int) -> bytes:
+    assert chip.start(False, t_ns)
+    assert chip.write(0x04)
+    assert chip.start(True, t_ns)
+    raw = chip.read(8)
+    chip.stop(t_ns)
+    return raw
+
+
+def test_a_part_that_was_unplugged_comes_back_with_empty_registers() -> None:
+    # Power-up clears the registers (hardware.md 1.4), and a conversion under way is lost.
+    chip = part(faults=PartFaults(unplugged=between(2 * TC_NS, 3 * TC_NS)))
+    convert(chip, 0)
+    assert counts(chip, TC_NS) == (1, 101)
+    convert(chip, 2 * TC_NS - 1)
+    assert not chip.start(False, 2 * TC_NS)
+    assert counts(chip, 4 * TC_NS) == (0, 0)
+    assert coefficients(chip, 4 * TC_NS).hex() == "3eceb3f9c51733c8", "it is the same part"
+    convert(chip, 4 * TC_NS)
+    assert counts(chip, 5 * TC_NS) == (3, 103)
+
+
+def test_a_part_that_nobody_asked_while_it_was_unplugged_is_empty_all_the_same() -> None:
+    chip = part(faults=PartFaults(unplugged=between(2 * TC_NS, 3 * TC_NS)))
+    convert(chip, 0)
+    assert counts(chip, TC_NS) == (1, 101)
+    assert counts(chip, 4 * TC_NS) == (0, 0)
+
+
+def test_a_replaced_part_is_another_one_from_then_on() -> None:
+    forum = (0x3591, 0xC0A2, 0xC625, 0x2C18)
+    faults = PartFaults(replaced=between(TC_NS, 2 * TC_NS))
+    chip = part(faults=faults, spare=lambda: Silicon(forum, TC_NS, lambda _: (7, 700)))
+    convert(chip, 0)
+    assert not chip.start(False, TC_NS), "its channel is empty for a while"
+    assert counts(chip, 2 * TC_NS) == (0, 0)
+    assert coefficients(chip, 2 * TC_NS).hex() == "3591c0a2c6252c18"
+    convert(chip, 2 * TC_NS)
+    assert counts(chip, 3 * TC_NS) == (7, 700)
+
+
+def test_a_slow_part_takes_2_9_ms_which_the_data_sheet_allows() -> None:
+    chip = part(faults=PartFaults(slow=between(0, 1)))
+    convert(chip, 0)
+    assert counts(chip, 2_899_999) == (0, 0)
+    assert counts(chip, 2_900_000) == (1, 101)
+    convert(chip, 10_000_000)
+    assert counts(chip, 10_000_000 + TC_NS) == (2, 102), "and then its own time again"
+
+
+def test_a_part_that_is_lost_between_address_and_data_reads_as_ones() -> None:
+    chip = part(faults=PartFaults(all_ones=between(TC_NS, 2 * TC_NS)))
+    convert(chip, 0)
+    assert counts(chip, TC_NS) == (1023, 1023)
+    assert coefficients(chip, TC_NS) == b"\xff" * 8
+    assert counts(chip, 2 * TC_NS) == (1, 101)
+
+
+def test_a_witness_is_told_of_every_conversion_and_of_no_other_transfer() -> None:
+    told: list[tuple[int, tuple[int, int]]] = []
+    chip = part(faults=PartFaults(stale=between(2 * TC_NS, 3 * TC_NS)))
+    chip.witness = lambda stop_ns, words: told.append((stop_ns, words))
+    convert(chip, 7)
+    counts(chip, TC_NS)
+    convert(chip, 2 * TC_NS)  # it never ends, but what it would have given is known
+    assert told == [(7, (1, 101)), (2 * TC_NS, (2, 102))]

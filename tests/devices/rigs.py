@@ -1,0 +1,175 @@
+"""What several tests of the devices share: emulated tiles under an adapter that can be watched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+from smbus2 import i2c_msg
+
+from devices.array import TileArray
+from devices.budget import BusTiming
+from devices.clock import VirtualClock
+from devices.emulation.faults import Fault
+from devices.emulation.i2c_bus import EmulatedI2cAdapter
+from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
+from devices.emulation.tca9548a import EmulatedTca9548a
+from devices.frames import TileInfo
+from devices.i2c import I2cBus
+from devices.scan import Scan
+from devices.scene import ReadDuringConversion, ScheduleName
+
+DATA_SHEET = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
+FORUM = (0x3591, 0xC0A2, 0xC625, 0x2C18)
+
+# SCL periods per transaction, hardware.md 4
+SELECT, CONVERT, READ, READ_PRESSURE, COEFFICIENTS, NOT_ACKNOWLEDGED = 20, 29, 66, 48, 102, 11
+TYPICAL_NS = 1_600_000
+
+SETTLED = 3
+"""Frames after which every tile has the history that a reading is compared with."""
+
+Words = tuple[int, int, int, int]
+Plugs = tuple[tuple[int, int], ...]
+ONE: Plugs = ((0x70, 0),)
+FOUR: Plugs = ((0x70, 0), (0x70, 1), (0x70, 2), (0x70, 3))
+TWO_MUXES: Plugs = ((0x70, 0), (0x70, 5), (0x73, 0), (0x73, 1))
+
+SCHEDULES: tuple[ScheduleName, ...] = ("simultaneous", "pipelined", "per_mux", "sequential")
+
+
+def full(tiles: int) -> Plugs:
+    """So many tiles, eight to a mux as far as they go."""
+    return tuple((0x70 + i // 8, i % 8) for i in range(tiles))
+
+
+def counting(first: int) -> Sense:
+    """A sense in which no two conversions are alike; its tile is told by the hundreds."""
+    results: Iterator[int] = iter(range(first, first + 10_000_000))
+    return lambda _: (1 + next(results) % 1000, 500)
+
+
+class Wires:
+    """Emulated tiles under an adapter that notes the transactions and can be made to fail.
+
+    `on_transaction` is called with the number and the messages of each before it takes place,
+    `after_transaction` when it is over. `words` are the coefficients of single tiles, `tc_ns` their
+    conversion times.
+    """
+
+    def __init__(
+        self,
+        plugs: Plugs,
+        scl_hz: float = 400_000,
+        *,
+        words: dict[int, Words] | None = None,
+        tc_ns: Sequence[int] | int = TYPICAL_NS,
+        mode: ReadDuringConversion = "stale",
+    ) -> None:
+        self.plugs = plugs
+        self.scl_hz = scl_hz
+        self.words = [(words or {}).get(i, DATA_SHEET) for i in range(len(plugs))]
+        self.tc_ns = [tc_ns] * len(plugs) if isinstance(tc_ns, int) else list(tc_ns)
+        self.clock = VirtualClock(7_000_000_000)
+        self.faults = [PartFaults() for _ in plugs]
+        self.tiles = [
+            EmulatedMpl115a2(
+                Silicon(self.words[i], self.tc_ns[i], counting(100 * i)), mode, self.faults[i]
+            )
+            for i in range(len(plugs))
+        ]
+        self.brown_outs = {address: Fault() for address, _ in plugs}
+        self.resets = {address: Fault() for address, _ in plugs}
+        self.muxes = [
+            EmulatedTca9548a(
+                address,
+                {c: tile for (m, c), tile in zip(plugs, self.tiles, strict=True) if m == address},
+                self.brown_outs[address],
+                self.resets[address],
+            )
+            for address in sorted(self.brown_outs)
+        ]
+        self.adapter = EmulatedI2cAdapter(self.muxes, self.clock, scl_hz)
+        self.log: list[str] = []
+        self.on_transaction: Callable[[int, tuple[i2c_msg, ...]], None] = lambda _, __: None
+        self.after_transaction: Callable[[], None] = lambda: None
+
+    @property
+    def bus(self) -> I2cBus:
+        return I2cBus(self, "emulated")
+
+    @property
+    def infos(self) -> tuple[TileInfo, ...]:
+        """The tiles as a self-test would have found them."""
+        return tuple(
+            TileInfo(
+                serial=f"T{i + 1:02d}",
+                mux=mux,
+                channel=channel,
+                coefficient_words=self.words[i],
+                x_m=0.014 * i,
+                y_m=0.0,
+                z_m=-0.15,
+                reference=False,
+                conversion_ms=self.tc_ns[i] / 1e6,
+            )
+            for i, (mux, channel) in enumerate(self.plugs)
+        )
+
+    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
+        self.log.append(
+            " ".join(
+                f"{m.addr:02x}>{m.len}" if m.flags & 1 else f"{m.addr:02x}<{bytes(m).hex()}"
+                for m in i2c_msgs
+            )
+        )
+        self.on_transaction(len(self.log), i2c_msgs)
+        self.adapter.i2c_rdwr(*i2c_msgs)
+        self.after_transaction()
+
+    def set_timeout(self, units_10ms: int) -> None:
+        self.adapter.set_timeout(units_10ms)
+
+    def close(self) -> None:
+        pass
+
+
+def array_on(
+    wires: Wires,
+    schedule: ScheduleName = "simultaneous",
+    *,
+    waits_ns: Sequence[int] | None = None,
+    temperature_every: int = 1,
+    broadcast_channels: int = 64,
+    beside: Callable[[], float] | None = None,
+) -> TileArray:
+    """An array that waits exactly as long as each part converts, unless it is told otherwise."""
+    timing = BusTiming(
+        wires.scl_hz,
+        tuple(wait_ns * 1e-9 for wait_ns in waits_ns or wires.tc_ns),
+        tuple(mux for mux, _ in wires.plugs),
+        bytes_read=2.0 + 2.0 / temperature_every,
+    )
+    return TileArray(
+        wires.bus,
+        wires.infos,
+        wires.clock,
+        schedule=schedule,
+        timing=timing,
+        temperature_every=temperature_every,
+        broadcast_channels=broadcast_channels,
+        beside=beside,
+    )
+
+
+def settled(wires: Wires, schedule: ScheduleName = "simultaneous", **options: object) -> TileArray:
+    """The same, after the frames in which every reading is read twice."""
+    array = array_on(wires, schedule, **options)  # type: ignore[arg-type]
+    for _ in range(SETTLED + 1):
+        array.scan()
+    return array
+
+
+def timed_scan(array: TileArray, wires: Wires) -> tuple[Scan, int]:
+    """One frame, and how long it took in ns."""
+    begin_ns = wires.clock.now_ns()
+    return array.scan(), wires.clock.now_ns() - begin_ns
