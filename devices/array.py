@@ -15,7 +15,7 @@ from devices.budget import BusTiming, check_broadcast, frame_s
 from devices.bus_recovery import BusRecovery
 from devices.bus_watch import BusWatch
 from devices.clock import Clock
-from devices.conversion_watch import ConversionWatch
+from devices.conversion_watch import LOOK_FRAMES, ConversionWatch
 from devices.errors import (
     BusMisuseError,
     BusSetupError,
@@ -31,6 +31,9 @@ from devices.mpl115a2 import SAMPLE_PART_OF_CONVERSION
 from devices.scan import Scan
 from devices.scene import ScheduleName
 from devices.tile_ports import TilePorts
+
+AUDIT_NS = 1_000_000_000
+"""The muxes' control registers are read back so often."""
 
 _BUDGET_PART = 8
 _BUDGET_MIN_NS = 500_000
@@ -96,6 +99,9 @@ class TileArray:
             [round(wait_s * 1e9) for wait_s in timing.conversions_s],
         )
         self._schedule = SCHEDULES[schedule]
+        self._audit_due_ns = clock.now_ns() + AUDIT_NS
+        # Where a tile is started anew as soon as it was read, there is nothing to look at again.
+        self._looks_again = schedule != "pipelined" and len(tiles) > 1
         self._waits_for_slow_ones = schedule != "pipelined" or len(tiles) == 1
         self._temperature_every = temperature_every
         self._beside = beside
@@ -138,7 +144,7 @@ class TileArray:
         scan = Scan.blank(len(self.tiles), begin_ns, self._budget_ns)
         if not self.bus.is_down or self._bus_comes_back(scan):
             self._schedule(self, scan)
-            if self._watch.is_due(begin_ns) and not scan.bus_fault:
+            if not scan.bus_fault:
                 self._audit(scan)
         self._conclude(scan)
         if all(padc == NOT_READ for padc in scan.padc):
@@ -257,6 +263,10 @@ class TileArray:
                 health.find()
             elif self._ports.read_coefficient_words(tile) == health.coefficient_words:
                 health.find()  # the first reading was disturbed
+            elif self._ports.router.silent:
+                # Perhaps two tiles at once: a mux that could not be closed may connect another.
+                self._ports.router.forget()
+                health.lose(self._clock.now_ns())
             else:
                 # Three times the same and plausible: a part, but not the one that was here.
                 health.replaced = True
@@ -286,25 +296,33 @@ class TileArray:
         return False
 
     def _audit(self, scan: Scan) -> None:
+        """Now and then, at the end of a frame: is everything still as it is taken to be?"""
+        now_ns = self._clock.now_ns()
         try:
-            tile = self._watch.audit()
+            if now_ns >= self._audit_due_ns:
+                self._audit_due_ns = now_ns + AUDIT_NS
+                self._ports.router.audit()
+            if self._looks_again and self._frames % LOOK_FRAMES == 0:
+                self._watch.look_again([*zip(scan.padc, scan.tadc, strict=True)])
+            tile = self._watch.to_try()
+            if tile is not None:
+                self._watch.try_conversion(tile)
+                self._running[tile] = False
+                self.convert(scan, [tile])
         except (BusMisuseError, BusSetupError):
             raise
         except NoAcknowledgeError:  # the next frame will see who it is
             self._ports.router.forget()
         except I2cError:
             scan.note_bus_fault()
-        else:
-            if tile is not None:
-                self._running[tile] = False
-                self.convert(scan, [tile])
 
     def _conclude(self, scan: Scan) -> None:
         """What this frame says of the tiles' freshness and of the bus."""
         for i, health in enumerate(self.health):
             if health.is_stale(scan.padc[i], scan.tadc[i]):
                 scan.flag(i, TileStatus.STALE)
-                self._watch.slow_down(i)
+                if health.has_just_gone_stale:
+                    self._watch.suspect(i)
             if scan.status[i]:
                 health.note(scan.status[i])
         if self.bus.is_down:

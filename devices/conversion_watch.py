@@ -5,25 +5,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from devices.clock import Clock
+from devices.frames import NOT_READ
 from devices.health import TileHealth
 from devices.mpl115a2 import CONVERSION_MAX_NS
 from devices.tile_ports import TilePorts
 
-AUDIT_NS = 1_000_000_000
-"""So often the muxes' control registers are read back, and one part's conversion is tried."""
+LOOK_FRAMES = 10
+"""In one of so many frames a tile is read once more at the frame's end."""
 SLOW_AUDIT_NS = 500_000_000
-"""The same while a part is slow, to notice when it no longer is."""
+"""A part that was found to be slow is tried so often, to notice when it no longer is."""
 
 _TRIES = 3
 
 
 class ConversionWatch:
-    """Waits of all tiles, and the audit that keeps them true.
+    """Waits of all tiles, and what keeps them true.
 
-    A reading that was taken too early is that of the conversion before: in a schedule that always
-    waits equally long it changes from frame to frame like any other and betrays nothing. So one
-    part after another is asked for the same conversion twice, after its measured time and after the
-    longest that the data sheet allows; both have to be the same.
+    A reading that is taken too early is that of the conversion before. If the part is started anew
+    right after it, nothing ever finishes, and its words stand still, which is noticed. If it has
+    time to finish until the next CONVERT, its words change from frame to frame like any other, one
+    frame late, and betray nothing: so in some frames one tile is read again before that CONVERT,
+    and has to be the same. A suspect is tried: the same conversion is read after the measured time
+    and after the longest that the data sheet allows.
     """
 
     def __init__(
@@ -39,42 +42,60 @@ class ConversionWatch:
         self._clock = clock
         self._health = health
         self._measured_ns = tuple(measured_ns)
-        self._due_ns = clock.now_ns() + AUDIT_NS
-        self._audits = 0
+        self._suspects: list[int] = []
+        self._slow_due_ns = 0
+        self._looks = 0
 
-    def is_due(self, now_ns: int) -> bool:
-        """Is it time for an audit?"""
-        return now_ns >= self._due_ns
-
-    def audit(self) -> int | None:
-        """Look at the muxes and at one tile; which one, as its conversion has to be started anew.
+    def look_again(self, words: Sequence[tuple[int, int]]) -> None:
+        """Read one tile after another again, at the end of a frame that gave `words`.
 
         Raises:
-            I2cError: the bus or the tile does not answer.
+            I2cError: it does not answer.
         """
-        present = [i for i, health in enumerate(self._health) if health.present]
-        slow = [i for i in present if self._health[i].slow]
-        self._due_ns = self._clock.now_ns() + (SLOW_AUDIT_NS if slow else AUDIT_NS)
-        self._ports.router.audit()
-        if not present:
-            return None
-        self._audits += 1
-        tile = (slow or present)[self._audits % len(slow or present)]
-        # A disturbed bit looks like a late conversion once, but not again.
-        late = [self._is_late(tile) for _ in range(_TRIES)] if self._is_late(tile) else []
-        if late and all(late):
-            self.slow_down(tile)
-        elif self._health[tile].slow and not any(late):
-            self._health[tile].slow = False
-            self.wait_ns[tile] = self._measured_ns[tile]
-        return tile
+        self._looks += 1
+        tile = self._looks % len(words)
+        if not self._health[tile].present or self._health[tile].slow:
+            return
+        self._ports.connect(tile)
+        padc, tadc = self._ports.read(with_temperature=True)
+        if padc != words[tile][0] or words[tile][1] not in (tadc, NOT_READ):
+            self.suspect(tile)
 
-    def slow_down(self, tile: int) -> None:
-        """Allow a part all the time that the data sheet does."""
-        if not self._health[tile].slow:
-            self._health[tile].slow = True
+    def suspect(self, tile: int) -> None:
+        """This tile's words may be too old."""
+        if tile not in self._suspects and not self._health[tile].slow:
+            self._suspects.append(tile)
+
+    def to_try(self) -> int | None:
+        """A tile whose conversion should be tried now; None if there is none."""
+        if self._suspects:
+            return self._suspects.pop(0)
+        now_ns = self._clock.now_ns()
+        slow = [i for i, health in enumerate(self._health) if health.slow and health.present]
+        if slow and now_ns >= self._slow_due_ns:
+            self._slow_due_ns = now_ns + SLOW_AUDIT_NS
+            self._looks += 1
+            return slow[self._looks % len(slow)]
+        return None
+
+    def try_conversion(self, tile: int) -> None:
+        """Find out whether a part keeps its time, and wait for it accordingly from now on.
+
+        Its conversion has to be started anew afterwards.
+
+        Raises:
+            I2cError: it does not answer.
+        """
+        health = self._health[tile]
+        # A disturbed bit looks like a late conversion once, but not again.
+        late = [self._is_late(tile) for _ in range(_TRIES)]
+        if all(late) and not health.slow:
+            health.slow = True
             self.wait_ns[tile] = max(self._measured_ns[tile], CONVERSION_MAX_NS)
-            self._due_ns = min(self._due_ns, self._clock.now_ns() + SLOW_AUDIT_NS)
+            self._slow_due_ns = self._clock.now_ns() + SLOW_AUDIT_NS
+        elif not any(late) and health.slow:
+            health.slow = False
+            self.wait_ns[tile] = self._measured_ns[tile]
 
     def _is_late(self, tile: int) -> bool:
         """Does a reading after the measured time differ from a later one of the same conversion?"""

@@ -129,12 +129,17 @@ class TileHealth:
         same = padc == self._last_words[0] and (
             tadc == NOT_READ or self._last_words[1] in (tadc, NOT_READ)
         )
-        if not same:
-            self._stale_evidence = 0
-        else:
+        if same:
             self._stale_evidence += 1 if tadc == NOT_READ else 2
-        self._last_words = (padc, tadc if tadc != NOT_READ or not same else self._last_words[1])
+        else:
+            self._stale_evidence = 0
+        self._last_words = (padc, self._last_words[1] if same and tadc == NOT_READ else tadc)
         return self._stale_evidence >= STALE_EVIDENCE
+
+    @property
+    def has_just_gone_stale(self) -> bool:
+        """Is this the first of its stale readings?"""
+        return STALE_EVIDENCE <= self._stale_evidence < STALE_EVIDENCE + 2
 
     def _median(self) -> int:
         return sorted(self._recent)[_RECENT // 2]

@@ -275,7 +275,10 @@ class EmulationScene(_Section):
 
 
 class FaultScene(_Section):
-    """`[[fault]]`: something fails `t_s` after the scene began, for `duration_s`."""
+    """`[[fault]]`: something fails `t_s` after the scene began, for `duration_s`.
+
+    At `t_s` = 0 it has failed before the start.
+    """
 
     kind: FaultKind
     tile: str | None = None

@@ -56,6 +56,7 @@ def identify(bus: I2cBus, tiles: Sequence[TileScene]) -> tuple[TileInfo, ...]:
         TileSetupError: a tile or its mux does not answer, or its coefficients are implausible.
         BusFaultError: the bus itself fails.
     """
+    _all_closed(bus)
     router = MuxRouter(bus, (tile.mux for tile in tiles))
     chip = Mpl115a2(bus)
     return tuple(_identify(router, chip, tile) for tile in tiles)
@@ -108,7 +109,7 @@ def find_tiles(bus: I2cBus) -> tuple[Plug, ...]:
     Raises:
         BusFaultError: the bus itself fails, or acknowledges everything and gives nothing but zeros.
     """
-    muxes = [address for address in ADDRESSES if _answers(bus, address)]
+    muxes = _all_closed(bus)
     router = MuxRouter(bus, muxes)
     if muxes and not router.echoes():
         raise BusFaultError(
@@ -129,6 +130,12 @@ def find_tiles(bus: I2cBus) -> tuple[Plug, ...]:
             except TileSetupError as error:
                 plugs.append(Plug(mux, channel, None, str(error)))
     return tuple(plugs)
+
+
+def _all_closed(bus: I2cBus) -> list[int]:
+    """Addresses of all muxes that are there, now closed: a tile that others left open would answer
+    with those that are asked."""
+    return [address for address in ADDRESSES if _answers(bus, address)]
 
 
 def _answers(bus: I2cBus, address: int) -> bool:
@@ -156,7 +163,7 @@ def measure_wires(bus: I2cBus, clock: Clock, tile: TileInfo) -> WireTiming:
     Raises:
         I2cError: the tile does not answer.
     """
-    router = MuxRouter(bus, [tile.mux])
+    router = MuxRouter(bus, _all_closed(bus))
     router.connect_only(tile.mux, tile.channel)
     point = i2c_msg.write(ADDRESS, [REGISTER_COEFFICIENTS])
     took_ns: dict[int, list[int]] = {n: [] for n in _SCL_BYTES}
@@ -189,7 +196,7 @@ def measure_conversion_ns(
     Raises:
         I2cError: the part does not answer.
     """
-    router = MuxRouter(bus, [tile.mux])
+    router = MuxRouter(bus, _all_closed(bus))
     router.connect_only(tile.mux, tile.channel)
     chip = Mpl115a2(bus)
 

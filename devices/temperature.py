@@ -39,7 +39,7 @@ def hold_temperature(
     Any split of a stream into batches gives the same, if `held` is handed on.
 
     Args:
-        frames: n frames in order, at least one.
+        frames: n frames in order.
         held: from the frames before.
     """
     tiles = frames.tile_count
@@ -47,6 +47,8 @@ def hold_temperature(
         held = HeldTemperature(
             np.full(tiles, NOT_READ, dtype=np.uint16), np.zeros(tiles, dtype=np.int64)
         )
+    if not len(frames):
+        return frames, held
     unusable = (frames.status & np.uint8(TileStatus.UNUSABLE)) != 0
     known = (frames.tadc != NOT_READ) & ~unusable
     # Row 0 is what came before; every row then looks up the last one that is known.

@@ -11,6 +11,8 @@ from contextlib import AbstractContextManager, contextmanager
 
 from devices.scene import BUS, RATE, FaultKind, FaultScene
 
+_BEFORE_NS = 2**62
+
 
 class Fault:
     """One kind of fault of one target: is it there at a given time?
@@ -23,7 +25,10 @@ class Fault:
     def __init__(self, windows_s: Sequence[tuple[float, float]] = (), rate: float = 0.0) -> None:
         self.rate = rate
         self._windows_s = tuple(windows_s)
-        self._windows_ns: tuple[tuple[int, int], ...] = ()
+        # What is there from the scene's first instant on was there before it.
+        self._windows_ns: tuple[tuple[int, int], ...] = tuple(
+            (0, _BEFORE_NS) for begin, _ in windows_s if begin == 0.0
+        )
         self._depth = 0
         self._was_injected = False
         self._is_new = False

@@ -114,33 +114,38 @@ class EmulatedI2cAdapter:
         try:
             for message in i2c_msgs:
                 bits += 10  # START or repeated START, address with direction, acknowledge
+                address, length = message.addr, message.len
                 reading = bool(message.flags & _FLAG_READ)
-                t_ns = begin_ns + round(bits * self._ns_per_bit)
+                t_ns = begin_ns + self._ns(bits)
                 called = (
-                    self._wire.get(message.addr, ())
+                    self._wire.get(address, ())
                     if disturbed is None
-                    else self._called(message.addr, reading, t_ns, disturbed)
+                    else self._called(address, reading, t_ns, disturbed)
                 )
                 listeners = [device for device in called if device.start(reading, t_ns)]
                 addressed += listeners
-                routed |= message.addr in self._mux_addresses
-                _expect_acknowledge(listeners, t_ns, disturbed)
-                bits += 9 * message.len
+                routed |= address in self._mux_addresses
+                if not listeners or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
+                    raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
                 if reading:
+                    bits += 9 * length
                     _read(message, listeners, t_ns, disturbed)
-                else:
-                    written = _write(message, listeners, t_ns, disturbed)
-                    if written < message.len:
-                        bits -= 9 * (message.len - written - 1)
-                        raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+                    continue
+                acknowledged = _write(message, listeners, t_ns, disturbed)
+                bits += 9 * min(acknowledged + 1, length)
+                if acknowledged < length:
+                    raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
         finally:
-            stop_ns = begin_ns + round((bits + 1) * self._ns_per_bit)
+            stop_ns = begin_ns + self._ns(bits + 1)
             for device in addressed:
                 device.stop(stop_ns)
             # Routing changes at STOP and at no other time, and only if a mux was written to.
             if routed:
                 self._wire = self._devices_by_address()
             self._clock.sleep_until_ns(stop_ns)
+
+    def _ns(self, bits: int) -> int:
+        return round(bits * self._ns_per_bit)
 
     def _called(
         self, address: int, reading: bool, t_ns: int, disturbed: Line | None
@@ -170,7 +175,7 @@ class EmulatedI2cAdapter:
         return False
 
     def _pass(self, begin_ns: int, bits: int) -> None:
-        self._clock.sleep_until_ns(begin_ns + round(bits * self._ns_per_bit))
+        self._clock.sleep_until_ns(begin_ns + self._ns(bits))
 
     def close(self) -> None:
         """Nothing to release."""
@@ -195,11 +200,6 @@ def _refuse_unsupported(messages: Sequence[i2c_msg]) -> None:
         # drivers/i2c/busses/i2c-bcm2835.c: "only one read message supported, has to be last"
         if message.flags & _FLAG_READ and index < len(messages):
             raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
-
-
-def _expect_acknowledge(listeners: list[I2cDevice], t_ns: int, disturbed: Line | None) -> None:
-    if not listeners or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
-        raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
 
 
 def _write(message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: Line | None) -> int:

@@ -46,11 +46,6 @@ class PartFaults:
     scene: Faults | None = None
     """All faults of the scene; while none of them is possible, none of these is asked."""
 
-    @property
-    def possible(self) -> bool:
-        """May any of them be there, or have been?"""
-        return self.scene is None or self.scene.possible
-
 
 @dataclass(frozen=True)
 class Silicon:
@@ -90,6 +85,7 @@ class EmulatedMpl115a2:
         self._mode = read_during_conversion
         self._faults = faults if faults is not None else PartFaults()
         self._spare = spare
+        self._scene_faults = self._faults.scene
         self._seen_ns = 0
         self._t_ns = 0
         self._power_up()
@@ -104,12 +100,13 @@ class EmulatedMpl115a2:
 
     def start(self, reading: bool, t_ns: int) -> bool:
         """Acknowledge, unless the part is silent."""
-        if self._faults.possible and not self._lives(t_ns):
+        if (self._scene_faults is None or self._scene_faults.possible) and not self._lives(t_ns):
             return False
         self._t_ns = t_ns
-        self._settle(t_ns)
-        if reading:
-            self._disturb(t_ns)
+        if self._conversion is not None:
+            self._settle(t_ns)
+            if reading:
+                self._disturb(t_ns)
         self._expects_register = not reading
         return True
 
@@ -139,7 +136,7 @@ class EmulatedMpl115a2:
         """Give the bytes from the pointer on, which moves with them."""
         begin = self._pointer
         self._pointer = (begin + count) % _REGISTERS
-        if self._faults.all_ones(self._t_ns):
+        if self._faults.all_ones.possible and self._faults.all_ones(self._t_ns):
             return b"\xff" * count
         if begin + count <= _REGISTERS:
             return bytes(self._registers[begin : begin + count])

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from typing import get_args
 
+import pytest
 from smbus2 import i2c_msg
 
 from devices.array import TileArray
 from devices.budget import BusTiming
 from devices.clock import VirtualClock
-from devices.emulation.faults import Fault
+from devices.emulation.faults import Faults
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
+from devices.emulation.line import Line
 from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
 from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.frames import TileInfo
 from devices.i2c import I2cBus
 from devices.scan import Scan
-from devices.scene import ReadDuringConversion, ScheduleName
+from devices.scene import BUS, FaultKind, ReadDuringConversion, ScheduleName, TileFault
 
 DATA_SHEET = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 FORUM = (0x3591, 0xC0A2, 0xC625, 0x2C18)
@@ -27,6 +31,13 @@ TYPICAL_NS = 1_600_000
 
 SETTLED = 3
 """Frames after which every tile has the history that a reading is compared with."""
+
+
+def known_bug(*schedules: ScheduleName, reason: str) -> list[object]:
+    """All schedules as parameters; of these the test is known to fail, and will say when not."""
+    mark = pytest.mark.xfail(strict=True, reason=f"BUG in devices: {reason}")
+    return [pytest.param(name, marks=mark) if name in schedules else name for name in SCHEDULES]
+
 
 Words = tuple[int, int, int, int]
 Plugs = tuple[tuple[int, int], ...]
@@ -70,28 +81,38 @@ class Wires:
         self.words = [(words or {}).get(i, DATA_SHEET) for i in range(len(plugs))]
         self.tc_ns = [tc_ns] * len(plugs) if isinstance(tc_ns, int) else list(tc_ns)
         self.clock = VirtualClock(7_000_000_000)
-        self.faults = [PartFaults() for _ in plugs]
+        self._faults = Faults(())
         self.tiles = [
             EmulatedMpl115a2(
-                Silicon(self.words[i], self.tc_ns[i], counting(100 * i)), mode, self.faults[i]
+                Silicon(self.words[i], self.tc_ns[i], counting(100 * i)),
+                mode,
+                self._part_faults(f"T{i + 1:02d}"),
             )
             for i in range(len(plugs))
         ]
-        self.brown_outs = {address: Fault() for address, _ in plugs}
-        self.resets = {address: Fault() for address, _ in plugs}
         self.muxes = [
             EmulatedTca9548a(
                 address,
                 {c: tile for (m, c), tile in zip(plugs, self.tiles, strict=True) if m == address},
-                self.brown_outs[address],
-                self.resets[address],
+                self._faults.of("brown_out", f"0x{address:02x}"),
+                self._faults.of("mux_reset", f"0x{address:02x}"),
             )
-            for address in sorted(self.brown_outs)
+            for address in sorted({mux for mux, _ in plugs})
         ]
-        self.adapter = EmulatedI2cAdapter(self.muxes, self.clock, scl_hz)
+        line = Line(self._faults, "test")
+        self.adapter = EmulatedI2cAdapter(self.muxes, self.clock, scl_hz, line)
         self.log: list[str] = []
         self.on_transaction: Callable[[int, tuple[i2c_msg, ...]], None] = lambda _, __: None
         self.after_transaction: Callable[[], None] = lambda: None
+
+    def _part_faults(self, serial: str) -> PartFaults:
+        kinds = set(get_args(TileFault)) - {"over_range"}
+        own = {kind: self._faults.of(kind, serial) for kind in kinds}
+        return PartFaults(**own, scene=self._faults)
+
+    def fault(self, kind: FaultKind, target: str = BUS) -> AbstractContextManager[None]:
+        """Something fails while the block runs: a tile ("T01"), a mux ("0x70") or the bus."""
+        return self._faults.injected(kind, target)
 
     @property
     def bus(self) -> I2cBus:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,13 +12,14 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.acquisition import Acquisition
-from devices.array import STALE_AFTER, TileArray
+from devices.array import TileArray
+from devices.budget import BusTiming
 from devices.clock import UtcAnchor, VirtualClock
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
-from devices.emulation.mpl115a2 import EmulatedMpl115a2
+from devices.emulation.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.emulation.world import World
-from devices.errors import BusMisuseError, BusSetupError, TileSetupError
+from devices.errors import BusMisuseError, BusSetupError
 from devices.frames import (
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,
@@ -29,12 +30,16 @@ from devices.frames import (
 )
 from devices.i2c import I2cAdapter, I2cBus, open_bus
 from devices.scene import Scene, ScheduleName, TileScene
+from devices.self_test import identify
+from tests.devices.rigs import SCHEDULES, SETTLED
 
 SceneOf = Callable[..., Scene]
 
 ANCHOR = UtcAnchor.of(0, 1_577_836_800_000_000_000, clock_set=True)
 FRAME_NS = 2_532_500  # simultaneous, four tiles, 400 kHz, 1.6 ms: bus_budget.py, strategy b
 TYPICAL = {"conversion_ms": 1.6, "wait_ms": 1.6}
+LIVELY = {"noise_kpa": 0.06}
+"""So quiet that no reading is far from those before, and not so quiet that a part seems stuck."""
 
 
 @dataclass
@@ -72,16 +77,24 @@ def foot(
     start_ns: int = 3_000_000_000,
 ) -> Foot:
     clock = VirtualClock(start_ns)
-    world = World(scene, clock, lead_s=0.0)
-    array = TileArray(
-        open_bus("emulated", wrap(world.i2c_adapter)),
-        scene.tile,
-        clock,
-        schedule=schedule or scene.array.schedule,
-        wait_ms=scene.array.wait_ms,
-    )
-    tiles = array.identify()
-    return Foot(world, clock, array, Acquisition(array, tiles, clock, ANCHOR, rate_hz=rate_hz))
+    world = World(scene, clock, lead_s=0.0, begun=False)
+    array = array_of(open_bus("emulated", wrap(world.i2c_adapter)), scene.tile, clock, schedule)
+    for _ in range(SETTLED + 1):  # what has no history yet is read twice
+        array.scan()
+    world.begin()
+    stream = Acquisition(array, array.tiles, clock, ANCHOR, rate_hz=rate_hz)
+    return Foot(world, clock, array, stream)
+
+
+def array_of(
+    bus: I2cBus,
+    tiles: Sequence[TileScene],
+    clock: VirtualClock,
+    schedule: ScheduleName | None = None,
+) -> TileArray:
+    found = identify(bus, tiles)
+    timing = BusTiming(400_000, (1.6e-3,) * len(found), tuple(tile.mux for tile in found))
+    return TileArray(bus, found, clock, schedule=schedule or "simultaneous", timing=timing)
 
 
 def has(bits: int, batch: FrameBatch, tile: int) -> list[bool]:
@@ -91,49 +104,50 @@ def has(bits: int, batch: FrameBatch, tile: int) -> list[bool]:
 # Numbers and times
 
 
-@pytest.mark.parametrize("schedule", ["simultaneous", "sequential"])
+@pytest.mark.parametrize("schedule", SCHEDULES)
 def test_frames_are_numbered_without_a_gap_and_their_time_rises(
     scene_of: SceneOf, schedule: ScheduleName
 ) -> None:
-    batch = foot(scene_of(array=TYPICAL), schedule=schedule).take(100)
+    batch = foot(scene_of(array=TYPICAL, emulation=LIVELY), schedule=schedule).take(100)
     assert batch.seq.tolist() == list(range(len(batch)))
     assert (np.diff(batch.t_mono_ns) > 0).all()
     assert (batch.t_ns - batch.t_mono_ns == 1_577_836_800_000_000_000).all()
 
 
 def test_numbers_go_on_when_the_loop_is_run_again(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL))
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
     first, second = one.take(5), one.take(5)
     assert second.seq[0] == first.seq[-1] + 1
     assert second.t_mono_ns[0] > first.t_mono_ns[-1]
 
 
 def test_the_time_of_a_frame_is_the_sample_instant_of_its_first_tile(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL))
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
     begin_ns = one.clock.now_ns()
     # select and CONVERT: 20 + 29 periods of 2.5 us; the sample lies a quarter into 1.6 ms
     assert one.take(1).t_mono_ns[0] == begin_ns + 122_500 + 400_000
 
 
 def test_tiles_of_a_simultaneous_frame_are_sampled_together(scene_of: SceneOf) -> None:
-    batch = foot(scene_of(array=TYPICAL)).take(20)
+    batch = foot(scene_of(array=TYPICAL, emulation=LIVELY)).take(20)
     assert (batch.sample_offset_us == 0).all()
 
 
 def test_tiles_of_a_sequential_frame_are_sampled_one_after_another(scene_of: SceneOf) -> None:
-    batch = foot(scene_of(array=TYPICAL), schedule="sequential").take(5)
+    batch = foot(scene_of(array=TYPICAL, emulation=LIVELY), schedule="sequential").take(5)
     exact_us = 1887.5 * np.arange(4)
     assert (np.abs(batch.sample_offset_us - exact_us) < 1).all()
     assert (batch.sample_offset_us[:, 0] == 0).all()
 
 
 @pytest.mark.parametrize(
-    ("schedule", "frame_ns"), [("simultaneous", FRAME_NS), ("sequential", 7_550_000)]
+    ("schedule", "frame_ns"),
+    [("simultaneous", FRAME_NS), ("sequential", 7_550_000), ("pipelined", 1_837_500)],
 )
 def test_an_unpaced_stream_runs_at_the_rate_of_the_bus(
     scene_of: SceneOf, schedule: ScheduleName, frame_ns: int
 ) -> None:
-    one = foot(scene_of(array=TYPICAL), schedule=schedule)
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY), schedule=schedule)
     batch = one.take(50)
     assert set(np.diff(batch.t_mono_ns).tolist()) == {frame_ns}
     assert (batch.frame_status == 0).all()
@@ -142,21 +156,31 @@ def test_an_unpaced_stream_runs_at_the_rate_of_the_bus(
 
 @pytest.mark.parametrize("rate_hz", [100.0, 250.0, 390.0])
 def test_a_paced_stream_keeps_its_rate_exactly(scene_of: SceneOf, rate_hz: float) -> None:
-    one = foot(scene_of(array=TYPICAL), rate_hz=rate_hz)
-    batch = one.run_for(1.0)
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY), rate_hz=rate_hz)
+    batch = one.run_for(0.9)  # up to the first audit, which has a test of its own
     assert set(np.diff(batch.t_mono_ns).tolist()) == {round(1e9 / rate_hz)}
-    assert len(batch) == pytest.approx(rate_hz, abs=1)
+    assert len(batch) == pytest.approx(0.9 * rate_hz, abs=1)
     assert (batch.frame_status == 0).all()
     assert one.stream.missed_slots == 0
+
+
+def test_the_audit_of_a_second_costs_a_hundredth_of_it_at_most(scene_of: SceneOf) -> None:
+    one = foot(scene_of(array=TYPICAL, emulation={"noise_kpa": 0.165}), rate_hz=370.0)
+    batch = one.run_for(10.0)
+    assert one.stream.missed_slots <= 0.01 * 3700
+    assert (np.diff(batch.t_mono_ns) < 4 * FRAME_NS).all()
+    slower = foot(scene_of(array=TYPICAL, emulation={"noise_kpa": 0.165}), rate_hz=100.0)
+    slower.run_for(10.0)
+    assert slower.stream.missed_slots == 0, "it fits into the pause between two frames"
 
 
 @pytest.mark.parametrize("rate_hz", [396.0, 400.0, 1000.0, 5000.0])
 def test_a_rate_that_the_bus_does_not_give_shows_as_missed_slots(
     scene_of: SceneOf, rate_hz: float
 ) -> None:
-    one = foot(scene_of(array=TYPICAL), rate_hz=rate_hz)
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY), rate_hz=rate_hz)
     begin_ns = one.clock.now_ns()
-    batch = one.run_for(2.0)
+    batch = one.run_for(0.9)
     period_ns = round(1e9 / rate_hz)
     # Slot k begins at k periods; a frame belongs to the slot in which it began.
     begun_ns = batch.t_mono_ns - 522_500 - begin_ns
@@ -172,7 +196,7 @@ def test_a_rate_that_the_bus_does_not_give_shows_as_missed_slots(
 
 
 def test_a_consumer_that_dawdles_is_counted_and_not_waited_for(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL), rate_hz=100.0)
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY), rate_hz=100.0)
     frames = one.stream.run(lambda: False)
     first = next(frames)
     one.clock.sleep_until_ns(one.clock.now_ns() + 200_000_000)
@@ -186,27 +210,27 @@ def test_a_consumer_that_dawdles_is_counted_and_not_waited_for(scene_of: SceneOf
 
 
 def test_batches_are_about_25_ms_long(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL))
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
     sizes = [len(batch) for batch in one.batches(1.0)]
     assert set(sizes[:-1]) == {10}  # nine would be 22.8 ms, which is not yet enough
 
 
 def test_frames_that_are_further_apart_than_a_batch_come_one_by_one(scene_of: SceneOf) -> None:
-    slow = foot(scene_of(array=TYPICAL), rate_hz=10.0)
+    slow = foot(scene_of(array=TYPICAL, emulation=LIVELY), rate_hz=10.0)
     sizes = [len(batch) for batch in slow.batches(1.0)]
     assert sizes[0] <= 2
     assert set(sizes[1:]) == {1}
 
 
 def test_a_batch_is_contiguous_and_never_empty(scene_of: SceneOf) -> None:
-    for batch in foot(scene_of(array=TYPICAL)).batches(0.2):
+    for batch in foot(scene_of(array=TYPICAL, emulation=LIVELY)).batches(0.2):
         assert len(batch) > 0
         assert batch.padc.flags.c_contiguous
         assert batch.status.flags.c_contiguous
 
 
 def test_a_batch_is_not_touched_by_the_next_one(scene_of: SceneOf) -> None:
-    frames = foot(scene_of(array=TYPICAL)).stream.run(lambda: False)
+    frames = foot(scene_of(array=TYPICAL, emulation=LIVELY)).stream.run(lambda: False)
     first = next(frames)
     kept = first.padc.copy(), first.seq.copy()
     next(frames)
@@ -215,12 +239,12 @@ def test_a_batch_is_not_touched_by_the_next_one(scene_of: SceneOf) -> None:
 
 
 def test_nothing_is_taken_when_the_end_has_come_already(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL))
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
     assert list(one.stream.run(lambda: True)) == []
 
 
 def test_the_end_is_looked_for_before_every_frame(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL))
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
     begin_ns = one.clock.now_ns()
     end_ns = begin_ns + 3 * FRAME_NS + 1  # in the middle of a batch
     batches = list(one.stream.run(lambda: one.clock.now_ns() >= end_ns))
@@ -232,30 +256,32 @@ def test_the_end_is_looked_for_before_every_frame(scene_of: SceneOf) -> None:
 
 def test_a_plug_pulled_by_a_scene_costs_one_tile_and_no_frame(scene_of: SceneOf) -> None:
     fault = {"kind": "no_answer", "tile": "T02", "t_s": 0.2, "duration_s": 0.1}
-    one = foot(scene_of(array=TYPICAL, fault=[fault]), rate_hz=390.0)
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY, fault=[fault]), rate_hz=200.0)
     begin_ns = one.world.epoch_ns
     batch = one.run_for(0.5)
     gone = np.array(has(TileStatus.NO_ANSWER, batch, 1))
     # Read about 2 ms after the frame's instant: a frame at the edge may be on either side.
     since_s = (batch.t_mono_ns - begin_ns) * 1e-9
-    assert gone[(since_s > 0.2) & (since_s < 0.297)].all()
-    assert not gone[(since_s < 0.197) | (since_s > 0.3)].any()
+    assert gone[(since_s > 0.2) & (since_s < 0.294)].all()
+    # Looked for at 2, 4, 8, ... ms: found again after as long as it was away, at most.
+    assert not gone[(since_s < 0.194) | (since_s > 0.4)].any()
     assert (batch.padc[gone, 1] == NOT_READ).all()
     assert (batch.tadc[gone, 1] == NOT_READ).all()
     assert (batch.padc[~gone, 1] < 1024).all()
     for other in (0, 2, 3):
         assert (batch.padc[:, other] < 1024).all()
         assert (batch.status[:, other] == 0).all()
-    assert set(np.diff(batch.t_mono_ns).tolist()) == {round(1e9 / 390)}
+    assert set(np.diff(batch.t_mono_ns).tolist()) == {round(1e9 / 200)}
     assert (batch.frame_status == 0).all()
 
 
 def test_a_plug_can_be_pulled_by_hand_under_a_running_stream(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL))
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
     frames = one.stream.run(lambda: False)
     assert not any(has(TileStatus.NO_ANSWER, next(frames), 2))
     with one.world.fault("no_answer", "T03"):
         during = next(frames)
+    next(frames)
     after = next(frames)
     assert all(has(TileStatus.NO_ANSWER, during, 2))
     assert (during.padc[:, 2] == NOT_READ).all()
@@ -270,11 +296,12 @@ def test_a_part_that_stops_converting_becomes_stale(scene_of: SceneOf) -> None:
     before = one.take(3)
     with one.world.fault("stale", "T04"):
         during = one.take(60)
+    one.take(1)
     after = one.take(5)
     stale = has(TileStatus.STALE, during, 3)
     first = stale.index(True)
-    # The last reading before the fault may repeat by chance once or twice, no more.
-    assert STALE_AFTER - 4 <= first <= STALE_AFTER - 1
+    # Ten in a row (one in nine is equal by chance); the last before the fault may be one of them.
+    assert 7 <= first <= 10
     assert all(stale[first:])
     assert len(set(zip(during.padc[:, 3].tolist(), during.tadc[:, 3].tolist(), strict=True))) == 1
     for batch in (before, after):
@@ -290,14 +317,7 @@ def test_an_array_with_noise_is_not_called_stale(scene_of: SceneOf) -> None:
     same = (np.diff(batch.padc[:, 0].astype(int)) == 0) & (
         np.diff(batch.tadc[:, 0].astype(int)) == 0
     )
-    assert 0.05 < same.mean() < 0.2, "about one in ten, as devices.array says"
-
-
-def test_a_tile_that_is_absent_at_start_up_stops_the_start_and_is_named(scene_of: SceneOf) -> None:
-    fault = {"kind": "no_answer", "tile": "T03", "t_s": 0.0, "duration_s": 9.0}
-    with pytest.raises(TileSetupError) as caught:
-        foot(scene_of(((0x70, 0), (0x70, 1), (0x71, 6)), fault=[fault]))
-    assert caught.value.where == "tile T03 (mux 0x71 channel 6)"
+    assert 0.05 < same.mean() < 0.2, "about one in nine, as devices.health says"
 
 
 class Failing:
@@ -316,6 +336,9 @@ class Failing:
             raise OSError(self.number, "injected")
         self._adapter.i2c_rdwr(*i2c_msgs)
 
+    def set_timeout(self, units_10ms: int) -> None:
+        self._adapter.set_timeout(units_10ms)
+
     def close(self) -> None:
         self._adapter.close()
 
@@ -333,44 +356,48 @@ def failing_foot(scene: Scene) -> tuple[Foot, Failing]:
 
 
 def test_a_single_missing_acknowledge_is_retried_and_flagged(scene_of: SceneOf) -> None:
-    one, adapter = failing_foot(scene_of(array=TYPICAL))
+    one, adapter = failing_foot(scene_of(array=TYPICAL, emulation=LIVELY))
     one.take(1)
     pending = [True]
     adapter.clock = None
-    adapter.fails = lambda messages: len(messages) == 2 and bool(pending) and pending.pop()
+    reads = iter(range(1000))
+    adapter.fails = lambda messages: (
+        len(messages) == 2 and next(reads) == 1 and bool(pending) and pending.pop()
+    )
     batch = one.take(5)
-    assert batch.status[0].tolist() == [TileStatus.RETRIED, 0, 0, 0]
+    assert batch.status[0].tolist() == [0, TileStatus.RETRIED, 0, 0]
     assert (batch.status[1:] == 0).all()
     assert (batch.padc < 1024).all()
 
 
 def test_a_bus_that_times_out_is_a_flag_and_every_frame_is_still_a_frame(scene_of: SceneOf) -> None:
-    one, adapter = failing_foot(scene_of(array=TYPICAL))
+    one, adapter = failing_foot(scene_of(array=TYPICAL, emulation=LIVELY))
     before = one.take(2)
     adapter.number, adapter.fails = 110, lambda _: True
     during = one.take(5)
     adapter.fails = lambda _: False
+    one.take(5)  # tiles of a bus that was stuck are looked at before they are believed
     after = one.take(5)
     assert (during.frame_status == FrameStatus.BUS_FAULT).all()
     assert (during.padc == NOT_READ).all()
     assert (during.status == TileStatus.NO_ANSWER).all()
     assert (after.frame_status == 0).all()
     assert (after.status == 0).all()
-    seq = np.concatenate([before.seq, during.seq, after.seq])
+    seq = np.concatenate([before.seq, during.seq])
     assert seq.tolist() == list(range(len(seq)))
     t_ns = np.concatenate([before.t_mono_ns, during.t_mono_ns, after.t_mono_ns])
     assert (np.diff(t_ns) > 0).all()
-    assert (during.sample_offset_us == 0).all()
+    assert (np.abs(during.sample_offset_us) <= 1).all()
 
 
 def test_a_foot_without_a_single_answer_gives_frames_that_say_so(scene_of: SceneOf) -> None:
-    one, adapter = failing_foot(scene_of(array=TYPICAL))
+    one, adapter = failing_foot(scene_of(array=TYPICAL, emulation=LIVELY))
     adapter.clock, adapter.fails = None, lambda messages: bool(messages[0].addr == 0x60)
     batch = one.take(10)
     assert batch.seq.tolist() == list(range(len(batch)))
     assert (batch.padc == NOT_READ).all()
     assert (batch.tadc == NOT_READ).all()
-    assert (batch.status == TileStatus.NO_ANSWER).all()
+    assert ((batch.status & TileStatus.NO_ANSWER) != 0).all()
     assert (batch.frame_status == 0).all(), "the tiles are silent, the bus is not broken"
     assert (np.diff(batch.t_mono_ns) > 0).all()
 
@@ -381,7 +408,7 @@ def test_a_foot_without_a_single_answer_gives_frames_that_say_so(scene_of: Scene
 def test_a_bug_of_ours_is_raised_and_not_swallowed(
     scene_of: SceneOf, number: int, kind: type[Exception]
 ) -> None:
-    one, adapter = failing_foot(scene_of(array=TYPICAL))
+    one, adapter = failing_foot(scene_of(array=TYPICAL, emulation=LIVELY))
     one.take(1)
     adapter.clock, adapter.number, adapter.fails = None, number, lambda _: True
     with pytest.raises(kind):
@@ -396,15 +423,12 @@ DATA_SHEET = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 def reading(padc: int, tadc: int) -> tuple[int, int, int]:
     """Counts and status of a tile of the data sheet's part that measures these words."""
     clock = VirtualClock()
-    chip = EmulatedMpl115a2(DATA_SHEET, 1_600_000, lambda _: (padc, tadc))
+    chip = EmulatedMpl115a2(Silicon(DATA_SHEET, 1_600_000, lambda _: (padc, tadc)))
     adapter = EmulatedI2cAdapter([EmulatedTca9548a(0x70, {0: chip})], clock, 400_000)
     tile = TileScene(serial="T01", mux=0x70, channel=0, x_m=0.0, y_m=0.0, z_m=0.0)
-    array = TileArray(
-        I2cBus(adapter, "emulated"), [tile], clock, schedule="simultaneous", wait_ms=1.6
-    )
-    frames = Acquisition(array, array.identify(), clock, ANCHOR).run(lambda: False)
-    batch = next(frames)
-    assert (batch.status == batch.status[0]).all()
+    array = array_of(I2cBus(adapter, "emulated"), [tile], clock)
+    frames = Acquisition(array, array.tiles, clock, ANCHOR).run(lambda: False)
+    batch = next(frames)  # its first frame: later ones are stale
     return int(batch.padc[0, 0]), int(batch.tadc[0, 0]), int(batch.status[0, 0])
 
 
@@ -439,7 +463,7 @@ def test_over_range_is_what_lies_outside_50_to_115_kpa(padc: int, tadc: int) -> 
 
 
 def test_a_tile_that_was_not_read_is_not_called_over_range(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL))
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
     with one.world.fault("no_answer", "T01"):
         assert set(one.take(5).status[:, 0].tolist()) == {int(TileStatus.NO_ANSWER)}
 
@@ -462,19 +486,19 @@ class Servo:
 
 def with_servo(scene: Scene, servo: Servo, start_ns: int = 0) -> Foot:
     one = foot(scene, start_ns=start_ns)
-    one.stream = Acquisition(one.array, one.array.identify(), one.clock, ANCHOR, servo=servo)
+    one.stream = Acquisition(one.array, one.array.tiles, one.clock, ANCHOR, servo=servo)
     return one
 
 
 def test_without_a_servo_position_and_age_say_so(scene_of: SceneOf) -> None:
-    batch = foot(scene_of(array=TYPICAL)).take(3)
+    batch = foot(scene_of(array=TYPICAL, emulation=LIVELY)).take(3)
     assert set(batch.servo_counts.tolist()) == {NO_SERVO_COUNTS}
     assert set(batch.servo_age_us.tolist()) == {NO_SERVO_AGE}
     assert (batch.frame_status == 0).all()
 
 
 def test_a_servo_that_has_not_answered_yet_is_stale(scene_of: SceneOf) -> None:
-    batch = with_servo(scene_of(array=TYPICAL), Servo(None)).take(3)
+    batch = with_servo(scene_of(array=TYPICAL, emulation=LIVELY), Servo(None)).take(3)
     assert set(batch.servo_counts.tolist()) == {NO_SERVO_COUNTS}
     assert set(batch.servo_age_us.tolist()) == {NO_SERVO_AGE}
     assert (batch.frame_status == FrameStatus.SERVO_STALE).all()
@@ -482,7 +506,7 @@ def test_a_servo_that_has_not_answered_yet_is_stale(scene_of: SceneOf) -> None:
 
 def test_the_newest_position_goes_with_a_frame_and_ages(scene_of: SceneOf) -> None:
     servo = Servo((-4097, 1_000))
-    batch = with_servo(scene_of(array=TYPICAL), servo).take(30)
+    batch = with_servo(scene_of(array=TYPICAL, emulation=LIVELY), servo).take(30)
     assert set(batch.servo_counts.tolist()) == {-4097}
     age_ns = batch.t_mono_ns - 1_000
     assert batch.servo_age_us.tolist() == (age_ns // 1000).tolist()
@@ -496,25 +520,29 @@ def test_the_newest_position_goes_with_a_frame_and_ages(scene_of: SceneOf) -> No
 def test_a_servo_that_died_an_hour_ago_does_not_stop_the_stream(scene_of: SceneOf) -> None:
     # 2^31 us are 36 minutes, and int32 is what the column has.
     servo = Servo((2048, 0))
-    one = with_servo(scene_of(array=TYPICAL), servo, start_ns=3_600_000_000_000)
+    one = with_servo(scene_of(array=TYPICAL, emulation=LIVELY), servo, start_ns=3_600_000_000_000)
     batch = one.take(3)
     assert (batch.servo_counts == 2048).all()
     assert (batch.frame_status & FrameStatus.SERVO_STALE).all()
     assert (batch.servo_age_us > 30_000_000).all(), "old, however it is told"
 
 
-class Rig:
-    """A force sensor that reads the time."""
-
-    def force_n(self, t_mono_ns: int) -> float:
-        return t_mono_ns * 1e-9
-
-
-def test_the_reference_force_is_that_of_the_frames_instant(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL))
+def test_the_force_beside_the_array_goes_with_the_frame(scene_of: SceneOf) -> None:
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
     assert np.isnan(one.take(3).reference_force_n).all()
-    one.stream = Acquisition(one.array, one.array.identify(), one.clock, ANCHOR, reference=Rig())
+    timing = BusTiming(400_000, (1.6e-3,) * 4, (0x70,) * 4)
+    bus = I2cBus(one.world.i2c_adapter, "emulated")
+    array = TileArray(
+        bus,
+        one.array.tiles,
+        one.clock,
+        schedule="simultaneous",
+        timing=timing,
+        beside=lambda: one.clock.now_ns() * 1e-9,
+    )
+    one.stream = Acquisition(array, array.tiles, one.clock, ANCHOR)
     batch = one.take(3)
+    # It is sampled at the very instant of the first tile.
     np.testing.assert_allclose(batch.reference_force_n, batch.t_mono_ns * 1e-9, rtol=1e-7)
 
 
@@ -534,10 +562,8 @@ def test_the_same_scene_gives_the_same_frames_to_the_bit(scene_of: SceneOf) -> N
 
 
 def test_a_loop_that_was_stalled_says_how_many_frames_it_missed(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL))
-    stream = Acquisition(
-        one.array, one.array.identify(), one.clock, ANCHOR, expected_hz=1e9 / FRAME_NS
-    )
+    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+    stream = Acquisition(one.array, one.array.tiles, one.clock, ANCHOR, expected_hz=1e9 / FRAME_NS)
     batches = stream.run(lambda: False)
     before = next(batches)
     assert stream.missed_slots == 0

@@ -15,7 +15,6 @@ from devices.emulation.faults import Faults
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.emulation.line import Line
 from devices.emulation.tca9548a import EmulatedTca9548a
-
 from devices.errors import (
     BusFaultError,
     BusMisuseError,

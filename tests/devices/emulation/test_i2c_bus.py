@@ -17,7 +17,6 @@ from smbus2 import i2c_msg
 
 from devices.clock import VirtualClock
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
-from devices.emulation.faults import Faults
 from devices.emulation.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.scene import ReadDuringConversion

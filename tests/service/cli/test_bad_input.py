@@ -21,9 +21,9 @@ def left(folder: Path, *given: str) -> list[str]:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("schedule =", "shedule ="), ["array.shedule", "spelling"]),
+        (("conversion_ms =", "conversoin_ms ="), ["array.conversoin_ms", "spelling"]),
         (('serial = "T01"', "serial = 1"), ["tile.0.serial"]),
-        (("wait_ms = 1.6", 'wait_ms = "1.6"'), ["array.wait_ms", "'1.6'"]),
+        (("conversion_ms = 1.6", 'conversion_ms = "1.6"'), ["array.conversion_ms", "'1.6'"]),
         (("channel = 1", "channel = 0"), ["0x70", "channel 0", "two tiles"]),
         (('serial = "T02"', 'serial = "T01"'), ["T01", "twice"]),
         (("x_m = -0.021", "x_m = -21.0"), ["tile.0.x_m", "-21"]),

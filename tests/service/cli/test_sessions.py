@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from service.simulate import START_NS
 from storage.schema import ESTIMATES, FRAMES, TRUTH
 
 Run = Callable[..., object]
@@ -60,14 +61,19 @@ def test_a_fresh_bench_and_a_kept_one_give_the_same_bytes(run, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("schedule", "frame_us"), [("sequential", 7550.0), ("simultaneous", 2532.5)]
+    ("schedule", "limit_hz"), [("sequential", 132.45), ("simultaneous", 394.87), ("pipelined", 544.2)]
 )
-def test_frames_come_at_the_limit_of_the_bus(run, schedule, frame_us):
+def test_frames_come_at_the_limit_of_the_bus(run, tmp_path, schedule, limit_hz):
     outcome = run(
-        "simulate", "--scene", "standing", "--seconds", 2, "--schedule", schedule, "--json"
+        *("simulate", "--scene", "standing", "--seconds", 4, "--schedule", schedule, "--json"),
+        *("--out", "s.parquet"),
     )
     assert outcome.code == 0, outcome.err
-    assert json.loads(outcome.out)["rate_hz"] == pytest.approx(1e6 / frame_us, rel=1e-9)
+    # hardware.md 4; measured conversion times are a little longer than true ones, and every second
+    # one of them is tried anew.
+    assert 0.98 * limit_hz < json.loads(outcome.out)["rate_hz"] <= limit_hz
+    t_ns = pq.read_table(tmp_path / "s.parquet")["t_ns"].to_numpy()
+    assert np.median(np.diff(t_ns)) == pytest.approx(1e9 / limit_hz, rel=0.01)
 
 
 def test_a_session_has_raw_columns_then_estimates_then_truth(run, tmp_path):
@@ -134,7 +140,8 @@ def test_measured_walking_is_pressed_cell_by_cell(run, recording, tmp_path):
     )
     assert outcome.code == 0, outcome.err
     table = pq.read_table(tmp_path / "walk.parquet")
-    t_s = (table["t_mono_ns"].to_numpy() * 1e-9) - 1.01  # lead, and the touch-down before row 1
+    t_ns = table["t_ns"].to_numpy() - START_NS
+    t_s = t_ns * 1e-9 - 1.01  # lead, and the touch-down before row 1
     trace = np.genfromtxt(recording("insole_walk_left.csv"), delimiter=",", names=True)
     inside = (t_s > 0) & (t_s < trace["time_s"][-1])
     for cell in range(8):

@@ -344,12 +344,21 @@ def test_a_tile_that_answered_late_or_reads_high_is_not_missing(
 def test_counts_that_were_not_read_are_missing_whatever_their_status_says(
     info_of: InfoOf, plan_of: PlanOf, frames_of: FramesOf, estimate: Estimate
 ) -> None:
-    for column in ("padc", "tadc"):
-        frames = frames_of(held([7, 8, 9, 10]))
-        getattr(frames, column)[11, 0] = 65535
-        e = estimate(plan_of(info_of(SQUARE)), frames)
-        assert np.isnan(e.grf_n[11])
-        assert e.estimate_status[11] & EstimateStatus.TILE_MISSING
+    frames = frames_of(held([7, 8, 9, 10]))
+    frames.padc[11, 0] = 65535
+    e = estimate(plan_of(info_of(SQUARE)), frames)
+    assert np.isnan(e.grf_n[11])
+    assert e.estimate_status[11] & EstimateStatus.TILE_MISSING
+
+
+def test_a_temperature_that_was_not_read_is_that_of_the_frame_before_and_none_at_first(
+    info_of: InfoOf, plan_of: PlanOf, frames_of: FramesOf, estimate: Estimate
+) -> None:
+    frames = frames_of(held([7, 8, 9, 10]))
+    frames.tadc[0, 0] = frames.tadc[11, 0] = 65535
+    e = estimate(plan_of(info_of(SQUARE)), frames)
+    assert np.isnan(e.grf_n[0])
+    assert e.grf_n[1:] == pytest.approx([34.0] * 11)
 
 
 @pytest.mark.parametrize("padc", [894, 1000, 1022, 1023])

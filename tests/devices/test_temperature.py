@@ -1,0 +1,147 @@
+"""The temperature of frames that did not read it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.frames import FRAME_COLUMNS, NOT_READ, FrameBatch, TileStatus
+from devices.temperature import HeldTemperature, hold_temperature
+
+MS = 1_000_000
+
+
+def frames(
+    tadc: list[list[int]], t_ms: list[int] | None = None, status: list[list[int]] | None = None
+) -> FrameBatch:
+    n, tiles = len(tadc), len(tadc[0])
+    columns = {
+        name: np.zeros((n, tiles) if per_tile else n, dtype)
+        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
+    }
+    columns["tadc"][:] = tadc
+    columns["padc"][:] = 400
+    columns["t_mono_ns"][:] = np.array(t_ms if t_ms is not None else range(n)) * MS
+    if status is not None:
+        columns["status"][:] = status
+    return FrameBatch(**columns)
+
+
+def held(batch: FrameBatch, before: HeldTemperature | None = None) -> list[list[int]]:
+    result: list[list[int]] = hold_temperature(batch, before)[0].tadc.tolist()
+    return result
+
+
+N = NOT_READ
+
+
+def test_a_frame_without_temperature_has_that_of_the_frame_before() -> None:
+    assert held(frames([[500], [N], [N], [503], [N]])) == [[500], [500], [500], [503], [503]]
+
+
+def test_each_tile_has_its_own() -> None:
+    assert held(frames([[500, N], [N, 600], [N, N]])) == [[500, N], [500, 600], [500, 600]]
+
+
+def test_nothing_is_held_from_a_later_frame() -> None:
+    assert held(frames([[N], [N], [500]])) == [[N], [N], [500]]
+
+
+def test_what_was_read_is_never_changed() -> None:
+    batch = frames([[500], [510], [490]])
+    assert hold_temperature(batch)[0] is batch, "nothing to do, nothing copied"
+
+
+def test_the_frames_themselves_keep_what_was_read() -> None:
+    batch = frames([[500], [N]])
+    hold_temperature(batch)
+    assert batch.tadc.tolist() == [[500], [N]]
+
+
+@pytest.mark.parametrize(("age_ms", "known"), [(1, True), (1000, True), (1001, False)])
+def test_a_temperature_is_held_for_a_second(age_ms: int, known: bool) -> None:
+    assert held(frames([[500], [N]], [0, age_ms])) == [[500], [500 if known else N]]
+
+
+def test_being_held_does_not_make_it_any_younger() -> None:
+    assert held(frames([[500], [N], [N]], [0, 700, 1400])) == [[500], [500], [N]]
+
+
+@pytest.mark.parametrize("bit", [s for s in TileStatus if s & TileStatus.UNUSABLE])
+def test_an_unusable_reading_is_not_held(bit: TileStatus) -> None:
+    batch = frames([[500], [1023], [N]], status=[[0], [int(bit)], [0]])
+    assert held(batch) == [[500], [1023], [500]]
+
+
+@pytest.mark.parametrize("bit", [TileStatus.RETRIED, TileStatus.OVER_RANGE])
+def test_a_usable_reading_is_held_whatever_else_is_said_of_it(bit: TileStatus) -> None:
+    batch = frames([[500], [505], [N]], status=[[0], [int(bit)], [0]])
+    assert held(batch) == [[500], [505], [505]]
+
+
+def test_no_temperature_has_come_before_the_first_frame() -> None:
+    _, last = hold_temperature(frames([[N, 500], [N, N]]))
+    assert last.tadc.tolist() == [N, 500]
+    assert last.t_mono_ns.tolist() == [0, 0]
+
+
+streams = st.integers(1, 30).flatmap(
+    lambda n: st.tuples(
+        st.lists(
+            st.lists(st.sampled_from([N, N, N, 480, 500, 520]), min_size=2, max_size=2),
+            min_size=n,
+            max_size=n,
+        ),
+        st.lists(st.integers(1, 700), min_size=n, max_size=n),
+        st.lists(
+            st.lists(st.sampled_from([0, 0, 0, 1, 4, 8]), min_size=2, max_size=2),
+            min_size=n,
+            max_size=n,
+        ),
+        st.lists(st.booleans(), min_size=n, max_size=n),
+    )
+)
+
+
+@settings(max_examples=200)
+@given(stream=streams)
+def test_any_split_of_a_stream_gives_the_same(
+    stream: tuple[list[list[int]], list[int], list[list[int]], list[bool]],
+) -> None:
+    tadc, gaps_ms, status, cuts = stream
+    batch = frames(tadc, np.cumsum(gaps_ms).tolist(), status)
+    whole, last = hold_temperature(batch)
+    ends = [row for row, cut in enumerate(cuts) if cut and row] + [len(batch)]
+    pieces, before, begin = [], None, 0
+    for end in ends:
+        piece, before = hold_temperature(batch.rows(begin, end), before)
+        pieces.append(piece)
+        begin = end
+    assert np.concatenate([piece.tadc for piece in pieces]).tolist() == whole.tadc.tolist()
+    assert before is not None
+    np.testing.assert_array_equal(before.tadc, last.tadc)
+    np.testing.assert_array_equal(before.t_mono_ns, last.t_mono_ns)
+
+
+@settings(max_examples=200)
+@given(stream=streams)
+def test_what_is_held_is_the_last_usable_one_of_the_last_second(
+    stream: tuple[list[list[int]], list[int], list[list[int]], list[bool]],
+) -> None:
+    tadc, gaps_ms, status, _ = stream
+    t_ms = np.cumsum(gaps_ms).tolist()
+    expected = [list(row) for row in tadc]
+    for tile in range(2):
+        for row in range(len(tadc)):
+            if tadc[row][tile] != N:
+                continue
+            usable = [
+                r
+                for r in range(row)
+                if tadc[r][tile] != N and not status[r][tile] & TileStatus.UNUSABLE
+            ]
+            if usable and t_ms[row] - t_ms[usable[-1]] <= 1000:
+                expected[row][tile] = tadc[usable[-1]][tile]
+    assert held(frames(tadc, t_ms, status)) == expected
