@@ -155,6 +155,7 @@ class Rig:
             clock=self._clock,
             servo_id=scene.id,
             model=scene.model,
+            protocol=scene.protocol,
         )
         stack.callback(servo.close)
         return stack.enter_context(ServoReader(servo, self._clock, rate_hz=scene.rate_hz))

@@ -223,6 +223,7 @@ def _polled_servo(world: World, scene: ServoScene, now_ns: int, stack: ExitStack
         clock=line_clock,
         servo_id=scene.id,
         model=scene.model,
+        protocol=scene.protocol,
     )
     stack.callback(servo.close)
     return PolledServo(servo, line_clock, rate_hz=scene.rate_hz)

@@ -282,7 +282,7 @@ def test_a_reader_of_the_servo_gets_the_true_angle_back(sign: int, ratio: float)
             model=keys.model,
         )
         with contextlib.closing(servo):
-            assert servo.ping() == 30  # MX-28
+            assert servo.identify().model_number == 30  # MX-28
             reading = servo.read_position()
     # design.md 3: angle = sign (counts - zero) 2 pi / counts per turn * ratio
     angle_rad = sign * (reading.counts - 1000) * 2 * math.pi / 4096 * ratio
