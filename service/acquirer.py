@@ -31,9 +31,10 @@ _END_S = 5.0
 
 @dataclass(frozen=True)
 class Started:
-    """The array was found; frames follow."""
+    """The array was found; frames follow. `remarks` say what is wrong that they can do without."""
 
     info: ArrayInfo
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ def _run(options: RigOptions, connection: Connection) -> None:
 
 
 def _stream(rig: Rig, connection: Connection, stop: threading.Event) -> None:
-    connection.send(Started(rig.info))
+    connection.send(Started(rig.info, rig.remarks))
     waiting: queue.Queue[tuple[FrameBatch, int] | None] = queue.Queue(_WAITING_MAX)
     sender = threading.Thread(target=_send, args=(rig, waiting, connection, stop))
     sender.start()

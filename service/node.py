@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from devices.frames import ArrayInfo
 from service.acquirer import AcquisitionProcess, Batch, Failed, Message, Started
 from service.backlog import Backlog
 from service.estimation.calibration import Calibration
@@ -46,9 +45,12 @@ async def run_node(
     acquisition = AcquisitionProcess(options, lambda message: _hand_over(loop, messages, message))
     publishing: asyncio.Task[None] | None = None
     try:
-        info = await _started(messages, stopping)
-        if info is None:
+        started = await _started(messages, stopping)
+        if started is None:
             return 0
+        info = started.info
+        for remark in started.remarks:
+            report(remark)
         report(f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s, {info.schedule}")
         publisher = Publisher(
             server,
@@ -95,16 +97,16 @@ def _tell_failure(task: asyncio.Task[None], messages: asyncio.Queue[Message]) ->
 
 async def _started(
     messages: asyncio.Queue[Message], stopping: asyncio.Task[bool]
-) -> ArrayInfo | None:
-    """The array, once it is open; None if the node is stopped before."""
+) -> Started | None:
+    """What the acquisition says once it has begun; None if the node is stopped before."""
     first = asyncio.create_task(messages.get())
     await asyncio.wait({first, stopping}, return_when=asyncio.FIRST_COMPLETED)
     if not first.done():
         first.cancel()
         return None
     match first.result():
-        case Started(info):
-            return info
+        case Started() as started:
+            return started
         case Failed(error) if error is not None:
             raise error
         case _:

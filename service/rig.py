@@ -68,6 +68,8 @@ class Rig:
         sharpen_timers()
         self._clock = SystemClock()
         self._lead_end_ns: int | None = None
+        self.remarks: tuple[str, ...] = ()
+        """What is wrong that frames can do without; for whoever opened it."""
         world = self._world(options, stack)
         bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
         stack.callback(bus.close)
@@ -158,6 +160,7 @@ class Rig:
             protocol=scene.protocol,
         )
         stack.callback(servo.close)
+        self.remarks += servo.remarks
         return stack.enter_context(ServoReader(servo, self._clock, rate_hz=scene.rate_hz))
 
     def _bus_hz(self, array: TileArray) -> float:

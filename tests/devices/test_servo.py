@@ -219,6 +219,21 @@ def test_a_position_sampled_while_the_frame_was_taken_has_no_negative_age() -> N
     assert reading[1] == 0
 
 
+def test_a_frame_gets_the_position_of_its_own_instant_though_newer_ones_have_come() -> None:
+    servo: Any = Counting()
+    with ServoReader(servo, SystemClock(), rate_hz=500.0) as source:
+        assert soon(lambda: servo.readings > 3)
+        t_mono_ns = time.monotonic_ns()
+        at_once = source.latest(t_mono_ns)
+        readings = servo.readings
+        assert soon(lambda: servo.readings > readings + 3)
+        later = source.latest(t_mono_ns)
+    assert at_once is not None
+    assert later is not None
+    assert later[1] <= t_mono_ns
+    assert 0 <= later[0] - at_once[0] <= 1, "one more may have been on its way"
+
+
 def test_a_hanging_servo_costs_the_frames_nothing_and_grows_old() -> None:
     servo: Any = Counting()
     with ServoReader(servo, SystemClock(), rate_hz=500.0) as source:
