@@ -1,8 +1,8 @@
 """How long a frame takes on the wire, schedule by schedule, and which schedule is best.
 
 The timing model of hardware.md 4: START, repeated START and STOP count one SCL period each, nine
-per byte; every transaction may cost a fixed overhead on top, every sleep an overshoot. The schedules
-themselves are in `devices.schedules`.
+per byte; every transaction may cost a fixed overhead on top, every sleep an overshoot. What the
+schedules do is in `devices.schedules`.
 """
 
 from __future__ import annotations

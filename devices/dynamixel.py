@@ -1,4 +1,4 @@
-"""Dynamixel MX servos over Protocol 2.0, read only: who is there, and where its shaft stands.
+"""Dynamixel MX servos over Protocol 1.0 or 2.0, read only: who is there, where its shaft stands.
 
 Sources: e-manual of the MX series and hardware.md 5. A servo can neither be moved nor set up from
 here, so that no mistake in a measurement can move a robot.
@@ -6,24 +6,11 @@ here, so that no mistake in a measurement can move a robot.
 
 from __future__ import annotations
 
-import contextlib
-import termios
 from dataclasses import dataclass
-from typing import Protocol
-
-import serial
 
 from devices.clock import Clock
-from devices.dynamixel_packets import (
-    ALERT,
-    ERRORS,
-    Instruction,
-    Packet,
-    PacketDecoder,
-    instruction_packet,
-    read_packet,
-    wire_time_ns,
-)
+from devices.dynamixel_models import FIRMWARES, known_model
+from devices.dynamixel_packets import PacketDecoder, Status, wire_time_ns
 from devices.errors import (
     ServoError,
     ServoPacketError,
@@ -31,42 +18,10 @@ from devices.errors import (
     ServoStatusError,
     ServoTimeoutError,
 )
+from devices.serial_line import PORT_ERRORS, SerialPort, latency_remark, open_line
 
-# Far more than a status (16 bytes at most here): it bounds a line that never stops chattering.
+# Far more than a status (15 bytes at most here): it bounds a line that never stops chattering.
 _MAX_BYTES_PER_ANSWER = 256
-
-_PORT_ERRORS = (OSError, termios.error)
-
-
-@dataclass(frozen=True, slots=True)
-class ServoModel:
-    """What differs, or might, between models with "MX(2.0)" firmware (hardware.md 5)."""
-
-    number: int
-    """The model number at address 0, which a ping returns."""
-    counts_per_turn: int = 4096
-    position_address: int = 132
-    position_length: int = 4
-    """Bytes of the present position, little-endian and signed."""
-
-
-MODELS = {"MX-28": ServoModel(number=30), "MX-64": ServoModel(number=311)}
-
-
-class SerialPort(Protocol):
-    """What a servo needs of a serial port: `serial.Serial`, or a test's."""
-
-    def write(self, data: bytes, /) -> int | None:
-        """Send `data`."""
-
-    def read(self, size: int, /) -> bytes:
-        """Up to `size` bytes; fewer, or none, once the port's time-out is over."""
-
-    def reset_input_buffer(self) -> None:
-        """Discard what has come in so far."""
-
-    def close(self) -> None:
-        """Release the port."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +39,27 @@ class PositionReading:
     """The servo reports a hardware error; the position is valid all the same."""
 
 
+@dataclass(frozen=True, slots=True)
+class ServoIdentity:
+    """What a servo says of itself."""
+
+    model_number: int
+    firmware_version: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    status: Status
+    asked_ns: int
+    done_ns: int
+    """Its last byte."""
+
+
 class Dynamixel:
     """One servo. Not thread-safe: one thread owns a port.
 
     `timeout_s`, in seconds, should be the port's own: it is the longest that one read of it waits.
+    `protocol` is 1 or 2.
     """
 
     def __init__(
@@ -98,72 +70,109 @@ class Dynamixel:
         servo_id: int,
         baudrate: int,
         timeout_s: float,
-        model: str = "MX-64",
+        protocol: int = 2,
     ) -> None:
+        self.remarks: tuple[str, ...] = ()
+        """What is wrong with this servo that frames can do without; for whoever opened it."""
         self._port = port
         self._clock = clock
         self._id = servo_id
         self._baudrate = baudrate
         self._timeout_ns = round(timeout_s * 1e9)
-        self._where = f"servo {servo_id} at {baudrate} baud"
-        self._position_length = MODELS[model].position_length
-        self._ping = instruction_packet(servo_id, Instruction.PING)
-        self._read = read_packet(servo_id, MODELS[model].position_address, self._position_length)
+        self._where = f"servo {servo_id} at {baudrate} baud, protocol {protocol}"
+        self._firmware = FIRMWARES[protocol]
+        self._protocol = self._firmware.protocol
+        self._identity_request = self._protocol.identity_request(servo_id)
+        self._position_request = self._protocol.read_request(
+            servo_id, self._firmware.position_address, self._firmware.asked_bytes
+        )
 
-    def ping(self) -> int:
-        """The servo's model number (`ServoModel.number`).
+    def identify(self) -> ServoIdentity:
+        """Model number and firmware version.
 
         Raises:
             ServoTimeoutError: no answer within the time-out.
-            ServoPacketError: an answer with a wrong CRC, id or length, or nothing but noise.
-            ServoStatusError: the servo answered with an error number.
+            ServoPacketError: an answer that is damaged, another servo's, or of another length, or
+                nothing but noise.
+            ServoStatusError: the servo refused.
             ServoSetupError: the port itself failed, as when its plug is pulled.
         """
-        status, _, _ = self._exchange(self._ping, n_data=3)
-        return int.from_bytes(status.parameters[1:3], "little")
+        data = self._exchange(self._identity_request, n_data=3).status.data
+        return ServoIdentity(int.from_bytes(data[:2], "little"), data[2])
+
+    def check_model(self, model: str) -> None:
+        """Ask the servo whether it is the `model` with the firmware that the scene says.
+
+        Raises:
+            ServoSetupError: it is another; the text names the keys to set.
+            ServoError: as for `identify`.
+        """
+        number = self.identify().model_number
+        expected = self._firmware.model_numbers[model]
+        if number == expected:
+            return
+        what, remedy = f"a servo with model number {number} answers", "Plug in the one of the scene"
+        if known := known_model(number):
+            name, protocol = known
+            what = f"an {name} with firmware for Protocol {protocol}.0 answers"
+            if protocol == self._protocol.version:
+                remedy = f'Set model = "{name}" in [servo]'
+            else:
+                remedy = (
+                    f"Its firmware speaks Protocol {protocol}.0 once address 13, Protocol Type, "
+                    f"says so: set that to {protocol}, and in [servo] protocol = {protocol}"
+                )
+        raise ServoSetupError(
+            what,
+            where=self._where,
+            expected=f"an {model} with firmware for Protocol {self._protocol.version}.0, "
+            f"model number {expected}",
+            remedy=remedy,
+        )
 
     def read_position(self) -> PositionReading:
-        """The present position. Raises what `ping` raises.
+        """The present position. Raises what `identify` raises.
 
         The servo samples it somewhere between the last bit of the request and the first of the
         answer (hardware.md 5.2); a slow adapter delays the answer and so widens the interval.
         """
-        status, start_ns, done_ns = self._exchange(self._read, n_data=self._position_length)
-        earliest_ns = start_ns + wire_time_ns(len(self._read), self._baudrate)
-        latest_ns = done_ns - wire_time_ns(status.wire_bytes, self._baudrate)
+        answer = self._exchange(self._position_request, n_data=self._firmware.asked_bytes)
+        earliest_ns = answer.asked_ns + wire_time_ns(len(self._position_request), self._baudrate)
+        latest_ns = answer.done_ns - wire_time_ns(answer.status.wire_bytes, self._baudrate)
+        position = answer.status.data[: self._firmware.position_bytes]
         return PositionReading(
-            counts=int.from_bytes(status.parameters[1:], "little", signed=True),
+            counts=int.from_bytes(position, "little", signed=True),
             t_mono_ns=(earliest_ns + latest_ns) // 2,
             half_width_ns=max(0, latest_ns - earliest_ns + 1) // 2,
-            done_ns=done_ns,
-            alert=bool(status.parameters[0] & ALERT),
+            done_ns=answer.done_ns,
+            alert=answer.status.alert,
         )
 
     def close(self) -> None:
         """Close the port."""
         self._port.close()
 
-    def _exchange(self, request: bytes, n_data: int) -> tuple[Packet, int, int]:
-        """The status with `n_data` bytes, and the instants of asking and of its last byte, ns."""
+    def _exchange(self, request: bytes, n_data: int) -> _Answer:
+        """The answer to `request` with `n_data` bytes."""
         try:
             # Packets carry no number: a late answer to an older request would pass for this one's.
             self._port.reset_input_buffer()
-            start_ns = self._clock.now_ns()
+            asked_ns = self._clock.now_ns()
             self._port.write(request)
-            status, done_ns = self._await_status(start_ns + self._timeout_ns)
+            status, done_ns = self._await_status(request, asked_ns + self._timeout_ns)
         except ServoError:  # a ServoTimeoutError is an OSError too
             raise
-        except _PORT_ERRORS as error:
+        except PORT_ERRORS as error:
             raise ServoSetupError(
                 f"the serial port failed ({error})",
                 where=self._where,
                 remedy="Check the adapter's plug, and that nothing else uses the port",
             ) from error
         self._check(status, n_data)
-        return status, start_ns, done_ns
+        return _Answer(status, asked_ns, done_ns)
 
-    def _await_status(self, deadline_ns: int) -> tuple[Packet, int]:
-        decoder = PacketDecoder()
+    def _await_status(self, request: bytes, deadline_ns: int) -> tuple[Status, int]:
+        decoder = PacketDecoder(self._protocol)
         n_bytes = 0
         while n_bytes < _MAX_BYTES_PER_ANSWER:
             data = self._port.read(min(decoder.missing, _MAX_BYTES_PER_ANSWER - n_bytes))
@@ -174,36 +183,34 @@ class Dynamixel:
                 raise self._timed_out(n_bytes)
             n_bytes += len(data)
             for packet in reversed(decoder.feed(data)):
-                # Whole packets that are no status are our own, echoed by a one-wire adapter.
-                if packet.instruction == Instruction.STATUS or not packet.crc_ok:
-                    return packet, done_ns
+                # A one-wire adapter hands back what it was given.
+                echo = packet.wire == request
+                if not echo and (status := self._protocol.status(packet)) is not None:
+                    return status, done_ns
         raise self._packet_error(f"{n_bytes} bytes came and no status packet among them")
 
     def _timed_out(self, n_bytes: int) -> ServoTimeoutError:
-        noise = f" ({n_bytes} bytes came, but no whole packet)" if n_bytes else ""
+        noise = f" ({n_bytes} bytes came, but no whole status packet)" if n_bytes else ""
         return ServoTimeoutError(
             f"no answer within {self._timeout_ns / 1e6:g} ms{noise}",
             where=self._where,
             remedy="Check the servo's power, its id, its baud rate, that its firmware speaks "
-            "Protocol 2.0, and that the adapter's latency timer is 1 ms",
+            f"Protocol {self._protocol.version}.0, and that the adapter's latency timer is 1 ms",
         )
 
     def _packet_error(self, what: str, expected: str = "") -> ServoPacketError:
         remedy = "Check the cable and its termination, and that no two servos share an id"
         return ServoPacketError(what, where=self._where, expected=expected, remedy=remedy)
 
-    def _check(self, status: Packet, n_data: int) -> None:
-        if not status.crc_ok:
-            raise self._packet_error("the CRC of the answer is wrong")
+    def _check(self, status: Status, n_data: int) -> None:
+        if not status.intact:
+            raise self._packet_error("the answer is damaged: its checksum does not fit")
         if status.servo_id != self._id:
             raise self._packet_error(f"servo {status.servo_id} answered", f"servo {self._id}")
-        if status.parameters and (number := status.parameters[0] & ~ALERT):
-            meaning = ERRORS[number] if number < len(ERRORS) else "unknown"
-            raise ServoStatusError(
-                f"the servo answered with error {number}, {meaning}", where=self._where
-            )
-        if len(status.parameters) != 1 + n_data:
-            raise self._packet_error(f"{len(status.parameters)} parameters", str(1 + n_data))
+        if status.refusal:
+            raise ServoStatusError(f"the servo refused: {status.refusal}", where=self._where)
+        if len(status.data) != n_data:
+            raise self._packet_error(f"an answer of {len(status.data)} bytes", f"{n_data} bytes")
 
 
 def open_servo(
@@ -214,29 +221,36 @@ def open_servo(
     servo_id: int = 1,
     timeout_s: float = 0.1,
     model: str = "MX-64",
+    protocol: int = 2,
 ) -> Dynamixel:
     """Open the servo at `port`: /dev/ttyUSB0 and the like, or an emulated servo's `port`.
+
+    It is asked who it is. One that does not answer is opened all the same, for it may yet come to
+    life: that, and a slow adapter, are among the `remarks` of what is returned.
 
     The default `timeout_s`, in seconds, is ample for the slowest case: 9600 baud (30 ms), the
     longest return delay (0.5 ms) and an FTDI's default latency timer (16 ms).
 
     Raises:
-        ServoSetupError: there is no such port, it may not be used, or somebody else uses it.
+        ServoSetupError: there is no such port, it may not be used, or somebody else uses it; or
+            another model or firmware answers than `model` and `protocol`.
     """
-    try:
-        line = serial.Serial(
-            port, baudrate, timeout=timeout_s, write_timeout=timeout_s, exclusive=True
-        )
-    except (*_PORT_ERRORS, ValueError) as error:
-        raise ServoSetupError(
-            f"the serial port cannot be opened ({error})",
-            where=port,
-            remedy="Check that the device exists, that this user is in the group dialout, that no "
-            "other program has it open, and the baud rate",
-        ) from error
-    # Saves up to 15 ms per read on FTDI adapters (hardware.md 5.2); others refuse, and need not.
-    with contextlib.suppress(ValueError):
-        line.set_low_latency_mode(True)
-    return Dynamixel(
-        line, clock, servo_id=servo_id, baudrate=baudrate, timeout_s=timeout_s, model=model
+    line = open_line(port, baudrate, timeout_s)
+    servo = Dynamixel(
+        line,
+        clock,
+        servo_id=servo_id,
+        baudrate=baudrate,
+        timeout_s=timeout_s,
+        protocol=protocol,
     )
+    slow, silent = latency_remark(port), None
+    try:
+        servo.check_model(model)
+    except ServoSetupError:
+        servo.close()
+        raise
+    except ServoError as error:
+        silent = str(error)
+    servo.remarks = tuple(remark for remark in (slow, silent) if remark is not None)
+    return servo

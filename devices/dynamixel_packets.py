@@ -1,76 +1,24 @@
-"""Packets of Dynamixel Protocol 2.0, as pure functions of bytes.
+"""What both Dynamixel protocols share: packets, the search for them, and what a protocol is.
 
-Sources: e-manual protocol2.md and crc.md, hardware.md 5.1 and 5.2.
+Sources: e-manual protocol1.md and protocol2.md, hardware.md 5.1 and 5.2.
 """
 
 from __future__ import annotations
 
-import struct
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import IntEnum
 
 BROADCAST_ID = 0xFE
-ALERT = 0x80
-"""Bit of the error byte: the hardware complains (address 70 says of what); the answer is valid."""
-ERRORS = (
-    "none",
-    "result fail",
-    "undefined instruction",
-    "CRC of the request",
-    "data range",
-    "data length",
-    "data limit",
-    "access",
-)
-"""Meaning of the number in the error byte's other bits (e-manual protocol2.md, "Error")."""
-
-_HEADER = b"\xff\xff\xfd\x00"
-_PREAMBLE = 7  # header, id and the two bytes of the length
-_CRC = 2
-_MIN_LENGTH, _MAX_LENGTH = 1 + _CRC, 1024  # instruction to CRC; more is noise (the SDK's limit)
-_PATTERN, _STUFFED = b"\xff\xff\xfd", b"\xff\xff\xfd\xfd"
 
 
 class Instruction(IntEnum):
-    """Instructions of Protocol 2.0 that FootTile speaks (hardware.md 5.1)."""
+    """Instructions that FootTile speaks (hardware.md 5.1); the last two exist in 2.0 only."""
 
     PING = 0x01
     READ = 0x02
     STATUS = 0x55
     SYNC_READ = 0x82
-
-
-def _crc_table() -> list[int]:
-    table = []
-    for byte in range(256):
-        crc = byte << 8
-        for _ in range(8):
-            crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
-        table.append(crc & 0xFFFF)
-    return table
-
-
-_CRC_TABLE = _crc_table()
-
-
-def crc16(data: bytes) -> int:
-    """CRC-16 of Protocol 2.0: polynomial 0x8005, initially 0, not reflected (e-manual crc.md)."""
-    crc = 0
-    for byte in data:
-        crc = (crc << 8 & 0xFFFF) ^ _CRC_TABLE[crc >> 8 ^ byte]
-    return crc
-
-
-def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """One packet, ready for the wire: stuffed first, then length and CRC over what was stuffed."""
-    body = (bytes([instruction]) + parameters).replace(_PATTERN, _STUFFED)
-    packet = _HEADER + struct.pack("<BH", servo_id, len(body) + _CRC) + body
-    return packet + struct.pack("<H", crc16(packet))
-
-
-def read_packet(servo_id: int, address: int, length: int) -> bytes:
-    """The instruction to read `length` bytes of the control table from `address` on."""
-    return instruction_packet(servo_id, Instruction.READ, struct.pack("<HH", address, length))
 
 
 def wire_time_ns(n_bytes: int, baudrate: int) -> int:
@@ -80,29 +28,87 @@ def wire_time_ns(n_bytes: int, baudrate: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet off the wire, unstuffed. A status packet's first parameter is its error byte."""
+    """One packet off the wire, unstuffed.
+
+    Whether it asks or answers is written in it in 2.0 only. In 1.0 the byte of the `instruction` is
+    the error byte of an answer, and whoever listens has to know which of the two it is.
+    """
 
     servo_id: int
     instruction: int
     parameters: bytes
-    crc_ok: bool
+    intact: bool
+    """Its CRC or checksum fits."""
+    wire: bytes
+    """As it came, stuffing and checksum included."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What a servo answered."""
+
+    servo_id: int
+    data: bytes
+    alert: bool
+    """The hardware complains; the data are valid all the same."""
+    refusal: str
+    """Why the servo did not do what it was asked; empty if it did."""
+    intact: bool
     wire_bytes: int
-    """Its length on the wire, stuffing included."""
+
+
+class DynamixelProtocol(ABC):
+    """One version of the protocol: pure functions of bytes, no state."""
+
+    version: int
+    highest_id: int
+    header: bytes
+    preamble_bytes: int
+    """From the header to the end of the length."""
+    shortest_bytes: int
+    """A packet without parameters."""
+
+    @abstractmethod
+    def size(self, preamble: bytes) -> int:
+        """Bytes of the packet that begins so; 0 if none does, because it is noise."""
+
+    @abstractmethod
+    def pack(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+        """One packet, ready for the wire."""
+
+    @abstractmethod
+    def unpack(self, wire: bytes) -> Packet:
+        """The packet in bytes whose length is the one they say."""
+
+    @abstractmethod
+    def read_request(self, servo_id: int, address: int, length: int) -> bytes:
+        """The packet that asks for `length` bytes of the control table from `address` on."""
+
+    @abstractmethod
+    def identity_request(self, servo_id: int) -> bytes:
+        """The packet that asks for model number (2 bytes, little-endian) and firmware version."""
+
+    @abstractmethod
+    def status(self, packet: Packet) -> Status | None:
+        """`packet` as an answer; None if it is certain to be none."""
 
 
 class PacketDecoder:
     """Finds packets in a stream of bytes, however it is cut and whatever lies between them."""
 
-    def __init__(self) -> None:
+    def __init__(self, protocol: DynamixelProtocol) -> None:
+        self._protocol = protocol
         self._buffer = bytearray()
 
     @property
     def missing(self) -> int:
         """The fewest bytes that must still come. Who asks for no more never waits in vain."""
-        return self._size() - len(self._buffer)
+        known = len(self._buffer) >= self._protocol.preamble_bytes
+        size = self._size() if known else self._protocol.shortest_bytes
+        return size - len(self._buffer)
 
     def feed(self, data: bytes) -> list[Packet]:
-        """Add `data`; return the packets it completes, in order, whether their CRC fits or not."""
+        """Add `data`; return the packets it completes, in order, whether they are intact or not."""
         self._buffer += data
         packets = []
         while self._seek_packet():
@@ -110,27 +116,25 @@ class PacketDecoder:
         return packets
 
     def _size(self) -> int:
-        known = len(self._buffer) >= _PREAMBLE
-        return _PREAMBLE + (int.from_bytes(self._buffer[5:7], "little") if known else _MIN_LENGTH)
+        return self._protocol.size(bytes(self._buffer[: self._protocol.preamble_bytes]))
 
     def _seek_packet(self) -> bool:
-        buffer = self._buffer
+        """Drop what comes before a packet's beginning; is all of the packet there?"""
+        buffer, header = self._buffer, self._protocol.header
         while True:
-            start = buffer.find(_HEADER)
+            start = buffer.find(header)
             if start < 0:  # but the last bytes may be the beginning of one
-                kept = (n for n in (3, 2, 1) if buffer.endswith(_HEADER[:n]))
+                kept = (n for n in range(len(header) - 1, 0, -1) if buffer.endswith(header[:n]))
                 start = len(buffer) - next(kept, 0)
             del buffer[:start]
-            if _MIN_LENGTH <= self._size() - _PREAMBLE <= _MAX_LENGTH:
-                return self.missing <= 0
-            del buffer[: len(_HEADER)]
+            if len(buffer) < self._protocol.preamble_bytes:
+                return False
+            if size := self._size():
+                return len(buffer) >= size
+            del buffer[0]
 
     def _take_packet(self) -> Packet:
-        size = self._size()
-        frame = bytes(self._buffer[:size])
-        crc_ok = crc16(frame[:-_CRC]) == int.from_bytes(frame[-_CRC:], "little")
-        # Stuffing keeps headers out of packets. So if the CRC is wrong, the header may have been
-        # noise that swallowed a true one: go on right behind it.
-        del self._buffer[: size if crc_ok else len(_HEADER)]
-        body = frame[_PREAMBLE:-_CRC].replace(_STUFFED, _PATTERN)
-        return Packet(frame[4], body[0], body[1:], crc_ok, size)
+        packet = self._protocol.unpack(bytes(self._buffer[: self._size()]))
+        # A header that noise made may have swallowed a true one: go on right behind it.
+        del self._buffer[: len(packet.wire) if packet.intact else 1]
+        return packet

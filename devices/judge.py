@@ -87,7 +87,7 @@ class Judge:
     def _confirmed(
         self, scan: Scan, tile: int, words: tuple[int, int], with_temperature: bool
     ) -> tuple[int, int]:
-        """The reading that came twice: if two differ, one was disturbed, and a third tells which."""
+        """The reading that came twice: if two differ, one was disturbed, a third tells which."""
         again = self._again(scan, tile, with_temperature)
         if again == words:
             return words

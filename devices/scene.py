@@ -14,8 +14,17 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
+from devices.dynamixel_models import FIRMWARES
 from devices.errors import SceneError
 from devices.tca9548a import ADDRESSES, CHANNELS
 
@@ -106,8 +115,9 @@ class ServoScene(_Section):
     port: str = EMULATED
     """A device such as /dev/ttyUSB0, or "emulated"."""
     model: Literal["MX-28", "MX-64"] = "MX-64"
-    protocol: Literal[2] = 2
-    id: Annotated[int, Field(ge=0, le=252)] = 1
+    protocol: Literal[1, 2] = 2
+    """What its firmware speaks; the factory's speaks 1."""
+    id: Annotated[int, Field(ge=0)] = 1
     baudrate: Annotated[int, Field(gt=0)] = 1_000_000
     rate_hz: _Positive = 100.0
     """How often the position is read."""
@@ -118,12 +128,23 @@ class ServoScene(_Section):
     ankle_travel_m_per_rad: _Number | None = None
     """Forward travel of the ankle per radian of the segment; absent: not known."""
 
-    @field_validator("sign", mode="before")
+    @field_validator("sign", "protocol", mode="before")
     @classmethod
-    def _sign_is_a_number(cls, sign: object) -> object:
-        if isinstance(sign, bool):  # true equals 1, and would pass
-            raise ValueError(f"{sign} is no sign, which is 1 or -1")  # noqa: TRY004  # pydantic's
-        return sign
+    def _is_a_number(cls, value: object) -> object:
+        if isinstance(value, bool):  # true equals 1, and would pass
+            raise ValueError(f"{value} is no number")  # noqa: TRY004  # pydantic's
+        return value
+
+    @field_validator("id")
+    @classmethod
+    def _id_exists(cls, servo_id: int, info: ValidationInfo) -> int:
+        protocol = info.data.get("protocol", 2)
+        highest = FIRMWARES[protocol].protocol.highest_id
+        if servo_id > highest:
+            raise ValueError(
+                f"{servo_id} is no id of a servo with protocol {protocol}, which are 0 to {highest}"
+            )
+        return servo_id
 
     @field_validator("ratio")
     @classmethod

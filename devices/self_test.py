@@ -133,8 +133,10 @@ def find_tiles(bus: I2cBus) -> tuple[Plug, ...]:
 
 
 def _all_closed(bus: I2cBus) -> list[int]:
-    """Addresses of all muxes that are there, now closed: a tile that others left open would answer
-    with those that are asked."""
+    """Addresses of all muxes that are there, now closed.
+
+    A tile behind one that was left open would answer with those that are asked.
+    """
     return [address for address in ADDRESSES if _answers(bus, address)]
 
 

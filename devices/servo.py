@@ -17,6 +17,9 @@ from devices.clock import Clock
 from devices.dynamixel import Dynamixel, PositionReading
 from devices.errors import ServoError
 
+_RECENT = 16
+"""Readings kept for a frame that takes long: 64 tiles take 16 ms, a quick servo 1 ms."""
+
 
 class PolledServo:
     """A `ServoSource` for virtual time: readings at fixed intervals on the servo line's clock.
@@ -65,7 +68,7 @@ class ServoReader:
         self._servo = servo
         self._clock = clock
         self._period_ns = round(1e9 / rate_hz)
-        self._newest: PositionReading | None = None
+        self._recent: tuple[PositionReading, ...] = ()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read, name="servo", daemon=True)
 
@@ -75,12 +78,16 @@ class ServoReader:
         return 3 * self._period_ns
 
     def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
-        """Newest position known with its sample instant; None before the first.
+        """Newest position sampled by `t_mono_ns`, with its sample instant; None before the first.
 
-        One that was sampled after `t_mono_ns`, while the frame was taken, is given with age 0.
+        The thread goes on while a frame is taken, so there are newer ones: they are for the next
+        frame. Only if there is no older one is the oldest given, with age 0.
         """
-        newest = self._newest
-        return None if newest is None else (newest.counts, min(newest.t_mono_ns, t_mono_ns))
+        recent = self._recent
+        if not recent:
+            return None
+        reading = next((r for r in recent if r.t_mono_ns <= t_mono_ns), recent[-1])
+        return reading.counts, min(reading.t_mono_ns, t_mono_ns)
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -99,7 +106,8 @@ class ServoReader:
         due_ns = self._clock.now_ns()
         while not self._stop.is_set():
             try:
-                self._newest = self._servo.read_position()
+                # Replaced as a whole, newest first: whoever looks sees the old or the new ones.
+                self._recent = (self._servo.read_position(), *self._recent[: _RECENT - 1])
             except ServoError:
                 self.failures += 1
                 # A port that has gone fails at once: do not spin on it.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from devices.clock import UtcAnchor
-from devices.dynamixel import MODELS
+from devices.dynamixel_models import COUNTS_PER_TURN
 from devices.frames import ArrayInfo, ServoInfo, TileInfo
 from devices.scene import Scene, ScheduleName
 from service.version import SOFTWARE
@@ -34,7 +34,7 @@ def describe(
     if scene.servo is not None:
         servo = ServoInfo(
             model=scene.servo.model,
-            counts_per_turn=MODELS[scene.servo.model].counts_per_turn,
+            counts_per_turn=COUNTS_PER_TURN,
             zero_counts=scene.servo.zero_counts,
             sign=scene.servo.sign,
             ratio=scene.servo.ratio,

@@ -1,4 +1,4 @@
-"""What hangs on a bus, how fast it can be asked, and what to change: the start-up self-test in words.
+"""What hangs on a bus, how fast it can be asked, and what to change, in words.
 
 Everything is measured over the bus; a scene only says what should be there.
 """
@@ -222,9 +222,12 @@ def _advice(
     tiles = f"{len(timing.muxes)} tile{'s' * (len(timing.muxes) > 1)}"
     if rate is None:
         wrong.append(
-            f"{chosen} would open more than {array.broadcast_channels} channels at once: use {best}."
+            f"{chosen} would open more than {array.broadcast_channels} channels at once: "
+            f"use {best}."
         )
-        summary = f"{tiles} on {len(timing.tiles_by_mux)} mux{'es' * (len(timing.tiles_by_mux) > 1)}."
+        summary = (
+            f"{tiles} on {len(timing.tiles_by_mux)} mux{'es' * (len(timing.tiles_by_mux) > 1)}."
+        )
         return _Advice(summary, tuple(wrong), tuple(hints))
     summary = f"{tiles}: {chosen} gives {rate:.0f} frames/s."
     if asked_hz and rate < asked_hz:
@@ -251,7 +254,9 @@ def _pace_setter(
         timing, conversions_s=tuple(min(wait_s, usual_s) for wait_s in timing.conversions_s)
     )
     without_hz = 1.0 / frame_s(chosen, like_others)
-    slow = next((f for f in findings if f.conversion_ms and f.conversion_ms / slowest_s > 999.9), None)
+    slow = next(
+        (f for f in findings if f.conversion_ms and f.conversion_ms / slowest_s > 999.9), None
+    )
     if slow is None or without_hz < _WORTH_SAYING * rate_hz:
         return ""
     name = slow.serial or f"The tile at 0x{slow.mux:02x} channel {slow.channel}"

@@ -203,8 +203,10 @@ class Rig:
             clock=self._clock,
             servo_id=scene.id,
             model=scene.model,
+            protocol=scene.protocol,
         )
         stack.callback(servo.close)
+        self.remarks += servo.remarks
         return stack.enter_context(ServoReader(servo, self._clock, rate_hz=scene.rate_hz))
 
     def _bus_hz(self, array: TileArray) -> float:

@@ -172,6 +172,7 @@ class World:
             clock,
             servo_id=servo.id,
             model=servo.model,
+            protocol=servo.protocol,
             baudrate=servo.baudrate,
         ) as emulated:
             yield emulated

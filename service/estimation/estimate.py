@@ -17,7 +17,9 @@ from devices.frames import FrameBatch
 from devices.temperature import HeldTemperature, hold_temperature
 from service.estimation.contact import UNKNOWN, UNLOADED, RunState, believed, seeming
 from service.estimation.estimates import Estimates, EstimateStatus
+from service.estimation.geometry import angle_rad, to_ground_x_m
 from service.estimation.instant import estimate_instants
+from service.estimation.kinematics import Readings, counts_at, readings_of
 from service.estimation.plan import SIGMAS, EstimationPlan
 
 Floats = npt.NDArray[np.float64]
@@ -42,6 +44,9 @@ class _Pending:
     """Frames whose look-ahead is not complete."""
 
     estimates: Estimates
+    cop_z_m: Floats
+    readings: Readings | None
+    """None without a servo."""
     loaded: npt.NDArray[np.int64]
     since_ns: npt.NDArray[np.int64]
     t_ns: npt.NDArray[np.int64]
@@ -57,6 +62,8 @@ class EstimationState:
     contact: int = 0
     last_seq: int | None = None
     last_t_ns: int = 0
+    last_reading: Readings | None = None
+    """One row."""
 
 
 def step(
@@ -73,12 +80,17 @@ def step(
         The estimates due (any number, possibly none), and the state for the next step.
     """
     if not len(frames):
-        return estimate_instants(plan, frames, np.zeros(0, dtype=np.bool_)), state
+        return estimate_instants(plan, frames, np.zeros(0, dtype=np.bool_))[0], state
     broken = _after_gap(plan, frames, state)
     frames, temperature = hold_temperature(frames, state.temperature)
-    now = estimate_instants(plan, frames, broken)
+    now, cop_z_m = estimate_instants(plan, frames, broken)
     loaded, since_ns, run = seeming(plan.contact, now.grf_n, frames.t_mono_ns, broken, state.run)
-    known = _append(state.pending, _Pending(now, loaded, since_ns, frames.t_mono_ns))
+    readings = None
+    if plan.info.servo is not None:
+        turn = plan.info.servo.counts_per_turn
+        readings = readings_of(frames, broken, state.last_reading, turn)
+    new = _Pending(now, cop_z_m, readings, loaded, since_ns, frames.t_mono_ns)
+    known = _append(state.pending, new)
     due = int(np.searchsorted(known.t_ns, known.t_ns[-1] - plan.lag_ns, side="right"))
     state = replace(
         state,
@@ -86,6 +98,7 @@ def step(
         run=run,
         last_seq=int(frames.seq[-1]),
         last_t_ns=int(frames.t_mono_ns[-1]),
+        last_reading=None if readings is None else readings.rows(len(frames) - 1, len(frames)),
     )
     return _release(plan, known, due, state)
 
@@ -102,11 +115,14 @@ def finish(plan: EstimationPlan, state: EstimationState) -> Estimates | None:
 def _release(
     plan: EstimationPlan, known: _Pending, due: int, state: EstimationState
 ) -> tuple[Estimates, EstimationState]:
-    """Give away the first `due` estimates of `known`; decide their contact and mask their COP."""
+    """Give away the first `due` estimates of `known`.
+
+    Decides their contact and where the foot stands, and masks their COP.
+    """
     contact = believed(
         plan.contact, plan.lag_ns, due, known.loaded, known.since_ns, known.t_ns, state.contact
     )
-    out = known.estimates.rows(0, due)
+    out = _placed(plan, known, due)
     in_doubt = np.isnan(out.grf_n)
     masked = _cop_masked(plan, out) | (contact == 0)
     columns = {name: np.where(masked, np.nan, getattr(out, name)) for name in _COP_COLUMNS}
@@ -122,11 +138,29 @@ def _release(
     if rest:
         pending = _Pending(
             known.estimates.rows(due, due + rest),
+            known.cop_z_m[due:],
+            None if known.readings is None else known.readings.rows(due, due + rest),
             known.loaded[due:],
             known.since_ns[due:],
             known.t_ns[due:],
         )
     return out, replace(state, pending=pending, contact=int(contact[-1]) if due else state.contact)
+
+
+def _placed(plan: EstimationPlan, known: _Pending, due: int) -> Estimates:
+    """The first `due` estimates of `known` with the segment's angle, and COP on the ground."""
+    out = known.estimates.rows(0, due)
+    servo = plan.info.servo
+    if servo is None or known.readings is None:
+        return out
+    angle = angle_rad(servo, counts_at(known.readings, due, plan.lag_ns))
+    travel = servo.ankle_travel_m_per_rad
+    return replace(
+        out,
+        angle_rad=angle,
+        cop_ground_x_m=to_ground_x_m(out.cop_x_m, known.cop_z_m[:due], angle, travel),
+        cop_ground_y_m=out.cop_y_m if travel is not None else out.cop_ground_y_m,
+    )
 
 
 def _cop_masked(plan: EstimationPlan, e: Estimates) -> npt.NDArray[np.bool_]:
@@ -153,8 +187,13 @@ def _append(before: _Pending | None, new: _Pending) -> _Pending:
         f.name: np.concatenate([getattr(before.estimates, f.name), getattr(new.estimates, f.name)])
         for f in fields(Estimates)
     }
+    readings = new.readings
+    if readings is not None and before.readings is not None:
+        readings = before.readings.followed_by(readings)
     return _Pending(
         Estimates(**joined),
+        np.concatenate([before.cop_z_m, new.cop_z_m]),
+        readings,
         np.concatenate([before.loaded, new.loaded]),
         np.concatenate([before.since_ns, new.since_ns]),
         np.concatenate([before.t_ns, new.t_ns]),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from devices.frames import NO_SERVO_COUNTS, ServoInfo
+from devices.frames import ServoInfo
 
 Floats = npt.NDArray[np.float64]
 
@@ -54,13 +54,10 @@ def grid_indices(
     return x.astype(np.float64) + 1.0, y.astype(np.float64) + 1.0
 
 
-def angle_rad(servo: ServoInfo, servo_counts: npt.NDArray[np.int32]) -> Floats:
-    """Segment angle from signed multi-turn servo counts; NaN where there is no reading."""
+def angle_rad(servo: ServoInfo, servo_counts: Floats) -> Floats:
+    """Segment angle from signed multi-turn servo counts; NaN where they are."""
     per_count = servo.sign * servo.ratio * 2.0 * np.pi / servo.counts_per_turn
-    known = servo_counts != NO_SERVO_COUNTS
-    return np.where(
-        known, (servo_counts.astype(np.float64) - servo.zero_counts) * per_count, np.nan
-    )
+    return (servo_counts - servo.zero_counts) * per_count
 
 
 def to_ground_x_m(

@@ -1,4 +1,4 @@
-"""What one frame says by itself: tile forces, GRF, COP, angle, each with its uncertainty and flags.
+"""What one frame says by itself: tile forces, GRF, COP, each with its uncertainty and flags.
 
 No memory, and the same bits for one row as for many: nothing is summed over time, multiplied as a
 matrix, or dependent on how rows lie in memory.
@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from devices.frames import FrameBatch, FrameStatus
+from devices.frames import FrameBatch
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from service.estimation.contact import UNKNOWN
 from service.estimation.estimates import Estimates, EstimateStatus
-from service.estimation.geometry import angle_rad, to_ground_x_m
 from service.estimation.models.unwrap import unwrap
 from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
 
@@ -34,22 +33,26 @@ class _TileForces:
 
 def estimate_instants(
     plan: EstimationPlan, frames: FrameBatch, after_gap: npt.NDArray[np.bool_]
-) -> Estimates:
-    """All that follows from each frame alone; contact is left unknown, and no COP is masked.
+) -> tuple[Estimates, Floats]:
+    """All that follows from each frame alone.
+
+    Contact is left unknown, so is where the foot stands, and no COP is masked.
 
     Args:
         plan: constants of the estimate.
         frames: n frames.
         after_gap: (n,), which of them come after a gap.
+
+    Returns:
+        The estimates, and the height z of their centre of pressure in the foot frame, in metres.
     """
     tiles = _tile_forces(plan, frames)
     bearing = np.flatnonzero(plan.bears)
     grf_n = _sum(tiles.force_n, bearing)
     (x_m, y_m, z_m), (sigma_x_m, sigma_y_m, _) = _centre_of_pressure(plan, tiles, grf_n, bearing)
     index_x, index_y = _grid_index(plan, tiles.gauge_kpa, bearing)
-    angle = _angle(plan, frames)
-    travel = plan.info.servo.ankle_travel_m_per_rad if plan.info.servo else None
-    return Estimates(
+    unknown = np.full(len(frames), np.nan)
+    estimates = Estimates(
         seq=frames.seq,
         t_ns=frames.t_ns,
         gauge_kpa=tiles.gauge_kpa,
@@ -63,12 +66,13 @@ def estimate_instants(
         cop_sigma_y_m=sigma_y_m,
         cop_index_x=index_x,
         cop_index_y=index_y,
-        cop_ground_x_m=to_ground_x_m(x_m, z_m, angle, travel),
-        cop_ground_y_m=y_m if travel is not None else np.full(len(frames), np.nan),
-        angle_rad=angle,
+        cop_ground_x_m=unknown,
+        cop_ground_y_m=unknown,
+        angle_rad=unknown,
         contact=np.full(len(frames), UNKNOWN, dtype=np.uint8),
         estimate_status=_status(plan, frames, tiles, bearing, after_gap),
     )
+    return estimates, z_m
 
 
 def _tile_forces(plan: EstimationPlan, frames: FrameBatch) -> _TileForces:
@@ -141,13 +145,6 @@ def _grid_index(
         for index in plan.grid
     )
     return x, y
-
-
-def _angle(plan: EstimationPlan, frames: FrameBatch) -> Floats:
-    if plan.info.servo is None:
-        return np.full(len(frames), np.nan)
-    angle = angle_rad(plan.info.servo, frames.servo_counts)
-    return np.where((frames.frame_status & FrameStatus.SERVO_STALE) != 0, np.nan, angle)
 
 
 def _sum(values: Floats, tiles: npt.NDArray[np.intp] | range) -> Floats:

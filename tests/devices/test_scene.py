@@ -395,9 +395,18 @@ def test_lines_that_make_no_sense_are_refused(line: str, key: str) -> None:
     assert key in refused(sections=f"[recovery]\n{line}")
 
 
-def test_true_is_no_sign() -> None:
-    text = refused(sections="[servo]\nsign = true")
-    assert "servo.sign = True" in text
+@pytest.mark.parametrize("key", ["sign", "protocol"])
+def test_true_is_no_number(key: str) -> None:
+    text = refused(sections=f"[servo]\n{key} = true")
+    assert f"servo.{key} = True" in text
+
+
+def test_a_servo_of_protocol_1_has_one_id_more() -> None:
+    old = refused(sections="[servo]\nprotocol = 1\nid = 254")
+    assert "servo.id = 254: 254 is no id of a servo with protocol 1, which are 0 to 253" in old
+    new = refused(sections="[servo]\nid = 253")
+    assert "servo.id = 253: 253 is no id of a servo with protocol 2, which are 0 to 252" in new
+    assert "servo.protocol = 3" in refused(sections="[servo]\nprotocol = 3\nid = 1")
 
 
 def test_a_servo_that_would_not_turn_the_segment_is_refused() -> None:

@@ -160,9 +160,12 @@ def test_an_emulated_servo_is_read_over_its_line_and_ages_right() -> None:
 
 def test_a_servo_of_another_id_is_counted_as_failing() -> None:
     with emulated(lambda _: 0, asked_id=2, timeout_s=0.01) as (source, line_clock):
-        assert source.latest(1_000 * MS) is None
+        opened_ns = line_clock.now_ns()
+        assert source.latest(opened_ns) is None
         assert source.failures == 1
-        assert line_clock.now_ns() >= 1_010 * MS, "the time-out passes on the virtual clock"
+        assert line_clock.now_ns() >= opened_ns + 10 * MS, (
+            "the time-out passes on the virtual clock"
+        )
 
 
 # On a real clock
@@ -214,6 +217,21 @@ def test_a_position_sampled_while_the_frame_was_taken_has_no_negative_age() -> N
         reading = source.latest(0)
     assert reading is not None
     assert reading[1] == 0
+
+
+def test_a_frame_gets_the_position_of_its_own_instant_though_newer_ones_have_come() -> None:
+    servo: Any = Counting()
+    with ServoReader(servo, SystemClock(), rate_hz=500.0) as source:
+        assert soon(lambda: servo.readings > 3)
+        t_mono_ns = time.monotonic_ns()
+        at_once = source.latest(t_mono_ns)
+        readings = servo.readings
+        assert soon(lambda: servo.readings > readings + 3)
+        later = source.latest(t_mono_ns)
+    assert at_once is not None
+    assert later is not None
+    assert later[1] <= t_mono_ns
+    assert 0 <= later[0] - at_once[0] <= 1, "one more may have been on its way"
 
 
 def test_a_hanging_servo_costs_the_frames_nothing_and_grows_old() -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import pty
 import re
 import signal
+import tty
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -12,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from devices.frames import NO_SERVO_COUNTS, FrameStatus
 
 Running = Any
 Until = Callable[..., Any]
@@ -62,6 +66,29 @@ def test_an_emulated_node_streams_tares_and_ends_without_loss(
     node = running.node("demo")
     seqs = np.concatenate([b.seq for b in running.journal(node["boot_id"], "demo").read(0, 2**61)])
     np.testing.assert_array_equal(seqs, np.arange(node["last_seq"] + 1))
+
+
+def test_a_servo_that_is_silent_from_the_start_is_said_and_the_tiles_stream(
+    running: Running, foottile: Foottile, scene: Path, until: Until
+) -> None:
+    master, slave = pty.openpty()
+    try:
+        tty.setraw(slave)
+        servo = f'\n[servo]\nport = "{os.ttyname(slave)}"\nprotocol = 1\nmodel = "MX-28"\n'
+        scene.write_text(scene.read_text() + servo)
+        process = foottile("node", "--scene", scene, "--server", running.url, "--name", "mute")
+        process.said("servo 1 at 1000000 baud, protocol 1: no answer within 100 ms")
+        process.said("connected to")
+        until(lambda: (running.node("mute")["last_seq"] or 0) > 100, 15.0)
+        process.process.send_signal(signal.SIGTERM)
+        assert process.ended(8.0) == 0, process.err
+    finally:
+        os.close(master)
+        os.close(slave)
+    boot_id = running.node("mute")["boot_id"]
+    batches = list(running.journal(boot_id, "mute").read(0, 2**61))
+    assert all((b.frame_status & FrameStatus.SERVO_STALE).all() for b in batches)
+    assert all((b.servo_counts == NO_SERVO_COUNTS).all() for b in batches)
 
 
 def test_a_tile_that_does_not_answer_is_named(

@@ -272,11 +272,16 @@ def test_the_force_of_a_rolling_foot_is_the_vertical_sum() -> None:
     assert (np.diff(truth.true_angle_rad) > 0).all()
 
 
+@pytest.mark.parametrize("protocol", [1, 2])
 @pytest.mark.parametrize(("sign", "ratio"), [(1, 0.1), (-1, 0.1), (1, 1.0), (-1, 0.5)])
-def test_a_reader_of_the_servo_gets_the_true_angle_back(sign: int, ratio: float) -> None:
+def test_a_reader_of_the_servo_gets_the_true_angle_back(
+    sign: int, ratio: float, protocol: int
+) -> None:
     scene = load_scene("rolling")
     assert scene.servo is not None
-    keys = scene.servo.model_copy(update={"sign": sign, "ratio": ratio, "zero_counts": 1000})
+    keys = scene.servo.model_copy(
+        update={"sign": sign, "ratio": ratio, "zero_counts": 1000, "protocol": protocol}
+    )
     world, _, _ = switched_on(scene, lead_s=0.0)
     line_clock = VirtualClock(EPOCH_NS + 1_000_000_000)
     with world.servo(keys, line_clock) as emulated:
@@ -286,9 +291,10 @@ def test_a_reader_of_the_servo_gets_the_true_angle_back(sign: int, ratio: float)
             clock=line_clock,
             servo_id=keys.id,
             model=keys.model,
+            protocol=keys.protocol,
         )
         with contextlib.closing(servo):
-            assert servo.ping() == 30  # MX-28
+            assert servo.identify().model_number == {1: 29, 2: 30}[protocol]  # MX-28
             reading = servo.read_position()
     # design.md 3: angle = sign (counts - zero) 2 pi / counts per turn * ratio
     angle_rad = sign * (reading.counts - 1000) * 2 * math.pi / 4096 * ratio

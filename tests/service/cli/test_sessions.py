@@ -61,7 +61,8 @@ def test_a_fresh_bench_and_a_kept_one_give_the_same_bytes(run, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("schedule", "limit_hz"), [("sequential", 132.45), ("simultaneous", 394.87), ("pipelined", 544.2)]
+    ("schedule", "limit_hz"),
+    [("sequential", 132.45), ("simultaneous", 394.87), ("pipelined", 544.2)],
 )
 def test_frames_come_at_the_limit_of_the_bus(run, tmp_path, schedule, limit_hz):
     outcome = run(

@@ -84,6 +84,12 @@ def wild_frames(frames_of: FramesOf, rows: int, tiles: int, seed: int) -> FrameB
     frames = frames_of(forces_n)
     steps_ns = rng.choice([2_000_000] * 9 + [2_000_007, 900_000, 3_100_000, 60_000_000_000], rows)
     t_mono_ns = np.cumsum(steps_ns).astype(np.int64)
+    # Readings 1 to 9 ms apart, each for several frames; some jump by more than half a turn.
+    since_ns = np.cumsum(np.minimum(steps_ns, 4_000_000))
+    sampled_ns = np.cumsum(rng.integers(1_000_000, 9_000_000, 4 * rows + 9)) - 9_000_000
+    newest = np.clip(np.searchsorted(sampled_ns, since_ns) - 1, 0, None)
+    counts = np.cumsum(rng.choice([-700, -1, 0, 3, 900, 3000], len(sampled_ns)))
+    age_us = np.clip((since_ns - sampled_ns[newest]) // 1000, 0, None)
     status = frames.status | np.where(
         rng.random((rows, tiles)) < 0.05, 2 ** rng.integers(0, 6, (rows, tiles)), 0
     )
@@ -99,9 +105,12 @@ def wild_frames(frames_of: FramesOf, rows: int, tiles: int, seed: int) -> FrameB
         frame_status=np.where(rng.random(rows) < 0.1, rng.integers(0, 32, rows), 0).astype(
             np.uint8
         ),
-        servo_counts=np.where(
-            rng.random(rows) < 0.1, NO_SERVO_COUNTS, rng.integers(-20000, 20000, rows)
-        ).astype(np.int32),
+        servo_counts=np.where(rng.random(rows) < 0.05, NO_SERVO_COUNTS, counts[newest]).astype(
+            np.int32
+        ),
+        servo_age_us=np.where(rng.random(rows) < 0.05, rng.integers(-1, 3000, rows), age_us).astype(
+            np.int32
+        ),
         reference_force_n=rng.choice([np.nan, np.inf, 3.0], rows).astype(np.float32),
     )
 

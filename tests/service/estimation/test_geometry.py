@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from devices.frames import NO_SERVO_COUNTS, ServoInfo
+from devices.frames import ServoInfo
 from service.estimation.geometry import angle_rad, grid_indices, hull, to_ground_x_m
 
 coordinates = st.integers(-100, 100).map(lambda mm: mm / 1000)
@@ -37,8 +37,8 @@ def servo(
     )
 
 
-def angle_at(info: ServoInfo, counts: int) -> float:
-    return float(angle_rad(info, np.array([counts], dtype=np.int32))[0])
+def angle_at(info: ServoInfo, counts: float) -> float:
+    return float(angle_rad(info, np.array([counts], dtype=np.float64))[0])
 
 
 # --- hull -----------------------------------------------------------------------------------------
@@ -147,8 +147,8 @@ def test_sign_ratio_and_zero_are_the_scenes() -> None:
     assert angle_at(servo(zero=0, sign=-1, ratio=0.1), 4096) == pytest.approx(-0.2 * math.pi)
 
 
-def test_a_servo_that_was_not_read_has_no_angle() -> None:
-    assert math.isnan(angle_at(servo(), NO_SERVO_COUNTS))
+def test_unknown_counts_have_no_angle() -> None:
+    assert math.isnan(angle_at(servo(), math.nan))
 
 
 # --- ground frame ---------------------------------------------------------------------------------

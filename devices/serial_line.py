@@ -1,0 +1,86 @@
+"""A servo's serial line: opened for one user, and asked to hand short answers over at once.
+
+An FTDI adapter collects bytes for as long as its latency timer says before it hands them over,
+16 ms by default, so that every short answer comes that late (hardware.md 5.2).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import termios
+from pathlib import Path
+from typing import Protocol
+
+import serial
+
+from devices.errors import ServoSetupError
+
+SYSFS = Path("/sys/bus/usb-serial/devices")
+LATENCY_MS = 1
+"""What the timer should say."""
+
+PORT_ERRORS = (OSError, termios.error)
+
+
+class SerialPort(Protocol):
+    """What a servo needs of a serial port: `serial.Serial`, or a test's."""
+
+    def write(self, data: bytes, /) -> int | None:
+        """Send `data`."""
+
+    def read(self, size: int, /) -> bytes:
+        """Up to `size` bytes; fewer, or none, once the port's time-out is over."""
+
+    def reset_input_buffer(self) -> None:
+        """Discard what has come in so far."""
+
+    def close(self) -> None:
+        """Release the port."""
+
+
+def open_line(port: str, baudrate: int, timeout_s: float) -> SerialPort:
+    """Open a serial port for this program alone; a read waits `timeout_s` seconds at most.
+
+    Raises:
+        ServoSetupError: there is no such port, it may not be used, or somebody else uses it.
+    """
+    try:
+        line = serial.Serial(
+            port, baudrate, timeout=timeout_s, write_timeout=timeout_s, exclusive=True
+        )
+    except (*PORT_ERRORS, ValueError) as error:
+        raise ServoSetupError(
+            f"the serial port cannot be opened ({error})",
+            where=port,
+            remedy="Check that the device exists, that this user is in the group dialout, that no "
+            "other program has it open, and the baud rate",
+        ) from error
+    # Saves up to 15 ms per read on FTDI adapters (hardware.md 5.2); others refuse, and need not.
+    with contextlib.suppress(ValueError):
+        line.set_low_latency_mode(True)
+    return line
+
+
+def latency_timer_ms(port: str, sysfs: Path = SYSFS) -> int | None:
+    """The latency timer of the adapter at `port`, in milliseconds; None if it has none.
+
+    Only USB adapters with an FTDI chip have one. `port` may be a link, as those in
+    /dev/serial/by-id are.
+    """
+    try:
+        return int((sysfs / Path(port).resolve().name / "latency_timer").read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def latency_remark(port: str, sysfs: Path = SYSFS) -> str | None:
+    """What is wrong with the latency timer of `port`, and the remedy; None if nothing is."""
+    timer_ms = latency_timer_ms(port, sysfs)
+    if timer_ms is None or timer_ms <= LATENCY_MS:
+        return None
+    return (
+        f"{port}: the adapter holds every answer of the servo back for {timer_ms} ms (its latency "
+        f"timer); expected {LATENCY_MS} ms. Put this line into /etc/udev/rules.d/99-servo.rules "
+        'and plug the adapter in again: ACTION=="add", SUBSYSTEM=="usb-serial", '
+        f'DRIVER=="ftdi_sio", ATTR{{latency_timer}}="{LATENCY_MS}"'
+    )
