@@ -10,12 +10,13 @@ and then. Before it is believed again its coefficients are read: it may be anoth
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from devices.budget import BusTiming, check_broadcast, frame_s
 from devices.bus_recovery import BusRecovery
 from devices.bus_watch import BusWatch
 from devices.clock import Clock
-from devices.conversion_watch import LOOK_FRAMES, ConversionWatch
+from devices.conversion_watch import ConversionWatch
 from devices.errors import (
     BusMisuseError,
     BusSetupError,
@@ -34,6 +35,9 @@ from devices.tile_ports import TilePorts
 
 AUDIT_NS = 1_000_000_000
 """The muxes' control registers are read back so often."""
+
+_LOOK_FRAMES, _LOOK_PART = 10, 0.008
+"""In one of so many frames, and for no more than this part of the time, a tile is read again."""
 
 _BUDGET_PART = 8
 _BUDGET_MIN_NS = 500_000
@@ -100,15 +104,21 @@ class TileArray:
         )
         self._schedule = SCHEDULES[schedule]
         self._audit_due_ns = clock.now_ns() + AUDIT_NS
-        # Where a tile is started anew as soon as it was read, there is nothing to look at again.
-        self._looks_again = schedule != "pipelined" and len(tiles) > 1
+        self._turns_ns = _turns_ns(timing)
         self._waits_for_slow_ones = schedule != "pipelined" or len(tiles) == 1
         self._temperature_every = temperature_every
         self._beside = beside
         self._frame_ns = round(frame_s(schedule, timing) * 1e9)
+        # Where a tile is started anew as soon as it was read, there is nothing to look at again.
+        self._look_frames = 0
+        if schedule != "pipelined" and len(tiles) > 1:
+            look_ns = (timing.select_s + timing.read_s) * 1e9
+            self._look_frames = max(_LOOK_FRAMES, round(look_ns / (_LOOK_PART * self._frame_ns)))
         self._budget_ns = max(_BUDGET_MIN_NS, self._frame_ns // _BUDGET_PART)
         self._started_ns = [clock.now_ns()] * len(tiles)
         self._running = [False] * len(tiles)
+        self._words = [(NOT_READ, NOT_READ)] * len(tiles)
+        self._busy_since_ns = 0
         self._frames = 0
 
     @property
@@ -156,19 +166,45 @@ class TileArray:
     # What schedules are made of
 
     def convert(self, scan: Scan, tiles: Sequence[int]) -> None:
-        """Start a conversion in all `tiles` at once."""
-        if len(tiles) == 1:
-            if self._running[tiles[0]]:
-                return  # of a slow part, which is not waited for and not to be disturbed
-            if not self.health[tiles[0]].present:
-                self._started_ns[tiles[0]] = self._clock.now_ns()
-                return
-        started = self._attempt(scan, tiles, lambda: self._ports.convert(tiles))
+        """Start a conversion in all `tiles` at once; whoever is lost is left out."""
+        if len(tiles) == 1 and self._running[tiles[0]]:
+            return  # of a slow part, which is not waited for and not to be disturbed
+        if self._look_frames and self._frames % self._look_frames == self._look_frames - 1:
+            self._look_again(scan, tiles)
+        called = self._worth_calling(tiles)
+        while called and not self._attempt(scan, called, partial(self._ports.convert, called)):
+            # One mux that does not answer must not keep the others from being started.
+            silent = self._ports.router.refused
+            gone = [i for i in called if silent in (None, self.tiles[i].mux)]
+            for i in gone:
+                scan.flag(i, TileStatus.NO_ANSWER)
+                self.health[i].lose(self._clock.now_ns())
+            called = () if scan.given_up else tuple(i for i in called if i not in gone)
         now_ns = self._clock.now_ns()
         for i in tiles:
             self._started_ns[i] = now_ns
             # One that is not known to be there may have missed a broadcast.
-            self._running[i] = started and self.health[i].present
+            self._running[i] = i in called and self.health[i].present
+
+    def _worth_calling(self, tiles: Sequence[int]) -> tuple[int, ...]:
+        """Those behind a mux of which anybody is present: a broadcast names muxes, not tiles."""
+        if all(self.health[i].present for i in tiles):
+            return tuple(tiles)
+        muxes = {self.tiles[i].mux for i in tiles if self.health[i].present}
+        return tuple(i for i in tiles if self.tiles[i].mux in muxes)
+
+    def close_ranks(self) -> None:
+        """Wait until all tiles can be read and started anew one right after the other.
+
+        A tile that was read late once, because another one was asked twice, would stay late for
+        ever: its samples would drift away from those of the others.
+        """
+        due_ns = 0
+        for i in self.indices:
+            if self._running[i] and (self._waits_for_slow_ones or not self.health[i].slow):
+                ready_ns = self._started_ns[i] + self._watch.wait_ns[i]
+                due_ns = max(due_ns, ready_ns - self._turns_ns[i])
+        self._clock.sleep_until_ns(due_ns)
 
     def collect(self, scan: Scan, tile: int) -> None:
         """Read the conversion of a tile as soon as it is finished."""
@@ -197,10 +233,12 @@ class TileArray:
 
         answers = self._attempt(scan, [tile], transfers)
         self._running[tile] = False
+        self._words[tile] = words
         if answers:
             may_ask = self._may_spend(scan, tile)
             self._judge.judge(scan, tile, words, with_temperature=with_temperature, may_ask=may_ask)
         else:
+            scan.flag(tile, TileStatus.NO_ANSWER)
             health.lose(self._clock.now_ns())
 
     # What becomes of a transfer
@@ -208,7 +246,7 @@ class TileArray:
     def _attempt(self, scan: Scan, tiles: Sequence[int], transfers: Callable[[], None]) -> bool:
         """Run `transfers` for `tiles`, a second time if the frame's budget allows."""
         for attempt in range(2):
-            begin_ns = self._clock.now_ns()
+            self._busy_since_ns = self._clock.now_ns()
             try:
                 if scan.given_up:
                     break
@@ -217,7 +255,7 @@ class TileArray:
                 raise
             except NoAcknowledgeError:
                 self._ports.forget(tiles)
-                scan.budget_ns -= self._clock.now_ns() - begin_ns
+                scan.budget_ns -= self._clock.now_ns() - self._busy_since_ns
             except I2cError:
                 self._ports.router.forget()
                 scan.note_bus_fault()
@@ -228,8 +266,6 @@ class TileArray:
                 return True
             if not self._may_spend(scan, tiles[0]):
                 break
-        for i in tiles:
-            scan.flag(i, TileStatus.NO_ANSWER)
         return False
 
     def _may_spend(self, scan: Scan, tile: int) -> bool:
@@ -247,29 +283,20 @@ class TileArray:
             self._clock.sleep_until_ns(scan.reference_ns)
             scan.reference_n = self._beside()
         self._clock.sleep_until_ns(ready_ns)
+        self._busy_since_ns = self._clock.now_ns()  # who waits spends nothing
 
     def _look_for(self, scan: Scan, tile: int) -> None:
         """See whether a tile that was lost is back; its sample comes with the next frame."""
         health = self.health[tile]
         begin_ns = self._clock.now_ns()
         scan.flag(tile, TileStatus.IMPLAUSIBLE if health.replaced else TileStatus.NO_ANSWER)
-        if health.replaced or not health.is_probe_due(begin_ns):
-            return
-        if not self._may_spend(scan, tile):
+        if not health.is_probe_due(begin_ns) or not self._may_spend(scan, tile):
             return
         try:
-            self._ports.connect(tile)
-            if self._ports.read_coefficients() == health.coefficient_bytes:
+            if self._is_itself(tile):
                 health.find()
-            elif self._ports.read_coefficient_words(tile) == health.coefficient_words:
-                health.find()  # the first reading was disturbed
-            elif self._ports.router.silent:
-                # Perhaps two tiles at once: a mux that could not be closed may connect another.
-                self._ports.router.forget()
-                health.lose(self._clock.now_ns())
             else:
-                # Three times the same and plausible: a part, but not the one that was here.
-                health.replaced = True
+                health.lose(self._clock.now_ns())
         except (BusMisuseError, BusSetupError):
             raise
         except TileSetupError:
@@ -281,6 +308,26 @@ class TileArray:
         except I2cError:
             scan.note_bus_fault()
         scan.budget_ns -= self._clock.now_ns() - begin_ns
+
+    def _is_itself(self, tile: int) -> bool:
+        """Do its coefficients say so? If another part's do, it is noted as replaced."""
+        health = self.health[tile]
+        self._ports.connect(tile)
+        if self._ports.read_coefficients() == health.coefficient_bytes:
+            health.replaced = False
+            return True
+        # A disturbed bit, in the reading or in the select before it, must not make another part.
+        words = set()
+        for _ in range(2):
+            self._ports.router.forget()
+            self._ports.connect(tile)
+            words.add(self._ports.read_coefficient_words(tile))
+        if words == {health.coefficient_words}:
+            health.replaced = False
+            return True
+        # Each of them three times the same and plausible: a part, but not the one that was here.
+        health.replaced = len(words) == 1 and not self._ports.router.silent
+        return False
 
     # Frame by frame
 
@@ -302,8 +349,6 @@ class TileArray:
             if now_ns >= self._audit_due_ns:
                 self._audit_due_ns = now_ns + AUDIT_NS
                 self._ports.router.audit()
-            if self._looks_again and self._frames % LOOK_FRAMES == 0:
-                self._watch.look_again([*zip(scan.padc, scan.tadc, strict=True)])
             tile = self._watch.to_try()
             if tile is not None:
                 self._watch.try_conversion(tile)
@@ -316,12 +361,28 @@ class TileArray:
         except I2cError:
             scan.note_bus_fault()
 
+    def _look_again(self, scan: Scan, tiles: Sequence[int]) -> None:
+        """Before they are started anew: was what was read of one of them its final result?"""
+        tile = self._frames // self._look_frames % len(self.tiles)
+        if tile not in tiles:
+            return
+        if not self.health[tile].present or self._running[tile] or self._words[tile][0] == NOT_READ:
+            return
+        try:
+            self._watch.look_again(tile, self._words[tile])
+        except (BusMisuseError, BusSetupError):
+            raise
+        except NoAcknowledgeError:  # reading it will tell
+            self._ports.forget([tile])
+        except I2cError:
+            scan.note_bus_fault()
+
     def _conclude(self, scan: Scan) -> None:
         """What this frame says of the tiles' freshness and of the bus."""
         for i, health in enumerate(self.health):
             if health.is_stale(scan.padc[i], scan.tadc[i]):
                 scan.flag(i, TileStatus.STALE)
-                if health.has_just_gone_stale:
+                if health.wants_trial:
                     self._watch.suspect(i)
             if scan.status[i]:
                 health.note(scan.status[i])
@@ -332,3 +393,15 @@ class TileArray:
         if scan.given_up:
             self.bus.fall()
             self._running = [False] * len(self.tiles)
+
+
+def _turns_ns(timing: BusTiming) -> tuple[int, ...]:
+    """From the begin of a pipelined frame to each tile's read, if none of them has to wait."""
+    turns_ns = []
+    t_s, alone = 0.0, len(timing.muxes) == 1
+    for i, mux in enumerate(timing.muxes):
+        leaves = mux != timing.muxes[i - 1]  # the first tile comes after the last one
+        t_s += 0.0 if alone else (1 + leaves) * timing.select_s
+        turns_ns.append(int(t_s * 1e9))
+        t_s += timing.read_s + timing.convert_s
+    return tuple(turns_ns)

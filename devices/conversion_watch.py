@@ -10,8 +10,6 @@ from devices.health import TileHealth
 from devices.mpl115a2 import CONVERSION_MAX_NS
 from devices.tile_ports import TilePorts
 
-LOOK_FRAMES = 10
-"""In one of so many frames a tile is read once more at the frame's end."""
 SLOW_AUDIT_NS = 500_000_000
 """A part that was found to be slow is tried so often, to notice when it no longer is."""
 
@@ -44,21 +42,19 @@ class ConversionWatch:
         self._measured_ns = tuple(measured_ns)
         self._suspects: list[int] = []
         self._slow_due_ns = 0
-        self._looks = 0
+        self._tries = 0
 
-    def look_again(self, words: Sequence[tuple[int, int]]) -> None:
-        """Read one tile after another again, at the end of a frame that gave `words`.
+    def look_again(self, tile: int, words: tuple[int, int]) -> None:
+        """Read a tile again that gave `words` and was not started since.
 
         Raises:
             I2cError: it does not answer.
         """
-        self._looks += 1
-        tile = self._looks % len(words)
-        if not self._health[tile].present or self._health[tile].slow:
+        if self._health[tile].slow:
             return
         self._ports.connect(tile)
         padc, tadc = self._ports.read(with_temperature=True)
-        if padc != words[tile][0] or words[tile][1] not in (tadc, NOT_READ):
+        if padc != words[0] or words[1] not in (tadc, NOT_READ):
             self.suspect(tile)
 
     def suspect(self, tile: int) -> None:
@@ -74,8 +70,8 @@ class ConversionWatch:
         slow = [i for i, health in enumerate(self._health) if health.slow and health.present]
         if slow and now_ns >= self._slow_due_ns:
             self._slow_due_ns = now_ns + SLOW_AUDIT_NS
-            self._looks += 1
-            return slow[self._looks % len(slow)]
+            self._tries += 1
+            return slow[self._tries % len(slow)]
         return None
 
     def try_conversion(self, tile: int) -> None:
@@ -87,13 +83,14 @@ class ConversionWatch:
             I2cError: it does not answer.
         """
         health = self._health[tile]
-        # A disturbed bit looks like a late conversion once, but not again.
-        late = [self._is_late(tile) for _ in range(_TRIES)]
-        if all(late) and not health.slow:
+        # A disturbed bit looks like a late conversion, but not twice; two results are equal by
+        # chance, but not three times.
+        late = sum(self._is_late(tile) for _ in range(_TRIES))
+        if late > 1 and not health.slow:
             health.slow = True
             self.wait_ns[tile] = max(self._measured_ns[tile], CONVERSION_MAX_NS)
             self._slow_due_ns = self._clock.now_ns() + SLOW_AUDIT_NS
-        elif not any(late) and health.slow:
+        elif not late and health.slow:
             health.slow = False
             self.wait_ns[tile] = self._measured_ns[tile]
 

@@ -25,6 +25,7 @@ STALE_EVIDENCE = 20
 readings one in nine is equal to its neighbour, so ten in a row come once in 10^9; with noise that
 is correlated over 10 ms once in 10^6."""
 
+_TRIAL_EVERY = 256
 _IMPOSSIBLE_TADC = (0, COUNTS_MAX)
 _FIRST_PROBE_NS = 2_000_000
 _PROBES_NS = 1_000_000_000
@@ -137,9 +138,9 @@ class TileHealth:
         return self._stale_evidence >= STALE_EVIDENCE
 
     @property
-    def has_just_gone_stale(self) -> bool:
-        """Is this the first of its stale readings?"""
-        return STALE_EVIDENCE <= self._stale_evidence < STALE_EVIDENCE + 2
+    def wants_trial(self) -> bool:
+        """Of its stale readings the first, and then one now and then, calls for a look at why."""
+        return 0 <= (self._stale_evidence - STALE_EVIDENCE) % _TRIAL_EVERY < 2
 
     def _median(self) -> int:
         return sorted(self._recent)[_RECENT // 2]

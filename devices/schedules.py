@@ -37,6 +37,7 @@ def pipelined(array: TileArray, scan: Scan) -> None:
     While one tile converts, the others are served, so that the wait costs nothing but for the
     first. Tiles are sampled one after another; every tile's own instant goes with its sample.
     """
+    array.close_ranks()
     for tile in array.indices:
         array.collect(scan, tile)
         array.convert(scan, [tile])

@@ -49,6 +49,8 @@ class MuxRouter:
         self._muxes = {address: Tca9548a(bus, address) for address in sorted(set(addresses))}
         self._masks: dict[int, int | None] = dict.fromkeys(self._muxes)
         self._refusals = dict.fromkeys(self._muxes, 0)
+        self.refused: int | None = None
+        """The mux that did not acknowledge in the last `connect`; None if all did."""
         self.silent: set[int] = set()
         """Muxes that did not let themselves be closed. They are taken to be without supply, which
         connects nothing; whoever reads a tile of another mux has to make sure of that."""
@@ -67,6 +69,7 @@ class MuxRouter:
             I2cError: a mux did not answer. One that refuses to be closed twice in a row is
                 `silent` from then on, and in nobody's way.
         """
+        self.refused = None
         for address, mask in self._masks.items():
             if mask != 0 and not masks.get(address):
                 self._close(address)
@@ -139,7 +142,9 @@ class MuxRouter:
 
     def _write(self, address: int, mask: int) -> None:
         self._masks[address] = None  # until the STOP nobody knows
+        self.refused = address
         self._muxes[address].write_mask(mask)
+        self.refused = None
         self._masks[address] = mask
         self._refusals[address] = 0
         self.silent.discard(address)

@@ -17,7 +17,6 @@ from devices.mpl115a2 import CONVERSION_MAX_NS, CONVERSION_TYPICAL_NS
 from devices.scene import ArrayScene, Scene, ScheduleName, TileScene
 from devices.self_test import Plug, find_tiles, measure_conversion_ns, measure_wires
 
-NOMINAL_HZ = 400_000.0
 _AS_ASKED = 0.95
 _PI_TRAP = 0.625  # core clock 250 MHz where the kernel believes in 400 MHz (hardware.md 3.2)
 _PI_TRAP_WITHIN = 0.03

@@ -33,7 +33,7 @@ class FrontEnd:
     """Samples one dome: a `Sense` for the emulated chip.
 
     Before `begin` its dome is at rest at the scene's first instant. Fault `over_range`: it is
-    pressed 45 kPa harder, past the end of its counts.
+    pressed 45 kPa harder, past its range; most wrap.
     """
 
     def __init__(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,11 +13,12 @@ from rich.table import Table
 from devices.clock import Clock, SystemClock, VirtualClock
 from devices.errors import UsageError
 from devices.i2c import I2cBus, open_bus
-from devices.scene import EMULATED, Scene, load_scene
+from devices.scene import EMULATED, Scene, ServoScene, load_scene
 from service.cli.options import JsonOption, print_json, progress, say, stdout
 
 if TYPE_CHECKING:
     from service.doctor import Diagnosis
+    from service.servo_doctor import ServoDiagnosis
 
 _EMULATED_SCENE = "standing"
 
@@ -32,16 +34,22 @@ def doctor_command(
     rate_hz: Annotated[
         float, typer.Option(min=0.0, help="Frames a second wanted; 0: the scene's, or the most.")
     ] = 0.0,
+    servo: Annotated[
+        str | None,
+        typer.Option(help="Serial port of a servo, emulated, or none; default: the scene's."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the tiles of a bus, measure it, and say what rate it will hold and what to change.
 
     Looks behind every multiplexer, reads each tile's coefficients three times, measures the bus
-    clock and every part's conversion time, and predicts the frame rate of every schedule. An
-    emulated bus is examined in virtual time. Exit codes: 0 all is well, 1 nothing works, 2 wrong
-    usage, 3 something has to be changed.
+    clock and every part's conversion time, and predicts the frame rate of every schedule. With a
+    servo, asks for it in both protocols at the usual baud rates. An emulated bus is examined in
+    virtual time. Exit codes: 0 all is well, 1 nothing works, 2 wrong usage, 3 something has to be
+    changed.
     """
     from service.doctor import diagnose
+    from service.servo_doctor import diagnose_servo
 
     the_scene = load_scene(scene) if scene is not None else None
     name = bus or (the_scene.array.bus if the_scene is not None else None)
@@ -53,14 +61,38 @@ def doctor_command(
         opened, clock = _open(name, the_scene)
         stack.callback(opened.close)
         diagnosis = diagnose(opened, clock, the_scene, asked_hz=rate_hz)
+    wanted = the_scene.servo if the_scene is not None else None
+    port = servo or (wanted.port if wanted is not None else "none")
+    found = None
+    if port != "none":
+        with ExitStack() as stack, progress(f"asking for a servo at {port}"):
+            opened_port = port
+            if port == EMULATED:
+                opened_port = stack.enter_context(_emulated_servo(the_scene, wanted))
+            found = diagnose_servo(opened_port, SystemClock(), wanted)
     if as_json:
-        print_json(_as_json(name, diagnosis))
+        print_json(_as_json(name, diagnosis, port, found))
     else:
         _print(name, diagnosis, the_scene)
+        if found is not None:
+            say(f"Servo at {port}: {found.verdict}")
     if diagnosis.scl_hz is None:
         raise typer.Exit(1)
-    if not diagnosis.holds:
+    if not diagnosis.holds or (found is not None and not found.is_well):
         raise typer.Exit(3)
+
+
+@contextmanager
+def _emulated_servo(scene: Scene | None, wanted: ServoScene | None) -> Iterator[str]:
+    if scene is None or wanted is None:
+        raise UsageError(
+            "an emulated servo for a scene without servo", remedy="Add --scene rolling"
+        )
+    from devices.emulation.world import World
+
+    clock = SystemClock()
+    with World(scene, clock).servo(wanted, clock) as emulated:
+        yield emulated.port
 
 
 def _open(name: str, scene: Scene | None) -> tuple[I2cBus, Clock]:
@@ -75,7 +107,9 @@ def _open(name: str, scene: Scene | None) -> tuple[I2cBus, Clock]:
     return open_bus(name, world.i2c_adapter), clock
 
 
-def _as_json(name: str, diagnosis: Diagnosis) -> dict[str, object]:
+def _as_json(
+    name: str, diagnosis: Diagnosis, port: str, servo: ServoDiagnosis | None
+) -> dict[str, object]:
     return {
         "bus": name,
         "tiles": [asdict(tile) for tile in diagnosis.tiles],
@@ -86,6 +120,7 @@ def _as_json(name: str, diagnosis: Diagnosis) -> dict[str, object]:
         "schedule": diagnosis.schedule,
         "holds": diagnosis.holds,
         "verdict": diagnosis.verdict,
+        "servo": None if servo is None else {**asdict(servo), "port": port},
     }
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import get_args
 
-import pytest
 from smbus2 import i2c_msg
 
 from devices.array import TileArray
@@ -33,13 +32,10 @@ SETTLED = 3
 """Frames after which every tile has the history that a reading is compared with."""
 
 
-def known_bug(*schedules: ScheduleName, reason: str) -> list[object]:
-    """All schedules as parameters; of these the test is known to fail, and will say when not."""
-    mark = pytest.mark.xfail(strict=True, reason=f"BUG in devices: {reason}")
-    return [pytest.param(name, marks=mark) if name in schedules else name for name in SCHEDULES]
-
-
 Words = tuple[int, int, int, int]
+LOOK_FRAMES = 10
+"""In one of so many frames a tile is read once more before it is started anew."""
+
 Plugs = tuple[tuple[int, int], ...]
 ONE: Plugs = ((0x70, 0),)
 FOUR: Plugs = ((0x70, 0), (0x70, 1), (0x70, 2), (0x70, 3))

@@ -24,7 +24,7 @@ from devices.frames import NOT_READ, FrameBatch, FrameStatus, TileStatus
 from devices.i2c import open_bus
 from devices.scene import BusFault, FaultKind, MuxFault, ScheduleName, TileFault, build_scene
 from devices.startup import make_ready
-from tests.devices.rigs import FOUR, SCHEDULES, Plugs
+from tests.devices.rigs import FOUR, SCHEDULES, TWO_MUXES, Plugs
 
 BEGIN_S, LENGTH_S, RECOVERED_S, RUN_S = 0.7, 0.4, 1.2, 2.6
 END_S = BEGIN_S + LENGTH_S
@@ -76,7 +76,7 @@ def run(
     schedule: ScheduleName,
     kind: FaultKind | None,
     *,
-    plugs: Plugs = FOUR,
+    plugs: Plugs | None = None,
     mux: int = 0x70,
     rate: float = 0.02,
     length_s: float = LENGTH_S,
@@ -84,6 +84,9 @@ def run(
     recovery: bool = False,
     temperature_every: int = 1,
 ) -> Run:
+    if plugs is None:
+        # Mux by mux needs two of them; but then one without supply is no fault of the bus.
+        plugs = TWO_MUXES if schedule == "per_mux" and kind != "brown_out" else FOUR
     fault: dict[str, Any] = {"kind": kind, "t_s": BEGIN_S, "duration_s": length_s}
     if kind in get_args(TileFault):
         fault["tile"] = f"T{BAD + 1:02d}"
@@ -126,31 +129,17 @@ def run(
     # What the very first frame holds was converted before the witness came.
     frames = frames.rows(1, len(frames))
     verdict = witness.judge(frames, ready.tiles)
-    return Run(frames, verdict, (frames.t_mono_ns - begin_ns) * 1e-9, ready.array)
+    t_s = np.asarray((frames.t_mono_ns - begin_ns) * 1e-9, dtype=np.float64)
+    return Run(frames, verdict, t_s, ready.array)
 
 
 every_schedule = pytest.mark.parametrize("schedule", SCHEDULES)
 
 
-def cases(
-    kinds: list[FaultKind], bugs: dict[tuple[ScheduleName, FaultKind], str] | None = None
-) -> pytest.MarkDecorator:
-    """All schedules and kinds, of which some are known to fail."""
+def cases(kinds: list[FaultKind]) -> pytest.MarkDecorator:
+    """All schedules and kinds."""
     return pytest.mark.parametrize(
-        ("schedule", "kind"),
-        [
-            pytest.param(
-                schedule,
-                kind,
-                marks=[
-                    pytest.mark.xfail(strict=True, reason=f"BUG in devices: {reason}")
-                    for (bug_schedule, bug_kind), reason in (bugs or {}).items()
-                    if (bug_schedule, bug_kind) == (schedule, kind)
-                ],
-            )
-            for schedule in SCHEDULES
-            for kind in kinds
-        ],
+        ("schedule", "kind"), [(schedule, kind) for schedule in SCHEDULES for kind in kinds]
     )
 
 
@@ -160,13 +149,6 @@ GONE: list[FaultKind] = ["no_answer", "unplugged", "replaced", "all_ones"]
 STUCK: list[FaultKind] = ["sda_low", "sda_high", "scl_low", "brown_out"]
 """A bus, or the only mux on it, of which nothing can be known."""
 BY_CHANCE: list[FaultKind] = ["adapter_timeout", "nack_storm", "bit_errors"]
-
-NO_BUS_FAULT = "tiles whose CONVERT is not acknowledged stay `present`, so the bus is not looked at"
-FALSELY_REPLACED = (
-    "a bit error in the select of a mux makes three equal readings of another tile's coefficients, "
-    "and the tile is taken to be replaced for ever"
-)
-
 
 # A healthy foot
 
@@ -199,13 +181,7 @@ def test_what_the_bus_shows_is_never_passed_on_as_a_number(
     assert not run(schedule, kind).verdict.wrong.any()
 
 
-@cases(
-    [kind for kind in KINDS if kind != "replaced"],
-    {
-        ("simultaneous", "bit_errors"): FALSELY_REPLACED,
-        ("per_mux", "bit_errors"): FALSELY_REPLACED,
-    },
-)
+@cases([kind for kind in KINDS if kind != "replaced"])
 def test_a_foot_recovers_by_itself_within_1_2_s(schedule: ScheduleName, kind: FaultKind) -> None:
     one = run(schedule, kind)
     assert one.recovered.sum() > 25
@@ -309,21 +285,23 @@ def test_a_slow_part_is_noticed_by_its_repeats_if_it_is_read_as_soon_as_it_may_b
     assert one.verdict.right[one.during, BAD][20:][given[20:]].all()
 
 
-@pytest.mark.parametrize("schedule", ["simultaneous", "per_mux", "sequential"])
-def test_a_slow_part_in_a_schedule_that_waits_is_noticed_when_its_turn_of_the_audit_comes(
+@pytest.mark.parametrize("schedule", ["simultaneous", "sequential"])
+def test_a_slow_part_in_a_schedule_that_waits_is_noticed_by_a_second_look(
     schedule: ScheduleName,
 ) -> None:
-    # Read after equally long each time, it gives the conversion before, and nothing shows.
-    one = run(schedule, "slow", length_s=6.0, seconds=9.0)
-    audited_s = BEGIN_S + 4 * 1.05 + EDGE_S
-    late = one.within(audited_s, BEGIN_S + 6.0 - EDGE_S)
-    assert late.sum() > 80
-    assert one.verdict.right[late].all(), "four tiles, one a second"
+    # Read after equally long each time, it gives the conversion before, and nothing shows: but read
+    # again at the end of the frame it gives another one. One tile in one frame of ten is; a look
+    # sees it in eight cases of nine, and a trial confirms it in seven of ten.
+    one = run(schedule, "slow", length_s=4.0, seconds=6.5)
+    frame_s = 1 / one.rate_hz(one.before)
+    late = one.within(BEGIN_S + 6 * 40 * frame_s + EDGE_S, BEGIN_S + 4.0 - EDGE_S)
+    assert late.sum() > 50
+    assert one.verdict.right[late].all()
     assert one.rate_hz(late) < one.rate_hz(one.before)
     wrong = one.verdict.wrong[:, BAD]
     assert wrong.any()
     assert np.nanmedian(one.verdict.error_kpa[wrong, BAD]) < 0.5
-    healed = one.within(BEGIN_S + 6.0 + RECOVERED_S, 9.0)
+    healed = one.within(BEGIN_S + 4.0 + RECOVERED_S, 6.5)
     assert one.verdict.right[healed].all()
     assert one.rate_hz(healed) >= 0.98 * one.rate_hz(one.before)
 
@@ -331,13 +309,7 @@ def test_a_slow_part_in_a_schedule_that_waits_is_noticed_when_its_turn_of_the_au
 # The bus
 
 
-@cases(
-    STUCK,
-    {
-        ("sequential", "sda_high"): NO_BUS_FAULT,
-        ("sequential", "brown_out"): NO_BUS_FAULT,
-    },
-)
+@cases(STUCK)
 def test_a_stuck_bus_is_a_fault_of_the_bus_in_every_frame(
     schedule: ScheduleName, kind: FaultKind
 ) -> None:
@@ -422,32 +394,17 @@ EIGHT: Plugs = tuple((mux, channel) for mux in (0x70, 0x71) for channel in range
 
 
 @pytest.mark.parametrize("mux", [0x70, 0x71])
-@pytest.mark.parametrize(
-    "schedule",
-    [
-        pytest.param(
-            "simultaneous",
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="BUG in devices: a broadcast fails as a whole if one mux is silent, frame "
-                "after frame, so that the tiles of the other mux are lost too",
-            ),
-        ),
-        "pipelined",
-        "per_mux",
-        "sequential",
-    ],
-)
+@every_schedule
 def test_tiles_of_the_other_mux_go_on_while_one_is_without_supply(
     schedule: ScheduleName, mux: int
 ) -> None:
     one = run(schedule, "brown_out", plugs=EIGHT, mux=mux)
     dark = [i for i, (address, _) in enumerate(EIGHT) if address == mux]
     lit = [i for i in range(8) if i not in dark]
-    assert not one.verdict.given[np.ix_(one.during, dark)].any()
+    assert not one.verdict.given[one.during][:, dark].any()
     assert not one.verdict.wrong.any()
     begun = one.within(BEGIN_S + 0.1, END_S - EDGE_S)
-    assert one.verdict.right[np.ix_(begun, lit)].mean() > 0.99
+    assert one.verdict.right[begun][:, lit].mean() > 0.99
     assert (one.frames.frame_status[begun] & FrameStatus.BUS_FAULT == 0).all()
     assert one.verdict.right[one.recovered].all()
 

@@ -125,6 +125,9 @@ class Script:
             for i, value in enumerate(bytes.fromhex(answer)):
                 i2c_msgs[-1].buf[i] = value
 
+    def set_timeout(self, units_10ms: int) -> None:
+        pass
+
     def close(self) -> None:
         pass
 

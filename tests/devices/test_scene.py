@@ -63,7 +63,7 @@ def test_a_built_in_scene_loads_under_its_own_name(name: str) -> None:
 def test_standing_has_four_tiles_of_the_typical_conversion_time() -> None:
     standing = load_scene("standing")
     assert len(standing.tile) == 4
-    assert (standing.array.conversion_ms, standing.array.wait_ms) == (1.6, 1.6)
+    assert (standing.array.conversion_ms, standing.array.wait_ms) == (1.6, None)
     assert standing.array.scl_hz == 400_000
 
 

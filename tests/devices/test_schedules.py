@@ -98,7 +98,7 @@ def steady_ns(schedule: ScheduleName, plugs: Plugs, scl_hz: int, every: int = 1)
     array = settled(wires, schedule, temperature_every=every)
     for _ in range(2):
         array.scan()
-    (common, count), *_ = Counter(timed_scan(array, wires)[1] for _ in range(6)).most_common(1)
+    (common, count), *_ = Counter(timed_scan(array, wires)[1] for _ in range(9)).most_common(1)
     assert count >= 4
     return common
 
@@ -345,9 +345,9 @@ def test_a_broadcast_reaches_the_tiles_of_the_scene_and_no_other_channel() -> No
     assert masks == [{0x70: 0b100001, 0x73: 0b11}] * 3
 
 
-@settings(max_examples=40, deadline=None)
+@every_schedule
+@settings(max_examples=15, deadline=None)
 @given(
-    schedule=st.sampled_from(SCHEDULES),
     plugs=plugs_drawn,
     tc_ns=st.lists(st.integers(1_200_000, 3_000_000), min_size=20, max_size=20),
     scl_hz=st.sampled_from([400_000, 100_000]),
@@ -376,9 +376,9 @@ def test_no_read_begins_before_its_parts_conversion_is_finished(
 
     wires.on_transaction = before
     array = array_on(wires, schedule)
-    for _ in range(5):
+    for _ in range(21):  # some of them with a second look at a tile
         array.scan()
-    assert reads >= 4 * len(plugs)
+    assert reads >= 20 * len(plugs)
 
 
 @pytest.mark.parametrize("mode", ["stale", "abort", "torn"])

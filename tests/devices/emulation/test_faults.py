@@ -58,13 +58,21 @@ def test_it_has_struck_if_it_was_there_at_any_instant_since(
     assert fault.struck(since_ns, t_ns) == any(t in covered for t in range(since_ns, t_ns + 1))
 
 
-def test_before_a_scene_begins_nothing_fails() -> None:
+def test_what_fails_from_the_first_instant_on_has_failed_before() -> None:
     faults = Faults([of_tile("stale", "T01", 0.0, 9.0)])
+    assert faults.of("stale", "T01")(1)
+    faults.begin(EPOCH_NS)
+    assert faults.of("stale", "T01")(EPOCH_NS)
+    assert not faults.of("stale", "T01")(EPOCH_NS + 9 * S)
+
+
+def test_before_a_scene_begins_nothing_else_fails() -> None:
+    faults = Faults([of_tile("stale", "T01", 0.001, 9.0)])
     assert faults.possible
     fault = faults.of("stale", "T01")
     assert not fault(EPOCH_NS)
     faults.begin(EPOCH_NS)
-    assert fault(EPOCH_NS)
+    assert fault(EPOCH_NS + 1_000_000)
     # And whoever asks for it only now gets the same one.
     assert faults.of("stale", "T01") is fault
 

@@ -18,6 +18,7 @@ from devices.clock import VirtualClock
 from devices.dynamixel import open_servo
 from devices.emulation.parts import draw_chip, draw_dome
 from devices.emulation.world import World
+from devices.errors import TileSetupError
 from devices.frames import TileInfo
 from devices.i2c import I2cBus, open_bus
 from devices.mpl115a2 import Coefficients, compensate_kpa, padc_of_kpa
@@ -352,7 +353,7 @@ def test_until_it_begins_all_is_as_at_its_first_instant(scene_of: SceneOf) -> No
 
 
 def test_faults_wait_for_the_scene_to_begin(scene_of: SceneOf) -> None:
-    fault = {"kind": "no_answer", "tile": "T01", "t_s": 0.0, "duration_s": 0.5}
+    fault = {"kind": "no_answer", "tile": "T01", "t_s": 1e-4, "duration_s": 0.5}
     world, array, clock = switched_on(scene_of(TWO, fault=[fault]), begun=False)
     assert array.scan().status == [0, 0]
     world.begin()
@@ -361,6 +362,12 @@ def test_faults_wait_for_the_scene_to_begin(scene_of: SceneOf) -> None:
     clock.sleep_until_ns(begin_ns + 3_000_000_000)
     assert array.scan().status == [1, 0], "it is looked for, and believed with the next frame"
     assert array.scan().status == [0, 0]
+
+
+def test_a_tile_that_fails_from_the_first_instant_on_is_not_found(scene_of: SceneOf) -> None:
+    fault = {"kind": "no_answer", "tile": "T02", "t_s": 0.0, "duration_s": 0.5}
+    with pytest.raises(TileSetupError, match="T02"):
+        switched_on(scene_of(TWO, fault=[fault]), begun=False)
 
 
 def test_the_bus_is_as_fast_as_the_core_clock_lets_it(scene_of: SceneOf) -> None:

@@ -1,0 +1,97 @@
+"""Does a part still keep the time it was measured to need?"""
+
+from __future__ import annotations
+
+import pytest
+
+from devices.conversion_watch import ConversionWatch
+from devices.errors import NoAcknowledgeError
+from devices.health import TileHealth
+from devices.tile_ports import TilePorts
+from tests.devices.rigs import FOUR, TYPICAL_NS, Wires
+
+LONGEST_NS = 3_000_000  # MPL115A2 data sheet, table 10
+
+
+def watched(wires: Wires) -> tuple[ConversionWatch, TilePorts, list[TileHealth]]:
+    ports = TilePorts(wires.bus, wires.infos)
+    health = [TileHealth(info) for info in wires.infos]
+    return ConversionWatch(ports, wires.clock, health, [TYPICAL_NS] * 4), ports, health
+
+
+def tried(watch: ConversionWatch, ports: TilePorts, tile: int) -> None:
+    ports.connect(tile)
+    watch.try_conversion(tile)
+
+
+def test_a_part_that_keeps_its_time_is_waited_for_as_measured() -> None:
+    watch, ports, health = watched(Wires(FOUR))
+    for tile in range(4):
+        tried(watch, ports, tile)
+    assert watch.wait_ns == [TYPICAL_NS] * 4
+    assert not any(one.slow for one in health)
+
+
+def test_a_slow_part_is_given_all_the_time_of_the_data_sheet_and_the_others_are_not() -> None:
+    wires = Wires(FOUR)
+    watch, ports, health = watched(wires)
+    with wires.fault("slow", "T03"):
+        for tile in range(4):
+            tried(watch, ports, tile)
+    assert watch.wait_ns == [TYPICAL_NS, TYPICAL_NS, LONGEST_NS, TYPICAL_NS]
+    assert [one.slow for one in health] == [False, False, True, False]
+
+
+def test_a_part_that_is_no_longer_slow_is_waited_for_as_measured_again() -> None:
+    wires = Wires(FOUR)
+    watch, ports, health = watched(wires)
+    with wires.fault("slow", "T03"):
+        tried(watch, ports, 2)
+    tried(watch, ports, 2)
+    assert watch.wait_ns == [TYPICAL_NS] * 4
+    assert not health[2].slow
+
+
+def test_a_reading_that_is_the_same_the_second_time_is_no_suspect() -> None:
+    wires = Wires(FOUR)
+    watch, ports, _ = watched(wires)
+    ports.convert([1])
+    wires.clock.sleep_until_ns(wires.clock.now_ns() + TYPICAL_NS)
+    words = ports.read(with_temperature=True)
+    watch.look_again(1, words)
+    assert watch.to_try() is None
+
+
+@pytest.mark.parametrize("words", [(11, 500), (10, 501)])
+def test_a_reading_that_has_changed_since_makes_a_suspect_once(words: tuple[int, int]) -> None:
+    wires = Wires(FOUR)
+    watch, ports, _ = watched(wires)
+    ports.convert([1])
+    wires.clock.sleep_until_ns(wires.clock.now_ns() + TYPICAL_NS)
+    watch.look_again(1, words)
+    watch.look_again(1, words)
+    assert watch.to_try() == 1
+    assert watch.to_try() is None
+
+
+def test_a_slow_part_is_tried_again_every_half_second() -> None:
+    wires = Wires(FOUR)
+    watch, ports, _ = watched(wires)
+    tried_ms = []
+    with wires.fault("slow", "T03"):
+        tried(watch, ports, 2)
+        begin_ns = wires.clock.now_ns()
+        for _ in range(2_500):
+            wires.clock.sleep_until_ns(wires.clock.now_ns() + 1_000_000)
+            if watch.to_try() == 2:
+                tried_ms.append((wires.clock.now_ns() - begin_ns) // 1_000_000)
+    assert len(tried_ms) == 5 or len(tried_ms) == 4
+    assert tried_ms[0] == pytest.approx(500, abs=2)
+
+
+def test_a_part_that_does_not_answer_is_somebody_elses_business() -> None:
+    wires = Wires(FOUR)
+    watch, ports, _ = watched(wires)
+    with wires.fault("no_answer", "T02"), pytest.raises(NoAcknowledgeError):
+        tried(watch, ports, 1)
+    assert watch.wait_ns == [TYPICAL_NS] * 4
