@@ -1,18 +1,17 @@
-"""Pace of acquisition in a thread beside a busy event loop, and in a process of its own.
+"""Pace of acquisition: a thread against a process, a plain sleep against one that ends in a spin.
 
     python benchmarks/acquisition_jitter.py [SECONDS]
 
-Both take frames of four tiles at 250 Hz with the real driver on the real clock. Beneath it is an
+All take frames of four tiles at 250 Hz with the real driver on the real clock. Beneath it is an
 adapter that sleeps as long as the wire would take, with Python's lock released, as the kernel's
-ioctl does, and gives constant words: an emulated world would take time of its own. Meanwhile an
-asyncio loop in the main process serves fifty clients JSON thirty times a second. The period error
-is the distance of two frames' instants from 4 ms.
+ioctl does: an emulated world would take time of its own. Meanwhile an asyncio loop in the main
+process serves fifty clients JSON thirty times a second. The period error is the distance of two
+frames' instants from 4 ms; CPU is that of the process that takes the frames.
 """
 
 from __future__ import annotations
 
 import asyncio
-import ctypes
 import json
 import multiprocessing
 import sys
@@ -21,63 +20,57 @@ import time
 from multiprocessing.connection import Connection
 
 import numpy as np
+from acquisition import FreeAdapter, scene_of
 from smbus2 import i2c_msg
 
 from devices.acquisition import Acquisition
-from devices.array import TileArray
-from devices.clock import SystemClock, UtcAnchor
-from devices.i2c import open_bus
+from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
+from devices.i2c import I2cBus
 from devices.realtime import sharpen_timers
-from devices.scene import load_scene
+from devices.startup import Ready, make_ready
 
 RATE_HZ = 250.0
 CLIENTS = 50
 SCL_HZ = 400_000
-COEFFICIENTS = bytes.fromhex("3ECEB3F9C51733C8")  # the data sheet's example part
-COUNTS = bytes.fromhex("66807EC0")
+
+Taken = tuple[list[int], float]
 
 
-class SleepingAdapter:
-    """Takes the time of the wire and answers every read with the same words."""
+class SleepingAdapter(FreeAdapter):
+    """Takes the time of the wire."""
 
     def i2c_rdwr(self, *messages: i2c_msg) -> None:
         """One transaction, in the time that the wire would take."""
         bits = sum(10 + 9 * message.len for message in messages) + 1
         end_ns = time.monotonic_ns() + bits * 1_000_000_000 // SCL_HZ
-        for message in messages:
-            if message.flags & 1:
-                words = COEFFICIENTS if message.len == len(COEFFICIENTS) else COUNTS
-                ctypes.memmove(message.buf, words[: message.len], message.len)
+        super().i2c_rdwr(*messages)
         SystemClock().sleep_until_ns(end_ns)
 
-    def close(self) -> None:
-        """Nothing to release."""
+
+def opened(clock: Clock) -> Ready:
+    """Four tiles on that adapter."""
+    scene = scene_of(4, SCL_HZ, 1.6)
+    array = scene.array.model_copy(update={"wait_ms": 1.6, "schedule": "simultaneous"})
+    adapter = SleepingAdapter(bytes.fromhex("3ECEB3F9C51733C8"))
+    return make_ready(I2cBus(adapter, "sleeping"), scene.model_copy(update={"array": array}), clock)
 
 
-def take(seconds: float) -> list[int]:
-    """Instants of the frames."""
+def take(seconds: float, *, spins: bool) -> Taken:
+    """Instants of the frames, and the share of a core that they took."""
     sharpen_timers()
-    clock = SystemClock()
-    scene = load_scene("standing")
-    array = TileArray(
-        open_bus("emulated", SleepingAdapter()),
-        scene.tile,
-        clock,
-        schedule="simultaneous",
-        wait_ms=scene.array.wait_ms,
-    )
-    tiles = array.identify()
+    clock = SpinningClock() if spins else SystemClock()
+    ready = opened(clock)
     anchor = UtcAnchor.now(clock_set=True)
-    acquisition = Acquisition(array, tiles, clock, anchor, rate_hz=RATE_HZ)
-    end_ns = clock.now_ns() + round(seconds * 1e9)
+    acquisition = Acquisition(ready.array, ready.tiles, clock, anchor, rate_hz=RATE_HZ)
+    begin_s, end_ns = time.thread_time(), clock.now_ns() + round(seconds * 1e9)
     t_ns: list[int] = []
     for batch in acquisition.run(lambda: clock.now_ns() >= end_ns):
         t_ns += batch.t_mono_ns.tolist()
-    return t_ns
+    return t_ns, (time.thread_time() - begin_s) / seconds
 
 
-def take_and_send(seconds: float, connection: Connection) -> None:
-    connection.send(take(seconds))
+def take_and_send(seconds: float, connection: Connection, spins: bool) -> None:
+    connection.send(take(seconds, spins=spins))
 
 
 async def busy(seconds: float) -> None:
@@ -93,38 +86,43 @@ async def busy(seconds: float) -> None:
     await asyncio.gather(*(client() for _ in range(CLIENTS)))
 
 
-def in_a_thread(seconds: float) -> list[int]:
-    taken: list[list[int]] = []
-    thread = threading.Thread(target=lambda: taken.append(take(seconds)))
+def in_a_thread(seconds: float, *, spins: bool) -> Taken:
+    taken: list[Taken] = []
+    thread = threading.Thread(target=lambda: taken.append(take(seconds, spins=spins)))
     thread.start()
     asyncio.run(busy(seconds))
     thread.join()
     return taken[0]
 
 
-def in_a_process(seconds: float) -> list[int]:
+def in_a_process(seconds: float, *, spins: bool) -> Taken:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=take_and_send, args=(seconds, theirs))
+    process = context.Process(target=take_and_send, args=(seconds, theirs, spins))
     process.start()
     asyncio.run(busy(seconds + 1.0))
-    t_ns: list[int] = ours.recv()
+    taken: Taken = ours.recv()
     process.join()
-    return t_ns
+    return taken
 
 
 def main() -> None:
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
+    print("| round | runs in | waits by | frames/s | p50 us | p99 us | max us | CPU % |")
+    print("|--:|---|---|--:|--:|--:|--:|--:|")
     for round_ in range(3):
         for name, taken in (("thread", in_a_thread), ("process", in_a_process)):
-            t_ns = np.array(taken(seconds)[50:])
-            error_us = np.abs(np.diff(t_ns) * 1e-3 - 1e6 / RATE_HZ)
-            p50, p99, most = np.percentile(error_us, [50, 99, 100])
-            rate_hz = 1e9 * (len(t_ns) - 1) / (t_ns[-1] - t_ns[0])
-            print(
-                f"{round_} {name:8} {rate_hz:6.1f} Hz  period error "
-                f"p50 {p50:6.0f}  p99 {p99:6.0f}  max {most:6.0f} us"
-            )
+            for spins in (False, True):
+                instants, busy_part = taken(seconds, spins=spins)
+                t_ns = np.array(instants[50:])
+                error_us = np.abs(np.diff(t_ns) * 1e-3 - 1e6 / RATE_HZ)
+                p50, p99, most = np.percentile(error_us, [50, 99, 100])
+                rate_hz = 1e9 * (len(t_ns) - 1) / (t_ns[-1] - t_ns[0])
+                print(
+                    f"| {round_} | {name} | {'sleep, spin' if spins else 'sleep'} | {rate_hz:.1f} "
+                    f"| {p50:.0f} | {p99:.0f} | {most:.0f} | {100 * busy_part:.0f} |",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

@@ -27,17 +27,14 @@ from collections.abc import Iterator
 from multiprocessing.connection import Connection
 
 import numpy as np
-from acquisition_jitter import RATE_HZ, SleepingAdapter
+from acquisition_jitter import RATE_HZ, opened
 
 from devices.acquisition import Acquisition
-from devices.array import TileArray
 from devices.clock import SystemClock, UtcAnchor
 from devices.dynamixel import open_servo
 from devices.emulation.dynamixel import EmulatedServo
 from devices.frames import FrameStatus
-from devices.i2c import open_bus
 from devices.realtime import sharpen_timers
-from devices.scene import load_scene
 from devices.servo import ServoReader
 
 BAUDRATE = 1_000_000
@@ -90,15 +87,7 @@ def take(kind: str, protocol: int, seconds: float) -> tuple[list[int], int, int]
     """Instants of the frames; how many of them had a position; readings that failed."""
     sharpen_timers()
     clock = SystemClock()
-    scene = load_scene("standing")
-    array = TileArray(
-        open_bus("emulated", SleepingAdapter()),
-        scene.tile,
-        clock,
-        schedule="simultaneous",
-        wait_ms=scene.array.wait_ms,
-    )
-    tiles = array.identify()
+    ready = opened(clock)
     with contextlib.ExitStack() as stack:
         reader = None
         if kind != "none":
@@ -111,7 +100,9 @@ def take(kind: str, protocol: int, seconds: float) -> tuple[list[int], int, int]
             stack.callback(servo.close)
             reader = stack.enter_context(ServoReader(servo, clock, rate_hz=SERVO_HZ))
         anchor = UtcAnchor.now(clock_set=True)
-        acquisition = Acquisition(array, tiles, clock, anchor, rate_hz=RATE_HZ, servo=reader)
+        acquisition = Acquisition(
+            ready.array, ready.tiles, clock, anchor, rate_hz=RATE_HZ, servo=reader
+        )
         end_ns = clock.now_ns() + round(seconds * 1e9)
         t_ns: list[int] = []
         positions = 0

@@ -14,8 +14,9 @@ import time
 from pathlib import Path
 
 from devices.clock import VirtualClock
+from devices.emulation.faults import Faults
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
-from devices.emulation.mpl115a2 import EmulatedMpl115a2
+from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
 from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.i2c import i2c_msg
 from devices.scene import load_scene
@@ -43,7 +44,8 @@ def session(scene_name: str, schedule: str | None) -> tuple[float, float]:
 def bare_bus() -> float:
     """Virtual seconds per wall second of ten transfers a frame and nothing else."""
     clock = VirtualClock()
-    chips = [EmulatedMpl115a2((1, 1, 1, 1), 1_600_000, lambda t_ns: (500, 500)) for _ in range(4)]
+    silicon = Silicon((1, 1, 1, 1), 1_600_000, lambda t_ns: (500, 500))
+    chips = [EmulatedMpl115a2(silicon, faults=PartFaults(scene=Faults(()))) for _ in range(4)]
     mux = EmulatedTca9548a(0x70, dict(enumerate(chips)))
     adapter = EmulatedI2cAdapter([mux], clock, 400_000.0)
     selects = [i2c_msg.write(0x70, [1 << i]) for i in range(4)]
@@ -70,6 +72,7 @@ def main() -> None:
     print("|---|---|--:|--:|")
     print(f"| bare emulated bus | as simultaneous | - | {bare_bus():.1f} |")
     for name, schedule in (
+        ("standing", "pipelined"),
         ("standing", "simultaneous"),
         ("standing", "sequential"),
         ("rolling", None),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from devices.acquisition import Acquisition
-from devices.clock import SystemClock, UtcAnchor
+from devices.clock import SpinningClock, SystemClock, UtcAnchor
 from devices.dynamixel import open_servo
 from devices.emulation.ground import press_on
 from devices.emulation.load_trace import CopTransform, LoadTrace
@@ -71,7 +71,9 @@ class Rig:
         scene = options.scene
         sharpen_timers()
         self._options = options
-        self._clock = SystemClock()
+        self._clock = SpinningClock()
+        # What runs beside the loop, or plays the wires, must not keep it from its core.
+        self._line_clock = SystemClock()
         self._lead_end_ns: int | None = None
         world = self._world(options, stack)
         self._bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
@@ -182,7 +184,7 @@ class Rig:
             )
         world = World(
             scene,
-            self._clock,
+            self._line_clock,
             seed=options.seed,
             parts_seed=options.parts_seed,
             lead_s=options.lead_s,
@@ -196,18 +198,18 @@ class Rig:
     def _servo(self, scene: ServoScene, world: World | None, stack: ExitStack) -> ServoReader:
         port = scene.port
         if port == EMULATED and world is not None:
-            port = stack.enter_context(world.servo(scene, self._clock)).port
+            port = stack.enter_context(world.servo(scene, self._line_clock)).port
         servo = open_servo(
             port,
             baudrate=scene.baudrate,
-            clock=self._clock,
+            clock=self._line_clock,
             servo_id=scene.id,
             model=scene.model,
             protocol=scene.protocol,
         )
         stack.callback(servo.close)
         self.remarks += servo.remarks
-        return stack.enter_context(ServoReader(servo, self._clock, rate_hz=scene.rate_hz))
+        return stack.enter_context(ServoReader(servo, self._line_clock, rate_hz=scene.rate_hz))
 
     def _bus_hz(self, array: TileArray) -> float:
         """What rate this bus gives, from some frames before the stream begins."""

@@ -67,6 +67,9 @@ class MuxDevice(I2cDevice, Protocol):
         """Its RESET line was low."""
 
 
+_NOBODY: Sequence[I2cDevice] = ()
+
+
 class EmulatedI2cAdapter:
     """The bus of an emulated Raspberry Pi: multiplexers on the trunk, chips behind them."""
 
@@ -116,15 +119,18 @@ class EmulatedI2cAdapter:
                 bits += 10  # START or repeated START, address with direction, acknowledge
                 address, length = message.addr, message.len
                 reading = bool(message.flags & _FLAG_READ)
-                t_ns = begin_ns + self._ns(bits)
-                called = (
-                    self._wire.get(address, ())
-                    if disturbed is None
-                    else self._called(address, reading, t_ns, disturbed)
-                )
-                listeners = [device for device in called if device.start(reading, t_ns)]
+                t_ns = begin_ns + round(bits * self._ns_per_bit)
+                listeners = self._wire.get(address, _NOBODY)
+                if disturbed is not None:
+                    listeners = self._called(address, reading, t_ns, disturbed)
+                if len(listeners) == 1:
+                    if not listeners[0].start(reading, t_ns):
+                        listeners = _NOBODY
+                else:
+                    listeners = [device for device in listeners if device.start(reading, t_ns)]
                 addressed += listeners
-                routed |= address in self._mux_addresses
+                if not routed:
+                    routed = address in self._mux_addresses
                 if not listeners or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
                     raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
                 if reading:
@@ -132,11 +138,12 @@ class EmulatedI2cAdapter:
                     _read(message, listeners, t_ns, disturbed)
                     continue
                 acknowledged = _write(message, listeners, t_ns, disturbed)
-                bits += 9 * min(acknowledged + 1, length)
+                bits += 9 * length
                 if acknowledged < length:
+                    bits -= 9 * (length - acknowledged - 1)
                     raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
         finally:
-            stop_ns = begin_ns + self._ns(bits + 1)
+            stop_ns = begin_ns + round((bits + 1) * self._ns_per_bit)
             for device in addressed:
                 device.stop(stop_ns)
             # Routing changes at STOP and at no other time, and only if a mux was written to.
@@ -144,19 +151,14 @@ class EmulatedI2cAdapter:
                 self._wire = self._devices_by_address()
             self._clock.sleep_until_ns(stop_ns)
 
-    def _ns(self, bits: int) -> int:
-        return round(bits * self._ns_per_bit)
-
     def _called(
-        self, address: int, reading: bool, t_ns: int, disturbed: Line | None
+        self, address: int, reading: bool, t_ns: int, disturbed: Line
     ) -> Sequence[I2cDevice]:
-        """Who hears the address byte as his own."""
-        if disturbed is not None:
-            heard = disturbed.disturbed(address << 1 | reading, t_ns)
-            if heard & 1 != reading:
-                return ()  # one side reads where the other does: nobody gets on with it
-            address = heard >> 1
-        return self._wire.get(address, ())
+        """Who hears a disturbed address byte as his own."""
+        heard = disturbed.disturbed(address << 1 | reading, t_ns)
+        if heard & 1 != reading:
+            return _NOBODY  # one side reads where the other does: nobody gets on with it
+        return self._wire.get(heard >> 1, _NOBODY)
 
     def _is_stuck(self, messages: Sequence[i2c_msg], begin_ns: int) -> bool:
         """Go through a transaction on wires that do not move; True if that looks like success."""
@@ -175,7 +177,7 @@ class EmulatedI2cAdapter:
         return False
 
     def _pass(self, begin_ns: int, bits: int) -> None:
-        self._clock.sleep_until_ns(begin_ns + self._ns(bits))
+        self._clock.sleep_until_ns(begin_ns + round(bits * self._ns_per_bit))
 
     def close(self) -> None:
         """Nothing to release."""
@@ -192,17 +194,20 @@ class EmulatedI2cAdapter:
 
 
 def _refuse_unsupported(messages: Sequence[i2c_msg]) -> None:
-    if not 1 <= len(messages) <= I2C_RDWR_IOCTL_MAX_MSGS:
+    last = len(messages) - 1
+    if not 0 <= last < I2C_RDWR_IOCTL_MAX_MSGS:
         raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
-    for index, message in enumerate(messages, start=1):
+    for index, message in enumerate(messages):
         if message.len > MESSAGE_BYTES_MAX:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         # drivers/i2c/busses/i2c-bcm2835.c: "only one read message supported, has to be last"
-        if message.flags & _FLAG_READ and index < len(messages):
+        if index < last and message.flags & _FLAG_READ:
             raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
 
 
-def _write(message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: Line | None) -> int:
+def _write(
+    message: i2c_msg, listeners: Sequence[I2cDevice], t_ns: int, disturbed: Line | None
+) -> int:
     """Give the bytes of a message to who listens; how many were acknowledged."""
     sent = bytes(message)
     if disturbed is None and len(listeners) == 1:
@@ -219,12 +224,14 @@ def _write(message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: L
     return len(sent)
 
 
-def _read(message: i2c_msg, listeners: list[I2cDevice], t_ns: int, disturbed: Line | None) -> None:
-    given = [device.read(message.len) for device in listeners]
-    # Open drain: a bit is low if anybody pulls it low.
-    values = (
-        given[0] if len(given) == 1 else bytes(map(partial(reduce, and_), zip(*given, strict=True)))
-    )
+def _read(
+    message: i2c_msg, listeners: Sequence[I2cDevice], t_ns: int, disturbed: Line | None
+) -> None:
+    if len(listeners) == 1:
+        values = listeners[0].read(message.len)
+    else:  # open drain: a bit is low if anybody pulls it low
+        given = [device.read(message.len) for device in listeners]
+        values = bytes(map(partial(reduce, and_), zip(*given, strict=True)))
     if disturbed is not None:
         values = bytes([disturbed.disturbed(value, t_ns) for value in values])
     ctypes.memmove(message.buf, values, message.len)

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.frames import NO_SERVO_COUNTS, FrameStatus
+from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus, TileStatus
+from storage.session_file import SessionReader
 
 Running = Any
 Until = Callable[..., Any]
@@ -144,3 +145,50 @@ def test_a_node_without_a_server_takes_frames_and_says_that_they_were_not_sent(
     assert process.ended(12.0) == 3
     said = [line for line in process.err if "never acknowledged" in line]
     assert re.match(r"\d+ frames", said[0])
+
+
+def frames_of(running: Running, session_id: str) -> FrameBatch:
+    path = running.data / "sessions" / session_id / "frames.parquet"
+    with SessionReader(path) as file:
+        return file.frames()
+
+
+def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old_one(
+    running: Running, foottile: Foottile, scene: Path, until: Until
+) -> None:
+    swap = '\n[[fault]]\nkind = "replaced"\ntile = "T02"\nt_s = 6.0\nduration_s = 0.5\n'
+    scene.write_text(scene.read_text() + swap)
+    process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
+    process.said("connected to")
+    until(lambda: running.node("demo")["tare"], 20.0)
+    answer = running.http.post("/sessions", json={"node": "demo", "name": "swap"})
+    assert answer.status_code == 201, answer.text
+    process.said("a new stream begins", 20.0)
+    sealed = running.sealed(answer.json()["id"])
+    assert sealed["complete"] is True
+    assert "other tiles" in sealed["problem"]
+    first = frames_of(running, sealed["id"])
+    tile = first.status[-20:, 1]
+    assert (tile & TileStatus.UNUSABLE != 0).all(), "of the other part nothing was believed"
+    assert (first.status[:, 0] & TileStatus.UNUSABLE == 0).all()
+    until(lambda: (running.node("demo")["last_seq"] or 0) > 200, 10.0)
+    (second,) = running.http.get("/sessions").json()["items"][:1]
+    assert (second["name"], second["state"]) == ("swap (2)", "recording")
+    running.http.post(f"/sessions/{second['id']}/stop")
+    running.sealed(second["id"])
+    again = frames_of(running, second["id"])
+    assert again.frame_status[0] & FrameStatus.NEW_ARRAY_INFO
+    assert not (again.frame_status[1:] & FrameStatus.NEW_ARRAY_INFO).any()
+    assert (again.status[20:, 1] & TileStatus.UNUSABLE == 0).mean() > 0.99
+
+
+def test_a_tile_that_dies_is_named_on_the_terminal_and_so_is_its_return(
+    running: Running, foottile: Foottile, scene: Path
+) -> None:
+    death = '\n[[fault]]\nkind = "unplugged"\ntile = "T03"\nt_s = 1.0\nduration_s = 2.5\n'
+    scene.write_text(scene.read_text() + death)
+    process = foottile("node", "--scene", scene, "--server", running.url)
+    process.said("tile T03 (mux 0x70 channel 2) does not answer", 25.0)
+    process.said("no longer: tile T03", 15.0)
+    process.process.send_signal(signal.SIGTERM)
+    assert process.ended(10.0) == 0

@@ -320,6 +320,47 @@ def test_a_node_that_comes_back_with_other_tiles_ends_its_recording(
     assert_same(frames_of(running, session), first)
 
 
+def test_another_session_takes_up_a_recording_whose_node_came_back_with_other_tiles(
+    running: Running, tared: FakeNode, node_of: Callable[..., FakeNode], until: Until
+) -> None:
+    session = start(running, name="mud", subject="leg 2", tags=["wet"])
+    tared.send(100, 10.0)
+    tared.acknowledged(169)
+    tared.leave()
+    other = node_of(running, tiles=3)
+    other.connect()
+    new = other.send(30)
+    sessions = running.http.get("/sessions").json()["items"]
+    (taken_up,) = [s for s in sessions if s["id"] != session["id"]]
+    assert taken_up["state"] == "recording"
+    assert (taken_up["name"], taken_up["subject"], taken_up["tags"]) == (
+        "mud (2)",
+        "leg 2",
+        ["wet"],
+    )
+    taken_in(running, other, until)
+    stop(running, taken_up)
+    other.send(10, now=True)
+    sealed = running.sealed(taken_up["id"])
+    assert sealed["complete"] is True
+    frames = frames_of(running, taken_up)
+    assert_same(frames.rows(0, 30), new)
+
+
+def test_a_stream_that_ended_in_order_leaves_no_doubt_about_its_end(
+    running: Running, tared: FakeNode, node_of: Callable[..., FakeNode]
+) -> None:
+    session = start(running)
+    tared.send(100, 10.0)
+    tared.acknowledged(169)
+    tared.leave()
+    other = node_of(running, tiles=3)
+    other.connect(previous={"boot_id": tared.boot_id, "next_seq": 170})
+    sealed = running.sealed(session["id"])
+    assert sealed["parts"][0]["seq_last"] == 169
+    assert sealed["complete"] is True, "nothing can be missing behind an end that was told"
+
+
 def test_a_recording_goes_on_over_a_restart_of_the_server(
     running: Running, tared: FakeNode, until: Until
 ) -> None:
