@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from devices.budget import BusTiming, check_broadcast, frame_s
+from devices.budget import BusTiming, check_broadcast, frame_s, turns_s
 from devices.bus_recovery import BusRecovery
 from devices.bus_watch import BusWatch
 from devices.clock import Clock
@@ -22,7 +22,6 @@ from devices.errors import (
     BusSetupError,
     I2cError,
     NoAcknowledgeError,
-    TileSetupError,
 )
 from devices.frames import NOT_READ, TileInfo, TileStatus
 from devices.health import TileHealth
@@ -31,6 +30,7 @@ from devices.judge import Judge
 from devices.mpl115a2 import SAMPLE_PART_OF_CONVERSION
 from devices.scan import Scan
 from devices.scene import ScheduleName
+from devices.search import Search
 from devices.tile_ports import TilePorts
 
 AUDIT_NS = 1_000_000_000
@@ -96,6 +96,7 @@ class TileArray:
         self._ports = TilePorts(bus, tiles)
         self.bus = BusWatch(self._ports.router, clock, recovery)
         self._judge = Judge(self._ports, clock, self.health, self.bus)
+        self._search = Search(self._ports, clock, self.health)
         self._watch = ConversionWatch(
             self._ports,
             clock,
@@ -104,7 +105,7 @@ class TileArray:
         )
         self._schedule = SCHEDULES[schedule]
         self._audit_due_ns = clock.now_ns() + AUDIT_NS
-        self._turns_ns = _turns_ns(timing)
+        self._turns_ns = [round(turn_s * 1e9) for turn_s in turns_s(timing)]
         self._waits_for_slow_ones = schedule != "pipelined" or len(tiles) == 1
         self._temperature_every = temperature_every
         self._beside = beside
@@ -214,7 +215,10 @@ class TileArray:
             scan.flag(tile, TileStatus.NO_ANSWER)
             return
         if not health.present:
-            self._look_for(scan, tile)
+            if self._may_spend(scan, tile):
+                self._search.look_for(scan, tile)
+            else:
+                self._search.note_absence(scan, tile)
             return
         ready_ns = self._started_ns[tile] + self._watch.wait_ns[tile]
         if not self._running[tile] or (
@@ -285,50 +289,6 @@ class TileArray:
         self._clock.sleep_until_ns(ready_ns)
         self._busy_since_ns = self._clock.now_ns()  # who waits spends nothing
 
-    def _look_for(self, scan: Scan, tile: int) -> None:
-        """See whether a tile that was lost is back; its sample comes with the next frame."""
-        health = self.health[tile]
-        begin_ns = self._clock.now_ns()
-        scan.flag(tile, TileStatus.IMPLAUSIBLE if health.replaced else TileStatus.NO_ANSWER)
-        if not health.is_probe_due(begin_ns) or not self._may_spend(scan, tile):
-            return
-        try:
-            if self._is_itself(tile):
-                health.find()
-            else:
-                health.lose(self._clock.now_ns())
-        except (BusMisuseError, BusSetupError):
-            raise
-        except TileSetupError:
-            scan.flag(tile, TileStatus.IMPLAUSIBLE)
-            health.lose(self._clock.now_ns())
-        except NoAcknowledgeError:
-            self._ports.forget([tile])
-            health.lose(self._clock.now_ns())
-        except I2cError:
-            scan.note_bus_fault()
-        scan.budget_ns -= self._clock.now_ns() - begin_ns
-
-    def _is_itself(self, tile: int) -> bool:
-        """Do its coefficients say so? If another part's do, it is noted as replaced."""
-        health = self.health[tile]
-        self._ports.connect(tile)
-        if self._ports.read_coefficients() == health.coefficient_bytes:
-            health.replaced = False
-            return True
-        # A disturbed bit, in the reading or in the select before it, must not make another part.
-        words = set()
-        for _ in range(2):
-            self._ports.router.forget()
-            self._ports.connect(tile)
-            words.add(self._ports.read_coefficient_words(tile))
-        if words == {health.coefficient_words}:
-            health.replaced = False
-            return True
-        # Each of them three times the same and plausible: a part, but not the one that was here.
-        health.replaced = len(words) == 1 and not self._ports.router.silent
-        return False
-
     # Frame by frame
 
     def _bus_comes_back(self, scan: Scan) -> bool:
@@ -393,15 +353,3 @@ class TileArray:
         if scan.given_up:
             self.bus.fall()
             self._running = [False] * len(self.tiles)
-
-
-def _turns_ns(timing: BusTiming) -> tuple[int, ...]:
-    """From the begin of a pipelined frame to each tile's read, if none of them has to wait."""
-    turns_ns = []
-    t_s, alone = 0.0, len(timing.muxes) == 1
-    for i, mux in enumerate(timing.muxes):
-        leaves = mux != timing.muxes[i - 1]  # the first tile comes after the last one
-        t_s += 0.0 if alone else (1 + leaves) * timing.select_s
-        turns_ns.append(int(t_s * 1e9))
-        t_s += timing.read_s + timing.convert_s
-    return tuple(turns_ns)

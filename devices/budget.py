@@ -90,6 +90,18 @@ def frame_s(schedule: ScheduleName, timing: BusTiming) -> float:
     return max(m * start + sum(reads), max(waits) + start + max(reads))
 
 
+def turns_s(timing: BusTiming) -> tuple[float, ...]:
+    """From the begin of a pipelined frame to each tile's read, if none of them has to wait."""
+    turns = []
+    t_s, alone = 0.0, len(timing.muxes) == 1
+    for i, mux in enumerate(timing.muxes):
+        leaves = mux != timing.muxes[i - 1]  # the first tile comes after the last one
+        t_s += 0.0 if alone else (1 + leaves) * timing.select_s
+        turns.append(t_s)
+        t_s += timing.read_s + timing.convert_s
+    return tuple(turns)
+
+
 def rates_hz(timing: BusTiming) -> dict[ScheduleName, float]:
     """Frames a second of every schedule."""
     return {name: 1.0 / frame_s(name, timing) for name in get_args(ScheduleName)}
