@@ -88,6 +88,7 @@ class Acquisition:
         self._next_seq = 0
         self._last_t_mono_ns = 0
         self._temperature: HeldTemperature | None = None
+        array.begin()
 
     def run(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
         """Take frames until `stop()` is true, which is asked before every frame.

@@ -42,6 +42,8 @@ _LOOK_FRAMES, _LOOK_PART = 10, 0.008
 _BUDGET_PART = 8
 _BUDGET_MIN_NS = 500_000
 """Second attempts may take an eighth of a frame, but always one reading and a look at who it is."""
+_DISTURBED_BUDGETS = 4
+"""On a line where bits turn over, to be right is worth some of the rate."""
 
 
 class TileArray:
@@ -131,6 +133,14 @@ class TileArray:
             if health.replaced
         )
 
+    def begin(self) -> None:
+        """A stream begins, or goes on after something else used the bus.
+
+        Its first frame reads all temperatures, and nothing is taken to be as it was left.
+        """
+        self._frames = 0
+        self._ports.router.forget()
+
     def troubles(self) -> dict[str, str]:
         """What is wrong now, in words: by serial, and under "" what is wrong with the bus."""
         found = {"": "the bus is stuck or cut"} if self.bus.is_down else {}
@@ -140,8 +150,10 @@ class TileArray:
                 found[tile.serial] = f"another part answers in place of {where}"
             elif not health.present and not self.bus.is_down:
                 found[tile.serial] = f"{where} does not answer"
+            elif health.is_repeating:
+                found[tile.serial] = f"{where} never finishes a conversion"
             elif health.slow:
-                found[tile.serial] = f"{where} converts too slowly or not at all"
+                found[tile.serial] = f"{where} converts more slowly than it was measured to"
         return found
 
     def scan(self) -> Scan:
@@ -152,7 +164,8 @@ class TileArray:
             BusSetupError: the bus went away.
         """
         begin_ns = self._clock.now_ns()
-        scan = Scan.blank(len(self.tiles), begin_ns, self._budget_ns)
+        budget_ns = self._budget_ns * (_DISTURBED_BUDGETS if self._judge.is_disturbed else 1)
+        scan = Scan.blank(len(self.tiles), begin_ns, budget_ns)
         if not self.bus.is_down or self._bus_comes_back(scan):
             self._schedule(self, scan)
             if not scan.bus_fault:
@@ -226,7 +239,9 @@ class TileArray:
         ):
             scan.flag(tile, TileStatus.NOT_CONVERTED)
             return
-        with_temperature = self._frames % self._temperature_every == 0 or health.wants_temperature
+        with_temperature = self._frames % self._temperature_every == 0 or health.wants_temperature(
+            self._clock.now_ns()
+        )
         words = (NOT_READ, NOT_READ)
 
         def transfers() -> None:

@@ -14,6 +14,18 @@ _RECOVERY_NS = (10_000_000, 1_000_000_000)
 """A stuck bus is helped at once, then ever more rarely."""
 
 
+def help_bus(recovery: BusRecovery) -> bool:
+    """Nine clocks, and if nobody lets go of them the multiplexers' RESET; whether one of it worked.
+
+    A line that cannot be had now may be had the next time.
+    """
+    for help_ in (recovery.clock_out, recovery.reset_muxes):
+        with suppress(I2cError):
+            if help_():
+                return True
+    return False
+
+
 class BusWatch:
     """The bus as a whole.
 
@@ -46,10 +58,7 @@ class BusWatch:
         back = self._moves()
         if not back and self._recovery is not None and self._clock.now_ns() >= self._due_ns:
             self.recoveries += 1
-            with suppress(I2cError):  # a line that cannot be had now may be had the next time
-                self._recovery.clock_out()
-                self._recovery.reset_muxes()
-            back = self._moves()
+            back = help_bus(self._recovery) and self._moves()
             self._due_ns = self._clock.now_ns() + self._wait_ns
             self._wait_ns = min(2 * self._wait_ns, _RECOVERY_NS[1])
         self.is_down = not back

@@ -13,7 +13,10 @@ from devices.tile_ports import TilePorts
 SLOW_AUDIT_NS = 500_000_000
 """A part that was found to be slow is tried so often, to notice when it no longer is."""
 
-_TRIES = 3
+_TRIES, _SLOW_TRIES, _SAME_MAX = 8, 2, 3
+"""Every second pair of healthy readings has the same temperature: eight are one in 250. One that is
+known to be slow is asked less often each time: whether it is quick again need not be known at once.
+"""
 
 
 class ConversionWatch:
@@ -23,8 +26,7 @@ class ConversionWatch:
     right after it, nothing ever finishes, and its words stand still, which is noticed. If it has
     time to finish until the next CONVERT, its words change from frame to frame like any other, one
     frame late, and betray nothing: so in some frames one tile is read again before that CONVERT,
-    and has to be the same. A suspect is tried: the same conversion is read after the measured time
-    and after the longest that the data sheet allows.
+    and has to be the same. A suspect is tried: is a conversion finished after the measured time?
     """
 
     def __init__(
@@ -77,28 +79,43 @@ class ConversionWatch:
     def try_conversion(self, tile: int) -> None:
         """Find out whether a part keeps its time, and wait for it accordingly from now on.
 
-        Its conversion has to be started anew afterwards.
+        As in the self-test there is one read for each CONVERT: to read a conversion that is not
+        finished may abort it. Its conversion has to be started anew afterwards.
 
         Raises:
             I2cError: it does not answer.
         """
         health = self._health[tile]
-        # A disturbed bit looks like a late conversion, but not twice; two results are equal by
-        # chance, but not three times.
-        late = sum(self._is_late(tile) for _ in range(_TRIES))
-        if late > 1 and not health.slow:
+        tries = _SLOW_TRIES if health.slow else _TRIES
+        settled = [self._converted(tile, CONVERSION_MAX_NS)]
+        early = []
+        for _ in range(tries):
+            early.append(self._converted(tile, self._measured_ns[tile]))
+            if early[-1][1] != settled[-1][1]:
+                self._believe(tile)  # the temperature is loaded last: this one was finished
+                return
+            settled.append(self._converted(tile, CONVERSION_MAX_NS))
+            if len(early) >= _SAME_MAX and early == settled[: len(early)]:
+                break  # not a word of it has changed: it is late
+        if len({tadc for _, tadc in settled}) == 1 and any(
+            words != before for words, before in zip(early, settled, strict=False)
+        ):
+            self._believe(tile)  # its temperature never changes, so its pressure has to tell
+        elif len(set(settled)) > 1 and not health.slow:
+            # It does finish, but late. (If it never does, nothing is worth waiting for.)
             health.slow = True
             self.wait_ns[tile] = max(self._measured_ns[tile], CONVERSION_MAX_NS)
-            self._slow_due_ns = self._clock.now_ns() + SLOW_AUDIT_NS
-        elif not late and health.slow:
-            health.slow = False
-            self.wait_ns[tile] = self._measured_ns[tile]
+        self._slow_due_ns = self._clock.now_ns() + SLOW_AUDIT_NS
 
-    def _is_late(self, tile: int) -> bool:
-        """Does a reading after the measured time differ from a later one of the same conversion?"""
+    def _believe(self, tile: int) -> None:
+        self._health[tile].slow = False
+        self.wait_ns[tile] = self._measured_ns[tile]
+
+    def _converted(self, tile: int, delay_ns: int) -> tuple[int, int]:
+        """What is read so long after a CONVERT; the conversion is given its time in any case."""
         self._ports.convert([tile])
         stop_ns = self._clock.now_ns()
-        self._clock.sleep_until_ns(stop_ns + self._measured_ns[tile])
-        early = self._ports.read(with_temperature=True)
+        self._clock.sleep_until_ns(stop_ns + delay_ns)
+        words = self._ports.read(with_temperature=True)
         self._clock.sleep_until_ns(stop_ns + CONVERSION_MAX_NS)
-        return self._ports.read(with_temperature=True) != early
+        return words

@@ -28,13 +28,14 @@ class TileStatus(IntFlag):
     STALE = 2
     """The same two words came for so long that the part must have stopped converting."""
     RETRIED = 4
-    """It answered only at the second attempt in this frame."""
+    """It took a second attempt, or a third reading, in this frame; the reading is good."""
     IMPLAUSIBLE = 8
-    """All ones on both words: what an undriven bus reads as."""
+    """No part gives these words, or they could not be confirmed, or another part gave them."""
     OVER_RANGE = 16
     """Outside the chip's 50 to 115 kPa, or at the end of its counts."""
     NOT_CONVERTED = 32
-    """Both words zero: the registers of a part that was just powered up."""
+    """Zeros, as the registers of a part that was just powered up, or no conversion that was
+    finished in this frame."""
 
     UNUSABLE = NO_ANSWER | STALE | IMPLAUSIBLE | NOT_CONVERTED
     """No pressure can be computed from this tile in this frame."""

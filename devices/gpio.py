@@ -59,7 +59,7 @@ class GpioLines:
             raise BusSetupError(
                 "recovery of the bus needs gpiod",
                 where=scene.gpiochip,
-                remedy="Install the extra: pip install 'foottile[gpio]', or remove [recovery]",
+                remedy="Install the extra: pip install '.[gpio]', or remove [recovery]",
             ) from error
         tool = next(filter(None, map(shutil.which, _TOOLS)), None)
         if tool is None:

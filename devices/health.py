@@ -25,7 +25,8 @@ STALE_EVIDENCE = 20
 readings one in nine is equal to its neighbour, so ten in a row come once in 10^9; with noise that
 is correlated over 10 ms once in 10^6."""
 
-_TRIAL_EVERY = 256
+_TRIAL_EVERY = 2048
+_TADC_MAX_NS = 500_000_000  # half of what `devices.temperature` holds one for
 _IMPOSSIBLE_TADC = (0, COUNTS_MAX)
 _FIRST_PROBE_NS = 2_000_000
 _PROBES_NS = 1_000_000_000
@@ -62,6 +63,7 @@ class TileHealth:
         self._far_jump = FAR_JUMP_KPA / count_kpa
         self._recent: deque[int] = deque(maxlen=_RECENT)
         self._tadc: int | None = None
+        self._tadc_ns = 0
         self._last_words = (NOT_READ, NOT_READ)
         self._stale_evidence = 0
         self._probe_due_ns = 0
@@ -100,16 +102,19 @@ class TileHealth:
 
     # Readings
 
-    @property
-    def wants_temperature(self) -> bool:
-        """Is there no temperature to go by yet?"""
-        return self._tadc is None
+    def wants_temperature(self, now_ns: int) -> bool:
+        """Is there no temperature to go by, or only an old one?"""
+        return self._tadc is None or now_ns - self._tadc_ns > _TADC_MAX_NS
 
-    def jumps(self, padc: int, tadc: int) -> bool:
-        """Is it too far from the readings before, or are there none yet to compare it with?"""
+    def jumps(self, padc: int, tadc: int, *, strictly: bool = False) -> bool:
+        """Is it too far from the readings before, or are there none yet to compare it with?
+
+        Strictly: half as far is too far, for a line that is known to be disturbed.
+        """
         if len(self._recent) < _RECENT:
             return True
-        return abs(padc - self._median()) > self._jump or self._is_hot(tadc)
+        limit = self._jump / 2 if strictly else self._jump
+        return abs(padc - self._median()) > limit or self._is_hot(tadc)
 
     def may_be_another(self, padc: int, tadc: int) -> bool:
         """Although it came twice: may another tile have answered, or two of them at once?"""
@@ -117,11 +122,12 @@ class TileHealth:
             return False
         return abs(padc - self._median()) > self._far_jump or self._is_hot(tadc)
 
-    def believe(self, padc: int, tadc: int) -> None:
+    def believe(self, padc: int, tadc: int, now_ns: int) -> None:
         """A reading that was accepted."""
         self._recent.append(padc)
         if tadc != NOT_READ:
             self._tadc = tadc
+            self._tadc_ns = now_ns
 
     def is_stale(self, padc: int, tadc: int) -> bool:
         """Take note of a frame's reading; has it been the same for too long?"""
@@ -135,6 +141,11 @@ class TileHealth:
         else:
             self._stale_evidence = 0
         self._last_words = (padc, self._last_words[1] if same and tadc == NOT_READ else tadc)
+        return self.is_repeating
+
+    @property
+    def is_repeating(self) -> bool:
+        """Are its readings stale?"""
         return self._stale_evidence >= STALE_EVIDENCE
 
     @property

@@ -87,6 +87,28 @@ class I2cBus:
         self._adapter.close()
 
 
+class PatientBus(I2cBus):
+    """The same bus for a start-up on a disturbed line: what is not acknowledged is tried again."""
+
+    TRIES = 4
+
+    def __init__(self, bus: I2cBus) -> None:
+        super().__init__(bus._adapter, bus.name)  # noqa: SLF001  # the same class
+        self.lost = 0
+        """Transfers that were not acknowledged and then were."""
+
+    def transfer(self, *messages: i2c_msg) -> None:
+        """As `I2cBus.transfer`, up to `TRIES` times."""
+        for _ in range(self.TRIES - 1):
+            try:
+                super().transfer(*messages)
+            except NoAcknowledgeError:
+                self.lost += 1
+            else:
+                return
+        super().transfer(*messages)
+
+
 def _classified(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cError:
     number = error.errno
     where = f"{bus}, address 0x{messages[-1].addr:02x}" if messages else bus

@@ -18,7 +18,7 @@ from devices.scan import Scan
 from devices.tile_ports import TilePorts
 
 DISTURBED_NS = 1_000_000_000
-"""For so long after a reading was found disturbed, every reading of every tile is asked twice."""
+"""For so long after a reading was found disturbed, a jump that cannot be checked is no reading."""
 
 _IMPLAUSIBLE = int(TileStatus.IMPLAUSIBLE)
 
@@ -35,6 +35,11 @@ class Judge:
         self._bus = bus
         self._silent: frozenset[int] = frozenset()
         self._disturbed_until_ns = clock.now_ns()
+
+    @property
+    def is_disturbed(self) -> bool:
+        """Was a bit seen to turn over, not long ago?"""
+        return self._clock.now_ns() < self._disturbed_until_ns
 
     def judge(
         self,
@@ -55,15 +60,14 @@ class Judge:
             may_ask: is there time to ask again?
         """
         health = self._health[tile]
-        disturbed = self._clock.now_ns() < self._disturbed_until_ns
+        disturbed = self.is_disturbed
         jumps = health.jumps(*words)
-        if jumps or disturbed:
-            if may_ask:
-                words = self._confirmed(scan, tile, words, with_temperature)
-                jumps = health.jumps(*words)
-            elif jumps and disturbed:
-                # Where bits are known to turn over, what cannot be checked is no reading.
-                scan.flag(tile, TileStatus.IMPLAUSIBLE)
+        if may_ask and (jumps or (disturbed and health.jumps(*words, strictly=True))):
+            words = self._confirmed(scan, tile, words, with_temperature)
+            jumps = health.jumps(*words)
+        elif jumps and disturbed:
+            # Where bits are known to turn over, what cannot be checked is no reading.
+            scan.flag(tile, TileStatus.IMPLAUSIBLE)
         scan.padc[tile], scan.tadc[tile] = words
         if impossible := is_impossible(*words):
             scan.flag(tile, impossible)
@@ -82,7 +86,7 @@ class Judge:
                 scan.flag(tile, TileStatus.IMPLAUSIBLE)
         self._silent = frozenset(self._ports.router.silent)
         if not scan.status[tile] & _IMPLAUSIBLE:
-            health.believe(*words)
+            health.believe(*words, self._clock.now_ns())
 
     def _confirmed(
         self, scan: Scan, tile: int, words: tuple[int, int], with_temperature: bool

@@ -50,7 +50,7 @@ def open_spi(name: str, emulated: SpiDevice | None = None) -> SpiDevice:
         raise SpiSetupError(
             "a device on SPI needs spidev",
             where=name,
-            remedy="Install the extra: pip install 'foottile[rig]' (it is compiled, and needs gcc)",
+            remedy="Install the extra: pip install '.[rig]' (it is compiled, and needs gcc)",
         ) from error
     device = SpiDev()
     try:

@@ -8,13 +8,15 @@ from dataclasses import dataclass, replace
 from devices.array import TileArray
 from devices.budget import BusTiming, Choice, choose, frame_s
 from devices.bus_recovery import BusRecovery
+from devices.bus_watch import help_bus
 from devices.clock import Clock
-from devices.errors import SceneError
+from devices.errors import BusFaultError, SceneError
 from devices.frames import TileInfo
-from devices.i2c import I2cBus
+from devices.i2c import I2cBus, PatientBus
 from devices.mpl115a2 import CONVERSION_MAX_NS, CONVERSION_TYPICAL_NS
 from devices.scene import AnySchedule, Scene
 from devices.self_test import identify, measure_conversion_ns, measure_wires
+from devices.tca9548a import MuxRouter
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ def make_ready(
         TileSetupError, I2cError: a tile or the bus does not work.
         SceneError: the schedule does not suit the tiles.
     """
+    free_bus(bus, scene, recovery)
     found = measured(bus, scene, clock)
     asked = schedule or scene.array.schedule
     if beside is not None:
@@ -71,6 +74,30 @@ def make_ready(
     else:
         choice = Choice(asked, "as the scene says" if schedule is None else "as asked for")
     return _ready(bus, scene, clock, found, choice, recovery, beside)
+
+
+def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
+    """Make sure that the wires move at all: a slave may hang in a byte since the last run.
+
+    Raises:
+        BusFaultError: SDA is stuck low, and nobody or nothing could free it.
+    """
+    router = MuxRouter(bus, [tile.mux for tile in scene.tile])
+    for helped in (False, True):
+        try:
+            if router.echoes() or router.refused is not None:
+                return  # it moves, or nobody answers: whose fault that is, identification says
+        except BusFaultError:
+            if helped or recovery is None:
+                raise
+        if helped or recovery is None or not help_bus(recovery):
+            break
+    raise BusFaultError(
+        "the multiplexers acknowledge, and none keeps what is written to it",
+        where=bus.name,
+        remedy="SDA is stuck low: pull the tiles' plugs one by one, cycle their supply, or wire "
+        "[recovery]",
+    )
 
 
 def renew(
@@ -162,6 +189,7 @@ def measured(bus: I2cBus, scene: Scene, clock: Clock) -> Measured:
     Raises:
         TileSetupError, I2cError: as for `make_ready`.
     """
+    bus = PatientBus(bus)
     tiles = list(identify(bus, scene.tile))
     wires = measure_wires(bus, clock, tiles[0])
     unmeasured = []

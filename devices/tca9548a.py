@@ -121,9 +121,11 @@ class MuxRouter:
             BusFaultError: the bus itself failed.
         """
         self.forget()
-        for mux in self._muxes.values():
+        for address, mux in self._muxes.items():
+            self.refused = address
             try:
                 mux.write_mask(1)
+                self.refused = None
                 if mux.read_mask() == 1:
                     return True
             except NoAcknowledgeError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count
 
@@ -16,6 +17,8 @@ from service.publisher import Publisher
 from service.rig import RigOptions
 
 _LOOK_S = 0.02
+_DRAIN_S = 3.0
+_AWAY_LOOKS = 50
 
 
 async def run_node(
@@ -93,9 +96,7 @@ async def run_node(
         if message.error is not None:
             raise message.error
         streams[-1].has_ended = True
-        for stream in streams:
-            if stream.publisher is not None and not stream.is_delivered:
-                await stream.publisher.drain()
+        await _drain(streams)
     finally:
         stopping.cancel()
         if publishing is not None:
@@ -103,6 +104,17 @@ async def run_node(
             await asyncio.gather(publishing, return_exceptions=True)
         await asyncio.to_thread(acquisition.close)
     return sum(s.backlog.next_seq - s.backlog.first_seq + s.backlog.evicted_frames for s in streams)
+
+
+async def _drain(streams: list[_Stream]) -> None:
+    """Give the server, if it is there, a moment to take all streams to their ends."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(_DRAIN_S):
+            away = 0
+            while any(not stream.is_delivered for stream in streams) and away < _AWAY_LOOKS:
+                # Between two streams there is no connection for a moment.
+                away = 0 if any(stream.is_connected for stream in streams) else away + 1
+                await asyncio.sleep(_LOOK_S)
 
 
 @dataclass
@@ -120,6 +132,11 @@ class _Stream:
     def is_delivered(self) -> bool:
         """Has the server everything?"""
         return self.has_ended and self.backlog.first_seq == self.backlog.next_seq
+
+    @property
+    def is_connected(self) -> bool:
+        """Is there a server that takes it now?"""
+        return self.publisher is not None and self.publisher.is_connected and not self.is_delivered
 
 
 def _begin(started: Started, before: _Stream | None, report: Callable[[str], None]) -> _Stream:

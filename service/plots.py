@@ -1,4 +1,4 @@
-"""Plots for people. matplotlib is an extra: `pip install foottile[plot]`."""
+"""Plots for people. matplotlib is an extra: `pip install '.[plot]'`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def plot_calibration(calibration: Calibration, recordings: Sequence[Path]) -> by
         from matplotlib.figure import Figure
     except ImportError as error:
         raise UsageError(
-            "plots need matplotlib", remedy="Install the extra: pip install 'foottile[plot]'"
+            "plots need matplotlib", remedy="Install the extra: pip install '.[plot]'"
         ) from error
 
     indentations: dict[str, Indentation] = {}

@@ -38,7 +38,6 @@ PING_S = 2.0
 PROBE_EVERY_S = 10.0
 STATUS_EVERY_S = 1.0
 _BACK_OFF_S = (0.2, 3.0)
-_DRAIN_S = 3.0
 _UNAUTHORISED = 401
 
 
@@ -108,14 +107,10 @@ class Publisher:
             await asyncio.sleep(wait_s * random.uniform(0.5, 1.0))  # noqa: S311  # no secret
             wait_s = min(2.0 * wait_s, _BACK_OFF_S[1])
 
-    async def drain(self) -> None:
-        """Wait a moment for the server, if it is there, to acknowledge everything."""
-        if not self._connected:
-            return
-        with suppress(TimeoutError):
-            async with asyncio.timeout(_DRAIN_S):
-                while self._backlog.first_seq < self._backlog.next_seq:
-                    await asyncio.sleep(0.02)
+    @property
+    def is_connected(self) -> bool:
+        """Has a server welcomed it?"""
+        return self._connected
 
     async def _greet(self, socket: ClientConnection) -> Welcome:
         if socket.subprotocol != SUBPROTOCOL:

@@ -21,9 +21,9 @@ _SLOW_NS = 2_900_000
 Sense = Callable[[int], tuple[int, int]]
 """Sample instant in ns -> the 10-bit words `padc`, `tadc` of a conversion that samples then."""
 
-Witness = Callable[[int, tuple[int, int]], None]
-"""Told of every conversion: the instant of its CONVERT's STOP and its words. Only for who judges a
-driver; no driver has it."""
+OnConversion = Callable[[int, tuple[int, int], tuple[int, int, int, int]], None]
+"""Told of every conversion: the instant of its CONVERT's STOP, its words, and the coefficients of
+the part that made it. Only for who judges a driver; no driver has it."""
 
 
 @dataclass
@@ -80,7 +80,7 @@ class EmulatedMpl115a2:
         faults: PartFaults | None = None,
         spare: Callable[[], Silicon] | None = None,
     ) -> None:
-        self.witness: Witness | None = None
+        self.on_conversion: OnConversion | None = None
         self._silicon = silicon
         self._mode = read_during_conversion
         self._faults = faults if faults is not None else PartFaults()
@@ -149,8 +149,8 @@ class EmulatedMpl115a2:
             self._settle(t_ns)
             self._conversion = None
             words = self._silicon.sense(t_ns + self._silicon.conversion_ns // _SAMPLE_QUARTER)
-            if self.witness is not None:
-                self.witness(t_ns, words)
+            if self.on_conversion is not None:
+                self.on_conversion(t_ns, words, self._silicon.coefficient_words)
             if not self._faults.stale(t_ns):
                 slow = self._faults.slow(t_ns)
                 tc = _SLOW_NS if slow else self._silicon.conversion_ns

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -14,12 +15,13 @@ import numpy.typing as npt
 from devices.compensation import Compensation
 from devices.emulation.world import World
 from devices.frames import NOT_READ, FrameBatch, TileInfo, TileStatus
-from devices.mpl115a2 import SAMPLE_PART_OF_CONVERSION
+from devices.mpl115a2 import SAMPLE_PART_OF_CONVERSION, Coefficients, compensate_kpa
 from devices.temperature import hold_temperature
 
 _ROUNDING_NS = 2_000  # offsets are whole microseconds
 _NEIGHBOURS = 5
 
+Counts = npt.NDArray[np.uint16]
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float64]
 
@@ -30,12 +32,14 @@ class Verdict:
 
     Attributes:
         given: a reading was passed on as good.
-        right: it is, word for word, that of the conversion it claims to be.
+        same: the words are those of the conversion that they claim to be, given or not.
+        right: given, the same, and of the part whose coefficients the array was described with.
         error_kpa: by how much its pressure differs from that conversion's; from the median of
             those around it where there was no conversion. NaN where none is given.
     """
 
     given: Bools
+    same: Bools
     right: Bools
     error_kpa: Floats
 
@@ -51,47 +55,64 @@ class Witness:
     def __init__(self, world: World) -> None:
         self._stops_ns: list[list[int]] = [[] for _ in world.parts]
         self._words: list[list[tuple[int, int]]] = [[] for _ in world.parts]
-        for part, stops_ns, words in zip(world.parts, self._stops_ns, self._words, strict=True):
+        self._chips: list[list[tuple[int, int, int, int]]] = [[] for _ in world.parts]
+        for i, part in enumerate(world.parts):
+            part.on_conversion = partial(self._note, i)
 
-            def note(
-                stop_ns: int,
-                converted: tuple[int, int],
-                stops_ns: list[int] = stops_ns,
-                words: list[tuple[int, int]] = words,
-            ) -> None:
-                stops_ns.append(stop_ns)
-                words.append(converted)
-
-            part.witness = note
+    def _note(
+        self, tile: int, stop_ns: int, words: tuple[int, int], chip: tuple[int, int, int, int]
+    ) -> None:
+        self._stops_ns[tile].append(stop_ns)
+        self._words[tile].append(words)
+        self._chips[tile].append(chip)
 
     def judge(self, frames: FrameBatch, tiles: tuple[TileInfo, ...]) -> Verdict:
         """Compare frames with what their conversions gave."""
         held, _ = hold_temperature(frames)
         compensation = Compensation(tiles)
         kpa = compensation.readable_kpa(held)
-        true_padc, true_tadc, converted = self._truth(frames, tiles)
-        true_kpa = compensation.kpa(true_padc, np.where(true_tadc > 0, true_tadc, held.tadc))
+        true_kpa, true_padc, true_tadc, own = self._truth(frames, tiles, held.tadc)
         given = ((frames.status & np.uint8(TileStatus.UNUSABLE)) == 0) & (frames.padc != NOT_READ)
         same_tadc = (frames.tadc == NOT_READ) | (frames.tadc == true_tadc)
-        right = converted & (frames.padc == true_padc) & same_tadc
-        return Verdict(given, right, np.where(given, np.abs(kpa - true_kpa), np.nan))
+        same = (frames.padc == true_padc) & same_tadc
+        error_kpa = np.where(given, np.abs(kpa - true_kpa), np.nan)
+        # Given, and no pressure can be made of it: that is wrong too, by an error without a number.
+        right = given & same & own & np.isfinite(kpa)
+        return Verdict(given, same, right, error_kpa)
 
     def _truth(
-        self, frames: FrameBatch, tiles: tuple[TileInfo, ...]
-    ) -> tuple[Floats, Floats, Bools]:
+        self, frames: FrameBatch, tiles: tuple[TileInfo, ...], held_tadc: Counts
+    ) -> tuple[Floats, Floats, Floats, Bools]:
+        """Pressure and words of the conversions that the frames claim to be, (n, tiles).
+
+        By the coefficients of the part that converted; and whether these are those described.
+        """
         shape = frames.padc.shape
+        kpa = np.full(shape, np.nan)
         padc, tadc = np.zeros(shape), np.zeros(shape)
-        converted = np.zeros(shape, dtype=np.bool_)
+        own = np.zeros(shape, dtype=np.bool_)
         for i, tile in enumerate(tiles):
             delay_ns = round(tile.conversion_ms * 1e6) // SAMPLE_PART_OF_CONVERSION
             asked_ns = frames.t_mono_ns + frames.sample_offset_us[:, i] * 1000 - delay_ns
-            stops_ns, words = self._stops_ns[i], self._words[i]
+            stops_ns, words, chips = self._stops_ns[i], self._words[i], self._chips[i]
             for row, stop_ns in enumerate(asked_ns.tolist()):
                 at = bisect_left(stops_ns, stop_ns - _ROUNDING_NS)
                 if at < len(stops_ns) and stops_ns[at] <= stop_ns + _ROUNDING_NS:
+                    true_padc, true_tadc = words[at]
                     padc[row, i], tadc[row, i] = words[at]
-                    converted[row, i] = True
+                    own[row, i] = chips[at] == tile.coefficient_words
+                    # Without a temperature of its own the held one is as good as it gets.
+                    if frames.tadc[row, i] == NOT_READ:
+                        true_tadc = int(held_tadc[row, i])
                 elif words:
                     around = words[max(0, at - _NEIGHBOURS) : at + _NEIGHBOURS] or words[-1:]
-                    padc[row, i], tadc[row, i] = np.median(np.array(around), axis=0)
-        return padc, tadc, converted
+                    true_padc, true_tadc = np.median(np.array(around), axis=0)
+                else:
+                    continue
+                chip = Coefficients.from_words(chips[min(at, len(chips) - 1)])
+                kpa[row, i] = _kpa(true_padc, true_tadc, chip)
+        return kpa, padc, tadc, own
+
+
+def _kpa(padc: float, tadc: float, chip: Coefficients) -> float:
+    return float(compensate_kpa(padc, tadc, chip.a0, chip.b1, chip.b2, chip.c12))

@@ -383,7 +383,7 @@ def failing_foot(scene: Scene) -> tuple[Foot, Failing]:
 
 def test_a_single_missing_acknowledge_is_retried_and_flagged(scene_of: SceneOf) -> None:
     one, adapter = failing_foot(scene_of(array=TYPICAL, emulation=LIVELY))
-    one.take(1)
+    one.take(5)
     pending = [True]
     adapter.clock = None
     reads = iter(range(1000))
@@ -391,7 +391,7 @@ def test_a_single_missing_acknowledge_is_retried_and_flagged(scene_of: SceneOf) 
         len(messages) == 2 and next(reads) == 1 and bool(pending) and pending.pop()
     )
     batch = one.take(5)
-    assert batch.status[0].tolist() == [0, TileStatus.RETRIED, 0, 0]
+    assert sorted(batch.status[0].tolist()) == [0, 0, 0, TileStatus.RETRIED]
     assert (batch.status[1:] == 0).all()
     assert (batch.padc < 1024).all()
 

@@ -95,11 +95,14 @@ def test_a_sample_is_dated_by_the_stop_of_its_own_convert(schedule: ScheduleName
     for tile, stops_ns in zip(wires.tiles, told, strict=True):
 
         def note(
-            stop_ns: int, words: tuple[int, int], stops: dict[tuple[int, int], int] = stops_ns
+            stop_ns: int,
+            words: tuple[int, int],
+            chip: tuple[int, int, int, int],
+            stops: dict[tuple[int, int], int] = stops_ns,
         ) -> None:
             stops[words] = stop_ns
 
-        tile.witness = note
+        tile.on_conversion = note
     array = array_on(wires, schedule)
     array.scan()
     for _ in range(20):

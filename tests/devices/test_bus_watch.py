@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from devices.bus_watch import BusWatch
 from devices.errors import BusSetupError
 from devices.scan import Scan
@@ -19,12 +21,13 @@ class Helper:
         self.asked_ns: list[int] = []
         self.resets = 0
         self.fails = False
+        self.lets_go = True
 
     def clock_out(self) -> bool:
         self.asked_ns.append(self.wires.clock.now_ns())
         if self.fails:
             raise BusSetupError("the lines are somebody else's", where="gpio", errno=16)
-        return True
+        return self.lets_go
 
     def reset_muxes(self) -> bool:
         self.resets += 1
@@ -96,7 +99,20 @@ def test_a_stuck_bus_is_helped_at_once_and_then_ever_more_rarely() -> None:
         for found, due in zip(waits_ms, [10, 20, 40, 80, 160, 320, 640, 1000, 1000], strict=False)
     )
     assert len(waits_ms) >= 9
-    assert watch.recoveries == helper.resets == len(helper.asked_ns)
+    assert watch.recoveries == len(helper.asked_ns)
+    assert helper.resets == 0, "the clocks were enough, as far as anybody could see"
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_reset_is_for_a_bus_that_nine_clocks_did_not_free(fails: bool) -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    helper.fails, helper.lets_go = fails, False
+    watch = watch_on(wires, helper)
+    with wires.fault("sda_low"):
+        watch.fall()
+        assert not watch.comes_back()
+    assert len(helper.asked_ns) == helper.resets == 1
 
 
 def test_after_it_was_well_a_stuck_bus_is_helped_at_once_again() -> None:

@@ -22,7 +22,7 @@ def health() -> TileHealth:
 def settled(padc: int = 410, tadc: int = 507) -> TileHealth:
     one = health()
     for _ in range(3):
-        one.believe(padc, tadc)
+        one.believe(padc, tadc, 0)
     return one
 
 
@@ -55,7 +55,7 @@ def test_without_a_history_every_reading_is_looked_at_twice() -> None:
     for _ in range(3):
         assert one.jumps(410, 507)
         assert not one.may_be_another(410, 507), "there is nothing yet to be unlike"
-        one.believe(410, 507)
+        one.believe(410, 507, 0)
     assert not one.jumps(410, 507)
 
 
@@ -81,14 +81,14 @@ def test_a_reading_without_temperature_is_judged_by_its_pressure() -> None:
     one = settled()
     assert not one.jumps(410, NOT_READ)
     assert one.jumps(430, NOT_READ)
-    one.believe(410, NOT_READ)
-    assert not one.wants_temperature, "it has that of before"
-    assert health().wants_temperature
+    one.believe(410, NOT_READ, 0)
+    assert not one.wants_temperature(0), "it has that of before"
+    assert health().wants_temperature(0)
 
 
 def test_one_outlier_that_was_believed_does_not_move_what_others_are_compared_with() -> None:
     one = settled(410)
-    one.believe(450, 507)
+    one.believe(450, 507, 0)
     assert not one.jumps(410, 507)
 
 
@@ -96,7 +96,7 @@ def test_what_is_lost_has_no_history_when_it_comes_back() -> None:
     one = settled()
     one.lose(0)
     one.find()
-    assert one.wants_temperature
+    assert one.wants_temperature(0)
     assert one.jumps(410, 507)
 
 
@@ -113,7 +113,7 @@ def test_of_healthy_readings_few_are_read_twice_and_none_is_far() -> None:
     for words in zip(padc.tolist(), tadc.tolist(), strict=True):
         jumps += one.jumps(*words)
         far += one.may_be_another(*words)
-        one.believe(*words)
+        one.believe(*words, 0)
     assert jumps / 50_000 < 0.03
     assert far < 10
 
@@ -228,3 +228,11 @@ def test_a_reading_equal_to_those_before_never_jumps(padc: int, tadc: int) -> No
     one = settled(padc, tadc)
     assert not one.jumps(padc, tadc)
     assert not one.may_be_another(padc, tadc)
+
+
+def test_on_a_disturbed_line_half_as_far_is_too_far() -> None:
+    one = settled()
+    near = 410 + 3  # of the example part's 0.1255 kPa: 0.38 kPa
+    assert not one.jumps(near, 507)
+    assert one.jumps(near, 507, strictly=True)
+    assert not one.jumps(410 + 1, 507, strictly=True)

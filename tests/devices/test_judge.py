@@ -123,34 +123,6 @@ def test_a_true_jump_is_believed_at_once_if_it_comes_twice(foot: tuple[Wires, Ti
     assert wires.log.count("60<04 60>8") == 1, "is it this tile that answers?"
 
 
-def test_for_a_second_after_a_disturbance_every_reading_is_read_twice(
-    foot: tuple[Wires, TileArray],
-) -> None:
-    wires, array = foot
-    tampered = []
-
-    def tamper(count: int, raw: list[int]) -> None:
-        if count == 0:
-            tampered.append(count)
-            raw[0] ^= 0x20
-
-    read_bytes(wires, 1, tamper)
-    array.scan()
-    begin_ns = wires.clock.now_ns()
-    quiet_frame(array)
-    wires.log.clear()
-    array.scan()
-    # As far as the budget of a frame goes: it is some tile's turn in each.
-    twice = sum(reads_of(wires, tile) == 2 for tile in range(4))
-    assert twice >= 2
-    while wires.clock.now_ns() < begin_ns + 1_050_000_000:
-        array.scan()
-    quiet_frame(array)
-    wires.log.clear()
-    array.scan()
-    assert sum(reads_of(wires, tile) == 1 for tile in range(4)) == 4
-
-
 def test_a_jump_that_is_another_tiles_word_is_noticed_by_its_coefficients() -> None:
     wires = Wires(FOUR, words={3: FORUM})
     array = settled(wires)

@@ -359,10 +359,12 @@ def test_no_read_begins_before_its_parts_conversion_is_finished(
     stop_ns: dict[int, int] = {}
     for i, tile in enumerate(wires.tiles):
 
-        def note(t_ns: int, words: tuple[int, int], i: int = i) -> None:
+        def note(
+            t_ns: int, words: tuple[int, int], chip: tuple[int, int, int, int], i: int = i
+        ) -> None:
             stop_ns[i] = t_ns
 
-        tile.witness = note
+        tile.on_conversion = note
     at = {(mux, 1 << channel): i for i, (mux, channel) in enumerate(plugs)}
     reads = 0
 

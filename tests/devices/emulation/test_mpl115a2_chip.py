@@ -276,7 +276,7 @@ def test_a_part_that_is_lost_between_address_and_data_reads_as_ones() -> None:
 def test_a_witness_is_told_of_every_conversion_and_of_no_other_transfer() -> None:
     told: list[tuple[int, tuple[int, int]]] = []
     chip = part(faults=PartFaults(stale=between(2 * TC_NS, 3 * TC_NS)))
-    chip.witness = lambda stop_ns, words: told.append((stop_ns, words))
+    chip.on_conversion = lambda stop_ns, words, _: told.append((stop_ns, words))
     convert(chip, 7)
     counts(chip, TC_NS)
     convert(chip, 2 * TC_NS)  # it never ends, but what it would have given is known
