@@ -247,7 +247,8 @@ def main() -> None:
         recovered = "new stream" if np.isnan(r.recovery_ms) else f"{r.recovery_ms:.0f} ms"
         lines.append(
             f"| {r.name} | {r.schedule} | {r.struck} | {r.flagged} | {r.needless} | {r.right} | "
-            f"{r.bounded} | {r.caught} | {r.missed} | {r.worst_kpa:.2f} | {r.run} | {r.wrongly} of {r.healthy} | "
+            f"{r.bounded} | {r.caught} | {r.missed} | {r.worst_kpa:.2f} | {r.run} | "
+            f"{r.wrongly} of {r.healthy} | "
             f"{r.strayed} | "
             f"{100 * r.rate:.0f} % | {recovered} |"
         )

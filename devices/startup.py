@@ -65,14 +65,7 @@ def make_ready(
     """
     free_bus(bus, scene, recovery)
     found = measured(bus, scene, clock)
-    asked = schedule or scene.array.schedule
-    if beside is not None:
-        choice = _beside_reference(asked)
-    elif asked == "auto":
-        channels_max = scene.array.broadcast_channels
-        choice = choose(found.timing, asked_hz=scene.rate_hz, channels_max=channels_max)
-    else:
-        choice = Choice(asked, "as the scene says" if schedule is None else "as asked for")
+    choice = chosen(scene, found.timing, schedule, has_reference=beside is not None)
     return _ready(bus, scene, clock, found, choice, recovery, beside)
 
 
@@ -157,6 +150,38 @@ def _ready(
     array.scan()
     predicted_hz = 1.0 / frame_s(choice.schedule, found.timing)
     return Ready(array, found.tiles, found.timing, choice, predicted_hz, found.unmeasured)
+
+
+def chosen(
+    scene: Scene,
+    timing: BusTiming,
+    schedule: AnySchedule | None = None,
+    *,
+    has_reference: bool,
+    asked_hz: float = 0.0,
+) -> Choice:
+    """The schedule for a scene on a bus with this timing, and why.
+
+    Args:
+        scene: what it asks for.
+        timing: as measured.
+        schedule: instead of the scene's.
+        has_reference: is a reference force read with the tiles?
+        asked_hz: instead of the scene's rate.
+
+    Raises:
+        SceneError: the schedule does not suit a reference sensor.
+    """
+    asked = schedule or scene.array.schedule
+    if has_reference:
+        return _beside_reference(asked)
+    if asked == "auto":
+        return choose(
+            timing,
+            asked_hz=asked_hz or scene.rate_hz,
+            channels_max=scene.array.broadcast_channels,
+        )
+    return Choice(asked, "as the scene says" if schedule is None else "as asked for")
 
 
 def _beside_reference(asked: AnySchedule) -> Choice:

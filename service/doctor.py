@@ -12,10 +12,11 @@ from devices.budget import BusTiming, broadcast_width, choose, frame_s, rates_hz
 from devices.clock import Clock
 from devices.errors import I2cError
 from devices.frames import TileInfo
-from devices.i2c import I2cBus
+from devices.i2c import I2cBus, PatientBus
 from devices.mpl115a2 import CONVERSION_MAX_NS, CONVERSION_TYPICAL_NS
 from devices.scene import ArrayScene, Scene, ScheduleName, TileScene
 from devices.self_test import Plug, find_tiles, measure_conversion_ns, measure_wires
+from devices.startup import chosen
 
 _AS_ASKED = 0.95
 _PI_TRAP = 0.625  # core clock 250 MHz where the kernel believes in 400 MHz (hardware.md 3.2)
@@ -83,12 +84,13 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
         BusSetupError: it cannot be used.
     """
     array = scene.array if scene is not None else ArrayScene()
-    findings = _findings(find_tiles(bus), scene.tile if scene is not None else ())
+    findings = _findings(find_tiles(PatientBus(bus)), scene.tile if scene is not None else ())
     well = [(finding, _info(finding)) for finding in findings if not finding.problem]
     if not well:
         return Diagnosis(
             findings, None, array.scl_hz, 0.0, {}, None, holds=False, verdict=_nobody(findings)
         )
+    bus = PatientBus(bus)
     wires = measure_wires(bus, clock, well[0][1])
     measured: dict[tuple[int, int], TileFinding] = {}
     for finding, info in well:
@@ -108,10 +110,7 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
     findings = tuple(measured.get((f.mux, f.channel), f) for f in findings)
     timing = BusTiming(
         scl_hz=wires.scl_hz,
-        conversions_s=tuple(
-            (CONVERSION_MAX_NS if f.conversion_ms is None else round(f.conversion_ms * 1e6)) * 1e-9
-            for f in measured.values()
-        ),
+        conversions_s=tuple(_wait_s(f, array) for f in measured.values()),
         muxes=tuple(f.mux for f in measured.values()),
         bytes_read=2.0 + 2.0 / array.temperature_every,
         transaction_s=wires.transaction_s,
@@ -122,7 +121,10 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
     }
     asked_hz = asked_hz or (scene.rate_hz if scene is not None else 0.0)
     choice = choose(timing, asked_hz=asked_hz, channels_max=array.broadcast_channels)
-    schedule = choice.schedule if array.schedule == "auto" else array.schedule
+    schedule = choice.schedule
+    if scene is not None:
+        has_reference = scene.reference is not None
+        schedule = chosen(scene, timing, has_reference=has_reference, asked_hz=asked_hz).schedule
     advice = _advice(findings, timing, rates, array, asked_hz, choice.schedule, schedule)
     return Diagnosis(
         findings,
@@ -134,6 +136,12 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
         holds=not advice.wrong,
         verdict=" ".join((advice.summary, *advice.wrong, *advice.hints)),
     )
+
+
+def _wait_s(finding: TileFinding, array: ArrayScene) -> float:
+    """How long a node would wait for a tile: as the scene says, else as measured."""
+    wait_ms = array.wait_ms if array.wait_ms is not None else finding.conversion_ms
+    return CONVERSION_MAX_NS * 1e-9 if wait_ms is None else wait_ms * 1e-3
 
 
 def _findings(plugs: tuple[Plug, ...], wanted: tuple[TileScene, ...]) -> tuple[TileFinding, ...]:

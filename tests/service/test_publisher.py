@@ -294,17 +294,6 @@ def test_what_is_no_address_is_refused(server: str) -> None:
         ingest_url(server)
 
 
-def test_a_drain_waits_for_the_last_acknowledgement(running: Running, node: FakeNode) -> None:
-    async def scenario() -> None:
-        async with Publishing(node, running.url) as publishing:
-            await publishing.until(lambda: publishing.reports)
-            publishing.take(200)
-            await publishing.publisher.drain()
-            assert publishing.backlog.first_seq == publishing.backlog.next_seq
-
-    asyncio.run(scenario())
-
-
 def test_a_redirect_is_no_end(node: FakeNode) -> None:
     asked: list[int] = []
 

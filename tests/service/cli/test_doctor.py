@@ -154,3 +154,35 @@ def test_a_servo_that_is_not_what_the_scene_says_is_said(run, tmp_path, monkeypa
     found = json.loads(outcome.out)["servo"]
     assert "MX-64, protocol 1" in found["verdict"]
     assert "The scene says MX-28, protocol 2" in found["verdict"]
+
+
+def test_a_wait_that_the_scene_fixes_is_the_one_that_counts(doctor):
+    text = scene_text("standing").replace("[array]", "[array]\nwait_ms = 3.0")
+    _, found = doctor(text)
+    assert found["rates_hz"]["pipelined"] == pytest.approx(309.0, rel=0.005)  # hardware.md 4
+
+
+def test_beside_a_reference_sensor_tiles_are_asked_at_once(run):
+    verdict = json.loads(run("doctor", "--scene", "indentation", "--json").out)["verdict"]
+    assert "simultaneous gives" in verdict
+
+
+def test_single_lost_acknowledges_do_not_make_tiles_look_ill(doctor):
+    outcome, found = doctor(scene_text("standing") + faulty("nack_storm", rate=0.002))
+    assert outcome.code == 0, found
+    assert not any(tile["problem"] for tile in found["tiles"])
+
+
+def test_a_bus_that_hangs_since_the_last_run_is_freed_before_the_start(run, tmp_path):
+    text = scene_text("standing") + faulty("sda_low") + "\n[recovery]\nreset_line = 17\n"
+    (tmp_path / "scene.toml").write_text(text)
+    outcome = run("simulate", "--scene", "scene.toml", "--seconds", 1, "--no-estimates")
+    assert outcome.code == 0, outcome.err
+
+
+def test_without_help_a_bus_that_hangs_is_named_and_no_tile_is_blamed(run, tmp_path):
+    (tmp_path / "scene.toml").write_text(scene_text("standing") + faulty("sda_low"))
+    outcome = run("simulate", "--scene", "scene.toml", "--seconds", 1, "--no-estimates")
+    assert outcome.code == 1
+    assert "SDA is stuck low" in outcome.err
+    assert "T01" not in outcome.err
