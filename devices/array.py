@@ -140,6 +140,8 @@ class TileArray:
         """
         self._frames = 0
         self._ports.router.forget()
+        for health in self.health:
+            health.counts.clear()
 
     def troubles(self) -> dict[str, str]:
         """What is wrong now, in words: by serial, and under "" what is wrong with the bus."""

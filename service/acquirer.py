@@ -12,9 +12,9 @@ import multiprocessing
 import queue
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 
 from devices.errors import FootTileError
@@ -30,7 +30,6 @@ _WAITING_MAX = 4096
 as a gap in `seq`."""
 _END_S = 5.0
 _NEWS_NS = 500_000_000
-_Item = tuple[FrameBatch, int, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,19 @@ class Started:
 
 
 @dataclass(frozen=True)
+class Health:
+    """How the array is.
+
+    Attributes:
+        troubles: what is wrong now, in words.
+        counts: of what went wrong since the stream began, by serial and reason.
+    """
+
+    troubles: tuple[str, ...] = ()
+    counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Batch:
     """Frames, and what was counted beside them so far."""
 
@@ -50,6 +62,7 @@ class Batch:
     missed_slots: int
     news: tuple[str, ...] = ()
     """What has become wrong with the array, or right again."""
+    health: Health = Health()  # frozen, so one for all is safe
 
 
 @dataclass(frozen=True)
@@ -60,6 +73,7 @@ class Failed:
 
 
 Message = Started | Batch | Failed
+_Item = tuple[FrameBatch, int, tuple[str, ...], Health]
 
 
 class AcquisitionProcess:
@@ -138,7 +152,7 @@ def _run(options: RigOptions, connection: Connection) -> None:
 def _stream(rig: Rig, connection: Connection, stop: threading.Event) -> None:
     connection.send(Started(rig.info, tuple(rig.remarks)))
     rig.remarks.clear()
-    news, news_due_ns = News(), 0
+    news, news_due_ns, health = News(), 0, Health()
     waiting: queue.Queue[_Item | None] = queue.Queue(_WAITING_MAX)
     sender = threading.Thread(target=_send, args=(rig.info, waiting, connection, stop))
     sender.start()
@@ -147,9 +161,10 @@ def _stream(rig: Rig, connection: Connection, stop: threading.Event) -> None:
             told: tuple[str, ...] = ()
             if batch.t_mono_ns[-1] >= news_due_ns:
                 told = news.since(rig.troubles())
+                health = Health(news.lasting, rig.counts())
                 news_due_ns = int(batch.t_mono_ns[-1]) + _NEWS_NS
             with suppress(queue.Full):
-                waiting.put_nowait((batch, rig.acquisition.missed_slots, told))
+                waiting.put_nowait((batch, rig.acquisition.missed_slots, told, health))
     finally:
         waiting.put(None)
         sender.join()
@@ -163,10 +178,10 @@ def _send(
 ) -> None:
     schema = wire_schema(info)
     while (item := waiting.get()) is not None:
-        frames, missed_slots, news = item
+        frames, missed_slots, news, health = item
         encoded = EncodedBatch(int(frames.seq[0]), int(frames.seq[-1]), encode(frames, schema))
         try:
-            connection.send(Batch(encoded, missed_slots, news))
+            connection.send(Batch(encoded, missed_slots, news, health))
         except OSError:
             stop.set()
             return

@@ -144,6 +144,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
                     server.recorder.note_clock(node)
             case Status():
                 node.missed_slots = said.missed_slots
+                node.troubles, node.fault_counts = said.troubles, said.counts
                 node.node_first_seq = max(node.node_first_seq, said.first_seq)
                 server.tell_node(node)
             case Hello():

@@ -136,6 +136,10 @@ class Status(_Message):
     missed_slots: Annotated[int, Field(ge=0)]
     first_seq: _Seq
     """The oldest frame it still has; older ones that the server lacks are lost: evicted."""
+    troubles: tuple[str, ...] = ()
+    """What is wrong with the array now, in words."""
+    counts: dict[str, dict[str, Annotated[int, Field(ge=0)]]] = {}
+    """How often what went wrong in this stream, by serial and reason."""
 
 
 FromNode: TypeAdapter[Hello | Probe | ClockRow | Status] = TypeAdapter(

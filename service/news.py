@@ -12,6 +12,11 @@ class News:
         self._last: Mapping[str, str] = {}
         self._told: dict[str, str] = {}
 
+    @property
+    def lasting(self) -> tuple[str, ...]:
+        """What is wrong, and lasts."""
+        return tuple(self._told.values())
+
     def since(self, troubles: Mapping[str, str]) -> tuple[str, ...]:
         """What is new since the last look.
 

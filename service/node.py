@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from itertools import count
 
 from devices.frames import ArrayInfo
-from service.acquirer import AcquisitionProcess, Batch, Failed, Message, Started
+from service.acquirer import AcquisitionProcess, Batch, Failed, Health, Message, Started
 from service.backlog import Backlog
 from service.estimation.calibration import Calibration
 from service.link import PROTOCOL, Hello, Status, StreamEnd
@@ -67,7 +67,12 @@ async def run_node(
             )
 
         def status() -> Status:
-            return Status(missed_slots=stream.missed_slots, first_seq=stream.backlog.first_seq)
+            return Status(
+                missed_slots=stream.missed_slots,
+                first_seq=stream.backlog.first_seq,
+                troubles=stream.health.troubles,
+                counts={serial: dict(counts) for serial, counts in stream.health.counts.items()},
+            )
 
         return Publisher(
             server, hello=hello, backlog=stream.backlog, status=status, token=token, report=report
@@ -86,6 +91,7 @@ async def run_node(
             if isinstance(message, Batch):
                 stream.backlog.append(message.batch)
                 stream.missed_slots = message.missed_slots
+                stream.health = message.health
                 if stream.publisher is not None:
                     stream.publisher.notify()
                 for news in message.news:
@@ -125,6 +131,7 @@ class _Stream:
     previous: StreamEnd | None
     backlog: Backlog = field(default_factory=Backlog)
     missed_slots: int = 0
+    health: Health = Health()  # noqa: RUF009  # frozen, so one for all is safe
     has_ended: bool = False
     publisher: Publisher | None = None
 

@@ -62,6 +62,10 @@ class Node:
         self.journals: dict[str, Journal] = {}
         self.storage_problem: str | None = None
         self.missed_slots = 0
+        self.troubles: tuple[str, ...] = ()
+        """What is wrong with its array, as it said last."""
+        self.fault_counts: dict[str, dict[str, int]] = {}
+        """How often what went wrong in its stream, by serial and reason, as it said last."""
         self.lost_frames = 0
         self.last_seq: int | None = None
         self.last_t_ns: int | None = None
@@ -112,6 +116,7 @@ class Node:
         if hello.array_info.boot_id != self.boot_id or self.last_seq is None:
             self.last_seq = self.last_t_ns = None
             self.lost_frames = 0
+            self.troubles, self.fault_counts = (), {}
             self.clock = None
             self._pace.clear()
         known = (self.hello.array_info, self.hello.calibration)

@@ -146,6 +146,15 @@ class Rig:
         """What is wrong now, in words, by what it is wrong with."""
         return self._ready.array.troubles()
 
+    def counts(self) -> dict[str, dict[str, int]]:
+        """How often what went wrong since the stream began, by serial and reason."""
+        array = self._ready.array
+        return {
+            tile.serial: dict(health.counts)
+            for tile, health in zip(array.tiles, array.health, strict=True)
+            if health.counts
+        }
+
     def _is_renewal_due(self) -> bool:
         return bool(self._ready.array.replaced) and self._clock.now_ns() >= self._renew_at_ns
 

@@ -108,6 +108,10 @@ class NodeView(View):
     rate_hz: float | None = Field(description="Frames a second over the last second.")
     lost_frames: int = Field(description="Frames of this stream that never came.")
     missed_slots: int = Field(description="Slots in which no frame was taken.")
+    troubles: list[str] = Field(description="What is wrong with its array now, in words.")
+    fault_counts: dict[str, dict[str, int]] = Field(
+        description="How often what went wrong in this stream, by serial and reason."
+    )
     last_seq: int | None
     last_t_ns: int | None
     last_seen_t_ns: int | None = Field(description="When its last frame came, server's UTC.")
@@ -152,6 +156,8 @@ class NodeView(View):
             rate_hz=node.rate_hz if node.connected else None,
             lost_frames=node.lost_frames,
             missed_slots=node.missed_slots,
+            troubles=list(node.troubles),
+            fault_counts=node.fault_counts,
             last_seq=node.last_seq,
             last_t_ns=node.last_t_ns,
             last_seen_t_ns=node.last_seen_t_ns,

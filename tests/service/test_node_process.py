@@ -182,13 +182,19 @@ def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old
     assert (again.status[20:, 1] & TileStatus.UNUSABLE == 0).mean() > 0.99
 
 
-def test_a_tile_that_dies_is_named_on_the_terminal_and_so_is_its_return(
-    running: Running, foottile: Foottile, scene: Path
+def test_a_tile_that_dies_is_named_on_the_terminal_and_by_the_server_and_so_is_its_return(
+    running: Running, foottile: Foottile, scene: Path, until: Until
 ) -> None:
     death = '\n[[fault]]\nkind = "unplugged"\ntile = "T03"\nt_s = 1.0\nduration_s = 2.5\n'
     scene.write_text(scene.read_text() + death)
     process = foottile("node", "--scene", scene, "--server", running.url)
     process.said("tile T03 (mux 0x70 channel 2) does not answer", 25.0)
+    (name,) = [node["node"] for node in running.http.get("/nodes").json()["items"]]
+    until(lambda: running.node(name)["troubles"])
+    assert running.node(name)["troubles"] == ["tile T03 (mux 0x70 channel 2) does not answer"]
     process.said("no longer: tile T03", 15.0)
+    until(lambda: not running.node(name)["troubles"])
+    counts = running.node(name)["fault_counts"]
+    assert counts["T03"]["no_answer"] > 100
     process.process.send_signal(signal.SIGTERM)
     assert process.ended(10.0) == 0
