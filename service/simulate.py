@@ -6,6 +6,7 @@ The same command and version give the same bytes: time is virtual, every draw co
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
@@ -24,7 +25,7 @@ from devices.emulation.ground import press_on
 from devices.emulation.load_trace import CopTransform, LoadTrace, PressedTrace
 from devices.emulation.world import World
 from devices.errors import UsageError
-from devices.frames import FrameBatch, FrameStatus
+from devices.frames import FrameBatch, FrameStatus, TileStatus
 from devices.i2c import open_bus
 from devices.scene import AnySchedule, Scene, ServoScene
 from devices.servo import PolledServo
@@ -73,6 +74,8 @@ class Simulated:
     choice: Choice
     replaced: tuple[str, ...]
     """Serials in whose place another part answered."""
+    flags: Mapping[str, Mapping[str, int]]
+    """Frames in which a tile was flagged, by serial and reason."""
     pressed: PressedTrace | None
     accuracy: Accuracy | None
     wall_s: float
@@ -178,6 +181,7 @@ def simulate(
     judged: list[Mapping[str, npt.NDArray[Any]]] = []
     frames = 0
     first_ns = last_ns = 0
+    flagged: Counter[tuple[int, str]] = Counter()
     with ExitStack() as stack:
         simulation = Simulation(options, stack)
         pieces: Iterator[tuple[FrameBatch, Extra]] = simulation.pieces()
@@ -194,6 +198,7 @@ def simulate(
             first_ns = first_ns or int(batch.t_ns[0])
             last_ns = int(batch.t_ns[-1])
             frames += len(batch)
+            flagged.update(_flags(batch))
             if options.truth and estimate is not None:
                 columns = {"t_ns": batch.t_ns, **extra}
                 judged.append({name: columns[name] for name in JUDGED})
@@ -205,10 +210,27 @@ def simulate(
         missed_slots=simulation.acquisition.missed_slots,
         choice=simulation.choice,
         replaced=simulation.array.replaced,
+        flags={
+            serial: {reason: n for (i, reason), n in sorted(flagged.items()) if i == tile}
+            for tile, serial in enumerate(simulation.info.serials)
+            if any(i == tile for i, _ in flagged)
+        },
         pressed=simulation.pressed,
         accuracy=judge(joined(judged)) if judged else None,
         wall_s=time.perf_counter() - began_s,
     )
+
+
+def _flags(batch: FrameBatch) -> dict[tuple[int, str], int]:
+    """Frames of a batch in which a tile has a flag, by its index and the flag's name."""
+    if not batch.status.any():
+        return {}
+    counts = {}
+    for bit in TileStatus:
+        for tile, n in enumerate(((batch.status & np.uint8(bit)) != 0).sum(axis=0).tolist()):
+            if n and bit.name:
+                counts[tile, bit.name.lower()] = n
+    return counts
 
 
 def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArray[Any]]:

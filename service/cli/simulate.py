@@ -135,6 +135,7 @@ def _as_json(result: Simulated, path: Path) -> dict[str, object]:
         "seconds": result.seconds,
         "rate_hz": result.rate_hz,
         "schedule": result.choice.schedule,
+        "flags": {serial: dict(flags) for serial, flags in result.flags.items()},
         "missed_slots": result.missed_slots,
         "bytes": path.stat().st_size,
         "moved_to_edge": pressed.moved_to_edge if pressed else None,
@@ -153,6 +154,9 @@ def _print(result: Simulated, path: Path) -> None:
         f"{result.wall_s:.1f} s of wall time, {result.seconds / result.wall_s:.1f} times real time"
     )
     remark(f"schedule {result.choice.schedule}: {result.choice.reason}")
+    for serial, flags in result.flags.items():
+        said = ", ".join(f"{n} {reason}" for reason, n in flags.items())
+        say(f"tile {serial}: of {result.frames} frames {said}")
     for serial in result.replaced:
         say(f"tile {serial} was replaced by another part: its readings are flagged from then on")
     if result.missed_slots:

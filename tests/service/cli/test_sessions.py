@@ -237,3 +237,16 @@ def test_calibrate_prints_the_contract_and_draws(run, tmp_path):
     }
     assert json.loads((tmp_path / "cal.json").read_text())["id"] == printed["id"]
     assert (tmp_path / "cal.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_befell_a_tile_is_said_on_the_terminal(run, tmp_path):
+    (tmp_path / "faulty.toml").write_text(
+        scene_text("standing")
+        + '[[fault]]\nkind = "unplugged"\ntile = "T02"\nt_s = 0.5\nduration_s = 0.5\n'
+    )
+    arguments = ("simulate", "--scene", "faulty.toml", "--seconds", 2, "--no-estimates")
+    assert "tile T02: of " in run(*arguments).out
+    flags = json.loads(run(*arguments, "--json").out)["flags"]
+    assert list(flags) == ["T02"]
+    # Half a second at 540 frames a second, and until it is found again.
+    assert 250 < flags["T02"]["no_answer"] < 500
