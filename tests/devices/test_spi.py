@@ -74,7 +74,7 @@ def test_a_device_that_cannot_be_opened_is_closed_and_said(
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "spidev", None)
-    with pytest.raises(SpiSetupError, match=r"foottile\[rig\]"):
+    with pytest.raises(SpiSetupError, match=r"'\.\[rig\]'"):
         open_spi("/dev/spidev0.0")
 
 

@@ -50,8 +50,8 @@ def test_an_emulated_node_streams_tares_and_ends_without_loss(
 ) -> None:
     process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
     process.said("connected to")
-    until(lambda: (running.node("demo")["last_seq"] or 0) > 600, 15.0)
-    until(lambda: running.node("demo")["tare"], 10.0)
+    until(lambda: (running.node("demo")["last_seq"] or 0) > 600, 30.0)
+    until(lambda: running.node("demo")["tare"], 30.0)
     node = running.node("demo")
     assert node["emulated"] is True
     assert node["tare"]["source"] == "lead"
@@ -160,10 +160,10 @@ def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old
     scene.write_text(scene.read_text() + swap)
     process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
     process.said("connected to")
-    until(lambda: running.node("demo")["tare"], 20.0)
+    until(lambda: running.node("demo")["tare"], 40.0)
     answer = running.http.post("/sessions", json={"node": "demo", "name": "swap"})
     assert answer.status_code == 201, answer.text
-    process.said("a new stream begins", 20.0)
+    process.said("a new stream begins", 40.0)
     sealed = running.sealed(answer.json()["id"])
     assert sealed["complete"] is True
     assert "other tiles" in sealed["problem"]
@@ -171,7 +171,7 @@ def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old
     tile = first.status[-20:, 1]
     assert (tile & TileStatus.UNUSABLE != 0).all(), "of the other part nothing was believed"
     assert (first.status[:, 0] & TileStatus.UNUSABLE == 0).all()
-    until(lambda: (running.node("demo")["last_seq"] or 0) > 200, 10.0)
+    until(lambda: (running.node("demo")["last_seq"] or 0) > 200, 30.0)
     (second,) = running.http.get("/sessions").json()["items"][:1]
     assert (second["name"], second["state"]) == ("swap (2)", "recording")
     running.http.post(f"/sessions/{second['id']}/stop")
