@@ -13,7 +13,7 @@ import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from devices.budget import read_bits
+from devices.budget import CONVERT_BITS, read_bits
 from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
 from devices.frames import TileInfo
@@ -31,6 +31,7 @@ from devices.tca9548a import ADDRESSES, CHANNELS, MuxRouter, Tca9548a
 _SETTLED_NS = 3_200_000  # the longest conversion and a little more
 _SHORTEST_NS = 800_000
 _RESOLUTION_NS = 8_000
+_NEVER_NS = 1 << 62
 _SAME_MAX = 8
 """So many readings without any change, and a conversion is taken to be unfinished. Of two healthy
 readings one in nine is equal by chance, in one of 10^7 cases all eight are."""
@@ -202,27 +203,44 @@ def measure_conversion_ns(
     router.connect_only(tile.mux, tile.channel)
     chip = Mpl115a2(bus)
 
+    wires_ns = round(1e9 * (CONVERT_BITS + read_bits(4.0)) / wires.scl_hz)
+    wires_ns += round(2e9 * wires.transaction_s)
+
     def convert_and_read(delay_ns: int) -> tuple[tuple[int, int], int]:
+        """The words, and how long after CONVERT they may have been read at the latest.
+
+        A busy machine may hesitate before either transaction, so all of the time counts that the
+        wires themselves did not take.
+        """
+        begin_ns = clock.now_ns()
         chip.convert()
         stop_ns = clock.now_ns()
         clock.sleep_until_ns(stop_ns + delay_ns)
-        waited_ns = clock.now_ns() - stop_ns
         words = chip.read_counts()
+        waited_ns = max(delay_ns, clock.now_ns() - begin_ns - wires_ns)
         clock.sleep_until_ns(stop_ns + _SETTLED_NS)
         return words, waited_ns
 
-    def finished_within(delay_ns: int) -> int | None:
-        """What was really waited when a conversion was seen to be finished; None if none was."""
+    def finished_within(delay_ns: int, known_ns: int) -> int | None:
+        """What was waited when a conversion was seen to be finished; None if none was.
+
+        What was waited as long as the `known_ns` in which one finishes proves nothing. If nothing
+        else was tried, that is what is given.
+        """
+        in_time = 0
         pressure_changed = False
-        for trial in range(_TEMPERATURE_SAME_MAX):
+        for _ in range(_TEMPERATURE_SAME_MAX):
             settled, _ = convert_and_read(_SETTLED_NS)
             words, waited_ns = convert_and_read(delay_ns)
+            if waited_ns >= known_ns and words != settled:
+                continue
             if words[1] != settled[1]:
                 return waited_ns
+            in_time += 1
             pressure_changed |= words[0] != settled[0]
-            if trial + 1 >= _SAME_MAX and not pressure_changed:
+            if in_time >= _SAME_MAX and not pressure_changed:
                 return None
-        return None
+        return None if in_time >= _SAME_MAX else known_ns
 
     delay_ns = _bisected(finished_within)
     if delay_ns is None:
@@ -230,13 +248,13 @@ def measure_conversion_ns(
     return min(CONVERSION_MAX_NS, round((delay_ns + _ADDRESS_BITS * 1e9 / wires.scl_hz) * _MARGIN))
 
 
-def _bisected(finished_within: Callable[[int], int | None]) -> int | None:
-    if finished_within(CONVERSION_MAX_NS) is None:
+def _bisected(finished_within: Callable[[int, int], int | None]) -> int | None:
+    if finished_within(CONVERSION_MAX_NS, _NEVER_NS) is None:
         return None
     unfinished_ns, finished_ns = _SHORTEST_NS, CONVERSION_MAX_NS
     while finished_ns - unfinished_ns > _RESOLUTION_NS:
         middle_ns = (unfinished_ns + finished_ns) // 2
-        waited_ns = finished_within(middle_ns)
+        waited_ns = finished_within(middle_ns, finished_ns)
         if waited_ns is None:
             unfinished_ns = middle_ns
         elif waited_ns < finished_ns:
