@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from devices.frames import NOT_READ, TileInfo
 from devices.i2c import I2cBus
-from devices.mpl115a2 import Mpl115a2
+from devices.mpl115a2 import COUNTS_MAX, Mpl115a2
 from devices.tca9548a import MuxRouter
 
 
@@ -31,8 +31,16 @@ class TilePorts:
         self._chip.convert()
 
     def read(self, with_temperature: bool) -> tuple[int, int]:
-        """`padc` and `tadc` (or `NOT_READ`) of the tile that is connected."""
-        return self._chip.read_counts() if with_temperature else (self._chip.read_padc(), NOT_READ)
+        """`padc` and `tadc` (or `NOT_READ`) of the tile that is connected.
+
+        At either end of its counts the pressure alone does not tell a part that is pressed too hard
+        from a line that is stuck (hardware.md 8), so there the temperature is read as well.
+        """
+        if not with_temperature:
+            padc = self._chip.read_padc()
+            if padc not in (0, COUNTS_MAX):
+                return padc, NOT_READ
+        return self._chip.read_counts()
 
     def read_coefficients(self) -> bytes:
         """The eight coefficient bytes of the tile that is connected, read once."""

@@ -364,6 +364,14 @@ def test_a_transfer_that_timed_out_is_flagged_in_its_frame(schedule: ScheduleNam
     assert one.verdict.right.mean() > 0.95
 
 
+@cases(["sda_low", "all_ones"])
+def test_a_stuck_line_is_told_from_a_tile_pressed_too_hard_although_temperature_is_rarely_read(
+    schedule: ScheduleName, kind: FaultKind
+) -> None:
+    one = run(schedule, kind, temperature_every=10)
+    assert not one.verdict.wrong.any()
+
+
 # Chance
 
 
