@@ -9,7 +9,6 @@ import logging
 import re
 from collections import deque
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -173,8 +172,10 @@ class Node:
             self._pace.popleft()
         due = list(self.live.feed(frames))
         if (tare := self.live.tare_from_lead(frames)) is not None:
-            with suppress(StorageError):
+            try:
                 self.put_in_force(self.tares.add(tare, self.info))
+            except StorageError as error:  # not in force then; the node can be tared by hand
+                self.storage_problem = str(error)
         return first, last, due
 
     def take_tare(self) -> RecordedTare:
