@@ -34,6 +34,10 @@ PRESSURE_MAX_KPA = 115.0
 
 COUNTS_MAX = 1023
 
+TADC_PER_KELVIN = -5.35
+"""Counts of `tadc` for a kelvin (Linux' mpl115 driver, Freescale's answer; hardware.md 1.3)."""
+_TADC_AT_25_DEGC = 472
+
 SAMPLE_PART_OF_CONVERSION = 4
 """The pressure is taken in the first part of a conversion (DS table 7); the exact instant is not
 stated, so a quarter into it is assumed (hardware.md 1.4)."""
@@ -196,3 +200,11 @@ class Mpl115a2:
                 remedy="Check that the tile is plugged in and that SDA is not stuck",
             )
         return a0, b1, b2, c12
+
+
+def indicative_degc(tadc: float) -> float:
+    """Temperature that `tadc` stands for, within some 5 K: the chip is not calibrated for it.
+
+    25 degC at 472 counts and -5.35 counts/K (hardware.md 1.3); no scale is in the data sheet.
+    """
+    return 25.0 + (tadc - _TADC_AT_25_DEGC) / TADC_PER_KELVIN

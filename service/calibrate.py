@@ -10,9 +10,10 @@ import numpy as np
 
 from devices.compensation import Compensation
 from devices.errors import CalibrationError
-from devices.frames import FrameBatch
+from devices.frames import NOT_READ, FrameBatch
 from devices.temperature import hold_temperature
-from service.estimation.calibration import Calibration
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.effects_fit import fit_effects
 from service.estimation.fit import fit_tile
 from service.estimation.indentation import Indentation
 from storage.session_file import SessionReader
@@ -49,10 +50,14 @@ def calibrate(paths: Sequence[Path], *, name: str, reference: str) -> Calibratio
         name=name,
         reference=reference,
         date=datetime.fromtimestamp(newest_ns // 1_000_000_000, tz=UTC).isoformat(),
-        tiles=tuple(
-            fit_tile(recordings[serial]).model_copy(update={"coefficient_words": chips[serial]})
-            for serial in sorted(recordings)
-        ),
+        tiles=tuple(_fitted(recordings[serial], chips[serial]) for serial in sorted(recordings)),
+    )
+
+
+def _fitted(recording: Indentation, chip: tuple[int, int, int, int]) -> TileCalibration:
+    tile = fit_tile(recording)
+    return tile.model_copy(
+        update={"coefficient_words": chip, "effects": fit_effects(recording, tile)}
     )
 
 
@@ -84,6 +89,7 @@ def read_indentations(session: SessionReader) -> list[Indentation]:
             reference_n=frames.reference_force_n.astype(np.float64),
             phase=phase,
             under_spindle=pressed == serial,
+            tadc=np.where(held.tadc[:, i] == NOT_READ, np.nan, held.tadc[:, i].astype(np.float64)),
         )
         for i, serial in enumerate(session.info.serials)
         if (pressed == serial).any()

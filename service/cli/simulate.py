@@ -79,7 +79,7 @@ def simulate_command(
     # Imported here: the physics pulls in scipy, which `--help` need not wait for.
     from devices.emulation.load_trace import CopTransform
     from service.calibrations import find_calibration, with_tiles
-    from service.estimation.plan import check_models
+    from service.estimation.ladder import check_models
     from service.pipeline import EstimateOptions
     from service.simulate import SimulateOptions, simulate
     from storage.load_trace_file import read_load_trace

@@ -16,9 +16,11 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from devices.errors import CalibrationError
+from service.estimation.effects import Effects
 
 ANY_SERIAL = "*"
 LOOP_OPENS_N = 1.0
+CURVE_OPENS_N = 0.2
 BASIS = 3
 """A cubic without constant term has three coefficients to be uncertain about."""
 
@@ -66,6 +68,8 @@ class TileCalibration(BaseModel):
     coefficient_words: tuple[int, int, int, int] | None = None
     """Registers of the chip that was calibrated: a serial can be re-labelled, a chip can not.
     None: for any chip, as a preset is."""
+    effects: Effects = Effects()
+    """What of the dome beside its static curve is known."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -161,6 +165,11 @@ class Calibration(BaseModel):
 def loop_share(force_n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """How far a hysteresis loop is open at a force: closed at zero, half open at one newton."""
     return np.asarray(1.0 - LOOP_OPENS_N / (np.abs(force_n) + LOOP_OPENS_N))
+
+
+def curve_share(force_n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """How much of a cubic's misfit there is at a force: none at zero, half of it at 0.2 N."""
+    return np.asarray(1.0 - CURVE_OPENS_N / (np.abs(force_n) + CURVE_OPENS_N))
 
 
 def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) -> bool:

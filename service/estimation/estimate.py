@@ -8,7 +8,7 @@ matrix, or dependent on how rows lie in memory.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,50 +16,99 @@ import numpy.typing as npt
 from devices.frames import FrameBatch
 from devices.temperature import HeldTemperature, hold_temperature
 from service.estimation.contact import UNKNOWN, UNLOADED, RunState, believed, seeming
-from service.estimation.estimates import Estimates, EstimateStatus
+from service.estimation.estimates import COP_COLUMNS, Estimates, EstimateStatus
 from service.estimation.geometry import angle_rad, to_ground_x_m
-from service.estimation.instant import estimate_instants
 from service.estimation.kinematics import Readings, counts_at, readings_of
+from service.estimation.lower import Felt, LowerState, felt, tile_kpa
+from service.estimation.models import denoise
 from service.estimation.plan import SIGMAS, EstimationPlan
+from service.estimation.upper import (
+    Foot,
+    UpperState,
+    foot_of,
+    forces,
+    grid_index,
+    summed,
+)
 
 Floats = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
 
 HULL_SIGMAS = 3.0
 
 
-_COP_COLUMNS = (
-    "cop_x_m",
-    "cop_y_m",
-    "cop_sigma_x_m",
-    "cop_sigma_y_m",
-    "cop_index_x",
-    "cop_index_y",
-    "cop_ground_x_m",
-    "cop_ground_y_m",
-)
-
-
 @dataclass(frozen=True)
-class _Pending:
-    """Frames whose look-ahead is not complete."""
+class _Known:
+    """Frames whose look-ahead is not complete, after those that their averages reach back to.
 
-    estimates: Estimates
-    cop_z_m: Floats
+    `felt`, `t_mono_ns` and `run` begin with the latter, all else with the first that is to come.
+    """
+
+    felt: Felt
+    t_mono_ns: Times
+    run: Times
+    seq: npt.NDArray[np.uint64]
+    t_ns: Times
     readings: Readings | None
     """None without a servo."""
     loaded: npt.NDArray[np.int64]
-    since_ns: npt.NDArray[np.int64]
-    t_ns: npt.NDArray[np.int64]
+    since_ns: Times
+
+    @property
+    def before(self) -> int:
+        """How many frames are only there to be reached back to."""
+        return len(self.t_mono_ns) - len(self.seq)
+
+    def followed_by(self, later: _Known) -> _Known:
+        readings = later.readings
+        if readings is not None and self.readings is not None:
+            readings = self.readings.followed_by(readings)
+        return _Known(
+            self.felt.followed_by(later.felt),
+            readings=readings,
+            **{
+                name: np.concatenate([getattr(self, name), getattr(later, name)])
+                for name in ("t_mono_ns", "run", "seq", "t_ns", "loaded", "since_ns")
+            },
+        )
+
+    def after(self, given: int, *, reach_back: bool) -> _Known:
+        """Without the first `given` frames, but for what averages will reach back to."""
+        first = self.before + given
+        keep = first
+        if reach_back and first < len(self.t_mono_ns):
+            oldest_ns = self.t_mono_ns[first] - denoise.PAST_NS
+            keep = max(
+                int(np.searchsorted(self.t_mono_ns, oldest_ns)), first - int(denoise.REACHES[-1])
+            )
+        end = len(self.t_mono_ns)
+        return _Known(
+            felt=self.felt.rows(keep, end),
+            t_mono_ns=self.t_mono_ns[keep:],
+            run=self.run[keep:],
+            seq=self.seq[given:],
+            t_ns=self.t_ns[given:],
+            readings=None if self.readings is None else self.readings.rows(given, len(self.seq)),
+            loaded=self.loaded[given:],
+            since_ns=self.since_ns[given:],
+        )
 
 
 @dataclass(frozen=True)
 class EstimationState:
     """What `step` hands on to the next `step`. Begin with `EstimationState()`."""
 
-    pending: _Pending | None = None
+    known: _Known | None = None
+    waiting: FrameBatch | None = None
+    """The last frame, if it has to wait for the next one to be told from an outlier."""
+    before_kpa: Floats | None = None
+    """Pressures of the frame before it."""
     temperature: HeldTemperature | None = None
-    run: RunState = UNLOADED
+    lower: LowerState = LowerState()  # noqa: RUF009  # frozen, so one for all is safe
+    upper: UpperState = UpperState()  # noqa: RUF009  # likewise
+    contact_run: RunState = UNLOADED
     contact: int = 0
+    runs: int = 0
     last_seq: int | None = None
     last_t_ns: int = 0
     last_reading: Readings | None = None
@@ -80,124 +129,166 @@ def step(
         The estimates due (any number, possibly none), and the state for the next step.
     """
     if not len(frames):
-        return estimate_instants(plan, frames, np.zeros(0, dtype=np.bool_))[0], state
-    broken = _after_gap(plan, frames, state)
+        return _no_estimates(plan), state
     frames, temperature = hold_temperature(frames, state.temperature)
-    now, cop_z_m = estimate_instants(plan, frames, broken)
-    loaded, since_ns, run = seeming(plan.contact, now.grf_n, frames.t_mono_ns, broken, state.run)
-    readings = None
-    if plan.info.servo is not None:
-        turn = plan.info.servo.counts_per_turn
-        readings = readings_of(frames, broken, state.last_reading, turn)
-    new = _Pending(now, cop_z_m, readings, loaded, since_ns, frames.t_mono_ns)
-    known = _append(state.pending, new)
-    due = int(np.searchsorted(known.t_ns, known.t_ns[-1] - plan.lag_ns, side="right"))
-    state = replace(
-        state,
-        temperature=temperature,
-        run=run,
-        last_seq=int(frames.seq[-1]),
-        last_t_ns=int(frames.t_mono_ns[-1]),
-        last_reading=None if readings is None else readings.rows(len(frames) - 1, len(frames)),
-    )
-    return _release(plan, known, due, state)
+    state = replace(state, temperature=temperature)
+    newest_ns = int(frames.t_mono_ns[-1])
+    if plan.waits:
+        if state.waiting is not None:
+            frames = FrameBatch.concatenate([state.waiting, frames])
+        state = replace(state, waiting=frames.rows(len(frames) - 1, len(frames)))
+        state = _taken(plan, frames, len(frames) - 1, state)
+    else:
+        state = _taken(plan, frames, len(frames), state)
+    if state.known is None:
+        return _no_estimates(plan), state
+    t_mono_ns = state.known.t_mono_ns[state.known.before :]
+    due = int(np.searchsorted(t_mono_ns, newest_ns - plan.lag_ns, side="right"))
+    return _release(plan, state.known, due, state)
 
 
 def finish(plan: EstimationPlan, state: EstimationState) -> Estimates | None:
     """The estimates that still wait for a look-ahead that will not come; None if none do."""
-    if state.pending is None:
+    if state.waiting is not None:
+        state = _taken(plan, state.waiting, 1, state)
+    known = state.known
+    if known is None or not len(known.seq):
         return None
-    known = state.pending
-    estimates, _ = _release(plan, known, len(known.t_ns), state)
+    estimates, _ = _release(plan, known, len(known.seq), state)
     return estimates
 
 
-def _release(
-    plan: EstimationPlan, known: _Pending, due: int, state: EstimationState
-) -> tuple[Estimates, EstimationState]:
-    """Give away the first `due` estimates of `known`.
-
-    Decides their contact and where the foot stands, and masks their COP.
-    """
-    contact = believed(
-        plan.contact, plan.lag_ns, due, known.loaded, known.since_ns, known.t_ns, state.contact
+def _taken(
+    plan: EstimationPlan, frames: FrameBatch, n: int, state: EstimationState
+) -> EstimationState:
+    """The first `n` of `frames` become known; what comes after tells outliers among them."""
+    broken = _after_gap(plan, frames, state)
+    kpa = tile_kpa(plan, frames)
+    neighbours = None
+    if plan.waits:
+        none = np.full((1, kpa.shape[1]), np.nan)
+        first = none if state.before_kpa is None else state.before_kpa
+        before = np.where(broken[:, None], np.nan, np.concatenate([first, kpa[:-1]]))
+        after = np.concatenate([np.where(broken[1:, None], np.nan, kpa[1:]), none])
+        neighbours = before[:n], after[:n]
+    if not n:
+        return state
+    frames, broken = frames.rows(0, n), broken[:n]
+    now, lower = felt(plan, frames, kpa[:n], neighbours, broken, state.lower)
+    loaded, since_ns, contact_run = seeming(
+        plan.contact, summed(now.felt_n), frames.t_mono_ns, broken, state.contact_run
     )
-    out = _placed(plan, known, due)
-    in_doubt = np.isnan(out.grf_n)
-    masked = _cop_masked(plan, out) | (contact == 0)
-    columns = {name: np.where(masked, np.nan, getattr(out, name)) for name in _COP_COLUMNS}
-    out = replace(
-        out,
-        **columns,
-        contact=np.where(in_doubt, UNKNOWN, contact).astype(np.uint8),
-        estimate_status=out.estimate_status
+    readings = None
+    if plan.info.servo is not None:
+        turn = plan.info.servo.counts_per_turn
+        readings = readings_of(frames, broken, state.last_reading, turn)
+    run = state.runs + np.cumsum(broken)
+    new = _Known(now, frames.t_mono_ns, run, frames.seq, frames.t_ns, readings, loaded, since_ns)
+    return replace(
+        state,
+        known=new if state.known is None else state.known.followed_by(new),
+        before_kpa=kpa[n - 1 : n],
+        lower=lower,
+        contact_run=contact_run,
+        runs=int(run[-1]),
+        last_seq=int(frames.seq[-1]),
+        last_t_ns=int(frames.t_mono_ns[-1]),
+        last_reading=None if readings is None else readings.rows(n - 1, n),
+    )
+
+
+def _release(
+    plan: EstimationPlan, known: _Known, due: int, state: EstimationState
+) -> tuple[Estimates, EstimationState]:
+    """Give away the next `due` frames of `known`, now that their look-ahead is there."""
+    if not due:
+        return _no_estimates(plan), state
+    first = known.before
+    stop = first + due
+    t_mono_ns = known.t_mono_ns[first:]
+    tiles, upper = forces(plan, known.felt, known.t_mono_ns, known.run, first, stop, state.upper)
+    foot = foot_of(plan, tiles)
+    contact = believed(
+        plan.contact, plan.look_ns, due, known.loaded, known.since_ns, t_mono_ns, state.contact
+    )
+    masked = _cop_masked(plan, foot) | (contact == 0)
+    gauge_kpa = known.felt.gauge_kpa[first:stop]
+    index_x, index_y = grid_index(plan, gauge_kpa)
+    x_m, y_m, z_m = foot.cop_m
+    ground_x_m = ground_y_m = angle = np.full(due, np.nan)
+    servo = plan.info.servo
+    if servo is not None and known.readings is not None:
+        angle = angle_rad(servo, counts_at(known.readings, due, plan.look_ns))
+        travel = servo.ankle_travel_m_per_rad
+        ground_x_m = to_ground_x_m(x_m, z_m, angle, travel)
+        ground_y_m = y_m if travel is not None else ground_y_m
+
+    def shown(values: Floats) -> Floats:
+        return np.where(masked, np.nan, values)
+
+    def by_tile(values: Floats) -> Floats:
+        of_all = np.full(gauge_kpa.shape, np.nan)
+        of_all[:, plan.bearing] = values
+        return of_all
+
+    out = Estimates(
+        seq=known.seq[:due],
+        t_ns=known.t_ns[:due],
+        gauge_kpa=gauge_kpa,
+        force_n=by_tile(tiles.force_n),
+        force_sigma_n=by_tile(tiles.sigma_n),
+        grf_n=foot.grf_n,
+        grf_sigma_n=foot.grf_sigma_n,
+        cop_x_m=shown(x_m),
+        cop_y_m=shown(y_m),
+        cop_sigma_x_m=shown(foot.cop_sigma_m[0]),
+        cop_sigma_y_m=shown(foot.cop_sigma_m[1]),
+        cop_index_x=shown(index_x),
+        cop_index_y=shown(index_y),
+        cop_ground_x_m=shown(ground_x_m),
+        cop_ground_y_m=shown(ground_y_m),
+        angle_rad=angle,
+        contact=np.where(np.isnan(foot.grf_n), UNKNOWN, contact).astype(np.uint8),
+        estimate_status=known.felt.status[first:stop]
         | np.where(masked, EstimateStatus.COP_MASKED, 0).astype(np.uint16),
     )
-    rest = len(known.t_ns) - due
-    pending = None
-    if rest:
-        pending = _Pending(
-            known.estimates.rows(due, due + rest),
-            known.cop_z_m[due:],
-            None if known.readings is None else known.readings.rows(due, due + rest),
-            known.loaded[due:],
-            known.since_ns[due:],
-            known.t_ns[due:],
-        )
-    return out, replace(state, pending=pending, contact=int(contact[-1]) if due else state.contact)
-
-
-def _placed(plan: EstimationPlan, known: _Pending, due: int) -> Estimates:
-    """The first `due` estimates of `known` with the segment's angle, and COP on the ground."""
-    out = known.estimates.rows(0, due)
-    servo = plan.info.servo
-    if servo is None or known.readings is None:
-        return out
-    angle = angle_rad(servo, counts_at(known.readings, due, plan.lag_ns))
-    travel = servo.ankle_travel_m_per_rad
-    return replace(
-        out,
-        angle_rad=angle,
-        cop_ground_x_m=to_ground_x_m(out.cop_x_m, known.cop_z_m[:due], angle, travel),
-        cop_ground_y_m=out.cop_y_m if travel is not None else out.cop_ground_y_m,
+    return out, replace(
+        state,
+        known=known.after(due, reach_back=plan.ladder.denoise),
+        upper=upper,
+        contact=int(contact[-1]),
     )
 
 
-def _cop_masked(plan: EstimationPlan, e: Estimates) -> npt.NDArray[np.bool_]:
+def _no_estimates(plan: EstimationPlan) -> Estimates:
+    tiles = np.empty((0, len(plan.info.tiles)))
+    none = np.empty(0)
+    return Estimates(
+        seq=np.empty(0, dtype=np.uint64),
+        t_ns=np.empty(0, dtype=np.int64),
+        **dict.fromkeys(("gauge_kpa", "force_n", "force_sigma_n"), tiles),
+        **dict.fromkeys(("grf_n", "grf_sigma_n", *COP_COLUMNS, "angle_rad"), none),
+        contact=np.empty(0, dtype=np.uint8),
+        estimate_status=np.empty(0, dtype=np.uint16),
+    )
+
+
+def _cop_masked(plan: EstimationPlan, foot: Foot) -> npt.NDArray[np.bool_]:
     """Where a centre of pressure would be more doubtful than useful."""
     normals, offsets_m = plan.hull
+    (x_m, y_m, _), (sigma_x_m, sigma_y_m, _) = foot.cop_m, foot.cop_sigma_m
     with np.errstate(invalid="ignore"):
         good = (
-            (e.grf_n >= SIGMAS * e.grf_sigma_n)
-            & (e.cop_sigma_x_m <= plan.cop_sigma_max_m)
-            & (e.cop_sigma_y_m <= plan.cop_sigma_max_m)
+            (foot.grf_n >= SIGMAS * foot.grf_sigma_n)
+            & (sigma_x_m <= plan.cop_sigma_max_m)
+            & (sigma_y_m <= plan.cop_sigma_max_m)
         )
         for (nx, ny), offset_m in zip(normals, offsets_m, strict=True):
-            beyond_m = nx * e.cop_x_m + ny * e.cop_y_m - offset_m
-            sigma_m = np.sqrt((nx * e.cop_sigma_x_m) ** 2 + (ny * e.cop_sigma_y_m) ** 2)
+            beyond_m = nx * x_m + ny * y_m - offset_m
+            sigma_m = np.sqrt((nx * sigma_x_m) ** 2 + (ny * sigma_y_m) ** 2)
             # Noise about the edge is let through, or the mean of what is left would lie inside.
             good &= beyond_m <= HULL_SIGMAS * sigma_m + 1e-9
     return ~good
-
-
-def _append(before: _Pending | None, new: _Pending) -> _Pending:
-    if before is None:
-        return new
-    joined = {
-        f.name: np.concatenate([getattr(before.estimates, f.name), getattr(new.estimates, f.name)])
-        for f in fields(Estimates)
-    }
-    readings = new.readings
-    if readings is not None and before.readings is not None:
-        readings = before.readings.followed_by(readings)
-    return _Pending(
-        Estimates(**joined),
-        np.concatenate([before.cop_z_m, new.cop_z_m]),
-        readings,
-        np.concatenate([before.loaded, new.loaded]),
-        np.concatenate([before.since_ns, new.since_ns]),
-        np.concatenate([before.t_ns, new.t_ns]),
-    )
 
 
 def _after_gap(

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.errors import CalibrationError
+from service.estimation.soak import Soak
 
 Floats = npt.NDArray[np.float64]
 
@@ -42,6 +43,8 @@ class Indentation:
     reference_n: Floats
     phase: npt.NDArray[np.str_]
     under_spindle: npt.NDArray[np.bool_]
+    tadc: Floats
+    """Temperature in counts; NaN where it is not known."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,17 @@ def strokes(recording: Indentation) -> Strokes:
         )
     gauge, force, repeat, loads = zip(*blocks, strict=True)
     return Strokes(np.array(gauge), np.array(force), np.array(repeat), np.array(loads))
+
+
+def soak(recording: Indentation, zero: Unloaded) -> Soak:
+    """The part of the recording in which nothing presses and the surroundings warm up."""
+    rows = recording.phase == "soak"
+    return Soak(
+        t_s=(recording.t_ns[rows] - recording.t_ns[0]) * 1e-9,
+        kpa=recording.kpa[rows],
+        tadc=recording.tadc[rows],
+        noise_kpa=zero.noise_kpa,
+    )
 
 
 def place(recording: Indentation) -> str:

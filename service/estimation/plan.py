@@ -17,12 +17,10 @@ from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.contact import ContactRule
 from service.estimation.geometry import grid_indices, hull
-from service.estimation.models.static import StaticCurves
+from service.estimation.ladder import MODELS, Ladder, make_ladder
 from service.estimation.tare import Tare
 
 Floats = npt.NDArray[np.float64]
-
-MODELS = ("unwrap", "static")
 
 CONTACT_ON_SIGMA = 5.0
 CONTACT_OFF_SIGMA = 3.0
@@ -48,16 +46,37 @@ class EstimationPlan:
     models: tuple[str, ...]
     lag_ns: int
     compensation: Compensation
-    curves: StaticCurves
-    bears: npt.NDArray[np.bool_]
-    """False for bare reference tiles, which are in no sum."""
+    ladder: Ladder
+    bearing: npt.NDArray[np.intp]
+    """Columns of the tiles that bear load; arrays below without another word are over these."""
+    references: npt.NDArray[np.intp]
+    """Columns of bare reference tiles, which are in no sum."""
+    baseline_kpa: Floats
+    baseline_sigma_kpa: Floats
+    noise_kpa: Floats
+    still_kpa: Floats
+    """Standard deviation of a single unloaded reading about the true baseline."""
     positions_m: Floats
+    """(all tiles, 3)."""
     hull: tuple[Floats, Floats]
     grid: tuple[Floats, Floats] | None
     contact: ContactRule
     assumed_scale: bool
     gap_ns: int
     cop_sigma_max_m: float = COP_SIGMA_MAX_M
+
+    @property
+    def waits(self) -> bool:
+        """Does every frame wait for the next one, to tell an outlier?"""
+        return self.ladder.denoise and self.lag_ns > 0
+
+    @property
+    def look_ns(self) -> int:
+        """How far what comes later may be looked at.
+
+        A frame that waits for the next one is not there yet when its instant is.
+        """
+        return self.lag_ns - 1 if self.waits else self.lag_ns
 
 
 def make_plan(
@@ -78,16 +97,18 @@ def make_plan(
         lag_ms: look-ahead: estimates come this much later and know that much more.
 
     Raises:
-        UsageError: an unknown model, no `static`, or a negative lag.
-        CalibrationError: a tile is not calibrated.
+        UsageError: an unknown model, no `static`, `ambient` without a bare tile, or a bad lag.
+        CalibrationError: a bearing tile is not calibrated, or not for one of the models.
     """
-    check_models(models)
     if not 0.0 <= lag_ms <= LAG_MAX_MS:
         raise UsageError(f"a look-ahead of {lag_ms} ms", expected=f"0 to {LAG_MAX_MS:g} ms")
-    if all(tile.reference for tile in info.tiles):
+    bearing = np.flatnonzero([not tile.reference for tile in info.tiles])
+    if not len(bearing):
         raise UsageError("every tile of the array is a reference tile: nothing bears load")
-    entries = [calibration.of(tile.serial) for tile in info.tiles]
-    for tile, entry in zip(info.tiles, entries, strict=True):
+    ladder = make_ladder(info, calibration, tare, models)
+    entries = [calibration.of(info.tiles[i].serial) for i in bearing]
+    for i, entry in zip(bearing, entries, strict=True):
+        tile = info.tiles[i]
         if entry.coefficient_words not in (None, tile.coefficient_words):
             raise CalibrationError(
                 f"tile {tile.serial} is not the part that was calibrated: its chip has the "
@@ -96,11 +117,9 @@ def make_plan(
                 where=f"calibration {calibration.name} ({calibration.id})",
                 remedy="Press this tile on the bench and calibrate it, or correct the serial",
             )
-    curves = StaticCurves(entries)
-    bears = np.array([not tile.reference for tile in info.tiles])
     positions_m = np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in info.tiles])
-    still_kpa = np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)
-    unloaded_n = float(np.sqrt(((curves.slope_at_zero_n_per_kpa * still_kpa)[bears] ** 2).sum()))
+    still_kpa = np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)[bearing]
+    unloaded_n = float(np.sqrt(((ladder.curves.slope_at_zero_n_per_kpa * still_kpa) ** 2).sum()))
     return EstimationPlan(
         info=info,
         calibration=calibration,
@@ -108,11 +127,16 @@ def make_plan(
         models=tuple(name for name in MODELS if name in models),
         lag_ns=round(lag_ms * 1e6),
         compensation=Compensation(info.tiles),
-        curves=curves,
-        bears=bears,
+        ladder=ladder,
+        bearing=bearing,
+        references=np.flatnonzero([tile.reference for tile in info.tiles]),
+        baseline_kpa=tare.baseline_kpa[bearing],
+        baseline_sigma_kpa=tare.baseline_sigma_kpa[bearing],
+        noise_kpa=tare.noise_kpa[bearing],
+        still_kpa=still_kpa,
         positions_m=positions_m,
-        hull=hull(positions_m[bears, :2]),
-        grid=grid_indices(positions_m[bears, :2]),
+        hull=hull(positions_m[bearing, :2]),
+        grid=grid_indices(positions_m[bearing, :2]),
         contact=ContactRule(
             on_n=CONTACT_ON_SIGMA * unloaded_n,
             off_n=CONTACT_OFF_SIGMA * unloaded_n,
@@ -121,16 +145,3 @@ def make_plan(
         assumed_scale=any(entry.absolute_scale == "assumed" for entry in entries),
         gap_ns=round(GAP * 1e9 / info.nominal_rate_hz),
     )
-
-
-def check_models(models: Sequence[str]) -> None:
-    """Refuse models that there are not, and a ladder without force.
-
-    Raises:
-        UsageError: an unknown model, or no `static`.
-    """
-    for name in models:
-        if name not in MODELS:
-            raise UsageError(f"unknown model {name!r}", expected=f"some of {', '.join(MODELS)}")
-    if "static" not in models:
-        raise UsageError("without the model 'static' there is no force", remedy="Add it")

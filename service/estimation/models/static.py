@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.estimation.calibration import BASIS, TileCalibration, loop_share
+from devices.errors import CalibrationError
+from service.estimation.calibration import BASIS, TileCalibration, curve_share, loop_share
+from service.estimation.effects import RubberEffect
 
 Floats = npt.NDArray[np.float64]
 
@@ -29,9 +31,30 @@ class StaticForce:
 
 
 class StaticCurves:
-    """The curves of an array's tiles, as arrays over tiles."""
+    """The curves of an array's tiles, as arrays over tiles.
 
-    def __init__(self, tiles: Sequence[TileCalibration]) -> None:
+    Args:
+        tiles: their calibrations.
+        lasting: take the curves of forces that have lasted, which lie beneath creep and loop, for
+            the model `rubber`; all tiles have it then.
+    """
+
+    def __init__(self, tiles: Sequence[TileCalibration], *, lasting: bool = False) -> None:
+        self._scatter = self._curve_n = np.zeros(len(tiles))
+        if lasting:
+            self._scatter = np.array([_rubber(t).scatter for t in tiles])
+            self._curve_n = np.array([_rubber(t).curve_misfit_n for t in tiles])
+            tiles = [
+                t.model_copy(
+                    update={
+                        "coefficients": _rubber(t).coefficients,
+                        "covariance": _rubber(t).covariance,
+                        "relative_misfit": 0.0,
+                        "loop_misfit_n": 0.0,
+                    }
+                )
+                for t in tiles
+            ]
         self._offset_kpa = np.array([t.p_offset_kpa for t in tiles])
         self._scale_kpa = np.array([t.p_scale_kpa for t in tiles])
         self._c1, self._c2, self._c3 = (
@@ -66,14 +89,17 @@ class StaticCurves:
         )
         below_kpa = np.minimum(gauge_kpa, 0.0)
         from_zero_n = curve_n + below_kpa * self.slope_at_zero_n_per_kpa
+        slope_n_per_kpa = self._slope(u)
         fit_variance = (
             self._coefficient_variance(u)
             + (self._misfit * from_zero_n) ** 2
+            + (self._curve_n * curve_share(from_zero_n)) ** 2
+            + (self._scatter * slope_n_per_kpa * inside_kpa) ** 2
             + (self._loop_n * loop_share(from_zero_n)) ** 2
         )
         return StaticForce(
             force_n=from_zero_n + self._zero_n,
-            slope_n_per_kpa=self._slope(u),
+            slope_n_per_kpa=slope_n_per_kpa,
             fit_sigma_n=np.sqrt(fit_variance),
         )
 
@@ -90,6 +116,12 @@ class StaticCurves:
             for j in range(BASIS):
                 variance = variance + self._covariance[:, i, j] * basis[i] * basis[j]
         return np.maximum(variance, 0.0)  # rounding may leave a trace below zero
+
+
+def _rubber(tile: TileCalibration) -> RubberEffect:
+    if tile.effects.rubber is None:
+        raise CalibrationError(f"tile {tile.serial} has no curve of forces that have lasted")
+    return tile.effects.rubber
 
 
 def _horner(tile: TileCalibration, u: float) -> float:

@@ -70,6 +70,7 @@ def indentation(
         reference_n=np.concatenate(force_n) + noise_n * rng.standard_normal(n),
         phase=np.array(phase),
         under_spindle=np.ones(n, dtype=bool),
+        tadc=np.full(n, 500.0),
     )
 
 
@@ -245,5 +246,6 @@ def test_the_range_ends_where_the_repeats_ended_on_average() -> None:
         reference_n=np.append(low.reference_n, high.reference_n),
         phase=np.append(low.phase, high.phase),
         under_spindle=np.append(low.under_spindle, high.under_spindle),
+        tadc=np.append(low.tadc, high.tadc),
     )
     assert fit_tile(both).range_kpa == pytest.approx((0.0, 1.02 * FULL_KPA))

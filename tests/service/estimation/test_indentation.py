@@ -25,6 +25,7 @@ def recording(*segments: Segment, period_ms: float = 10.0, **changes: Any) -> In
         "reference_n": np.array([f for _, _, force in segments for f in force]),
         "phase": np.array(phase),
         "under_spindle": np.array(under),
+        "tadc": np.full(len(phase), 500.0),
     }
     return Indentation(**columns | changes)
 

@@ -35,7 +35,7 @@ def test_a_reference_tile_is_in_no_sum_no_hull_and_no_grid(
     info_of: InfoOf, plan_of: PlanOf
 ) -> None:
     plan = plan_of(info_of([*LINE, (0.5, 0.5, -0.15)], references=[3]), sigma_n=0.5)
-    assert plan.bears.tolist() == [True, True, True, False]
+    assert (plan.bearing.tolist(), plan.references.tolist()) == ([0, 1, 2], [3])
     assert plan.contact.on_n == pytest.approx(5 * 0.5 * np.sqrt(3))
     assert sorted(plan.hull[1].tolist()) == pytest.approx([0.0, 0.028])
     assert plan.grid is not None
@@ -113,7 +113,7 @@ def test_another_chip_under_the_same_serial_is_refused(
     with pytest.raises(CalibrationError, match="T02 is not the part that was calibrated"):
         plan_of(info_of(LINE, chips=chips), tiles=own)
     for_any_chip = [tile_of(f"T0{i}") for i in (1, 2, 3)]
-    assert plan_of(info_of(LINE, chips=chips), tiles=for_any_chip).bears.all()
+    assert plan_of(info_of(LINE, chips=chips), tiles=for_any_chip).bearing.tolist() == [0, 1, 2]
 
 
 def test_an_array_without_a_tile_that_bears_load_is_refused_with_the_reason(

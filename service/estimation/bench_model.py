@@ -1,0 +1,103 @@
+"""What a tile would read if these were its parameters: reference force in, pressure out.
+
+The models of the ladder the other way round, sample by sample: creep, loop, curve, gas. A fit in
+this direction leaves the noise where it is, in the pressure; a fit of the inverse would explain it
+away (gamma = 46).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from service.estimation.compiled import compiled
+from service.estimation.models.gas import warmed
+from service.estimation.models.hysteresis import played
+from service.estimation.models.rubber import crept_parts
+
+Floats = npt.NDArray[np.float64]
+
+_NEWTON_STEPS = 30
+_GAS_STEPS = 6
+_FLATTEST = 0.05
+"""Of the curve's slope at zero: where a trial cubic turns over it is taken to go on like that."""
+
+
+@compiled
+def pressed(
+    t_s: Floats,
+    force_n: Floats,
+    curve: Floats,
+    scale_kpa: float,
+    baseline_kpa: float,
+    gamma: float,
+    tau_s: float,
+    wall: float,
+    part: Floats,
+    creep_s: Floats,
+    loop: Floats,
+    widths: Floats,
+) -> Floats:
+    """Pressures of one tile under forces that are linear between instants.
+
+    Args:
+        t_s: (n,) instants.
+        force_n: (n,) forces on the dome.
+        curve: c1, c2, c3 of force over x = gauge / `scale_kpa`.
+        scale_kpa: end of the curve.
+        baseline_kpa: pressure unloaded.
+        gamma: ratio of heat capacities; 1 for no gas effect.
+        tau_s: the gas' time constant.
+        wall: part of the volume that the wall gives way for a kPa.
+        part: (terms,) of the creep.
+        creep_s: (terms,) its times.
+        loop: (plays,) parts of the plays.
+        widths: (plays,) their half widths.
+
+    Returns:
+        (n, 3): pressure, pressure without the gas' heat, and force felt without creep and loop's
+        lag taken away, that is the force less what is felt of it.
+    """
+    n = len(t_s)
+    out = np.empty((n, 3))
+    crept = np.zeros(len(part))
+    plays = np.zeros(len(loop))
+    c1, c2, c3 = curve[0], curve[1], curve[2]
+    flattest = _FLATTEST * c1
+    k = (gamma - 1.0) / gamma
+    x, warm, force, time = 0.0, 1.0, 0.0, t_s[0]
+    ln_p = math.log(baseline_kpa)
+    for i in range(n):
+        dt = t_s[i] - time
+        felt = force_n[i]
+        for m in range(len(part)):
+            decay, of_before, of_now = crept_parts(dt / creep_s[m])
+            crept[m] = decay * crept[m] + of_before * force + of_now * force_n[i]
+            felt -= part[m] * (force_n[i] - crept[m])
+        lag = 0.0
+        for m in range(len(loop)):
+            plays[m] = played(felt, widths[m], plays[m])
+            lag += loop[m] * (plays[m] - felt)
+        felt += lag
+        for _ in range(_NEWTON_STEPS):
+            inside = min(max(x, 0.0), 1.0)
+            slope = max(flattest, c1 + inside * (2.0 * c2 + 3.0 * c3 * inside))
+            value = inside * (c1 + inside * (c2 + inside * c3)) + (x - inside) * slope
+            step = (felt - value) / slope
+            x += step
+            if abs(step) < 1e-10:
+                break
+        static = baseline_kpa + x * scale_kpa
+        p = static * warm
+        before = warm
+        if gamma > 1.0:
+            for _ in range(_GAS_STEPS):
+                warm = warmed(before, math.log(p) - ln_p, dt / (gamma * tau_s), k)
+                iso = p / warm
+                give = (1.0 + wall * (iso - baseline_kpa)) / (1.0 + wall * (p - baseline_kpa))
+                p = static * give * warm
+        out[i, 0], out[i, 1], out[i, 2] = p, static, force_n[i] - felt
+        ln_p, force, time = math.log(p), force_n[i], t_s[i]
+    return out

@@ -1,0 +1,86 @@
+"""Every loading of a tile on the bench, as one run of instants, forces and pressures.
+
+Slow strokes are averaged in blocks, because nothing happens within a block that the average would
+hide; holds, releases and taps are kept reading by reading. Spikes are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.estimation.indentation import Indentation, Unloaded
+from service.estimation.models.outliers import spikes
+
+Floats = npt.NDArray[np.float64]
+
+BLOCK = 10
+_NOISE_MIN_KPA = 0.03
+"""Rounding to a count alone leaves this much."""
+
+
+@dataclass(frozen=True)
+class Presses:
+    """m points in the order of time.
+
+    Attributes:
+        t_s: instants, from 0.
+        force_n: reference force above its zero.
+        kpa: absolute pressure; NaN where no reading is left.
+        weight: square root of the number of readings averaged, over the noise, in 1/kPa.
+        loading: number of the loading it belongs to, from 0.
+        fast: True for points of a hold, a release or a tap.
+    """
+
+    t_s: Floats
+    force_n: Floats
+    kpa: Floats
+    weight: Floats
+    loading: npt.NDArray[np.int64]
+    fast: npt.NDArray[np.bool_]
+
+    @property
+    def loadings(self) -> int:
+        """How often the tile was pressed."""
+        return int(self.loading.max()) + 1
+
+
+def presses(recording: Indentation, zero: Unloaded) -> Presses:
+    """All that was done to a tile, ready to be fitted."""
+    rows = recording.under_spindle & np.isfinite(recording.reference_n)
+    rows &= recording.phase != "soak"
+    t_s = (recording.t_ns[rows] - recording.t_ns[rows][0]) * 1e-9
+    force_n = recording.reference_n[rows] - zero.reference_zero_n
+    kpa, phase = recording.kpa[rows], recording.phase[rows]
+    kpa = np.where(spikes(kpa[:, None], np.array([zero.noise_kpa]))[:, 0], np.nan, kpa)
+    active = phase != "rest"
+    begins = active & ~np.concatenate([[False], active[:-1]])
+    loading = np.maximum(np.cumsum(begins) - 1, 0)
+    fast = np.isin(phase, ("hold", "release", "tap"))
+    # What follows a fast loading, and the load that precedes a hold, belong to it.
+    is_fast = np.zeros(int(loading[-1]) + 1, dtype=bool)
+    is_fast[loading[fast]] = True
+    fast = is_fast[loading]
+    # A block ends where it is full, and wherever reading by reading begins or ends.
+    run = np.cumsum(np.concatenate([[0], np.diff(fast.astype(np.int8)) != 0]))
+    index = np.arange(len(t_s))
+    first = np.searchsorted(run, run)
+    _, block = np.unique(
+        np.where(fast, index, first + (index - first) // BLOCK * BLOCK), return_inverse=True
+    )
+    size = np.bincount(block)
+    good = np.isfinite(kpa)
+    counted = np.bincount(block, good)
+    with np.errstate(invalid="ignore"):
+        mean_kpa = np.bincount(block, np.where(good, kpa, 0.0)) / counted
+    last = np.cumsum(size) - 1
+    return Presses(
+        t_s=np.bincount(block, t_s) / size,
+        force_n=np.bincount(block, force_n) / size,
+        kpa=mean_kpa,
+        weight=np.sqrt(counted) / max(zero.noise_kpa, _NOISE_MIN_KPA),
+        loading=loading[last],
+        fast=fast[last],
+    )

@@ -1,0 +1,94 @@
+"""What a bench recording shows of a tile beside its static curve: gas, rubber, hysteresis, warmth.
+
+Every parameter stands with its 95 % interval. What a recording does not determine is not here: the
+model that needs it is not offered for that tile, and `refused` says why.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+WALL_PER_KPA = 0.00124
+"""Part of the bubble's volume that the wall gives way for a kPa: elastic estimate for Vytaflex 60
+(hardware.md 9), where a soak at two temperatures does not tell."""
+
+EffectName = Literal["temperature", "ambient", "gas", "rubber", "hysteresis"]
+
+
+class Parameter(BaseModel):
+    """A fitted value and its standard uncertainty."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    value: float
+    sigma: float = Field(ge=0)
+
+    @property
+    def interval_95(self) -> tuple[float, float]:
+        """Where it lies in 95 of 100 cases."""
+        return self.value - 1.96 * self.sigma, self.value + 1.96 * self.sigma
+
+
+class _Effect(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class GasEffect(_Effect):
+    """Of the model `gas`."""
+
+    gamma: Parameter
+    tau_s: Parameter
+    misfit: float = Field(ge=0)
+    """Part of the correction that the bench shows to be wrong, root mean square."""
+
+
+class RubberEffect(_Effect):
+    """Of the model `rubber`, with the curve of forces that have lasted, beneath creep and loop.
+
+    Curve as in `TileCalibration`, in the same variable and units.
+    """
+
+    part: tuple[Parameter, ...]
+    tau_s: tuple[Parameter, ...]
+    coefficients: tuple[float, float, float, float]
+    covariance: tuple[tuple[float, ...], ...]
+    scatter: float = Field(ge=0)
+    """Standard deviation of a new loading's gauge pressure, relative."""
+    misfit: float = Field(ge=0)
+    """Part of the correction that the bench shows to be wrong, root mean square."""
+    curve_misfit_n: float = Field(ge=0)
+    """How far a cubic is off where slow strokes agree with one another, root mean square."""
+
+
+class HysteresisEffect(_Effect):
+    """Of the model `hysteresis`: parts of its plays."""
+
+    part: tuple[Parameter, ...]
+
+
+class TemperatureEffect(_Effect):
+    """Of the model `temperature`, and of `ambient`, which needs the wall's give."""
+
+    kpa_per_k: Parameter
+    """Rise of the baseline with the gas' temperature."""
+    lag_s: Parameter
+    """How long the gas follows its chip."""
+    wall_per_kpa: Parameter
+    """Part of the volume that the wall gives way for a kPa, by how much less than p/T it is."""
+
+
+class Effects(_Effect):
+    """All that the recording determined; None where it did not, and then `refused` says why."""
+
+    gas: GasEffect | None = None
+    rubber: RubberEffect | None = None
+    hysteresis: HysteresisEffect | None = None
+    temperature: TemperatureEffect | None = None
+    refused: dict[EffectName, str] = {}
+
+    @property
+    def wall_per_kpa(self) -> float:
+        """As measured in the soak, else the estimate for the material."""
+        return WALL_PER_KPA if self.temperature is None else self.temperature.wall_per_kpa.value

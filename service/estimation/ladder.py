@@ -1,0 +1,184 @@
+"""The model ladder: what of it a scene names, with its constants, over the tiles that bear load.
+
+Lower part, reading by reading: baseline (temperature, ambient), gas, static curve, skew. Upper
+part, once the look-ahead is there: denoise, hysteresis, rubber. Loop and creep are undone in the
+opposite order in which the dome makes them, and after the noise, because both remember.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.errors import CalibrationError, UsageError
+from devices.frames import ArrayInfo
+from devices.mpl115a2 import TADC_PER_KELVIN
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.effects import EffectName
+from service.estimation.models.ambient import Ambient
+from service.estimation.models.gas import Gas
+from service.estimation.models.hysteresis import Hysteresis
+from service.estimation.models.rubber import Rubber
+from service.estimation.models.static import StaticCurves
+from service.estimation.models.temperature import Temperature
+from service.estimation.tare import Tare
+
+Floats = npt.NDArray[np.float64]
+
+MODELS = (
+    "unwrap",
+    "temperature",
+    "ambient",
+    "gas",
+    "static",
+    "skew",
+    "denoise",
+    "hysteresis",
+    "rubber",
+)
+"""In the order in which they are applied."""
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Constants of the models; None for what is not named. Arrays over bearing tiles.
+
+    Attributes:
+        unwrap: are wrapped counts taken back?
+        temperature: of the baseline.
+        ambient: what the domes pass on.
+        gas: of the bubbles.
+        gas_misfit: part of the gas' correction that is uncertain.
+        curves: static curves; those beneath creep and loop if `rubber` is there.
+        skew: are tiles taken to the frame's instant?
+        denoise: is noise averaged away, and are outliers replaced?
+        hysteresis: of the rubber.
+        rubber: its creep.
+        rubber_misfit: part of the creep's correction that is uncertain.
+    """
+
+    unwrap: bool
+    temperature: Temperature | None
+    ambient: Ambient | None
+    gas: Gas | None
+    gas_misfit: Floats
+    curves: StaticCurves
+    skew: bool
+    denoise: bool
+    hysteresis: Hysteresis | None
+    rubber: Rubber | None
+    rubber_misfit: Floats
+
+
+def make_ladder(
+    info: ArrayInfo, calibration: Calibration, tare: Tare, models: Sequence[str]
+) -> Ladder:
+    """Work out the constants of the models named.
+
+    Raises:
+        UsageError: an unknown model, no `static`, or `ambient` without a bare tile.
+        CalibrationError: a bearing tile is not calibrated, or not for one of the models.
+    """
+    check_models(models)
+    bearing = [tile for tile in info.tiles if not tile.reference]
+    tiles = [calibration.of(tile.serial) for tile in bearing]
+    columns = np.array([i for i, tile in enumerate(info.tiles) if not tile.reference])
+    for name in ("temperature", "ambient", "gas", "rubber", "hysteresis"):
+        if name in models:
+            _refuse_undetermined(name, tiles, calibration)
+    if "ambient" in models and len(bearing) == len(info.tiles):
+        raise UsageError(
+            "model 'ambient' needs a bare reference tile, and the array has none",
+            remedy="Leave it out, or plug in a bare chip and mark it `reference = true`",
+        )
+    ones = np.ones(len(tiles))
+    gas = [tile.effects.gas for tile in tiles]
+    rubber = [tile.effects.rubber for tile in tiles]
+    return Ladder(
+        unwrap="unwrap" in models,
+        temperature=_temperature(tiles, tare, columns) if "temperature" in models else None,
+        ambient=_ambient(tiles, tare.baseline_kpa[columns]) if "ambient" in models else None,
+        gas=Gas(
+            gamma=np.array([g.gamma.value for g in gas if g is not None]),
+            tau_s=np.array([g.tau_s.value for g in gas if g is not None]),
+            wall_per_kpa=np.array([tile.effects.wall_per_kpa for tile in tiles]),
+            baseline_kpa=tare.baseline_kpa[columns],
+        )
+        if "gas" in models
+        else None,
+        gas_misfit=np.array([0.0 if g is None else g.misfit for g in gas]) * ones,
+        curves=StaticCurves(tiles, lasting="rubber" in models),
+        skew="skew" in models,
+        denoise="denoise" in models,
+        hysteresis=Hysteresis(
+            np.array(
+                [
+                    [p.value for p in h.part]
+                    for t in tiles
+                    if (h := t.effects.hysteresis) is not None
+                ]
+            )
+        )
+        if "hysteresis" in models
+        else None,
+        rubber=Rubber(
+            part=np.array([[p.value for p in r.part] for r in rubber if r is not None]),
+            tau_s=np.array([[p.value for p in r.tau_s] for r in rubber if r is not None]),
+        )
+        if "rubber" in models
+        else None,
+        rubber_misfit=np.array([0.0 if r is None else r.misfit for r in rubber]) * ones,
+    )
+
+
+def check_models(models: Sequence[str]) -> None:
+    """Refuse models that there are not, and a ladder without force.
+
+    Raises:
+        UsageError: an unknown model, or no `static`.
+    """
+    for name in models:
+        if name not in MODELS:
+            raise UsageError(f"unknown model {name!r}", expected=f"some of {', '.join(MODELS)}")
+    if "static" not in models:
+        raise UsageError("without the model 'static' there is no force", remedy="Add it")
+
+
+def _refuse_undetermined(
+    name: EffectName, tiles: Sequence[TileCalibration], calibration: Calibration
+) -> None:
+    needed = "temperature" if name == "ambient" else name
+    for tile in tiles:
+        if getattr(tile.effects, needed) is None:
+            reason = tile.effects.refused.get(name, "its calibration does not know of it")
+            raise CalibrationError(
+                f"model {name!r} is not offered for tile {tile.serial}: {reason}",
+                where=f"calibration {calibration.name} ({calibration.id})",
+                remedy="Leave the model out, or calibrate the tile from a recording with holds, "
+                "releases, taps and a soak at two temperatures",
+            )
+
+
+def _temperature(
+    tiles: Sequence[TileCalibration], tare: Tare, columns: npt.NDArray[np.intp]
+) -> Temperature:
+    found = [effect for tile in tiles if (effect := tile.effects.temperature) is not None]
+    return Temperature(
+        kpa_per_count=np.array([e.kpa_per_k.value for e in found]) / TADC_PER_KELVIN,
+        relative_sigma=np.array([e.kpa_per_k.sigma / e.kpa_per_k.value for e in found]),
+        lag_s=np.array([e.lag_s.value for e in found]),
+        relative_lag_sigma=np.array([e.lag_s.sigma / e.lag_s.value for e in found]),
+        tare_counts=tare.tadc_counts[columns],
+        baseline_kpa=tare.baseline_kpa[columns],
+    )
+
+
+def _ambient(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> Ambient:
+    give = np.array([tile.effects.wall_per_kpa for tile in tiles]) * baseline_kpa
+    found = [effect for tile in tiles if (effect := tile.effects.temperature) is not None]
+    wall = [e.wall_per_kpa for e in found]
+    relative = max((w.sigma / w.value if w.value > 0.0 else 1.0 for w in wall), default=1.0)
+    return Ambient(passed=give / (1.0 + give), relative_sigma=relative)

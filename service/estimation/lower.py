@@ -1,0 +1,178 @@
+"""The lower part of the ladder: counts to the force that every dome feels, reading by reading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.frames import NOT_READ, FrameBatch
+from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
+from service.estimation.estimates import EstimateStatus
+from service.estimation.models import ambient, gas, skew, temperature
+from service.estimation.models.outliers import despiked
+from service.estimation.models.unwrap import unwrap
+from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Felt:
+    """What the domes feel in n frames; arrays (n, bearing tiles) unless said otherwise.
+
+    Attributes:
+        gauge_kpa: (n, all tiles), pressure above the baseline.
+        felt_n: force by the static curve.
+        noise_n: standard deviation that a single reading's noise gives it; averages away.
+        sigma_n: standard uncertainty from all else; does not.
+        t_mono_ns: when it was sampled.
+        beyond: beyond the calibrated range: a lower bound.
+        status: (n,), bits of `EstimateStatus` that these frames have by themselves.
+    """
+
+    gauge_kpa: Floats
+    felt_n: Floats
+    noise_n: Floats
+    sigma_n: Floats
+    t_mono_ns: npt.NDArray[np.int64]
+    beyond: Bools
+    status: npt.NDArray[np.uint16]
+
+    def rows(self, start: int, stop: int) -> Felt:
+        """Rows `start` to `stop` as views."""
+        return Felt(**{f.name: getattr(self, f.name)[start:stop] for f in fields(self)})
+
+    def followed_by(self, later: Felt) -> Felt:
+        """These frames and later ones."""
+        return Felt(
+            **{
+                f.name: np.concatenate([getattr(self, f.name), getattr(later, f.name)])
+                for f in fields(self)
+            }
+        )
+
+
+@dataclass(frozen=True)
+class LowerState:
+    """What the lower models remember; None for those that are not named."""
+
+    temperature: temperature.TemperatureState | None = None
+    ambient: ambient.AmbientState = ambient.AT_REST
+    gas: gas.GasState | None = None
+    skew: skew.SkewState | None = None
+
+
+def tile_kpa(plan: EstimationPlan, frames: FrameBatch) -> Floats:
+    """Absolute pressure (n, all tiles), NaN where a tile gave none that could be one."""
+    kpa = plan.compensation.readable_kpa(frames)
+    if plan.ladder.unwrap:
+        kpa = unwrap(kpa, plan.compensation.kpa_per_count(frames.tadc))
+    return np.where(kpa >= PRESSURE_MIN_KPA, kpa, np.nan)
+
+
+def felt(
+    plan: EstimationPlan,
+    frames: FrameBatch,
+    kpa: Floats,
+    neighbours: tuple[Floats, Floats] | None,
+    broken: Bools,
+    state: LowerState,
+) -> tuple[Felt, LowerState]:
+    """The force that every dome feels.
+
+    Args:
+        plan: constants of the estimate.
+        frames: n frames, temperatures held.
+        kpa: their absolute pressures (n, all tiles), from `tile_kpa`.
+        neighbours: those of the frames before and after each; None without look-ahead.
+        broken: (n,), frames after a gap.
+        state: from the frames before.
+    """
+    ladder, columns = plan.ladder, plan.bearing
+    status = _frame_status(plan, frames, kpa, broken)
+    if ladder.denoise and neighbours is not None:
+        kpa, replaced = despiked(kpa, *neighbours, plan.tare.noise_kpa)
+        status[replaced[:, columns].any(axis=1)] |= np.uint16(EstimateStatus.OUTLIER_REPLACED)
+    t_mono_ns = (frames.t_mono_ns[:, None] + 1000 * frames.sample_offset_us.astype(np.int64))[
+        :, columns
+    ]
+    gauge_kpa = kpa - plan.tare.baseline_kpa
+    bearing_kpa = kpa[:, columns]
+    baseline_variance = np.broadcast_to(plan.baseline_sigma_kpa**2, bearing_kpa.shape)
+    if ladder.temperature is not None:
+        before = state.temperature or temperature.at_rest(len(columns))
+        tadc = np.where(frames.tadc == NOT_READ, np.nan, frames.tadc.astype(np.float64))
+        bearing_kpa, sigma_kpa, after = ladder.temperature.at_tare(
+            bearing_kpa, tadc[:, columns], t_mono_ns, before
+        )
+        baseline_variance = baseline_variance + sigma_kpa**2
+        state = replace(state, temperature=after)
+    if ladder.ambient is not None:
+        felt_kpa, sigma_kpa, outside = ladder.ambient.felt(
+            _mean_of(gauge_kpa, plan.references), frames.t_mono_ns, state.ambient
+        )
+        bearing_kpa = bearing_kpa - felt_kpa
+        baseline_variance = baseline_variance + sigma_kpa**2
+        state = replace(state, ambient=outside)
+    if ladder.temperature is not None or ladder.ambient is not None:
+        gauge_kpa = gauge_kpa.copy()
+        gauge_kpa[:, columns] = bearing_kpa - plan.baseline_kpa
+    settled_kpa = bearing_kpa
+    if ladder.gas is not None:
+        settled_kpa, warm = ladder.gas.settled(
+            bearing_kpa, t_mono_ns, state.gas or gas.at_rest(len(columns))
+        )
+        baseline_variance = (
+            baseline_variance + (ladder.gas_misfit * (settled_kpa - bearing_kpa)) ** 2
+        )
+        state = replace(state, gas=warm)
+    static_kpa = settled_kpa - plan.baseline_kpa
+    static = ladder.curves.force(static_kpa)
+    beyond = static_kpa > ladder.curves.high_kpa
+    status[beyond.any(axis=1)] |= np.uint16(EstimateStatus.SATURATED)
+    low_kpa = ladder.curves.low_kpa - SIGMAS * plan.still_kpa
+    status[(static_kpa < low_kpa).any(axis=1)] |= np.uint16(EstimateStatus.EXTRAPOLATED)
+    over = (kpa[:, columns] > PRESSURE_MAX_KPA) & ~beyond
+    status[over.any(axis=1)] |= np.uint16(EstimateStatus.OVER_RATED)
+    felt_n = static.force_n
+    if ladder.skew and not ladder.denoise:
+        felt_n, row = skew.aligned(
+            felt_n, t_mono_ns, frames.t_mono_ns, broken, state.skew or skew.at_rest(len(columns))
+        )
+        state = replace(state, skew=row)
+    now = Felt(
+        gauge_kpa=gauge_kpa,
+        felt_n=felt_n,
+        noise_n=np.abs(static.slope_n_per_kpa) * plan.noise_kpa,
+        sigma_n=np.sqrt(static.slope_n_per_kpa**2 * baseline_variance + static.fit_sigma_n**2),
+        t_mono_ns=t_mono_ns,
+        beyond=beyond,
+        status=status,
+    )
+    return now, state
+
+
+def _frame_status(
+    plan: EstimationPlan, frames: FrameBatch, kpa: Floats, broken: Bools
+) -> npt.NDArray[np.uint16]:
+    status = np.zeros(len(frames), dtype=np.uint16)
+    missing = np.isnan(kpa[:, plan.bearing]).any(axis=1)
+    status[missing] |= np.uint16(EstimateStatus.TILE_MISSING)
+    status[broken] |= np.uint16(EstimateStatus.GAP)
+    status[frames.t_ns - plan.tare.t_ns > TARE_OLD_NS] |= np.uint16(EstimateStatus.TARE_OLD)
+    if plan.assumed_scale:
+        status |= np.uint16(EstimateStatus.ASSUMED_SCALE)
+    return status
+
+
+def _mean_of(values: Floats, columns: npt.NDArray[np.intp]) -> Floats:
+    """Mean over some columns of those that are not NaN; one after the other, as in every sum."""
+    total, count = np.zeros(len(values)), np.zeros(len(values))
+    for column in columns:
+        good = np.isfinite(values[:, column])
+        total = total + np.where(good, values[:, column], 0.0)
+        count = count + good
+    return np.where(count > 0.0, total, np.nan) / np.maximum(count, 1.0)

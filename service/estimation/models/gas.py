@@ -1,0 +1,131 @@
+"""`gas`: what the bubble would read if its gas had the time to cool (hardware.md 9).
+
+A fast squeeze heats the sealed gas, which gives the heat to its wall within 5 to 42 ms. With T the
+gas' mean temperature over that of its wall, p measured, and an effective ratio of heat capacities
+gamma between 1 and 1.4::
+
+    gamma dT/dt = (gamma - 1) T/p dp/dt - (T - 1)/tau
+
+With u = T p^-k, k = (gamma - 1)/gamma, that is one linear low-pass; taken with ln p linear between
+samples it is exact and stable for any step. The wall gives way to the pressure over it by the part
+c of its volume for every kPa, so the pressure that the gas will settle at is::
+
+    p_static = p_iso (1 + c g)/(1 + c g_iso),  p_iso = p/T,  g = p - p0,  g_iso = p_iso - p0
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.estimation.compiled import compiled
+
+Floats = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
+
+RESTART = 5.0
+"""After so many gamma tau without a reading the gas has the temperature of its wall."""
+
+
+@dataclass(frozen=True)
+class GasState:
+    """Of every tile: temperature over the wall's, and the reading before (NaN: none)."""
+
+    temperature: Floats
+    ln_kpa: Floats
+    t_ns: Times
+
+
+def at_rest(tiles: int) -> GasState:
+    """Before the first reading."""
+    return GasState(np.ones(tiles), np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64))
+
+
+@dataclass(frozen=True)
+class Gas:
+    """Parameters over tiles.
+
+    Attributes:
+        gamma: effective ratio of heat capacities.
+        tau_s: time constant of the gas' cooling at constant volume.
+        wall_per_kpa: part of the bubble's volume that its wall gives way for a kPa.
+        baseline_kpa: absolute pressure unloaded.
+    """
+
+    gamma: Floats
+    tau_s: Floats
+    wall_per_kpa: Floats
+    baseline_kpa: Floats
+
+    def settled(self, kpa: Floats, t_ns: Times, state: GasState) -> tuple[Floats, GasState]:
+        """Pressures that measured ones would settle at.
+
+        Args:
+            kpa: absolute pressures (n, tiles); NaN stays NaN and changes nothing after it.
+            t_ns: instants of the readings (n, tiles).
+            state: from the readings before.
+        """
+        out = np.empty_like(kpa)
+        temperature, ln_kpa, last_ns = state.temperature.copy(), state.ln_kpa.copy(), state.t_ns
+        last_ns = last_ns.copy()
+        _settle(
+            np.ascontiguousarray(kpa),
+            np.ascontiguousarray(t_ns),
+            self.gamma,
+            self.tau_s,
+            self.wall_per_kpa,
+            self.baseline_kpa,
+            temperature,
+            ln_kpa,
+            last_ns,
+            out,
+        )
+        return out, GasState(temperature, ln_kpa, last_ns)
+
+
+@compiled
+def warmed(before: float, change_ln_p: float, h: float, k: float) -> float:
+    """Temperature over the wall's after a step of `h` gamma tau in which ln p changes linearly."""
+    x = h - k * change_ln_p
+    # (1 - exp(-x))/x, which is 1 at x = 0
+    mean = -math.expm1(-x) / x if x != 0.0 else 1.0
+    return before * math.exp(-x) + h * mean
+
+
+@compiled
+def _settle(
+    kpa: Floats,
+    t_ns: Times,
+    gamma: Floats,
+    tau_s: Floats,
+    wall_per_kpa: Floats,
+    baseline_kpa: Floats,
+    temperature: Floats,
+    ln_kpa: Floats,
+    last_ns: Times,
+    out: Floats,
+) -> None:
+    n, tiles = kpa.shape
+    for j in range(tiles):
+        gamma_tau_ns = gamma[j] * tau_s[j] * 1e9
+        k = (gamma[j] - 1.0) / gamma[j]
+        c, p0 = wall_per_kpa[j], baseline_kpa[j]
+        now, before, before_ns = temperature[j], ln_kpa[j], last_ns[j]
+        for i in range(n):
+            p = kpa[i, j]
+            if not p > 0.0:
+                out[i, j] = math.nan
+                continue
+            ln_p = math.log(p)
+            h = (t_ns[i, j] - before_ns) / gamma_tau_ns
+            if math.isnan(before) or not 0.0 <= h <= RESTART:
+                now = 1.0
+            else:
+                now = warmed(now, ln_p - before, h, k)
+            before, before_ns = ln_p, t_ns[i, j]
+            iso = p / now
+            out[i, j] = iso * (1.0 + c * (p - p0)) / (1.0 + c * (iso - p0))
+        temperature[j], ln_kpa[j], last_ns[j] = now, before, before_ns

@@ -1,0 +1,117 @@
+"""`rubber`: creep of the dome, whose rubber gives way to a force within seconds (hardware.md 9).
+
+Of a force F the bubble feels a part at once and the rest later; two Prony terms with the parts g
+and times tau::
+
+    felt = F - sum g (F - z),  tau dz/dt = F - z
+
+Inverted for F with F linear between samples, which is exact and stable for any step. A force that
+has lasted is felt whole, so the static curve is untouched.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.estimation.compiled import compiled
+
+Floats = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class RubberState:
+    """Of every tile: crept parts (tiles, terms), and the force before (NaN: none)."""
+
+    crept_n: Floats
+    force_n: Floats
+    t_ns: Times
+
+
+@dataclass(frozen=True)
+class Rubber:
+    """Parameters (tiles, terms): parts of the force that are felt later, and after what time."""
+
+    part: Floats
+    tau_s: Floats
+
+    def at_rest(self) -> RubberState:
+        """Before the first reading."""
+        tiles = len(self.part)
+        return RubberState(
+            np.zeros(self.part.shape), np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64)
+        )
+
+    def unfelt(self, felt_n: Floats, t_ns: Times, state: RubberState) -> tuple[Floats, RubberState]:
+        """Forces of which these are felt.
+
+        Args:
+            felt_n: (n, tiles); NaN stays NaN and changes nothing after it.
+            t_ns: instants (n, tiles).
+            state: from the readings before.
+        """
+        out = np.empty_like(felt_n)
+        crept, force, last_ns = state.crept_n.copy(), state.force_n.copy(), state.t_ns.copy()
+        _unfelt(
+            np.ascontiguousarray(felt_n),
+            np.ascontiguousarray(t_ns),
+            self.part,
+            self.tau_s,
+            crept,
+            force,
+            last_ns,
+            out,
+        )
+        return out, RubberState(crept, force, last_ns)
+
+
+@compiled
+def crept_parts(h: float) -> tuple[float, float, float]:
+    """Weights of the crept part, the force before and the force now, after `h` time constants."""
+    decay = math.exp(-h)
+    mean = -math.expm1(-h) / h if h > 0.0 else 1.0
+    return decay, mean - decay, 1.0 - mean
+
+
+@compiled
+def _unfelt(
+    felt_n: Floats,
+    t_ns: Times,
+    part: Floats,
+    tau_s: Floats,
+    crept: Floats,
+    force: Floats,
+    last_ns: Times,
+    out: Floats,
+) -> None:
+    n, tiles = felt_n.shape
+    terms = part.shape[1]
+    carried = np.empty(terms)
+    share = np.empty(terms)
+    for j in range(tiles):
+        before, before_ns = force[j], last_ns[j]
+        for i in range(n):
+            felt = felt_n[i, j]
+            if math.isnan(felt):
+                out[i, j] = math.nan
+                continue
+            if math.isnan(before):  # the first reading: at rest without a force
+                before, before_ns = 0.0, t_ns[i, j]
+            left, known = 1.0, felt
+            for m in range(terms):
+                h = max(0.0, (t_ns[i, j] - before_ns) * 1e-9 / tau_s[j, m])
+                decay, of_before, of_now = crept_parts(h)
+                carried[m] = decay * crept[j, m] + of_before * before
+                share[m] = of_now
+                left -= part[j, m] * (1.0 - of_now)
+                known -= part[j, m] * carried[m]
+            now = known / left
+            for m in range(terms):
+                crept[j, m] = carried[m] + share[m] * now
+            before, before_ns = now, t_ns[i, j]
+            out[i, j] = now
+        force[j], last_ns[j] = before, before_ns
