@@ -27,6 +27,9 @@ class EmulationScene(Section):
     hysteresis: bool = True
     """Rate-independent loop of the dome."""
     ambient_degc: Annotated[float, Field(gt=-273.15, allow_inf_nan=False)] = 21.0
+    ambient_kpa: Annotated[float, Field(ge=50, le=115)] | None = None
+    """Pressure of the atmosphere, which only a reference tile feels: the chip's range. Absent: an
+    ordinary day's, drawn from 99 to 101."""
     temperature_step_k: Kelvin = 0.0
     """A step of the surroundings' temperature ..."""
     temperature_step_s: NotNegative = 0.0

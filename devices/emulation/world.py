@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.clock import Clock
-from devices.emulation.dome import Domes, Surroundings
+from devices.emulation.dome import Domes
 from devices.emulation.dynamixel import EmulatedServo
 from devices.emulation.faults import Faults
 from devices.emulation.front_end import FrontEnd
@@ -29,6 +29,7 @@ from devices.emulation.load_trace import Floats, PressedTrace
 from devices.emulation.mill import Indentation, Mill
 from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
 from devices.emulation.parts import draw_chip, draw_dome, random_of
+from devices.emulation.surroundings import Surroundings
 from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.scene import BUS, FaultKind, Scene, ServoScene, TileFault
 
@@ -93,21 +94,23 @@ class World:
         self._positions_m = tile_positions_m(scene.tile)
         serials = [tile.serial for tile in scene.tile]
         domes = [draw_dome(serial, parts_seed) for serial in serials]
-        surroundings = self._surroundings()
         # By scene too: a tile on the bench and in the field must not see the same noise again.
         draw = f"{scene.name}/{seed}"
+        surroundings = self._surroundings(draw)
         self._domes = Domes(domes, serials, self.ground, scene.emulation, surroundings, draw)
         self._faults = Faults(scene.fault)
         self._front_ends: list[FrontEnd] = []
 
         def silicon(index: int, serial: str) -> Silicon:
-            """The chip of a serial under a dome of this foot."""
+            """The chip of a serial under a dome of this foot, or bare if it is for reference."""
+            bare = scene.tile[index].reference
+            pressure_kpa = surroundings.bare_kpa if bare else self._domes.pressure_kpa
             chip = draw_chip(serial, parts_seed)
             fixed_ms = scene.array.conversion_ms
             sense = FrontEnd(
                 chip,
                 domes[index],
-                lambda t_s: self._domes.pressure_kpa(index, t_s),
+                partial(pressure_kpa, index),
                 surroundings,
                 scene.emulation,
                 f"noise/{draw}/{serial}",
@@ -231,7 +234,7 @@ class World:
         own = {kind: self._faults.of(kind, serial) for kind in kinds if kind != "over_range"}
         return PartFaults(**own, scene=self._faults)
 
-    def _surroundings(self) -> Surroundings:
+    def _surroundings(self, draw: str) -> Surroundings:
         emulation = self.scene.emulation
         if isinstance(self.ground, Indentation):
             emulation = emulation.model_copy(
@@ -240,7 +243,7 @@ class World:
                     "temperature_step_s": self.ground.warm_from_s,
                 }
             )
-        return Surroundings(emulation)
+        return Surroundings(emulation, label=draw)
 
     def _seconds(self, t_ns: npt.NDArray[np.int64]) -> Floats:
         if not self._begun:

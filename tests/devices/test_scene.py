@@ -274,6 +274,7 @@ NOT_FINITE = ["nan", "inf", "-inf"]
         ("emulation", "correlated_ms"),
         ("emulation", "repeatability"),
         ("emulation", "ambient_degc"),
+        ("emulation", "ambient_kpa"),
         ("emulation", "temperature_step_k"),
         ("emulation", "temperature_step_s"),
         ("emulation", "head_kpa"),
