@@ -36,8 +36,10 @@ from devices.scene_faults import (
 from devices.scene_grounds import (
     GroundScene,
     IndentationGround,
+    MudGround,
     NoGround,
     PlateGround,
+    PoppyGround,
     RollingGround,
     TraceGround,
 )
@@ -65,9 +67,11 @@ __all__ = [
     "FaultScene",
     "GroundScene",
     "IndentationGround",
+    "MudGround",
     "MuxFault",
     "NoGround",
     "PlateGround",
+    "PoppyGround",
     "ReadDuringConversion",
     "RecoveryScene",
     "ReferenceScene",
@@ -114,6 +118,11 @@ class Scene(Section):
             raise ValueError(f"{twice} is used by two tiles; plug each into a channel of its own")
         if all(tile.reference for tile in self.tile):
             raise ValueError("every tile is a reference tile; at least one has to bear load")
+        if isinstance(self.ground, MudGround) and self.emulation.temperature_step_k:
+            raise ValueError(
+                "mud has a temperature step of its own; give ground.temperature_step_k, and leave "
+                "emulation.temperature_step_k away"
+            )
         for fault in self.fault:
             if fault.tile is not None and fault.tile not in serials:
                 raise ValueError(
