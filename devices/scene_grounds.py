@@ -56,13 +56,13 @@ class _HoppingGround(Section):
     """Mass of the leg (paper II-D), foot included."""
     drop_m: Annotated[float, Field(ge=0.01, le=0.5)] = 0.10
     """Height of the sole above the ground when it is dropped, and how high it hops."""
-    leg_n_per_m: Annotated[float, Field(ge=100, le=20_000)] = 600.0
+    leg_n_per_m: Annotated[float, Field(ge=100, le=5_000)] = 600.0
     """Stiffness of the leg."""
     stand_s: Annotated[float, Field(ge=0.2, le=10)] = 0.5
     """From touch-down to push-off."""
     pitch_rad: Annotated[float, Field(ge=0, le=0.3)] = 0.1
     """Angle of the segment at take-off, and the negative one at touch-down."""
-    sole_m2: Annotated[float, Field(ge=0.0005, le=0.05)] = 0.004
+    sole_m2: Annotated[float, Field(ge=0.0005, le=0.02)] = 0.004
     """Area of the sole."""
     dome_share: Annotated[float, Field(gt=0, le=1)] = 0.8
     """How much of that area rests on domes; the rest is the sole's rim."""
@@ -72,7 +72,7 @@ class PoppyGround(_HoppingGround):
     """Dry granular ground: loosely packed poppy seeds."""
 
     kind: Literal["poppy"]
-    strength_n_per_cm3: Annotated[float, Field(ge=0.02, le=10)] = 0.3
+    strength_n_per_cm3: Annotated[float, Field(ge=0.02, le=3)] = 0.3
     """Stress against sinking in per depth (Li, Zhang and Goldman 2013: of this order)."""
 
 
@@ -80,9 +80,10 @@ class MudGround(_HoppingGround):
     """Wet ground: softer, viscous, heavy, cold, and it sucks."""
 
     kind: Literal["mud"]
-    strength_n_per_cm3: Annotated[float, Field(ge=0.02, le=10)] = 0.15
+    strength_n_per_cm3: Annotated[float, Field(ge=0.02, le=3)] = 0.15
     """Stress against sinking in per depth."""
-    viscosity_pa_s: Annotated[float, Field(ge=0, le=500)] = 20.0
+    viscosity_pa_s: Annotated[float, Field(ge=0, le=100)] = 20.0
+    """Of the mud at the speeds of a hop (assumed; honey has about 10)."""
     suction_kpa: Annotated[float, Field(ge=0, le=50)] = 2.5
     """The most that sucks at the sole at lift-off."""
     head_kpa_per_m: Annotated[float, Field(ge=9.8, le=25)] = 16.5

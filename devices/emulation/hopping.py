@@ -16,7 +16,7 @@ from bisect import bisect_right
 import numpy as np
 import numpy.typing as npt
 
-from devices.emulation.hopping_leg import HoppingLeg, Leg, Strip
+from devices.emulation.hopping_leg import STEP_S, HoppingLeg, Leg, Strip
 from devices.emulation.load_trace import Floats
 from devices.emulation.parts import random_of
 from devices.emulation.soft_ground import SoftGround
@@ -103,7 +103,8 @@ class Hopping:
         for hop in range(HOPS):
             place = SoftGround.of(ground, float(firmness[hop]))
             hopping.fall(place, self._angle)
-            self.touch_s.append(hopping.motion.t_s)
+            # Its force has been felt for a step, and rises from nothing during the one before.
+            self.touch_s.append(hopping.motion.t_s - 2.0 * STEP_S)
             self._turn(hopping.motion.t_s, ground.stand_s + _STANCE_S, pitches_rad[hop])
             hopping.stand(place, self._angle, hopping.motion.t_s + ground.stand_s)
             height_m = hopping.release_m + heights_m[hop]

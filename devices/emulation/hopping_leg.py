@@ -15,7 +15,8 @@ from devices.emulation.soft_ground import GRAVITY_M_S2, SoftGround
 from devices.errors import SceneError
 
 STEP_S = 0.00025
-"""The stiffest thing, a foot of 0.12 kg in poppy seeds unloading, has a period of 14 ms."""
+"""The stiffest thing, a foot of 0.12 kg in poppy seeds unloading, has a period of 14 ms. The bounds
+of the scene's keys keep it stable."""
 
 LEG_M = 0.30
 _FOOT_SHARE = 0.13
@@ -24,6 +25,7 @@ _STANDING_DAMPING, _PUSHING_DAMPING = 0.4, 0.1
 """Of the leg's spring, relative to critical (assumed: geared servos hold it, or drive it)."""
 _STOP = 40.0
 """How many times stiffer than the spring the leg's end stop is; it is damped critically."""
+_FOLDED = 0.95
 _PUSH_S = 0.10
 _RETRACT_S = 0.12
 _STROKE_MAX_M = 0.20
@@ -238,7 +240,7 @@ class HoppingLeg:
             done = min((motion.t_s - begin_s) / _PUSH_S, 1.0)
             motion.stroke_m = stroke_m * 0.5 * (1.0 - math.cos(math.pi * done))
             self._step(motion, ground, angle, record)
-            if not self._touches:
+            if not self._touches and done > 0.5:
                 break
 
     def _retract(self) -> None:
@@ -302,11 +304,20 @@ class HoppingLeg:
         return stress_pa, press_n, rest_n
 
     def _leg_n(self, motion: Motion) -> float:
-        """Push of the leg: a damped spring, and an end stop that pulls."""
+        """Push of the leg: a damped spring, and an end stop that pulls.
+
+        Raises:
+            SceneError: it is pressed together all the way.
+        """
         leg = self.leg
         k = leg.stiffness_n_m
         pressed_m = LEG_M + motion.stroke_m - (motion.body_m - motion.ankle_m)
         pressing = motion.ankle_m_s - motion.body_m_s
+        if pressed_m > _FOLDED * LEG_M:
+            raise SceneError(
+                "the leg folds up: its spring is too soft for its mass and its fall",
+                expected="a greater ground.leg_n_per_m, less ground.mass_kg or ground.drop_m",
+            )
         if pressed_m >= 0.0:
             return k * pressed_m + 2.0 * self._damping * math.sqrt(k * leg.body_kg) * pressing
         k *= _STOP
