@@ -11,7 +11,6 @@ interpolated where a chip samples: the physics does not know who asks, or when.
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Sequence
 from typing import Protocol
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 from devices.emulation.parts import DomePart, random_of
+from devices.emulation.surroundings import Surroundings
 from devices.scene import EmulationScene
 
 Floats = npt.NDArray[np.float64]
@@ -44,38 +44,6 @@ class Load(Protocol):
 
     def forces_n(self, t_s: Floats) -> Floats:
         """Force on each dome along its axis, shape (len(t_s), domes), never negative."""
-
-
-class Surroundings:
-    """Temperature and hydrostatic pressure around the domes, and how chip and gas follow.
-
-    One step of each, as the scene says; closed forms of one and two first-order lags.
-    """
-
-    def __init__(self, scene: EmulationScene) -> None:
-        self._scene = scene
-
-    @property
-    def steady(self) -> bool:
-        """Does the temperature never change?"""
-        return self._scene.temperature_step_k == 0.0
-
-    def chip_degc(self, t_s: float, lag_s: float) -> float:
-        """Temperature of a chip that follows the surroundings with one lag."""
-        scene = self._scene
-        since = max(t_s - scene.temperature_step_s, 0.0)
-        return scene.ambient_degc - scene.temperature_step_k * math.expm1(-since / lag_s)
-
-    def gas_wall_degc(self, t_s: Floats, chip_lag_s: float, gas_lag_s: float) -> Floats:
-        """Temperature of the bubble's wall, which follows the chip with a second lag."""
-        scene, a, b = self._scene, chip_lag_s, gas_lag_s
-        since = np.maximum(t_s - scene.temperature_step_s, 0.0)
-        arrived = 1 - (a * np.exp(-since / a) - b * np.exp(-since / b)) / (a - b)
-        return np.asarray(scene.ambient_degc + scene.temperature_step_k * arrived)
-
-    def head_kpa(self, t_s: Floats) -> Floats:
-        """Pressure around the dome above the atmosphere's."""
-        return np.where(t_s >= self._scene.head_s, self._scene.head_kpa, 0.0)
 
 
 class Domes:
@@ -222,7 +190,7 @@ class Domes:
             ],
             axis=1,
         )
-        head_kpa = self._surroundings.head_kpa(t_s)[:, None]
+        head_kpa = self._surroundings.head_kpa(t_s)
         excess_k = np.zeros_like(wall_k)
         kpa = self._pressure(wall_k, volume, head_kpa)
         if not self._scene.gas:

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from devices.emulation.dome import Surroundings
 from devices.emulation.faults import Fault
 from devices.emulation.parts import ChipPart, DomePart, random_of
+from devices.emulation.surroundings import Surroundings
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.scene import EmulationScene
 
@@ -30,7 +30,7 @@ _FAR_OVER_RANGE_KPA = 45.0
 
 
 class FrontEnd:
-    """Samples one dome: a `Sense` for the emulated chip.
+    """Samples one dome, or what is around a bare chip: a `Sense` for the emulated chip.
 
     Before `begin` its dome is at rest at the scene's first instant. Fault `over_range`: it is
     pressed 45 kPa harder, past its range; most wrap.

@@ -11,14 +11,17 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from devices.emulation.hopping import Hopping
 from devices.emulation.load_trace import CopTransform, Floats, LoadTrace, PressedTrace, press
 from devices.emulation.mill import Indentation
 from devices.emulation.parts import random_of
 from devices.errors import SceneError, UsageError
 from devices.scene import (
     IndentationGround,
+    MudGround,
     NoGround,
     PlateGround,
+    PoppyGround,
     RollingGround,
     Scene,
     TileScene,
@@ -204,7 +207,9 @@ def make_ground(
     pressed: PressedTrace | None,
     looped: bool = False,
 ) -> Ground:
-    """The ground of a scene, or a recorded load in its place, `looped` or once.
+    """The ground of a scene, or a recorded load in its place.
+
+    `looped`: what would have an end, a recorded load or three hops, begins again and again.
 
     Raises:
         UsageError: the scene wants a load trace and there is none.
@@ -221,6 +226,8 @@ def make_ground(
             return Standing(ground, positions_m, bears, seed, lead_s)
         case RollingGround() as ground:
             return Rolling(ground, positions_m, bears, lead_s)
+        case PoppyGround() | MudGround() as ground:
+            return Hopping(ground, positions_m, bears, seed, lead_s, looped=looped)
         case IndentationGround() as ground:
             return Indentation(ground, scene.tile, lead_s)
         case TraceGround():

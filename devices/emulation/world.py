@@ -18,19 +18,21 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.clock import Clock
-from devices.emulation.dome import Domes, Surroundings
+from devices.emulation.dome import Domes
 from devices.emulation.dynamixel import EmulatedServo
 from devices.emulation.faults import Faults
 from devices.emulation.front_end import FrontEnd
 from devices.emulation.ground import Rolling, make_ground, tile_positions_m
+from devices.emulation.hopping import Hopping
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
 from devices.emulation.line import Line
 from devices.emulation.load_trace import Floats, PressedTrace
 from devices.emulation.mill import Indentation, Mill
 from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
 from devices.emulation.parts import draw_chip, draw_dome, random_of
+from devices.emulation.surroundings import Surroundings
 from devices.emulation.tca9548a import EmulatedTca9548a
-from devices.scene import BUS, FaultKind, Scene, ServoScene, TileFault
+from devices.scene import BUS, FaultKind, MudGround, Scene, ServoScene, TileFault
 
 _COUNTS_PER_TURN = 4096
 _FORESIGHT_S = 0.4
@@ -43,7 +45,7 @@ class Truth:
     Attributes:
         true_force_n: (n, tiles), force on each dome along its axis.
         true_grf_n: (n,), their vertical sum: what the array could know.
-        true_plate_n: (n,), vertical force on the whole foot.
+        true_plate_n: (n,), vertical force on the whole foot: what a plate under it sees.
         true_cop_x_m: (n,), force-weighted place of the load; NaN without load.
         true_cop_y_m: (n,), likewise.
         true_angle_rad: (n,), segment angle; NaN for a foot without one.
@@ -67,7 +69,7 @@ class World:
         parts_seed: draws other parts for the same serials.
         lead_s: seconds without load before the ground begins.
         pressed: a recorded load instead of the scene's ground.
-        looped: press it over and over again.
+        looped: press it, or hop, over and over again.
         begun: the scene's time begins now; else at `begin`, and until then all is as at its first
             instant.
     """
@@ -93,21 +95,23 @@ class World:
         self._positions_m = tile_positions_m(scene.tile)
         serials = [tile.serial for tile in scene.tile]
         domes = [draw_dome(serial, parts_seed) for serial in serials]
-        surroundings = self._surroundings()
         # By scene too: a tile on the bench and in the field must not see the same noise again.
         draw = f"{scene.name}/{seed}"
+        surroundings = self._surroundings(draw)
         self._domes = Domes(domes, serials, self.ground, scene.emulation, surroundings, draw)
         self._faults = Faults(scene.fault)
         self._front_ends: list[FrontEnd] = []
 
         def silicon(index: int, serial: str) -> Silicon:
-            """The chip of a serial under a dome of this foot."""
+            """The chip of a serial under a dome of this foot, or bare if it is for reference."""
+            bare = scene.tile[index].reference
+            pressure_kpa = surroundings.bare_kpa if bare else self._domes.pressure_kpa
             chip = draw_chip(serial, parts_seed)
             fixed_ms = scene.array.conversion_ms
             sense = FrontEnd(
                 chip,
                 domes[index],
-                lambda t_s: self._domes.pressure_kpa(index, t_s),
+                partial(pressure_kpa, index),
                 surroundings,
                 scene.emulation,
                 f"noise/{draw}/{serial}",
@@ -204,16 +208,19 @@ class World:
         forces_n = self.ground.forces_n(t_s)
         angle = self.ground.angle_rad(t_s)
         angle_rad = np.full(len(t_s), np.nan) if angle is None else angle
-        if isinstance(self.ground, Rolling):
+        if isinstance(self.ground, Rolling | Hopping):
             vertical_n = forces_n * np.cos(self.ground.arc_rad - angle_rad[:, None])
         else:
             vertical_n = forces_n
         grf_n = vertical_n.sum(axis=1)
+        plate_n = grf_n
+        if isinstance(self.ground, Hopping):
+            plate_n = grf_n + self.ground.rest_n(t_s)
         weight = vertical_n / np.where(grf_n > 0.0, grf_n, np.nan)[:, None]
         return Truth(
             true_force_n=forces_n,
             true_grf_n=grf_n,
-            true_plate_n=grf_n,
+            true_plate_n=plate_n,
             true_cop_x_m=(weight * self._positions_m[:, 0]).sum(axis=1),
             true_cop_y_m=(weight * self._positions_m[:, 1]).sum(axis=1),
             true_angle_rad=angle_rad,
@@ -231,16 +238,18 @@ class World:
         own = {kind: self._faults.of(kind, serial) for kind in kinds if kind != "over_range"}
         return PartFaults(**own, scene=self._faults)
 
-    def _surroundings(self) -> Surroundings:
-        emulation = self.scene.emulation
-        if isinstance(self.ground, Indentation):
+    def _surroundings(self, draw: str) -> Surroundings:
+        emulation, ground = self.scene.emulation, self.ground
+        step_k = step_s = 0.0
+        if isinstance(ground, Indentation):
+            step_k, step_s = ground.soak_k, ground.warm_from_s
+        elif isinstance(self.scene.ground, MudGround) and isinstance(ground, Hopping):
+            step_k, step_s = self.scene.ground.temperature_step_k, ground.touch_s[0]
+        if step_k:
             emulation = emulation.model_copy(
-                update={
-                    "temperature_step_k": self.ground.soak_k,
-                    "temperature_step_s": self.ground.warm_from_s,
-                }
+                update={"temperature_step_k": step_k, "temperature_step_s": step_s}
             )
-        return Surroundings(emulation)
+        return Surroundings(emulation, ground if isinstance(ground, Hopping) else None, draw)
 
     def _seconds(self, t_ns: npt.NDArray[np.int64]) -> Floats:
         if not self._begun:

@@ -12,7 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import SceneError
-from devices.scene import FaultKind, Scene, builtin_scenes, load_scene, parse_scene
+from devices.scene import (
+    FaultKind,
+    MudGround,
+    PoppyGround,
+    Scene,
+    builtin_scenes,
+    load_scene,
+    parse_scene,
+)
 
 TILE = """
 [[tile]]
@@ -74,6 +82,28 @@ def test_the_rolling_foot_is_an_arc_of_150_mm() -> None:
         assert math.hypot(t.x_m, t.z_m) == pytest.approx(0.150, abs=1e-6)
     assert rolling.servo is not None
     assert rolling.servo.ankle_travel_m_per_rad == 0.150
+
+
+@pytest.mark.parametrize("name", ["poppy", "mud"])
+def test_the_hopping_foot_is_the_rolling_one(name: str) -> None:
+    foot = load_scene(name).tile[:4]
+    assert foot == load_scene("rolling").tile
+    assert [tile.reference for tile in load_scene(name).tile[4:]] == (
+        [True] if name == "mud" else []
+    )
+
+
+def test_the_hopping_leg_is_the_papers_and_falls_from_10_cm() -> None:
+    # hardware.md 0: 909 g; design.md 6: a 10 cm drop, on wet ground about 5 cm deep
+    for name in ("poppy", "mud"):
+        ground = load_scene(name).ground
+        assert isinstance(ground, PoppyGround | MudGround)
+        assert (ground.mass_kg, ground.drop_m) == (0.909, 0.10)
+
+
+def test_mud_has_a_temperature_step_of_its_own() -> None:
+    text = refused(sections="[ground]\nkind = 'mud'\n[emulation]\ntemperature_step_k = -4.0")
+    assert "ground.temperature_step_k" in text
 
 
 def test_the_insole_has_its_tiles_where_the_recording_had_its_cells() -> None:
@@ -274,6 +304,7 @@ NOT_FINITE = ["nan", "inf", "-inf"]
         ("emulation", "correlated_ms"),
         ("emulation", "repeatability"),
         ("emulation", "ambient_degc"),
+        ("emulation", "ambient_kpa"),
         ("emulation", "temperature_step_k"),
         ("emulation", "temperature_step_s"),
         ("emulation", "head_kpa"),
@@ -300,6 +331,24 @@ def test_a_number_that_is_none_is_refused(section: str, key: str, value: str) ->
         ("indentation", "load_n"),
         ("indentation", "stroke_s"),
         ("indentation", "soak_k"),
+        *(
+            (kind, key)
+            for kind in ("poppy", "mud")
+            for key in (
+                "mass_kg",
+                "drop_m",
+                "leg_n_per_m",
+                "stand_s",
+                "pitch_rad",
+                "sole_m2",
+                "dome_share",
+                "strength_n_per_cm3",
+            )
+        ),
+        ("mud", "viscosity_pa_s"),
+        ("mud", "suction_kpa"),
+        ("mud", "head_kpa_per_m"),
+        ("mud", "temperature_step_k"),
     ],
 )
 def test_a_number_that_is_none_is_refused_in_a_ground(kind: str, key: str, value: str) -> None:
@@ -331,6 +380,11 @@ def test_a_number_that_is_none_is_refused_in_a_position_or_a_fault(value: str) -
         ("", "[ground]\nkind = 'plate'\nload_n = -3", "load_n"),
         ("", "[ground]\nkind = 'indentation'\nrepeats = 1", "repeats"),
         ("", "[emulation]\nnoise_kpa = -0.1", "emulation.noise_kpa"),
+        ("", "[emulation]\nambient_kpa = 1013", "emulation.ambient_kpa"),  # hPa
+        ("", "[ground]\nkind = 'poppy'\ndrop_m = 10", "drop_m"),  # cm
+        ("", "[ground]\nkind = 'poppy'\nmass_kg = 909", "mass_kg"),  # g
+        ("", "[ground]\nkind = 'poppy'\ndome_share = 80", "dome_share"),  # %
+        ("", "[ground]\nkind = 'mud'\nhead_kpa_per_m = 1.65", "head_kpa_per_m"),  # per 0.1 m
         ("", "[array]\ntemperature_every = 0", "array.temperature_every"),
         ("", "[array]\nbroadcast_channels = 0", "array.broadcast_channels"),
         ("", "[array]\nbroadcast_channels = 65", "array.broadcast_channels"),

@@ -20,8 +20,9 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from devices.emulation.dome import GRID_S, Domes, Surroundings
+from devices.emulation.dome import GRID_S, Domes
 from devices.emulation.parts import DomePart
+from devices.emulation.surroundings import Surroundings
 from devices.scene import EmulationScene
 
 Floats = npt.NDArray[np.float64]
@@ -481,24 +482,6 @@ def test_the_baseline_follows_the_temperature_by_0_30_kpa_per_kelvin() -> None:
 def test_cold_lowers_the_baseline() -> None:
     domes = domes_of(nothing, temperature_step_k=-5.0)
     assert domes.pressure_kpa(0, 60.0) == pytest.approx(100.0 - 5 * 0.30, abs=0.05)
-
-
-def test_chip_and_gas_follow_the_surroundings_with_one_and_two_lags() -> None:
-    scene = EmulationScene(ambient_degc=20.0, temperature_step_k=8.0, temperature_step_s=2.0)
-    surroundings = Surroundings(scene)
-    t_s = np.linspace(0, 20, 81)
-
-    def lags(t: float, state: Floats) -> list[float]:
-        outside = 28.0 if t >= 2.0 else 20.0
-        return [(outside - state[0]) / 1.0, (state[0] - state[1]) / 4.0]
-
-    solved = solve_ivp(lags, (0, 20), [20.0, 20.0], t_eval=t_s, rtol=1e-8, max_step=0.02)
-    chip = [surroundings.chip_degc(float(t), 1.0) for t in t_s]
-    np.testing.assert_allclose(chip, solved.y[0], atol=0.05)
-    gas = surroundings.gas_wall_degc(t_s, 1.0, 4.0)
-    np.testing.assert_allclose(gas, solved.y[1], atol=0.05)
-    assert not surroundings.steady
-    assert Surroundings(EmulationScene()).steady
 
 
 @pytest.mark.parametrize(("wall_per_kpa", "share"), [(0.00124, 0.11), (0.00389, 0.28)])

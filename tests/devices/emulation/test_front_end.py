@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from devices.emulation.dome import Surroundings
 from devices.emulation.faults import Fault
 from devices.emulation.front_end import FrontEnd
 from devices.emulation.parts import ChipPart, DomePart
+from devices.emulation.surroundings import Surroundings
 from devices.mpl115a2 import Coefficients, compensate_kpa
 from devices.scene import EmulationScene
 

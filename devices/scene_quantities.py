@@ -1,0 +1,23 @@
+"""What the sections of a scene file are made of: strict keys, and quantities within reason."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+# No quantity here is meant beyond a million; what is, is a slip of the keyboard or of the unit.
+Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+LoadN = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+Kelvin = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
+GpioLine = Annotated[int, Field(ge=0, le=511)]
+Position = Annotated[float, Field(gt=-1.0, lt=1.0)]  # a tile 50 m away was meant in millimetres
+
+
+class Section(BaseModel):
+    """One section of a scene file."""
+
+    # Strict: "4" is not 4, and 1 is not true. Only int to float is let through, as in TOML itself.
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)

@@ -1,0 +1,64 @@
+"""What is around the tiles, as chips, gas and bare reference tiles feel it."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.integrate import solve_ivp
+
+from devices.emulation.surroundings import Surroundings
+from devices.scene import EmulationScene
+
+Floats = npt.NDArray[np.float64]
+
+
+class Sinking:
+    """Two tiles that sink, one twice as deep as the other."""
+
+    def head_kpa(self, t_s: Floats) -> Floats:
+        return np.outer(t_s, [1.0, 2.0])
+
+
+def test_chip_and_gas_follow_the_surroundings_with_one_and_two_lags() -> None:
+    scene = EmulationScene(ambient_degc=20.0, temperature_step_k=8.0, temperature_step_s=2.0)
+    surroundings = Surroundings(scene)
+    t_s = np.linspace(0, 20, 81)
+
+    def lags(t: float, state: Floats) -> list[float]:
+        outside = 28.0 if t >= 2.0 else 20.0
+        return [(outside - state[0]) / 1.0, (state[0] - state[1]) / 4.0]
+
+    solved = solve_ivp(lags, (0, 20), [20.0, 20.0], t_eval=t_s, rtol=1e-8, max_step=0.02)
+    chip = [surroundings.chip_degc(float(t), 1.0) for t in t_s]
+    np.testing.assert_allclose(chip, solved.y[0], atol=0.05)
+    gas = surroundings.gas_wall_degc(t_s, 1.0, 4.0)
+    np.testing.assert_allclose(gas, solved.y[1], atol=0.05)
+    assert not surroundings.steady
+    assert Surroundings(EmulationScene()).steady
+
+
+def test_an_ordinary_day_has_an_ordinary_pressure_of_its_own() -> None:
+    drawn = [Surroundings(EmulationScene(), label=str(day)).ambient_kpa for day in range(200)]
+    assert 99.0 <= min(drawn) < 99.2
+    assert 100.8 < max(drawn) <= 101.0
+    assert Surroundings(EmulationScene(), label="7").ambient_kpa == drawn[7]
+
+
+def test_a_scene_can_say_what_the_weather_is() -> None:
+    # hardware.md 9: ISA at 1000 m
+    assert Surroundings(EmulationScene(ambient_kpa=89.9)).ambient_kpa == 89.9
+
+
+def test_a_bare_tile_senses_the_atmosphere_and_all_of_the_head_on_it() -> None:
+    scene = EmulationScene(ambient_kpa=100.0, head_kpa=0.5, head_s=2.0)
+    sunk = Surroundings(scene, Sinking())
+    assert [sunk.bare_kpa(tile, 1.0) for tile in (0, 1)] == pytest.approx([101.0, 102.0])
+    assert [sunk.bare_kpa(tile, 3.0) for tile in (0, 1)] == pytest.approx([103.5, 106.5])
+    assert Surroundings(scene).bare_kpa(1, 3.0) == pytest.approx(100.5)
+    assert Surroundings(scene).bare_kpa(1, 1.0) == pytest.approx(100.0)
+
+
+def test_the_head_on_each_tile_is_its_own() -> None:
+    heads = Surroundings(EmulationScene(), Sinking()).head_kpa(np.array([0.0, 1.0]))
+    np.testing.assert_allclose(heads, [[0.0, 0.0], [1.0, 2.0]])
