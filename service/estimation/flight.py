@@ -21,6 +21,7 @@ from service.estimation.tare import (
     STILL_SIGMAS,
     Tare,
     refuse_loaded,
+    refuse_stuck,
     tare_from_rows,
 )
 
@@ -105,6 +106,7 @@ def tare_in_flight(
         _refuse_above(tare, present, serials)
     if np.isfinite(bench_kpa).all():
         refuse_loaded(tare, calibration, serials)
+    refuse_stuck(frames, compensation, calibration, serials, low[0])
     return tare
 
 

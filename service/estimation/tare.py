@@ -36,7 +36,10 @@ QUIET = 1.5
 STILL_SIGMAS = 4.0
 """The halves of a window, and the window and the lowest one, differ by no more than chance does."""
 
-Source = Literal["interval", "lead", "recognised", "unloaded"]
+STUCK_COUNTS = 0.5
+"""A part that scatters by more than so many counts does not read the same one twenty times."""
+
+Source = Literal["interval", "lead", "recognised", "unloaded", "flight"]
 
 
 @dataclass(frozen=True)
@@ -129,12 +132,15 @@ def take_tare(
     lead = np.logical_and.accumulate((frames.frame_status & FrameStatus.LEAD) != 0)
     if lead[0]:
         tare = tare_from_rows(frames, compensation, serials, lead, "lead")
-        return refuse_loaded(tare, calibration, serials)
+        refuse_loaded(tare, calibration, serials)
+        refuse_stuck(frames, compensation, calibration, serials, lead)
+        return tare
     # How many frames are at hand must not matter, only which ones a recording begins with.
     frames = frames.rows(
         0, int(np.searchsorted(frames.t_ns, frames.t_ns[0] + RECOGNISE_WITHIN_NS, side="right"))
     )
     rows = _recognise(frames, compensation, calibration, serials)
+    refuse_stuck(frames, compensation, calibration, serials, rows)
     return tare_from_rows(frames, compensation, serials, rows, "recognised")
 
 
@@ -194,6 +200,35 @@ def refuse_loaded(tare: Tare, calibration: Calibration, serials: tuple[str, ...]
                 "temperature",
             )
     return tare
+
+
+def refuse_stuck(
+    frames: FrameBatch,
+    compensation: Compensation,
+    calibration: Calibration,
+    serials: tuple[str, ...],
+    rows: npt.NDArray[np.bool_],
+) -> None:
+    """Refuse a baseline of readings that are all the same, unless the bench saw no noise either.
+
+    Raises:
+        TareError: a tile gave the same count again and again, as a part does that hangs.
+    """
+    readable = np.isfinite(compensation.readable_kpa(frames)[rows])
+    padc = np.where(readable, frames.padc[rows], np.nan)
+    tadc = np.where(readable, frames.tadc[rows], np.nan)
+    count_kpa = np.sqrt(12.0) * compensation.rounding_kpa(np.nanmean(tadc, axis=0))
+    spread = np.nanmax(padc, axis=0) - np.nanmin(padc, axis=0)
+    for i, serial in enumerate(serials):
+        noise_kpa = calibration.of(serial).noise_kpa
+        quiet_by_nature = noise_kpa is not None and noise_kpa <= STUCK_COUNTS * count_kpa[i]
+        if spread[i] == 0.0 and not quiet_by_nature:
+            raise TareError(
+                f"tile {serial} gave {int(np.nanmin(padc[:, i]))} counts "
+                f"{int(np.isfinite(padc[:, i]).sum())} times and nothing else",
+                expected="readings that scatter, as those of a part that converts do",
+                remedy="It seems to hang: unplug it and plug it in again, then tare",
+            )
 
 
 def _recognise(

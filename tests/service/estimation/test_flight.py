@@ -305,3 +305,10 @@ def test_when_never_all_tiles_are_unloaded_at_once_it_is_refused(
     with pytest.raises(TareError, match="no tile was unloaded while all others were") as caught:
         flight_of(frames_of(forces_n))
     assert "whole foot" in caught.value.remedy
+
+
+def test_a_tile_that_hangs_is_refused_by_name(frames_of: FramesOf, flight_of: FlightOf) -> None:
+    forces_n = noise(1000)
+    forces_n[:, 1] = 0.0
+    with pytest.raises(TareError, match=r"T02 gave 500 counts 126 times"):
+        flight_of(frames_of(forces_n), present=present())
