@@ -2,9 +2,8 @@
 
 A load that builds up slowly looks like a dome that warms up slowly. What tells them apart is the
 chip's own temperature, and what bounds the mistake is how far a baseline may be moved without it:
-by `NEAR_KPA` at once, `APART_NS` apart, and by `FAR_KPA` in all since somebody tared by hand. Two
-newtons that rest on a foot of four tiles (0.25 kPa each) are therefore not tared away, and neither
-are they if they come in steps, for the second step is too far from the tare that was taken by hand.
+by `NEAR_KPA` at once, `APART_NS` apart, and by `FAR_KPA` in all since somebody tared by hand.
+However slowly a load comes, no more of it is tared away than that: half a newton on a tile.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ RATE_KPA_PER_S = 0.005
 """A baseline is never moved faster: a kelvin a minute, which is what a dome does in the sun."""
 NEAR_KPA = 0.15
 """How far a baseline may be moved at once beyond what the temperature explains: 0.3 N on a tile,
-well below what a single reading's noise lets through as no contact."""
+the noise of a single reading."""
 FAR_KPA = 0.25
 """And how far in all since the last tare that was not automatic: half a newton on a tile."""
 EXPLAINED_PART = 0.5
@@ -93,9 +92,9 @@ def look_in_flight(
     if begin_t_ns < free_since_t_ns + SETTLE_NS or tare.t_ns - present.t_ns < APART_NS:
         return NOTHING
     shift_kpa = tare.baseline_kpa - present.baseline_kpa
-    doubt = _too_far(tare, present, NEAR_KPA, serials, "at the last tare")
+    doubt = _too_far(tare, present, NEAR_KPA, serials, "the last tare")
     if doubt is None and anchor is not None:
-        doubt = _too_far(tare, anchor, FAR_KPA, serials, "when it was last tared by hand")
+        doubt = _too_far(tare, anchor, FAR_KPA, serials, "the last tare by hand")
     if doubt is not None:
         return Look(doubt=doubt)
     since_s = (tare.t_ns - present.t_ns) * 1e-9
@@ -143,7 +142,7 @@ def first_in_flight(
 
 
 def _too_far(
-    tare: Tare, other: Tare, bound_kpa: float, serials: tuple[str, ...], when: str
+    tare: Tare, other: Tare, bound_kpa: float, serials: tuple[str, ...], which: str
 ) -> str | None:
     """Why a baseline has moved too far from another one to be believed."""
     warmer = np.nan_to_num(warmer_k(other, tare.tadc_counts), nan=0.0)
@@ -154,7 +153,7 @@ def _too_far(
     if excess_kpa[worst] <= bound_kpa:
         return None
     return (
-        f"tile {serials[worst]} reads {shift_kpa[worst]:+.2f} kPa against {when}, and "
-        f"{warmer[worst]:+.1f} K explain {explained_kpa[worst]:+.2f} kPa: a light load, or a "
-        "baseline that has moved. If the foot is in the air, tare by hand"
+        f"tile {serials[worst]} reads {shift_kpa[worst]:+.2f} kPa against {which}, of which "
+        f"{abs(warmer[worst]):.1f} K explain {abs(explained_kpa[worst]):.2f} kPa: a light load, or "
+        "a baseline that has moved. If the foot is in the air, tare by hand"
     )
