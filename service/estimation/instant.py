@@ -14,6 +14,7 @@ import numpy.typing as npt
 from devices.frames import FrameBatch
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from service.estimation.contact import UNKNOWN
+from service.estimation.drift import has_warmed
 from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.models.unwrap import unwrap
 from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
@@ -125,7 +126,11 @@ def _status(
     for bit, flagged in tiles.flags.items():
         status[flagged[:, bearing].any(axis=1)] |= np.uint16(bit)
     status[after_gap] |= np.uint16(EstimateStatus.GAP)
-    status[frames.t_ns - plan.tare.t_ns > TARE_OLD_NS] |= np.uint16(EstimateStatus.TARE_OLD)
+    doubtful = frames.t_ns - plan.tare.t_ns > TARE_OLD_NS
+    if "temperature" not in plan.models:
+        known = ~tiles.flags[EstimateStatus.TILE_MISSING]
+        doubtful |= (known & has_warmed(plan.tare, frames.tadc))[:, bearing].any(axis=1)
+    status[doubtful] |= np.uint16(EstimateStatus.TARE_OLD)
     if plan.assumed_scale:
         status |= np.uint16(EstimateStatus.ASSUMED_SCALE)
     return status
