@@ -524,6 +524,18 @@ class Process:
             lines.extend(line.rstrip("\n") for line in iter(stream.readline, ""))
 
 
+@pytest.fixture(scope="session")
+def array_of() -> Callable[..., ArrayInfo]:
+    """An array of this name, stream and offset to UTC."""
+    return array_info
+
+
+@pytest.fixture(scope="session")
+def newtons_of() -> Callable[..., Calibration]:
+    """A calibration of one newton a count for these serials."""
+    return newton_calibration
+
+
 @pytest.fixture
 def no_threads_left() -> Iterator[None]:
     """Fail if a thread outlives what a test has started."""
