@@ -99,6 +99,8 @@ class Scene(Section):
     """Frame rate; 0: as fast as the schedule allows."""
     calibration: str = "bench"
     """A calibration file, a preset's name, or "bench": run the emulated bench once."""
+    auto_tare: bool = True
+    """May a server that sees the foot in the air let the baseline follow by itself?"""
     array: ArrayScene = ArrayScene()
     tile: Annotated[tuple[TileScene, ...], Field(min_length=1, strict=False)]
     servo: ServoScene | None = None

@@ -148,5 +148,8 @@ def _calibration(
             remedy="Press the tiles on a real bench and run `foottile calibrate`",
         )
     return find_calibration(
-        name, session.info.serials, parts_seed=int(notes.get("parts_seed", 0)), progress=remark
+        name,
+        [tile.serial for tile in session.info.tiles if not tile.reference],
+        parts_seed=int(notes.get("parts_seed", 0)),
+        progress=remark,
     )

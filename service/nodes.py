@@ -25,6 +25,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.link import ClockRow, Hello
 from service.live_estimates import LiveEstimates
 from service.pipeline import Columns
+from service.tare_keeper import TareKeeper
 from service.tares import RecordedTare, TareHistory
 from storage.durable import storage_errors, write_whole
 from storage.intervals import Intervals
@@ -83,7 +84,7 @@ class Node:
                     self.journals[path.name] = Journal.open(path)
                 except FileFormatError as error:
                     log.warning("a journal is left out: %s", error)
-        self.live = self._live_estimates()
+        self.live, self.tare_keeper = self._estimates()
 
     @property
     def info(self) -> ArrayInfo:
@@ -123,7 +124,7 @@ class Node:
         self.node_first_seq = hello.first_seq
         if known != (hello.array_info, hello.calibration):
             self._schema = wire_schema(hello.array_info)
-            self.live = self._live_estimates()
+            self.live, self.tare_keeper = self._estimates()
         try:
             self.keep()
         except StorageError as error:  # the picture goes on; what is sent is not acknowledged
@@ -162,7 +163,8 @@ class Node:
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         self.last_seen_t_ns = now_t_ns
         if self.last_seq is not None and last <= self.last_seq:
-            return first, last, []  # sent again for the journal; the picture is further on
+            self._look_for_tare()  # sent again for the journal; the picture is further on
+            return first, last, []
         if self.last_seq is not None:
             frames = frames.rows(max(0, self.last_seq + 1 - first), len(frames))
             self.lost_frames += int(frames.seq[0]) - self.last_seq - 1
@@ -171,14 +173,10 @@ class Node:
         while self._pace[-1][0] - self._pace[0][0] > _RATE_OVER_NS and len(self._pace) > 2:
             self._pace.popleft()
         due = list(self.live.feed(frames))
-        if (tare := self.live.tare_from_lead(frames)) is not None:
-            try:
-                self.put_in_force(self.tares.add(tare, self.info))
-            except StorageError as error:  # not in force then; the node can be tared by hand
-                self.storage_problem = str(error)
+        self._look_for_tare()
         return first, last, due
 
-    def take_tare(self) -> RecordedTare:
+    def take_tare(self, reason: str = "") -> RecordedTare:
         """Tare from an unloaded interval of the last seconds, and put it in force.
 
         Raises:
@@ -190,22 +188,7 @@ class Node:
             raise StateError(
                 f"node {self.name!r} is away", remedy="Tare when it is connected again"
             )
-        recorded = self.tares.add(self.live.tare_from_flight(), self.info)
-        self.put_in_force(recorded)
-        return recorded
-
-    def put_in_force(self, recorded: RecordedTare | None) -> None:
-        """Estimate with this tare from now on."""
-        self.live.use(recorded.tare if recorded is not None else None)
-
-    def undo_tare(self, tare_id: str) -> None:
-        """Undo a tare; the one before is in force again.
-
-        Raises:
-            UnknownError, StorageError: as for `TareHistory.undo`.
-        """
-        self.tares.undo(tare_id)
-        self.put_in_force(self.tares.in_force(self.info))
+        return self.tare_keeper.by_hand(reason)
 
     def server_t_ns(self, t_ns: int) -> int:
         """An instant of the node's UTC in the server's; the same while no offset is measured."""
@@ -246,10 +229,20 @@ class Node:
             self.journals[self.boot_id] = Journal(self._journals_folder / self.boot_id, self.info)
         return self.journals[self.boot_id]
 
-    def _live_estimates(self) -> LiveEstimates:
+    def _look_for_tare(self) -> None:
+        if self.storage_problem is not None:  # it could not be kept
+            return
+        try:
+            self.tare_keeper.look(self.journal, self.node_first_seq)
+        except StorageError as error:  # not in force then; tried again once it can be kept
+            self.storage_problem = str(error)
+
+    def _estimates(self) -> tuple[LiveEstimates, TareKeeper]:
         in_force = self.tares.in_force(self.info)
         tare = in_force.tare if in_force is not None else None
-        return LiveEstimates(self.info, self.hello.calibration, tare)
+        live = LiveEstimates(self.info, self.hello.calibration, tare)
+        automatic = self.hello.scene.get("auto_tare", True) is not False
+        return live, TareKeeper(self.info, live, self.tares, automatic=automatic)
 
 
 class Nodes:

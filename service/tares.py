@@ -1,4 +1,9 @@
-"""The tares of one node: which is in force, which were before, which were undone. Kept on disk."""
+"""The tares of one node: which is in force, which were before, which were undone. Kept on disk.
+
+Automatic tares (source "flight") come unasked, so they have rules of their own: of many the older
+ones are thinned out, never one that was taken by hand; and when one is undone, no other follows
+until somebody tares by hand, for whoever undoes it does not trust them now.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +18,32 @@ from service.estimation.tare import Tare
 from storage.durable import storage_errors, write_whole
 
 KEPT_MAX = 1000
+AUTOMATIC_KEPT_MAX = 200
+"""Beyond, their older half is thinned out: the course of hours stays."""
+REASON_LENGTH_MAX = 200
+
+_REASONS = {
+    "lead": "unloaded lead of the emulation",
+    "unloaded": "by hand",
+    "flight": "in flight",
+}
 
 
 @dataclass(frozen=True)
 class RecordedTare:
-    """A tare, the tiles it is of, and what became of it."""
+    """A tare, the tiles it is of, why it was taken, and what became of it."""
 
     id: str
     serials: tuple[str, ...]
     tare: Tare
     undone: bool = False
+    reason: str = ""
+    """In words."""
+
+    @property
+    def is_automatic(self) -> bool:
+        """Did it come unasked?"""
+        return self.tare.source == "flight"
 
 
 class TareHistory:
@@ -46,6 +67,26 @@ class TareHistory:
         fitting = self._of(info)
         return fitting[-1] if fitting else None
 
+    def anchor(self, info: ArrayInfo) -> RecordedTare | None:
+        """What automatic tares are held against: the last one that is none, else the oldest."""
+        fitting = self._of(info)
+        return next((t for t in reversed(fitting) if not t.is_automatic), (*fitting, None)[0])
+
+    def is_automatic_paused(self, info: ArrayInfo) -> bool:
+        """Was an automatic one undone, and none taken otherwise since?"""
+        for recorded in reversed(self._tares):
+            if recorded.serials != info.serials:
+                continue
+            if recorded.is_automatic and recorded.undone:
+                return True
+            if not recorded.is_automatic and not recorded.undone:
+                return False
+        return False
+
+    def valid(self, info: ArrayInfo) -> tuple[Tare, ...]:
+        """All that were not undone, in the order they were taken."""
+        return tuple(recorded.tare for recorded in self._of(info))
+
     def during(self, info: ArrayInfo, begin_t_ns: int, end_t_ns: int) -> tuple[Tare, ...]:
         """Tares that were in force at some time of an interval, oldest first.
 
@@ -57,14 +98,20 @@ class TareHistory:
         before = [tare for tare in fitting if tare.t_ns <= begin_t_ns][-1:]
         return tuple(before + [tare for tare in fitting if tare.t_ns > begin_t_ns])
 
-    def add(self, tare: Tare, info: ArrayInfo) -> RecordedTare:
+    def add(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
         """Put a tare in force.
+
+        Args:
+            tare: the tare.
+            info: the array.
+            reason: why, in words; what its source says if none is given.
 
         Raises:
             StorageError: it cannot be kept; it is not in force then.
         """
-        recorded = RecordedTare(uuid.uuid4().hex[:12], info.serials, tare)
-        self._keep([*self._tares, recorded][-KEPT_MAX:])
+        reason = (reason or _REASONS.get(tare.source, tare.source))[:REASON_LENGTH_MAX]
+        recorded = RecordedTare(uuid.uuid4().hex[:12], info.serials, tare, reason=reason)
+        self._keep(_bounded([*self._tares, recorded]))
         return recorded
 
     def undo(self, tare_id: str) -> None:
@@ -85,13 +132,34 @@ class TareHistory:
 
     def _keep(self, tares: list[RecordedTare]) -> None:
         content = [
-            {"id": t.id, "serials": t.serials, "undone": t.undone, "tare": t.tare.as_dict()}
+            {
+                "id": t.id,
+                "serials": t.serials,
+                "undone": t.undone,
+                "reason": t.reason,
+                "tare": t.tare.as_dict(),
+            }
             for t in tares
         ]
         with storage_errors(self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(self._path, json.dumps(content).encode())
         self._tares = tares
+
+
+def _bounded(tares: list[RecordedTare]) -> list[RecordedTare]:
+    automatic = [t for t in tares if t.is_automatic]
+    if len(automatic) > AUTOMATIC_KEPT_MAX:
+        # The one that says least: of the older half that whose neighbours are closest. Not the very
+        # first, for others may be held against it.
+        gaps_ns = {
+            now.id: after.tare.t_ns - before.tare.t_ns
+            for before, now, after in zip(automatic, automatic[1:], automatic[2:], strict=False)
+        }
+        older = [t.id for t in automatic[1 : len(automatic) // 2]]
+        least = min(older, key=lambda tare_id: gaps_ns[tare_id])
+        tares = [t for t in tares if t.id != least]
+    return tares[-KEPT_MAX:]
 
 
 def _read(path: Path) -> list[RecordedTare]:
@@ -105,6 +173,7 @@ def _read(path: Path) -> list[RecordedTare]:
                 tuple(entry["serials"]),
                 Tare.from_dict(entry["tare"], tiles=len(entry["serials"])),
                 bool(entry["undone"]),
+                str(entry.get("reason") or _REASONS.get(entry["tare"]["source"], "")),
             )
             for entry in content
         ]

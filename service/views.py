@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Generic, Literal, TypeVar
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from devices.frames import ServoInfo
 from service.estimation.calibration import Calibration
+from service.estimation.drift import expected_shift_kpa, trend, warmer_k
 from service.nodes import Node
 from service.recorder import Recorder
 from service.tares import RecordedTare
@@ -61,11 +64,17 @@ class TareView(View):
 
     id: str
     t_ns: int = Field(description="End of the interval it was taken from, node's UTC.")
-    source: Literal["interval", "lead", "recognised", "unloaded"]
+    source: Literal["interval", "lead", "recognised", "unloaded", "flight"] = Field(
+        description="unloaded: by hand; flight: automatic; lead: of an emulation."
+    )
+    reason: str = Field(description="Why, in words.")
     frames: int = Field(description="How many frames it was taken from.")
     baseline_kpa: list[float] = Field(description="Absolute pressure unloaded, by tile.")
     baseline_sigma_kpa: list[float] = Field(description="Its standard uncertainty.")
     noise_kpa: list[float] = Field(description="Standard deviation of one reading.")
+    tadc_counts: list[float | None] = Field(
+        description="Mean temperature counts, by tile; null in tares of older versions."
+    )
     undone: bool
 
     @classmethod
@@ -75,8 +84,59 @@ class TareView(View):
         return cls(
             id=recorded.id,
             undone=recorded.undone,
+            reason=recorded.reason,
             **{name: content[name] for name in cls.model_fields if name in content},
         )
+
+
+class DriftView(View):
+    """How baselines move. Lists are by tile; null is what is not determined."""
+
+    kpa_per_hour: list[float | None] = Field(
+        description="Straight line through the baselines of the last six hours; null until they "
+        "span ten minutes."
+    )
+    sigma_kpa_per_hour: list[float | None] = Field(description="Its standard uncertainty.")
+    n_per_hour: list[float | None] = Field(
+        description="The same in newtons, near zero load; null without a calibration."
+    )
+    grf_n_per_hour: float | None = Field(description="Sum over the tiles that bear load.")
+    kelvin_per_hour: list[float | None] = Field(
+        description="Of the chips, by the temperatures of the same tares."
+    )
+    kelvin_since_tare: list[float | None] = Field(
+        description="How much warmer the chips are now than at the tare, by `tadc`."
+    )
+    kpa_since_tare: list[float | None] = Field(
+        description="What a sealed bubble's baseline has moved by then, as far as that explains it."
+    )
+    grf_n_since_tare: float | None = Field(description="What that makes of the GRF.")
+
+    @classmethod
+    def of(cls, node: Node) -> DriftView:
+        """Of a node as it is now."""
+        live, tiles = node.live, len(node.info.tiles)
+        line = trend(node.tares.valid(node.info), tiles=tiles)
+        none = np.full(tiles, np.nan)
+        slope = live.slope_n_per_kpa if live.slope_n_per_kpa is not None else none
+        warmer_by_k = none if live.tare is None else warmer_k(live.tare, live.recent_tadc())
+        since_kpa = none if live.tare is None else expected_shift_kpa(live.tare, warmer_by_k)
+        return cls(
+            kpa_per_hour=_known(line.kpa_per_hour),
+            sigma_kpa_per_hour=_known(line.sigma_kpa_per_hour),
+            n_per_hour=_known(line.kpa_per_hour * slope),
+            grf_n_per_hour=live.newtons(line.kpa_per_hour),
+            kelvin_per_hour=_known(line.kelvin_per_hour),
+            kelvin_since_tare=_known(warmer_by_k),
+            kpa_since_tare=_known(since_kpa),
+            grf_n_since_tare=live.newtons(since_kpa),
+        )
+
+
+class TaresPage(Page[TareView]):
+    """The history of a node's tares, and where its baselines are going."""
+
+    drift: DriftView
 
 
 class ClockView(View):
@@ -101,7 +161,18 @@ class NodeView(View):
     calibration: CalibrationView | None
     calibration_problem: str | None = Field(description="Why there is no calibration.")
     tare: TareView | None = Field(description="The tare in force.")
-    tare_problem: str | None = Field(description="Why there is none.")
+    tare_problem: str | None = Field(
+        description="Why there is none, or why the one in force is not this stream's own."
+    )
+    tare_warnings: list[str] = Field(
+        description="Why the tare in force may no longer fit, in words: old, another temperature, "
+        "a baseline that does not fit the foot in the air."
+    )
+    auto_tare: Literal["on", "paused", "off"] = Field(
+        description="Whether the baseline follows by itself in flight. paused: an automatic tare "
+        "was undone, and nobody has tared since; off: the scene says `auto_tare = false`."
+    )
+    drift: DriftView
     storage_problem: str | None = Field(description="Why frames are not being kept.")
     clock: ClockView | None = Field(description="Null: not measured yet.")
     clock_set: bool = Field(description="Whether anything had set the node's date.")
@@ -142,9 +213,10 @@ class NodeView(View):
             ),
             calibration_problem=live.calibration_problem or node.hello.calibration_problem,
             tare=TareView.of(tare) if tare is not None else None,
-            tare_problem=None
-            if tare is not None
-            else "not tared: lift the foot, hold it still, and tare",
+            tare_problem=node.tare_keeper.problem,
+            tare_warnings=node.tare_keeper.warnings(),
+            auto_tare=node.tare_keeper.auto_tare,
+            drift=DriftView.of(node),
             storage_problem=node.storage_problem,
             clock=None
             if node.clock is None
@@ -229,17 +301,24 @@ class Problem(BaseModel):
 
 def _tiles(node: Node) -> list[TileView]:
     calibration, full_scale_n = node.live.calibration, node.live.full_scale_n
+    full_scales = [None] * len(node.info.tiles) if full_scale_n is None else _known(full_scale_n)
     placed = {"serial", "mux", "channel", "x_m", "y_m", "z_m", "reference"}
     return [
         TileView(
-            range_kpa=calibration.of(tile.serial).range_kpa if calibration is not None else None,
-            full_scale_n=float(full_scale_n[i]) if full_scale_n is not None else None,
+            range_kpa=entry.range_kpa if entry is not None else None,
+            full_scale_n=full_scales[i],
             **tile.model_dump(include=placed),
         )
         for i, tile in enumerate(node.info.tiles)
+        for entry in (calibration.find(tile.serial) if calibration is not None else None,)
     ]
 
 
+def _known(values: npt.NDArray[np.float64]) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
 def _scale(calibration: Calibration, serials: Iterable[str]) -> Literal["measured", "assumed"]:
-    assumed = any(calibration.of(serial).absolute_scale == "assumed" for serial in serials)
+    entries = [calibration.find(serial) for serial in serials]
+    assumed = any(entry is not None and entry.absolute_scale == "assumed" for entry in entries)
     return "assumed" if assumed else "measured"

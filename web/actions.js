@@ -62,9 +62,12 @@ export class Actions {
   }
 
   async undo(node) {
+    const automatic = node.tare.source === "flight";
     await api.undoTare(node.node, node.tare.id);
     this.undoable(null);
-    notice("Tare undone: the one before it holds again.");
+    notice(automatic
+      ? "Automatic tare undone: the one before it holds again, and no other comes until you press Tare."
+      : "Tare undone: the one before it holds again.");
     byId("tare").focus();
   }
 
@@ -120,7 +123,9 @@ export class Actions {
     if (this.undoId === undefined) {
       try { this.undoId = sessionStorage.getItem(UNDO_KEY); } catch { this.undoId = null; }
     }
-    byId("undo").hidden = !(this.undoId && node?.tare && !node.tare.undone && node.tare.id === this.undoId);
+    const tare = node?.tare;
+    const mine = this.undoId && tare?.id === this.undoId;
+    byId("undo").hidden = !(tare && !tare.undone && (mine || tare.source === "flight"));
     byId("recording").hidden = !session;
     if (session) {
       const elapsedS = Math.max(0, (this.state.serverNowMs() - session.started_t_ns / 1e6) / 1000);

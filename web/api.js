@@ -81,6 +81,7 @@ export async function call(method, path, body) {
 
 const id = encodeURIComponent;
 export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, {});
+export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
 export const startSession = (node, name) => call("POST", "/sessions", { node, name });
 export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);

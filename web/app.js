@@ -9,6 +9,7 @@ import { Link } from "./link.js";
 import { Notes } from "./notes.js";
 import { Sessions } from "./sessions.js";
 import { Status } from "./status.js";
+import { Tares } from "./tares.js";
 import { byId, el, setText } from "./text.js";
 import { Trace } from "./trace.js";
 
@@ -34,6 +35,7 @@ foot.resized = () => { state.fresh = true; };
 const trace = new Trace();
 const notes = new Notes();
 const sessions = new Sessions();
+const tares = new Tares();
 const actions = new Actions(state, takeSession);
 
 const handlers = {
@@ -162,6 +164,7 @@ function tick() {
   // The chosen node may not be known yet: the banner still says that the server is not there.
   status.draw(node ?? { node: "?", tiles: [] }, state.heard, nowMs, state.serverNowMs());
   if (node) notes.draw(node, state.frame, nowMs, state.serverNowMs());
+  tares.draw(node);
   actions.draw();
 }
 

@@ -1,6 +1,6 @@
 // Plain notes about what to trust. They change seldom: an estimate's flag is held so it can be read.
 
-import { byId, el, roughly, setText } from "./text.js";
+import { byId, el, number, roughly, setText } from "./text.js";
 import { ESTIMATE, FRAME, TILE } from "./tile.js";
 
 const HOLD_MS = 3000;
@@ -68,8 +68,11 @@ function standing(node, frame, serverNowMs) {
   }
   if (!tare) notes.push(said("Not tared", node.tare_problem || "lift the foot off the ground and press Tare."));
   else {
-    if (node.tare_problem) notes.push(`Tare: ${node.tare_problem}`);
-    if (bits & ESTIMATE.TARE_OLD) notes.push(`Tare is old (${tareAge(tare, serverNowMs)}): lift the foot, press Tare.`);
+    if (node.tare_problem) notes.push(`Tare: ${node.tare_problem}.`);
+    // In the server's words; the flag alone says as much while a node's description is on its way.
+    const doubts = node.tare_warnings ?? [];
+    for (const doubt of doubts) notes.push(`Tare in doubt: ${doubt}.`);
+    if (!doubts.length && bits & ESTIMATE.TARE_OLD) notes.push(`Tare in doubt (${tareAge(tare, serverNowMs)} old): lift the foot, press Tare.`);
   }
   // An emulated node runs on this machine, and its date is nobody's concern.
   if (node.clock_set === false && !node.emulated) notes.push("Clock of the node not set: dates may be wrong.");
@@ -81,12 +84,16 @@ const said = (what, why) => (why.toLowerCase().startsWith(what.toLowerCase()) ? 
 
 const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) / 1000);
 
-const SOURCES = { lead: "in the lead-in", unloaded: "unloaded", recognised: "recognised in flight" };
+const SOURCES = { lead: "in the lead-in", unloaded: "by hand", recognised: "recognised in flight", flight: "by itself in flight" };
+const FOLLOWS = { paused: "no automatic tare, one was undone: press Tare to allow it again", off: "automatic tare off" };
 
 function facts(node, frame, serverNowMs) {
   const tare = node.tare && !node.tare.undone ? node.tare : null;
   const parts = [];
   if (tare) parts.push(`Tared ${tareAge(tare, serverNowMs)} ago${SOURCES[tare.source] ? `, ${SOURCES[tare.source]}` : ""}`);
+  const perHour = node.drift?.grf_n_per_hour;
+  if (Number.isFinite(perHour) && Math.abs(perHour) >= 0.1) parts.push(`zero drifts ${number(perHour)} N/h`);
+  if (FOLLOWS[node.auto_tare]) parts.push(FOLLOWS[node.auto_tare]);
   if (node.calibration) parts.push(`calibration “${node.calibration.name}”, scale ${node.calibration.absolute_scale}`);
   if (!node.clock) parts.push("clock offset not measured yet");
   if (frame && frame.frame_status & FRAME.LEAD) parts.push("unloaded lead-in of the scene");

@@ -123,7 +123,7 @@ def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]
     try:
         calibration = find_calibration(
             scene.calibration,
-            [tile.serial for tile in scene.tile],
+            [tile.serial for tile in scene.tile if not tile.reference],
             parts_seed=options.parts_seed,
             progress=remark,
         )

@@ -111,7 +111,7 @@ def simulate_command(
     def estimate() -> EstimateOptions:
         calibration = find_calibration(
             the_scene.calibration,
-            [tile.serial for tile in the_scene.tile],
+            [tile.serial for tile in the_scene.tile if not tile.reference],
             parts_seed=parts_seed,
             progress=remark,
         )

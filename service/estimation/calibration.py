@@ -107,15 +107,21 @@ class Calibration(BaseModel):
         """First 16 hexadecimal digits of the SHA-256 of the content."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
+    def find(self, serial: str) -> TileCalibration | None:
+        """The entry for a serial; None if there is none, as for bare tiles, which bear nothing."""
+        for tile in self.tiles:
+            if tile.serial in (serial, ANY_SERIAL):
+                return tile
+        return None
+
     def of(self, serial: str) -> TileCalibration:
         """The entry for a serial.
 
         Raises:
             CalibrationError: there is none.
         """
-        for tile in self.tiles:
-            if tile.serial in (serial, ANY_SERIAL):
-                return tile
+        if (found := self.find(serial)) is not None:
+            return found
         known = ", ".join(tile.serial for tile in self.tiles)
         raise CalibrationError(
             f"no calibration for tile {serial}",

@@ -40,6 +40,7 @@ class EstimateStatus(IntFlag):
     ASSUMED_SCALE = 64
     """The calibration's scale is assumed: newtons are not to be trusted."""
     TARE_OLD = 128
+    """The tare was long ago, or at another temperature that no model corrects."""
     OVER_RATED = 256
     """A tile is above the chip's 115 kPa, but within its calibration."""
 

@@ -8,6 +8,7 @@ tare, because a tare under load makes every force after it too small.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from devices.compensation import Compensation
 from devices.errors import TareError
@@ -21,11 +22,14 @@ from service.estimation.tare import (
     STILL_SIGMAS,
     Tare,
     refuse_loaded,
+    refuse_stuck,
     tare_from_rows,
 )
 
 LOOK_BACK_NS = 10_000_000_000
 WINDOW_NS = 250_000_000
+WINDOW_MAX_NS = 1_000_000_000
+"""A window is longer if an array is so slow that it would hold too few frames, up to this."""
 
 
 def tare_in_flight(
@@ -62,9 +66,9 @@ def tare_in_flight(
         )
     if len(frames) < FRAMES_MIN:
         raise TareError(f"only {len(frames)} frames have come", expected=f"at least {FRAMES_MIN}")
-    entries = [calibration.of(serial) for serial in serials]
-    bench_kpa = np.array([np.nan if e.baseline_kpa is None else e.baseline_kpa for e in entries])
-    usual_kpa = np.array([np.nan if e.noise_kpa is None else e.noise_kpa for e in entries])
+    entries = [calibration.find(serial) for serial in serials]
+    bench_kpa = np.array([e.baseline_kpa if e else None for e in entries], dtype=np.float64)
+    usual_kpa = np.array([e.noise_kpa if e else None for e in entries], dtype=np.float64)
     if present is not None:
         usual_kpa = np.where(np.isnan(usual_kpa), present.noise_kpa, usual_kpa)
     # Else from what changes between two frames, which a slow motion hardly does.
@@ -72,19 +76,21 @@ def tare_in_flight(
     floor_kpa = compensation.rounding_kpa(np.nanmedian(frames.tadc, axis=0))
     usual_kpa = np.where(np.isnan(usual_kpa), np.maximum(steps_kpa, floor_kpa), usual_kpa)
     since_ns = frames.t_ns - frames.t_ns[0]
+    window_ns = _window_ns(since_ns)
     windows = []
-    for begin_ns in range(int(since_ns[-1]) - WINDOW_NS, -1, -WINDOW_NS // 4):
-        rows = (since_ns >= begin_ns) & (since_ns <= begin_ns + WINDOW_NS)
-        n = int(rows.sum())
-        if n < FRAMES_MIN or not np.isfinite(kpa[rows]).all():
+    for begin_ns in range(int(since_ns[-1]) - window_ns, -1, -window_ns // 4):
+        first = int(np.searchsorted(since_ns, begin_ns))
+        end = int(np.searchsorted(since_ns, begin_ns + window_ns, side="right"))
+        window_kpa, n = kpa[first:end], end - first
+        if n < FRAMES_MIN or not np.isfinite(window_kpa).all():
             continue
-        mean_kpa, noise_kpa = kpa[rows].mean(axis=0), kpa[rows].std(axis=0, ddof=1)
-        drift_kpa = kpa[rows][: n // 2].mean(axis=0) - kpa[rows][n // 2 :].mean(axis=0)
+        mean_kpa, noise_kpa = window_kpa.mean(axis=0), window_kpa.std(axis=0, ddof=1)
+        drift_kpa = window_kpa[: n // 2].mean(axis=0) - window_kpa[n // 2 :].mean(axis=0)
         mean_sigma_kpa = usual_kpa / np.sqrt(n)
         quiet = noise_kpa < QUIET * usual_kpa
         still = np.abs(drift_kpa) < STILL_SIGMAS * 2.0 * mean_sigma_kpa
         if (quiet & still).all():
-            windows.append((rows, mean_kpa, mean_sigma_kpa))
+            windows.append(((first, end), mean_kpa, mean_sigma_kpa))
     if not windows:
         raise TareError(
             "the foot moved or was loaded all the time in the last seconds",
@@ -93,19 +99,27 @@ def tare_in_flight(
         )
     lowest_kpa = np.min([mean_kpa for _, mean_kpa, _ in windows], axis=0)
     low = [
-        rows for rows, mean_kpa, sigma_kpa in windows if _as_low(mean_kpa, lowest_kpa, sigma_kpa)
+        span for span, mean_kpa, sigma_kpa in windows if _as_low(mean_kpa, lowest_kpa, sigma_kpa)
     ]
     if not low:
         raise TareError(
             "no tile was unloaded while all others were, in the last seconds",
             remedy="Lift the whole foot, hold it still for a second, and tare again",
         )
-    tare = tare_from_rows(frames, compensation, serials, low[0], "unloaded")
+    rows = np.zeros(len(frames), dtype=np.bool_)
+    rows[slice(*low[0])] = True
+    tare = tare_from_rows(frames, compensation, serials, rows, "unloaded")
     if present is not None:
         _refuse_above(tare, present, serials)
     if np.isfinite(bench_kpa).all():
         refuse_loaded(tare, calibration, serials)
+    refuse_stuck(frames, compensation, calibration, serials, rows)
     return tare
+
+
+def _window_ns(since_ns: npt.NDArray[np.int64]) -> int:
+    enough_ns = 1.25 * FRAMES_MIN * float(np.median(np.diff(since_ns)))
+    return int(min(max(WINDOW_NS, enough_ns), WINDOW_MAX_NS))
 
 
 def _as_low(mean_kpa: np.ndarray, lowest_kpa: np.ndarray, sigma_kpa: np.ndarray) -> bool:

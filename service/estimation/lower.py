@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from devices.frames import NOT_READ, FrameBatch
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
+from service.estimation.drift import has_warmed
 from service.estimation.estimates import EstimateStatus
 from service.estimation.models import ambient, gas, skew, temperature
 from service.estimation.models.outliers import despiked
@@ -159,10 +160,13 @@ def _frame_status(
     plan: EstimationPlan, frames: FrameBatch, kpa: Floats, broken: Bools
 ) -> npt.NDArray[np.uint16]:
     status = np.zeros(len(frames), dtype=np.uint16)
-    missing = np.isnan(kpa[:, plan.bearing]).any(axis=1)
-    status[missing] |= np.uint16(EstimateStatus.TILE_MISSING)
+    known = ~np.isnan(kpa)
+    status[~known[:, plan.bearing].all(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
     status[broken] |= np.uint16(EstimateStatus.GAP)
-    status[frames.t_ns - plan.tare.t_ns > TARE_OLD_NS] |= np.uint16(EstimateStatus.TARE_OLD)
+    doubtful = frames.t_ns - plan.tare.t_ns > TARE_OLD_NS
+    if plan.ladder.temperature is None:
+        doubtful |= (known & has_warmed(plan.tare, frames.tadc))[:, plan.bearing].any(axis=1)
+    status[doubtful] |= np.uint16(EstimateStatus.TARE_OLD)
     if plan.assumed_scale:
         status |= np.uint16(EstimateStatus.ASSUMED_SCALE)
     return status

@@ -36,7 +36,10 @@ QUIET = 1.5
 STILL_SIGMAS = 4.0
 """The halves of a window, and the window and the lowest one, differ by no more than chance does."""
 
-Source = Literal["interval", "lead", "recognised", "unloaded"]
+STUCK_COUNTS = 0.5
+"""A part that scatters by more than so many counts does not read the same one twenty times."""
+
+Source = Literal["interval", "lead", "recognised", "unloaded", "flight"]
 
 
 @dataclass(frozen=True)
@@ -129,12 +132,15 @@ def take_tare(
     lead = np.logical_and.accumulate((frames.frame_status & FrameStatus.LEAD) != 0)
     if lead[0]:
         tare = tare_from_rows(frames, compensation, serials, lead, "lead")
-        return refuse_loaded(tare, calibration, serials)
+        refuse_loaded(tare, calibration, serials)
+        refuse_stuck(frames, compensation, calibration, serials, lead)
+        return tare
     # How many frames are at hand must not matter, only which ones a recording begins with.
     frames = frames.rows(
         0, int(np.searchsorted(frames.t_ns, frames.t_ns[0] + RECOGNISE_WITHIN_NS, side="right"))
     )
     rows = _recognise(frames, compensation, calibration, serials)
+    refuse_stuck(frames, compensation, calibration, serials, rows)
     return tare_from_rows(frames, compensation, serials, rows, "recognised")
 
 
@@ -184,7 +190,8 @@ def refuse_loaded(tare: Tare, calibration: Calibration, serials: tuple[str, ...]
     A colder tile lies lower than on the bench, and no load does that, so only above is refused.
     """
     for serial, baseline_kpa in zip(serials, tare.baseline_kpa, strict=True):
-        bench_kpa = calibration.of(serial).baseline_kpa
+        entry = calibration.find(serial)
+        bench_kpa = entry.baseline_kpa if entry is not None else None
         if bench_kpa is not None and baseline_kpa > bench_kpa + LOADED_KPA:
             raise TareError(
                 f"tile {serial} reads {baseline_kpa:.2f} kPa in the interval, and "
@@ -194,6 +201,36 @@ def refuse_loaded(tare: Tare, calibration: Calibration, serials: tuple[str, ...]
                 "temperature",
             )
     return tare
+
+
+def refuse_stuck(
+    frames: FrameBatch,
+    compensation: Compensation,
+    calibration: Calibration,
+    serials: tuple[str, ...],
+    rows: npt.NDArray[np.bool_],
+) -> None:
+    """Refuse a baseline of readings that are all the same, unless the bench saw no noise either.
+
+    Raises:
+        TareError: a tile gave the same count again and again, as a part does that hangs.
+    """
+    readable = np.isfinite(compensation.readable_kpa(frames)[rows])
+    padc = np.where(readable, frames.padc[rows], np.nan)
+    tadc = np.where(readable, frames.tadc[rows], np.nan)
+    count_kpa = np.sqrt(12.0) * compensation.rounding_kpa(np.nanmean(tadc, axis=0))
+    spread = np.nanmax(padc, axis=0) - np.nanmin(padc, axis=0)
+    for i, serial in enumerate(serials):
+        entry = calibration.find(serial)
+        noise_kpa = entry.noise_kpa if entry is not None else None
+        quiet_by_nature = noise_kpa is not None and noise_kpa <= STUCK_COUNTS * count_kpa[i]
+        if spread[i] == 0.0 and not quiet_by_nature:
+            raise TareError(
+                f"tile {serial} gave {int(np.nanmin(padc[:, i]))} counts "
+                f"{int(np.isfinite(padc[:, i]).sum())} times and nothing else",
+                expected="readings that scatter, as those of a part that converts do",
+                remedy="It seems to hang: unplug it and plug it in again, then tare",
+            )
 
 
 def _recognise(
@@ -208,15 +245,23 @@ def _recognise(
     which no tile is higher than in the lowest of them: a foot that stands still is quiet too, but
     presses. The first of these is taken.
     """
-    entries = [calibration.of(serial) for serial in serials]
-    if any(entry.baseline_kpa is None or entry.noise_kpa is None for entry in entries):
+    entries = [calibration.find(serial) for serial in serials]
+    known = [entry for entry in entries if entry is not None]
+    if not known or any(e.baseline_kpa is None or e.noise_kpa is None for e in known):
         raise TareError(
             f"calibration {calibration.name} does not say where an unloaded tile lies",
             remedy="Name an unloaded interval with --tare-s BEGIN,END",
         )
-    expected_kpa = np.array([entry.baseline_kpa for entry in entries], dtype=np.float64)
-    noise_kpa = np.array([entry.noise_kpa for entry in entries], dtype=np.float64)
     kpa = compensation.readable_kpa(frames)
+    # A bare tile is not calibrated: it may read anything, with the noise that it shows.
+    steps_kpa = np.nanstd(np.diff(kpa, axis=0), axis=0) / np.sqrt(2.0)
+    expected_kpa = np.array(
+        [np.nan if e is None else e.baseline_kpa for e in entries], dtype=np.float64
+    )
+    noise_kpa = np.array(
+        [s if e is None else e.noise_kpa for e, s in zip(entries, steps_kpa, strict=True)],
+        dtype=np.float64,
+    )
     since_ns = frames.t_ns - frames.t_ns[0]
     found: list[tuple[npt.NDArray[np.bool_], Floats, Floats]] = []
     for begin_ns in range(0, int(since_ns[-1]) + 1, WINDOW_NS // 2):
@@ -228,7 +273,7 @@ def _recognise(
         mean_kpa = window_kpa.mean(axis=0)
         mean_sigma_kpa = noise_kpa / np.sqrt(n)
         drift_kpa = window_kpa[: n // 2].mean(axis=0) - window_kpa[n // 2 :].mean(axis=0)
-        near = np.abs(mean_kpa - expected_kpa) < NEAR_BASELINE_KPA
+        near = ~(np.abs(mean_kpa - expected_kpa) >= NEAR_BASELINE_KPA)
         quiet = window_kpa.std(axis=0, ddof=1) < QUIET * noise_kpa
         still = np.abs(drift_kpa) < STILL_SIGMAS * 2.0 * mean_sigma_kpa
         if (near & quiet & still).all():

@@ -6,11 +6,24 @@ from http import HTTPStatus
 from typing import Any
 
 from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field
 
 from service.routes.access import ServerState, problems
-from service.views import NodeView, Page, TareView
+from service.tares import REASON_LENGTH_MAX
+from service.views import DriftView, NodeView, Page, TaresPage, TareView
 
 router = APIRouter(prefix="/nodes", tags=["nodes"])
+
+
+class TareRequest(BaseModel):
+    """What may be said with a tare."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    reason: str = Field(
+        default="", max_length=REASON_LENGTH_MAX, description='For the history; else "by hand".'
+    )
+
 
 _UNKNOWN = problems(_404="No such node.")
 
@@ -45,13 +58,13 @@ async def get_scene(node: str, server: ServerState) -> dict[str, Any]:
         **problems(_409="The foot is loaded or moves, or the node is away.", _507="Disk full."),
     },
 )
-async def tare(node: str, server: ServerState) -> TareView:
+async def tare(node: str, server: ServerState, request: TareRequest | None = None) -> TareView:
     """Take the newest unloaded quarter of a second of the last ten seconds as the baseline.
 
     It may lie in a flight phase. The tare before is kept and comes back if this one is undone.
     """
     the_node = server.nodes.get(node)
-    recorded = the_node.take_tare()
+    recorded = the_node.take_tare(request.reason.strip() if request is not None else "")
     server.tell_node(the_node)
     return TareView.of(recorded)
 
@@ -59,9 +72,11 @@ async def tare(node: str, server: ServerState) -> TareView:
 @router.get(
     "/{node}/tares", operation_id="listTares", summary="History of tares", responses=_UNKNOWN
 )
-async def list_tares(node: str, server: ServerState) -> Page[TareView]:
-    """Newest first; the first one that is not undone is in force."""
-    return Page(items=[TareView.of(t) for t in reversed(server.nodes.get(node).tares.all)])
+async def list_tares(node: str, server: ServerState) -> TaresPage:
+    """Newest first; the first one of the present tiles that is not undone is in force."""
+    the_node = server.nodes.get(node)
+    items = [TareView.of(t) for t in reversed(the_node.tares.all)]
+    return TaresPage(items=items, drift=DriftView.of(the_node))
 
 
 @router.delete(
@@ -72,7 +87,10 @@ async def list_tares(node: str, server: ServerState) -> Page[TareView]:
     responses=problems(_404="No such node, or no such tare that is not undone.", _507="Disk full."),
 )
 async def undo_tare(node: str, tare_id: str, server: ServerState) -> None:
-    """The tare before it is in force again; it stays in the history, marked."""
+    """The tare before it is in force again; it stays in the history, marked.
+
+    If it was an automatic one, no other is taken until somebody tares by hand.
+    """
     the_node = server.nodes.get(node)
-    the_node.undo_tare(tare_id)
+    the_node.tare_keeper.undo(tare_id)
     server.tell_node(the_node)

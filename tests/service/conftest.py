@@ -359,8 +359,13 @@ class FakeNode:
         lead: bool = False,
         now: bool = False,
         noise: int = 0,
+        alive: bool = False,
     ) -> FrameBatch:
-        """The next `n` frames under a force; `now`: leaping to this instant."""
+        """The next `n` frames under a force; `now`: leaping to this instant.
+
+        Readings that are all the same are those of a part that hangs, so in a lead, and in frames
+        that are `alive`, one is a count higher and one a count lower: the mean stays exact.
+        """
         if now:
             self.next_t_mono_ns = max(self.next_t_mono_ns, time.monotonic_ns())
         shape = (n, self.tiles)
@@ -368,6 +373,8 @@ class FakeNode:
         random = np.random.default_rng(self.seq)
         counts = UNLOADED_COUNTS - np.broadcast_to(np.asarray(force_n), shape)
         counts = counts + random.integers(-noise, noise + 1, shape)
+        if lead or alive:
+            counts[-30:-28] += [[1], [-1]]
         batch = FrameBatch(
             seq=np.arange(self.seq, self.seq + n, dtype=np.uint64),
             t_mono_ns=t_mono_ns,
@@ -515,6 +522,18 @@ class Process:
     def _read(self, stream: Any, lines: list[str]) -> None:
         with contextlib.suppress(ValueError):  # closed
             lines.extend(line.rstrip("\n") for line in iter(stream.readline, ""))
+
+
+@pytest.fixture(scope="session")
+def array_of() -> Callable[..., ArrayInfo]:
+    """An array of this name, stream and offset to UTC."""
+    return array_info
+
+
+@pytest.fixture(scope="session")
+def newtons_of() -> Callable[..., Calibration]:
+    """A calibration of one newton a count for these serials."""
+    return newton_calibration
 
 
 @pytest.fixture

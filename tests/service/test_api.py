@@ -220,6 +220,44 @@ def test_every_operation_is_described(tmp_path: Path) -> None:
     assert len(ids) >= 18
 
 
+def test_the_history_of_tares_says_why_and_where_the_baselines_are_going(
+    running: Running, node: FakeNode, until: Until
+) -> None:
+    node.connect()
+    node.tared()
+    node.next_t_mono_ns += 900_000_000_000  # a quarter of an hour later, one count more
+    node.send(300, 1.0, alive=True)
+    until(lambda: running.node()["last_seq"] == node.seq - 1)
+    answer = running.http.post("/nodes/bench/tare", json={"reason": "  new shoe "})
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["reason"] == "new shoe"
+    assert answer.json()["tadc_counts"] == [480.0, 480.0]
+    page = running.http.get("/nodes/bench/tares").json()
+    said = [(tare["source"], tare["reason"]) for tare in page["items"]]
+    assert said == [("unloaded", "new shoe"), ("lead", "unloaded lead of the emulation")]
+    per_hour = [4 * 130 / 1023] * 2
+    assert page["drift"]["kpa_per_hour"] == pytest.approx(per_hour, rel=0.01)
+    assert page["drift"]["n_per_hour"] == pytest.approx([4.0, 4.0], rel=0.01)
+    assert page["drift"]["grf_n_per_hour"] == pytest.approx(8.0, rel=0.01)
+    assert page["drift"]["kelvin_since_tare"] == [0.0, 0.0]
+    shown = running.node()
+    assert shown["drift"] == page["drift"]
+    assert shown["auto_tare"] == "on"
+    assert shown["tare_warnings"] == []
+    assert running.http.post("/nodes/bench/tare", json={"why": "?"}).status_code == 422
+    assert running.http.post("/nodes/bench/tare").status_code in (201, 409)
+
+
+def test_a_node_without_a_tare_has_no_drift(running: Running, node: FakeNode) -> None:
+    node.connect()
+    shown = running.node()
+    assert shown["tare"] is None
+    assert shown["tare_problem"] == "not tared: lift the foot, hold it still, and tare"
+    assert shown["drift"]["kpa_per_hour"] == [None, None]
+    assert shown["drift"]["grf_n_per_hour"] is None
+    assert shown["drift"]["kelvin_since_tare"] == [None, None]
+
+
 def test_no_get_changes_anything(running: Running, node: FakeNode, until: Until) -> None:
     node.connect()
     node.tared()

@@ -446,7 +446,7 @@ def test_a_tare_without_load_is_in_force_until_it_is_undone(
 
     by_lead = running.node()["tare"]
     tared.next_t_mono_ns += 11_000_000_000
-    tared.send(300, 2.0)  # warmer by two counts
+    tared.send(300, 2.0, alive=True)  # warmer by two counts
     taken_in(running, tared, until)
     answer = running.http.post("/nodes/bench/tare", json={})
     assert answer.status_code == 201, answer.text
@@ -481,7 +481,7 @@ def test_a_tare_during_a_recording_serves_from_then_on(
     running: Running, tared: FakeNode, until: Until
 ) -> None:
     session = start(running)
-    tared.send(300, 2.0, now=True)
+    tared.send(300, 2.0, alive=True, now=True)
     taken_in(running, tared, until)
     answer = running.http.post("/nodes/bench/tare", json={})
     assert answer.status_code == 201, answer.text

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, StorageError, UnknownError
 from devices.frames import ArrayInfo, TileInfo
-from service.estimation.tare import Tare
+from service.estimation.tare import Source, Tare
 from service.tares import KEPT_MAX, RecordedTare, TareHistory
 
 
@@ -52,7 +52,7 @@ INFO = array("T01", "T02")
 OTHERS = (array("T01", "T03"), array("T02", "T01"), array("T01"), array("T01", "T02", "T03"))
 
 
-def tare(t_ns: int = 0, *, tiles: int = 2) -> Tare:
+def tare(t_ns: int = 0, *, tiles: int = 2, source: Source = "unloaded") -> Tare:
     return Tare(
         baseline_kpa=100.0 + np.arange(tiles) / 3,
         baseline_sigma_kpa=np.full(tiles, 0.01),
@@ -62,12 +62,13 @@ def tare(t_ns: int = 0, *, tiles: int = 2) -> Tare:
         begin_s=0.1,
         end_s=0.35,
         frames=125,
-        source="unloaded",
+        source=source,
     )
 
 
 def same(one: RecordedTare, other: RecordedTare) -> None:
     assert (one.id, one.serials, one.undone) == (other.id, other.serials, other.undone)
+    assert one.reason == other.reason
     for f in fields(Tare):
         a, b = getattr(one.tare, f.name), getattr(other.tare, f.name)
         if isinstance(a, np.ndarray):
@@ -173,6 +174,85 @@ def test_during_an_interval_are_those_that_were_in_force_at_some_time_of_it(
     found = instants(tares.during(INFO, begin, begin + length))
     assert sorted(set(found)) == sorted(in_force)
     assert found == sorted(found)
+
+
+# --- why, and automatic ones ----------------------------------------------------------------------
+
+
+def test_every_tare_has_a_reason_in_words(tmp_path: Path) -> None:
+    tares = history(tmp_path)
+    tares.add(tare(1, source="lead"), INFO)
+    tares.add(tare(2), INFO)
+    tares.add(tare(3), INFO, "new shoe")
+    tares.add(tare(4), INFO, "x" * 500)
+    path = tmp_path / "node" / "tares.json"
+    content = json.loads(path.read_bytes())
+    del content[1]["reason"]  # an older version's
+    path.write_text(json.dumps(content))
+    assert [recorded.reason for recorded in history(tmp_path).all] == [
+        "unloaded lead of the emulation",
+        "by hand",
+        "new shoe",
+        "x" * 200,
+    ]
+
+
+def test_an_undone_automatic_tare_pauses_them_until_somebody_tares(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1)
+    assert not tares.is_automatic_paused(INFO)
+    one = tares.add(tare(2, source="flight"), INFO)
+    two = tares.add(tare(3, source="flight"), INFO)
+    assert not tares.is_automatic_paused(INFO)
+    tares.undo(two.id)
+    in_force = tares.in_force(INFO)
+    assert in_force is not None
+    assert in_force.id == one.id
+    assert tares.is_automatic_paused(INFO)
+    assert history(tmp_path).is_automatic_paused(INFO), "also after a restart"
+    assert not tares.is_automatic_paused(OTHERS[0]), "not for other tiles"
+    by_hand = tares.add(tare(4), INFO)
+    assert not tares.is_automatic_paused(INFO)
+    tares.undo(by_hand.id)  # it did not change anybody's mind
+    assert tares.is_automatic_paused(INFO)
+
+
+def test_a_tare_by_hand_that_is_undone_pauses_nothing(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1, 2)
+    tares.undo(tares.all[-1].id)
+    assert not tares.is_automatic_paused(INFO)
+
+
+def test_automatic_tares_are_held_against_the_last_one_by_hand_or_the_oldest(
+    tmp_path: Path,
+) -> None:
+    tares = history(tmp_path)
+    assert tares.anchor(INFO) is None
+    first = tares.add(tare(1, source="flight"), INFO)
+    tares.add(tare(2, source="flight"), INFO)
+    assert tares.anchor(INFO) is first
+    by_hand = tares.add(tare(3), INFO)
+    tares.add(tare(4, source="flight"), INFO)
+    assert tares.anchor(INFO) is by_hand
+    tares.undo(by_hand.id)
+    anchor = tares.anchor(INFO)
+    assert anchor is not None
+    assert anchor.id == first.id
+
+
+def test_automatic_tares_never_push_out_one_that_was_taken_by_hand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.tares.AUTOMATIC_KEPT_MAX", 20)
+    tares = history(tmp_path, 0)
+    for t in range(1, 301):
+        tares.add(tare(t, source="unloaded" if t % 100 == 0 else "flight"), INFO)
+        assert sum(recorded.is_automatic for recorded in tares.all) <= 20
+    assert instants([t.tare for t in tares.all if not t.is_automatic]) == [0, 100, 200, 300]
+    kept = instants([t.tare for t in tares.all if t.is_automatic])
+    assert kept == sorted(kept)
+    assert kept[0] == 1, "the first of them"
+    assert set(range(290, 300)) <= set(kept), "the newest without a gap"
+    assert max(np.diff(kept)) < 120, "and of what was before some"
 
 
 # --- kept -----------------------------------------------------------------------------------------

@@ -549,6 +549,23 @@ def test_a_tare_is_old_after_half_an_hour(
     assert np.flatnonzero(status & EstimateStatus.TARE_OLD).tolist() == [11]
 
 
+def test_a_tare_at_another_temperature_is_flagged_like_an_old_one(
+    info_of: InfoOf, plan_of: PlanOf, frames_of: FramesOf, estimate: Estimate
+) -> None:
+    # Tared at 480 counts; four are let pass, and a fifth is not, whichever way.
+    plan = plan_of(info_of(SQUARE, references=[3]))
+    tadc = np.full((12, 4), 480)
+    tadc[3, 1], tadc[4, 1], tadc[5, 2], tadc[6, 2] = 476, 475, 484, 485
+    tadc[7, 3] = 300  # of a tile that bears no load it does not matter
+    frames = replace(frames_of(held([9] * 4)), tadc=tadc.astype(np.uint16))
+    status = estimate(plan, frames).estimate_status
+    assert np.flatnonzero(status & EstimateStatus.TARE_OLD).tolist() == [4, 6]
+    corrected = replace(plan, models=(*plan.models, "temperature"))
+    assert not (estimate(corrected, frames).estimate_status & EstimateStatus.TARE_OLD).any()
+    unknown = replace(plan, tare=replace(plan.tare, tadc_counts=np.full(4, np.nan)))
+    assert not (estimate(unknown, frames).estimate_status & EstimateStatus.TARE_OLD).any()
+
+
 # --- sums and centres -----------------------------------------------------------------------------
 
 

@@ -281,17 +281,27 @@ def test_windows_in_which_a_tile_was_silent_do_not_count(
 
 
 def test_no_frames_or_too_few_are_refused(frames_of: FramesOf, flight_of: FlightOf) -> None:
-    for n in (0, 1, FRAMES_MIN, WINDOW - 1):
+    for n in (0, 1, FRAMES_MIN - 1, FRAMES_MIN, WINDOW - 1):
         with pytest.raises(TareError):
             flight_of(frames_of(noise(n)))
     assert flight_of(frames_of(noise(WINDOW + 1))).frames == WINDOW + 1
+
+
+@pytest.mark.parametrize(("period_ms", "seconds"), [(4, 0.25), (15, 0.375), (39, 0.975)])
+def test_a_slow_array_has_a_longer_window(
+    frames_of: FramesOf, flight_of: FlightOf, period_ms: int, seconds: float
+) -> None:
+    n = 400
+    tare = flight_of(frames_of(noise(n), t_mono_ns=1_000_000 * period_ms * np.arange(n)))
+    assert tare.frames >= FRAMES_MIN
+    assert tare.end_s - tare.begin_s == pytest.approx(seconds, abs=1e-3 * period_ms)
 
 
 def test_frames_far_apart_are_too_few_for_a_window(
     frames_of: FramesOf, flight_of: FlightOf
 ) -> None:
     n = 300
-    slow = frames_of(noise(n), t_mono_ns=14_000_000 * np.arange(n))  # 18 frames in 250 ms
+    slow = frames_of(noise(n), t_mono_ns=60_000_000 * np.arange(n))  # 16 frames a second
     with pytest.raises(TareError):
         flight_of(slow)
 
@@ -305,3 +315,10 @@ def test_when_never_all_tiles_are_unloaded_at_once_it_is_refused(
     with pytest.raises(TareError, match="no tile was unloaded while all others were") as caught:
         flight_of(frames_of(forces_n))
     assert "whole foot" in caught.value.remedy
+
+
+def test_a_tile_that_hangs_is_refused_by_name(frames_of: FramesOf, flight_of: FlightOf) -> None:
+    forces_n = noise(1000)
+    forces_n[:, 1] = 0.0
+    with pytest.raises(TareError, match=r"T02 gave 500 counts 126 times"):
+        flight_of(frames_of(forces_n), present=present())

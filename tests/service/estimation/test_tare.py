@@ -195,9 +195,34 @@ def lead(n: int, first: int) -> np.ndarray:
 def test_the_lead_is_the_tare_if_no_interval_is_named(frames_of: FramesOf, tare_of: TareOf) -> None:
     forces_n = np.full((300, 2), 20.0)
     forces_n[:120] = 5.0  # wherever the tile lies in the lead, that is its baseline
+    forces_n[:2] += [[1.0], [-1.0]]
     tare = tare_of(frames_of(forces_n, frame_status=lead(300, 120)))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA + 5 * COUNT_KPA] * 2, abs=1e-12)
     assert (tare.source, tare.frames) == ("lead", 120)
+
+
+@pytest.mark.parametrize("readings", [20, 120])
+def test_a_tile_that_hangs_is_not_tared_by_itself(
+    frames_of: FramesOf, tare_of: TareOf, readings: int
+) -> None:
+    # The same count again and again, in the lead: the part is stuck, and says nothing of a load.
+    forces_n = noise_counts(300, 2)
+    forces_n[:readings, 1] = 2.0
+    forces_n[readings:120, 1] = np.nan
+    frames = frames_of(forces_n, frame_status=lead(300, 120))
+    with pytest.raises(TareError, match=rf"T02 gave 498 counts {readings} times") as caught:
+        tare_of(frames)
+    assert "plug" in caught.value.remedy
+    assert tare_of(frames, (0.0, 0.2)).source == "interval"  # who names one answers for it
+
+
+def test_a_tile_without_noise_on_the_bench_may_stand_still_in_the_lead(
+    frames_of: FramesOf, tare_of: TareOf
+) -> None:
+    frames = frames_of(np.zeros((120, 2)), frame_status=lead(120, 120))
+    assert tare_of(frames, noise_kpa=0.29 * COUNT_KPA).source == "lead"
+    with pytest.raises(TareError, match="nothing else"):
+        tare_of(frames, calibration=paper_eq2_shape())
 
 
 def test_frames_marked_as_lead_later_on_are_none(frames_of: FramesOf, tare_of: TareOf) -> None:
@@ -238,7 +263,9 @@ def test_a_tile_that_seems_loaded_is_no_tare_even_if_somebody_says_so(
 ) -> None:
     # 3 kPa are 23.6 counts; far below the bench's baseline it may be, for a colder tile is
     def take(*counts: float) -> Tare:
-        frames = frames_of(np.tile(counts, (100, 1)), frame_status=lead(100, 100))
+        forces_n = np.tile(counts, (100, 1))
+        forces_n[:2] += [[1.0], [-1.0]]
+        frames = frames_of(forces_n, frame_status=lead(100, 100))
         return tare_of(frames, (0.0, 0.1) if how == "interval" else None)
 
     assert take(23.0, -60.0).source == how

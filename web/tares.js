@@ -1,0 +1,51 @@
+// The history of a node's tares: when, why, and whether it was undone. Loaded when it is opened.
+
+import * as api from "./api.js";
+import { notice } from "./notices.js";
+import { byId, el, localTime, number, setText } from "./text.js";
+
+const SHOWN = 20;
+
+export class Tares {
+  constructor() {
+    this.card = byId("tares-card");
+    this.shown = "";
+    this.card.addEventListener("toggle", () => { this.shown = ""; });
+  }
+
+  /** Called often; asks the server only while it is open, and for what it does not show yet. */
+  draw(node) {
+    this.card.hidden = !node;
+    if (!node || !this.card.open) return;
+    const wanted = `${node.node} ${node.tare?.id} ${node.auto_tare}`;
+    if (wanted === this.shown) return;
+    this.shown = wanted;
+    this.load(node);
+  }
+
+  async load(node) {
+    try {
+      const { items, drift } = await api.listTares(node.node);
+      byId("tares").replaceChildren(...items.slice(0, SHOWN).map((tare) => row(tare, items)));
+      setText(byId("tares-legend"), legend(items, drift));
+    } catch (error) {
+      if (!(error instanceof api.Refusal)) throw error;
+      notice(error.message, { bad: true });
+    }
+  }
+}
+
+function row(tare, items) {
+  const inForce = !tare.undone && items.find((other) => !other.undone)?.id === tare.id;
+  const state = tare.undone ? ", undone" : inForce ? ", in force" : "";
+  return el("li", { text: `${localTime(new Date(tare.t_ns / 1e6))} ${tare.reason}${state}` });
+}
+
+function legend(items, drift) {
+  const all = `${items.length} in all, newest first`;
+  const known = drift.kpa_per_hour.filter(Number.isFinite);
+  if (!known.length) return all;
+  const most = known.reduce((a, b) => (Math.abs(b) > Math.abs(a) ? b : a));
+  const newtons = Number.isFinite(drift.grf_n_per_hour) ? `, ${number(drift.grf_n_per_hour)} N/h on the foot` : "";
+  return `${all}; drift up to ${number(most, 2)} kPa/h${newtons}`;
+}
