@@ -48,15 +48,18 @@ def fit_soak(soak: Soak) -> TemperatureEffect | str:
     if binned is None:
         return "the recording has no soak at two temperatures"
     t_s, kpa, tadc, sigma_kpa = binned
-    chip_k = (tadc - tadc[0]) / TADC_PER_KELVIN
+    # From the mean of the first second on: a single count of noise would stay for a lag.
+    chip_k = (tadc - tadc[t_s < t_s[0] + 1.0].mean()) / TADC_PER_KELVIN
     if np.ptp(chip_k) < STEP_MIN_K:
         return f"temperature changes by {np.ptp(chip_k):.1f} K only, {STEP_MIN_K} K are needed"
     step_s = float(np.median(np.diff(t_s)))
 
     def residual(x: Floats) -> Floats:
         base_kpa, kpa_per_k, ln_lag = x
-        decay = np.exp(-step_s / np.exp(ln_lag))
-        gas_k, _ = lfilter([1.0 - decay], [1.0, -decay], chip_k, zi=[decay * chip_k[0]])
+        # Exact for a chip whose temperature is linear between the means.
+        h = step_s / np.exp(ln_lag)
+        decay, mean = np.exp(-h), -np.expm1(-h) / h
+        gas_k, _ = lfilter([1.0 - mean, mean - decay], [1.0, -decay], chip_k, zi=[0.0])
         return np.asarray((base_kpa + kpa_per_k * gas_k - kpa) / sigma_kpa)
 
     low, high = np.log(_LAG_S)

@@ -1,6 +1,6 @@
 """`denoise`: white noise averaged away over as long as nothing happens.
 
-Around every sample a straight line is fitted to windows that grow, up to the look-ahead on one side
+Around every sample a line and a parabola are fitted to windows that grow, up to the look-ahead on one side
 and `PAST_NS` on the other. The longest one is taken whose value still agrees with those of all
 shorter ones (intersection of confidence intervals, Goldenshluger and Nemirovski 1997; Katkovnik
 1999). A window never crosses a gap.
@@ -19,9 +19,9 @@ Floats = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 
 PAST_NS = 250_000_000
-REACHES = np.array([1, 2, 3, 4, 6, 8, 11, 16, 22, 32, 45, 64, 90, 128])
+REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
 """How far the windows reach to either side, in samples."""
-AGREE = 2.0
+AGREE = 1.0
 """In standard uncertainties: how far the value of a longer window may be from that of any shorter
 one. A compromise between noise in quiet stance and lag at an impact."""
 
@@ -64,8 +64,8 @@ def denoised(
     n, tiles = values.shape
     out = np.full((stop - first, tiles), math.nan)
     left = np.full((stop - first, tiles), math.nan)
-    newest = first
-    oldest = first
+    moments = np.empty(8)
+    newest = oldest = first
     while oldest > 0 and frame_t_ns[oldest - 1] >= frame_t_ns[first] - past_ns:
         oldest -= 1
     for i in range(first, stop):
@@ -77,58 +77,83 @@ def denoised(
         for j in range(tiles):
             if math.isnan(values[i, j]):
                 continue
-            low, high = i, i
             sigma = sigmas[i, j]
+            moments[:] = 0.0
             # Times relative to the instant asked for, in milliseconds.
-            time = (t_ns[i, j] - at_ns[i, j]) * 1e-6
-            s0, s1, s2, y0, y1 = 1.0, time, time * time, values[i, j], time * values[i, j]
-            best, variance = values[i, j], 1.0
-            shorter, shorter_variance = best, variance
-            shortest, shortest_variance = best, variance
+            _add(moments, (t_ns[i, j] - at_ns[i, j]) * 1e-6, values[i, j])
+            best = shorter = shortest = values[i, j]
+            variance = shorter_variance = shortest_variance = 1.0
             least, most = best - agree * sigma, best + agree * sigma
+            low = high = i
+            straight, agrees = True, True
             for reach in reaches:
-                grown = False
-                while low > oldest and low > i - reach and run[low - 1] == run[i]:
+                before_low, before_high = low, high
+                while low > max(oldest, i - reach) and run[low - 1] == run[i]:
                     low -= 1
-                    value = values[low, j]
-                    grown = True
-                    if not math.isnan(value):
-                        time = (t_ns[low, j] - at_ns[i, j]) * 1e-6
-                        s0 += 1.0
-                        s1 += time
-                        s2 += time * time
-                        y0 += value
-                        y1 += time * value
-                while high < newest and high < i + reach and run[high + 1] == run[i]:
+                    if not math.isnan(values[low, j]):
+                        _add(moments, (t_ns[low, j] - at_ns[i, j]) * 1e-6, values[low, j])
+                while high < min(newest, i + reach) and run[high + 1] == run[i]:
                     high += 1
-                    value = values[high, j]
-                    grown = True
-                    if not math.isnan(value):
-                        time = (t_ns[high, j] - at_ns[i, j]) * 1e-6
-                        s0 += 1.0
-                        s1 += time
-                        s2 += time * time
-                        y0 += value
-                        y1 += time * value
-                if not grown:
+                    if not math.isnan(values[high, j]):
+                        _add(moments, (t_ns[high, j] - at_ns[i, j]) * 1e-6, values[high, j])
+                if low == before_low and high == before_high:
                     break
-                det = s0 * s2 - s1 * s1
-                if s0 < 3.0 or det <= 0.0:
-                    continue
-                value = (s2 * y0 - s1 * y1) / det
-                remains = s2 / det
-                spread = agree * sigma * math.sqrt(remains)
-                least, most = max(least, value - spread), min(most, value + spread)
-                if least > most:
+                accepted, remains = math.nan, 0.0
+                for bent in (True, False):
+                    if not bent and not straight:
+                        break
+                    value, of_noise = _parabola(moments) if bent else _line(moments)
+                    if math.isnan(value):
+                        continue
+                    spread = agree * sigma * math.sqrt(of_noise)
+                    if value - spread > most or value + spread < least:
+                        straight = False
+                        agrees = not bent
+                        break
+                    least, most = max(least, value - spread), min(most, value + spread)
+                    accepted, remains = value, of_noise
+                if not agrees:
                     break
-                if remains < variance:
+                if not math.isnan(accepted) and remains < variance:
                     shortest, shortest_variance = shorter, shorter_variance
                     shorter, shorter_variance = best, variance
-                    best, variance = value, remains
-            # A window of half the length gives the same but for noise; if not, a line is no good
-            # description of what happens here.
+                    best, variance = accepted, remains
+            # A window of half the length gives the same but for noise; if not, neither curve is a
+            # good description of what happens here.
             if sigma > 0.0:
-                bent = ((best - shortest) / sigma) ** 2 - (shortest_variance - variance)
-                variance += max(0.0, bent)
+                off = ((best - shortest) / sigma) ** 2
+                variance += max(0.0, off - (shortest_variance - variance))
             out[i - first, j], left[i - first, j] = best, variance
     return out, left
+
+
+@compiled
+def _add(moments: Floats, time: float, value: float) -> None:
+    square = time * time
+    moments[0] += 1.0
+    moments[1] += time
+    moments[2] += square
+    moments[3] += square * time
+    moments[4] += square * square
+    moments[5] += value
+    moments[6] += time * value
+    moments[7] += square * value
+
+
+@compiled
+def _line(m: Floats) -> tuple[float, float]:
+    """Value of the fitted line at time 0, and its variance in units of a sample's."""
+    det = m[0] * m[2] - m[1] * m[1]
+    if m[0] < 3.0 or det <= 0.0:
+        return math.nan, 0.0
+    return (m[2] * m[5] - m[1] * m[6]) / det, m[2] / det
+
+
+@compiled
+def _parabola(m: Floats) -> tuple[float, float]:
+    """Likewise of the fitted parabola, by the cofactors of its normal equations."""
+    a0, a1, a2 = m[2] * m[4] - m[3] * m[3], m[2] * m[3] - m[1] * m[4], m[1] * m[3] - m[2] * m[2]
+    det = m[0] * a0 + m[1] * a1 + m[2] * a2
+    if m[0] < 4.0 or det <= 0.0:
+        return math.nan, 0.0
+    return (a0 * m[5] + a1 * m[6] + a2 * m[7]) / det, a0 / det

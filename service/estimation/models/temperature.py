@@ -1,9 +1,10 @@
 """`temperature`: the baseline of a sealed bubble, which follows p/T of its gas (hardware.md 9).
 
-`tadc` is the chip's temperature, noisy by half a count: it is averaged over a quarter of a second.
-The gas follows its chip with one lag, measured per tile in the bench's soak. Pressure is taken back
-to what it would be at the tare's temperature, in proportion to itself, because a warmer gas answers
-a squeeze more strongly, too. While chip and gas differ, how far is itself uncertain.
+`tadc` is the chip's temperature. The gas follows its chip with one lag of some seconds, measured per
+tile in the bench's soak, in which the half count of noise of `tadc` drowns: it needs no smoothing,
+which would only be late in a cold shock. Pressure is taken back to what it would be at the tare's
+temperature, in proportion to itself, because a warmer gas answers a squeeze more strongly, too.
+While chip and gas differ, how far is itself uncertain.
 """
 
 from __future__ import annotations
@@ -19,24 +20,27 @@ from service.estimation.compiled import compiled
 Floats = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 
-SMOOTHING_S = 0.25
-"""Longer, and a cold shock is noticed too late: 2 s cost 0.3 N (design)."""
+SETTLE_S = 0.5
+"""So long is the mean of the chip's temperature taken for that of the gas."""
 
 
 @dataclass(frozen=True)
 class TemperatureState:
-    """Of every tile: averaged counts, how long they were averaged, the gas', and since when."""
+    """Of every tile: counts of the gas and of the chip, since when there are any, and the last.
 
-    chip_counts: Floats
-    averaged_s: Floats
+    NaN before the first reading.
+    """
+
     gas_counts: Floats
+    chip_counts: Floats
+    first_ns: Times
     t_ns: Times
 
 
 def at_rest(tiles: int) -> TemperatureState:
     """Before the first reading."""
-    nothing = np.full(tiles, np.nan)
-    return TemperatureState(nothing, np.zeros(tiles), nothing.copy(), np.zeros(tiles, np.int64))
+    unknown, never = np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64)
+    return TemperatureState(unknown, unknown, never, never)
 
 
 @dataclass(frozen=True)
@@ -73,19 +77,23 @@ class Temperature:
         Returns:
             The pressures, their standard uncertainty from temperature, and the next state.
         """
-        chip, gas = np.empty_like(kpa), np.empty_like(kpa)
-        mean, averaged_s = state.chip_counts.copy(), state.averaged_s.copy()
-        follower, last_ns = state.gas_counts.copy(), state.t_ns.copy()
+        gas, chip = np.empty_like(kpa), np.empty_like(kpa)
+        after = TemperatureState(
+            state.gas_counts.copy(),
+            state.chip_counts.copy(),
+            state.first_ns.copy(),
+            state.t_ns.copy(),
+        )
         _follow(
             np.ascontiguousarray(tadc),
             np.ascontiguousarray(t_ns),
             self.lag_s,
-            mean,
-            averaged_s,
-            follower,
-            last_ns,
-            chip,
+            after.gas_counts,
+            after.chip_counts,
+            after.first_ns,
+            after.t_ns,
             gas,
+            chip,
         )
         warmed_kpa = self.kpa_per_count * (gas - self.tare_counts)
         part = warmed_kpa / self.baseline_kpa
@@ -93,7 +101,7 @@ class Temperature:
             self.relative_sigma * warmed_kpa,
             self.relative_lag_sigma * self.kpa_per_count * (chip - gas),
         )
-        return kpa / (1.0 + part), sigma_kpa, TemperatureState(mean, averaged_s, follower, last_ns)
+        return kpa / (1.0 + part), sigma_kpa, after
 
 
 @compiled
@@ -101,38 +109,31 @@ def _follow(
     tadc: Floats,
     t_ns: Times,
     lag_s: Floats,
-    chip_counts: Floats,
-    averaged_s: Floats,
     gas_counts: Floats,
+    chip_counts: Floats,
+    first_ns: Times,
     last_ns: Times,
-    chip: Floats,
     gas: Floats,
+    chip: Floats,
 ) -> None:
     n, tiles = tadc.shape
     for j in range(tiles):
-        mean, known_s, follower, before_ns = (
-            chip_counts[j],
-            averaged_s[j],
-            gas_counts[j],
-            last_ns[j],
-        )
+        now, before = gas_counts[j], chip_counts[j]
         for i in range(n):
             counts = tadc[i, j]
             if not math.isnan(counts):
-                if math.isnan(mean):
-                    mean, follower = counts, counts
+                if math.isnan(now):  # as warm as its chip, as far as one can know
+                    now, first_ns[j] = counts, t_ns[i, j]
                 else:
-                    dt = max(0.0, (t_ns[i, j] - before_ns) * 1e-9)
-                    # What has been averaged for a short time is a plain mean of it.
-                    known_s = min(known_s + dt, SMOOTHING_S)
-                    new = -math.expm1(-dt / known_s) if known_s > 0.0 else 0.0
-                    before = mean
-                    mean += new * (counts - mean)
-                    decay = math.exp(-dt / lag_s[j])
-                    # Exact for a chip whose temperature is linear between readings.
-                    drive = -math.expm1(-dt / lag_s[j]) * lag_s[j] / dt if dt > 0.0 else 1.0
-                    follower = decay * follower + (drive - decay) * before + (1.0 - drive) * mean
-                before_ns = t_ns[i, j]
-            chip[i, j], gas[i, j] = mean, follower
-        chip_counts[j], averaged_s[j], gas_counts[j] = mean, known_s, follower
-        last_ns[j] = before_ns
+                    dt = max(0.0, (t_ns[i, j] - last_ns[j]) * 1e-9)
+                    known_s = (t_ns[i, j] - first_ns[j]) * 1e-9
+                    # At first a plain mean: a single noisy count would stay for the whole lag.
+                    lag = lag_s[j] if known_s > SETTLE_S else min(lag_s[j], max(dt, known_s))
+                    if dt > 0.0:
+                        # Exact for a chip whose temperature is linear between readings.
+                        decay = math.exp(-dt / lag)
+                        mean = -math.expm1(-dt / lag) * lag / dt
+                        now = decay * now + (mean - decay) * before + (1.0 - mean) * counts
+                before, last_ns[j] = counts, t_ns[i, j]
+            gas[i, j], chip[i, j] = now, before
+        gas_counts[j], chip_counts[j] = now, before
