@@ -216,7 +216,7 @@ def simulate(
             if any(i == tile for i, _ in flagged)
         },
         pressed=simulation.pressed,
-        accuracy=judge(joined(judged)) if judged else None,
+        accuracy=judged_of(judged, stream),
         wall_s=time.perf_counter() - began_s,
     )
 
@@ -231,6 +231,15 @@ def _flags(batch: FrameBatch) -> dict[tuple[int, str], int]:
             if n and bit.name:
                 counts[tile, bit.name.lower()] = n
     return counts
+
+
+def judged_of(
+    pieces: list[Mapping[str, npt.NDArray[Any]]], stream: EstimateStream | None
+) -> Accuracy | None:
+    """How far off the estimates of a stream were; None if there is no truth to compare with."""
+    if not pieces or stream is None or stream.plan is None:
+        return None
+    return judge(joined(pieces), lag_ms=stream.plan.lag_ns * 1e-6)
 
 
 def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArray[Any]]:
