@@ -53,6 +53,8 @@ class SimulateOptions:
 
     scene: Scene
     seconds: float | None = None
+    otherwise_s: float | None = None
+    """Length of a scene that has no end of its own, if `seconds` does not say one either."""
     schedule: AnySchedule | None = None
     seed: int = 0
     parts_seed: int = 0
@@ -248,7 +250,8 @@ def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArra
 
 
 def _duration_ns(options: SimulateOptions, ground_s: float | None) -> int:
-    seconds = options.seconds if options.seconds is not None else ground_s
+    lengths_s = (options.seconds, ground_s, options.otherwise_s)
+    seconds = next((s for s in lengths_s if s is not None), None)
     if seconds is None:
         raise UsageError(
             f"scene {options.scene.name!r} has no end of its own", remedy="Add --seconds S"
