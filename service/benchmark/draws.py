@@ -122,7 +122,7 @@ def estimated(recording: Recording, models: tuple[str, ...], lag_ms: float) -> A
     """
     options = EstimateOptions(recording.calibration, models, lag_ms)
     stream = EstimateStream(recording.info, options)
-    judged = []
+    judged: list[Mapping[str, npt.NDArray[Any]]] = []
     for frames, columns in stream.run([(recording.frames, recording.truth)]):
         columns["t_ns"] = frames.t_ns
         judged.append({name: np.asarray(columns[name]) for name in JUDGED})

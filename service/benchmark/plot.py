@@ -1,14 +1,23 @@
-"""Time per frame against GRF error, one panel per scene, with the Pareto front of each mode."""
+"""Time per frame against GRF error, one panel per scene, with the Pareto front of each mode.
+
+A panel has a half for each mode: their times lie two decades apart, with nothing in between.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from service.benchmark.draws import LAGS_MS
-from service.benchmark.figures import SceneFigures, pareto
+from service.benchmark.figures import SceneFigures, Spread, pareto
 from service.benchmark.goals import GRF_MAE_N
+from service.benchmark.placing import Box, free_place
+from service.benchmark.rungs import Rung
 from service.plots import DPI, new_figure, png_of
 
 if TYPE_CHECKING:
@@ -17,10 +26,21 @@ if TYPE_CHECKING:
 
 # Two of Okabe and Ito's colours, and two shapes, so that neither colour nor print is needed.
 STYLES = {"live": ("#0072B2", "o"), "offline": ("#D55E00", "s")}
+HALVES = ("offline", "live")
 GREY = "#595959"
+GOAL_DASHES = (0, (5, 4))
+_NEAR_PX = 14
 
-Box = tuple[float, float, float, float]
-"""Left, bottom, right, top in pixels."""
+
+@dataclass(frozen=True)
+class _Mark:
+    rung: Rung
+    ns: float
+    error_n: Spread
+
+    @property
+    def name(self) -> str:
+        return self.rung.label if self.rung.is_built_up else f"\N{MINUS SIGN}{self.rung.lacks}"
 
 
 def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
@@ -29,213 +49,192 @@ def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
     Raises:
         UsageError: matplotlib is not installed.
     """
-    figure = new_figure(1.2 + 6.4 * len(scenes), 6.2)
-    panels = figure.subplots(1, len(scenes), squeeze=False)[0]
-    marks = [_panel(axes, figures) for axes, figures in zip(panels, scenes, strict=True)]
-    panels[0].set_ylabel("GRF error, mean absolute, N")
-    figure.suptitle("What a frame's estimate costs, and how far its force is off", fontsize=13)
-    _legend(figure, panels[0])
-    figure.text(
-        *(0.01, 0.008),
-        "Emulated feet. Median over draws of tiles, calibration and noise; bars: 5 to 95 %.",
-        fontsize=8.5,
-        color=GREY,
-    )
+    figure = new_figure(9.0, 1.4 + 5.0 * len(scenes))
+    panels = figure.subplots(len(scenes), 2, squeeze=False)
+    to_label: list[tuple[Axes, str, list[_Mark]]] = []
+    for figures, (left, right) in zip(scenes, panels, strict=True):
+        for mode, axes in zip(HALVES, (left, right), strict=True):
+            to_label.append((axes, mode, _half(axes, figures, mode)))
+        left.set_ylabel("GRF error, mean absolute, N")
+        right.tick_params(axis="y", length=0, labelleft=False)
+        right.spines["left"].set_visible(False)
+        left.set_title(
+            f"{figures.scene}: {figures.tiles} tiles, median of {figures.draws} draws",
+            loc="left",
+            fontsize=12,
+            pad=22,
+        )
+    figure.suptitle("What the estimate of a frame costs, and how far its force is off", fontsize=14)
+    _legend(figure)
     # Places are known in pixels only after everything else has found its own.
     figure.set_dpi(DPI)
-    figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))
+    engine: Any = figure.get_layout_engine()
+    engine.set(wspace=0.02, hspace=0.05)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    for axes, marked in zip(panels, marks, strict=True):
-        _label(axes, marked)
+    for axes, mode, marks in to_label:
+        _label(axes, mode, marks)
     return png_of(figure)
 
 
-_Mark = tuple[float, float, str, str, bool]
-"""Where, what to call it, in which colour, and whether it is the scene's own."""
-
-
-def _panel(axes: Axes, figures: SceneFigures) -> list[_Mark]:
-    marks: list[_Mark] = []
-    for mode in LAGS_MS:
-        colour, shape = STYLES[mode]
-        points = []
-        for rung in figures.rungs:
-            m = figures.measured[mode, rung.label]
-            error_n = m.figures["grf_mae_n"]
-            at = (m.ns_per_frame.median, error_n.median)
-            points.append(at)
-            if not all(map(math.isfinite, at)):
-                continue
-            axes.errorbar(
-                *([at[0]], [at[1]]),
-                yerr=[[error_n.median - error_n.low], [error_n.high - error_n.median]],
-                marker=shape,
-                markersize=11 if rung.is_default else 6,
-                markerfacecolor=colour if rung.is_built_up else "white",
-                markeredgecolor="black" if rung.is_default else colour,
-                markeredgewidth=1.8 if rung.is_default else 1.2,
-                ecolor=colour,
-                elinewidth=0.8,
-                alpha=1.0 if rung.is_built_up else 0.75,
-                linestyle="none",
-                zorder=4 if rung.is_default else 3,
-            )
-            marks.append((*at, rung.label, colour, rung.is_default))
-        front = [points[i] for i in pareto(points)]
-        axes.plot(
-            [x for x, _ in front], [y for _, y in front], color=colour, linewidth=1.4, zorder=2
+def _half(axes: Axes, figures: SceneFigures, mode: str) -> list[_Mark]:
+    """Marks, bars, front and goal of one mode."""
+    colour, shape = STYLES[mode]
+    marks = []
+    for rung in figures.rungs:
+        m = figures.measured[mode, rung.label]
+        mark = _Mark(rung, m.ns_per_frame.median, m.figures["grf_mae_n"])
+        if math.isfinite(mark.ns) and math.isfinite(mark.error_n.median):
+            marks.append(mark)
+    for mark in marks:
+        error_n, is_default = mark.error_n, mark.rung.is_default
+        axes.errorbar(
+            *([mark.ns], [error_n.median]),
+            yerr=[[error_n.median - error_n.low], [error_n.high - error_n.median]],
+            marker=shape,
+            markersize=12 if is_default else 6.5,
+            markerfacecolor=colour if mark.rung.is_built_up else "white",
+            markeredgecolor="black" if is_default else colour,
+            markeredgewidth=2.0 if is_default else 1.2,
+            ecolor=colour,
+            elinewidth=0.8,
+            linestyle="none",
+            zorder=4 if is_default else 3,
         )
-        goal_n = GRF_MAE_N.get(figures.scene, {}).get(mode)
-        if goal_n is not None:
-            axes.axhline(goal_n, color=colour, linewidth=0.9, linestyle=(0, (5, 4)), zorder=1)
-    axes.set_xscale("log")
-    axes.set_ylim(bottom=0.0, top=_top_n(figures))
-    axes.margins(x=0.22)
-    axes.xaxis.set_major_formatter(_time_text)
-    axes.xaxis.set_minor_formatter(_time_text_between)
-    axes.tick_params(axis="x", which="both", labelsize=9)
-    axes.set_xlabel("time per frame")
-    axes.grid(visible=True, which="major", color="#E3E3E3")
-    axes.grid(visible=True, which="minor", axis="x", color="#F1F1F1")
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.set_title(
-        f"{figures.scene}: {figures.tiles} tiles, {figures.draws} draws", loc="left", fontsize=11
+    points = [(mark.ns, mark.error_n.median) for mark in marks]
+    front = [points[i] for i in pareto(points)]
+    axes.plot([x for x, _ in front], [y for _, y in front], color=colour, linewidth=1.5, zorder=2)
+    goal_n = GRF_MAE_N.get(figures.scene, {}).get(mode)
+    if goal_n is not None:
+        axes.axhline(goal_n, color=GREY, linewidth=1.0, linestyle=GOAL_DASHES, zorder=1)
+    _scales(axes, figures, [x for x, _ in points])
+    axes.text(
+        *(0.5, 1.015),
+        f"{mode}, {LAGS_MS[mode]:g} ms look-ahead",
+        transform=axes.transAxes,
+        ha="center",
+        color=colour,
+        fontsize=10,
+        fontweight="bold",
     )
     return marks
 
 
-def _top_n(figures: SceneFigures) -> float:
+def _scales(axes: Axes, figures: SceneFigures, times_ns: Sequence[float]) -> None:
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    axes.set_xscale("log")
+    if times_ns:
+        middle = math.sqrt(min(times_ns) * max(times_ns))
+        reach = 2.2 * math.sqrt(max(times_ns) / min(times_ns))
+        axes.set_xlim(middle / reach, middle * reach)
     highs = [m.figures["grf_mae_n"].high for m in figures.measured.values()]
-    goals = GRF_MAE_N.get(figures.scene, {}).values()
-    return 1.15 * max([high for high in highs if math.isfinite(high)] + list(goals) or [1.0])
+    goals_n = GRF_MAE_N.get(figures.scene, {}).values()
+    known = [high for high in highs if math.isfinite(high)] + list(goals_n)
+    axes.set_ylim(0.0, 1.08 * max(known, default=1.0))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(time_text)
+    axes.tick_params(labelsize=9)
+    axes.set_xlabel("time per frame")
+    axes.grid(visible=True, color="#E6E6E6")
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
 
 
-def _time_text(ns: float, _: object = None) -> str:
+def time_text(ns: float, _: object = None) -> str:
+    """A time of so many nanoseconds in the unit that suits it."""
     for unit, size in (("ms", 1e6), ("µs", 1e3)):
         if ns >= size:
             return f"{ns / size:g} {unit}"
     return f"{ns:g} ns"
 
 
-def _time_text_between(ns: float, _: object = None) -> str:
-    first_digit = f"{ns:e}"[0]
-    return _time_text(ns) if first_digit in "25" else ""
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
+def _legend(figure: Figure) -> None:
     from matplotlib.lines import Line2D
 
-    def mark(shape: str, face: str, edge: str, size: float, label: str) -> Line2D:
+    def mark(face: str, edge: str, width: float, size: float, label: str) -> Line2D:
         return Line2D(
             *([], []),
-            marker=shape,
+            marker="o",
             markerfacecolor=face,
             markeredgecolor=edge,
+            markeredgewidth=width,
             markersize=size,
             linestyle="none",
             label=label,
         )
 
-    modes = [
-        mark(shape, colour, colour, 7, f"{mode}, looks {LAGS_MS[mode]:g} ms ahead")
-        for mode, (colour, shape) in STYLES.items()
-    ]
-    handles = [
-        *modes,
-        mark("o", "white", GREY, 10, "the scene's own ladder"),
-        mark("o", "white", GREY, 6, "that without one model"),
-        Line2D([], [], color=GREY, linewidth=1.4, label="Pareto front"),
-        Line2D([], [], color=GREY, linewidth=0.9, linestyle=(0, (5, 4)), label="goal"),
-    ]
-    handles[2].set_markeredgecolor("black")
-    handles[2].set_markeredgewidth(1.8)
-    handles[2].set_markerfacecolor("#BFBFBF")
     figure.legend(
-        handles=handles,
+        handles=[
+            mark("#BFBFBF", "black", 2.0, 11, "the scene's whole ladder"),
+            mark(GREY, GREY, 1.2, 6, "built up, one model more each"),
+            mark("white", GREY, 1.2, 6, "whole ladder without one model"),
+            Line2D([], [], color=GREY, linewidth=1.5, label="Pareto front"),
+            Line2D([], [], color=GREY, linewidth=1.0, linestyle=GOAL_DASHES, label="goal"),
+        ],
         loc="outside lower center",
-        ncols=6 if len(figure.axes) > 1 else 3,
+        ncols=3,
         frameon=False,
         fontsize=9,
+        title="Emulated feet. Bars: 5 to 95 % of the draws of tiles, calibration and noise.",
+        title_fontsize=9,
     )
 
 
-def _label(axes: Axes, marks: Sequence[_Mark]) -> None:
+def _label(axes: Axes, mode: str, marks: Sequence[_Mark]) -> None:
     """Write every name where nothing is yet, as near to its mark as there is room."""
-    renderer: Any = axes.figure.canvas.get_renderer()
-    inside = axes.get_window_extent(renderer)
-    places = [axes.transData.transform((x, y)) for x, y, *_ in marks]
-    taken: list[Box] = [(x - 8, y - 8, x + 8, y + 8) for x, y in places]
-    for place, (x, y, name, colour, is_default) in sorted(
-        zip(places, marks, strict=True), key=lambda pair: not pair[1][4]
-    ):
+    from matplotlib.patheffects import withStroke
+
+    canvas: Any = axes.figure.canvas
+    renderer = canvas.get_renderer()
+    colour, _ = STYLES[mode]
+    window = axes.get_window_extent(renderer)
+    inside = (window.x0, window.y0, window.x1, window.y1)
+    taken: list[Box] = []
+    places: list[tuple[float, float]] = []
+    for mark in marks:
+        ends = [(mark.ns, y) for y in (mark.error_n.low, mark.error_n.median, mark.error_n.high)]
+        (x, low), (_, y), (_, high) = axes.transData.transform(np.array(ends)).tolist()
+        places.append((x, y))
+        half = 12.0 if mark.rung.is_default else 8.0
+        taken += [(x - half, y - half, x + half, y + half), (x - 1.5, low, x + 1.5, high)]
+    taken += _along([places[i] for i in pareto([(m.ns, m.error_n.median) for m in marks])])
+    # The scene's own ladder first, then what is built up: they get the best places.
+    order = sorted(
+        zip(places, marks, strict=True),
+        key=lambda pair: (not pair[1].rung.is_default, not pair[1].rung.is_built_up),
+    )
+    for (x, y), mark in order:
         text = axes.annotate(
-            name,
-            (x, y),
+            mark.name,
+            (mark.ns, mark.error_n.median),
             xytext=(0, 0),
             textcoords="offset pixels",
-            fontsize=9 if is_default else 8,
-            fontweight="bold" if is_default else "normal",
-            color=colour,
+            fontsize=9.5 if mark.rung.is_default else 8.5,
+            fontweight="bold" if mark.rung.is_default else "normal",
+            color="black" if mark.rung.is_default else colour,
+            path_effects=[withStroke(linewidth=2.0, foreground="white")],
             zorder=6,
         )
         size = text.get_window_extent(renderer)
-        bounds = (inside.x0, inside.y0, inside.x1, inside.y1)
-        dx, dy = free_place(tuple(place), (size.width, size.height), taken, bounds)
+        dx, dy = free_place((x, y), (size.width, size.height), taken, inside)
         text.set_position((dx, dy))
-        left, bottom = place[0] + dx, place[1] + dy
-        taken.append((left, bottom, left + size.width, bottom + size.height))
-        middle = (left + size.width / 2 - place[0], bottom + size.height / 2 - place[1])
-        if abs(middle[0]) > size.width / 2 + 14 or abs(middle[1]) > size.height / 2 + 14:
-            nearest = (
-                min(max(place[0], left), left + size.width),
-                min(max(place[1], bottom), bottom + size.height),
-            )
-            ends = axes.transData.inverted().transform([place, nearest])
-            axes.plot(*ends.T, color=colour, linewidth=0.5, alpha=0.7, zorder=1)
+        left, bottom = x + dx, y + dy
+        right, top = left + size.width, bottom + size.height
+        taken.append((left, bottom, right, top))
+        nearest = (min(max(x, left), right), min(max(y, bottom), top))
+        if math.dist((x, y), nearest) > _NEAR_PX:
+            ends_of = axes.transData.inverted().transform(np.array([(x, y), nearest]))
+            axes.plot(*ends_of.T, color=colour, linewidth=0.6, alpha=0.8, zorder=2.5)
 
 
-def free_place(
-    at: tuple[float, float],
-    size: tuple[float, float],
-    taken: Sequence[Box],
-    inside: Box,
-) -> tuple[float, float]:
-    """Where the lower left corner of a text goes, relative to what it names; all in pixels.
-
-    The nearest place at which it covers nothing; if there is none, the one that covers least.
-
-    Args:
-        at: what it names.
-        size: width and height of the text.
-        taken: boxes that are to be left free.
-        inside: box in which the text has to be.
-    """
-    width, height = size
-    best, least = (0.0, 0.0), math.inf
-    for away in range(11, 240, 8):
-        for turn in (0, 8, 4, 12, 2, 6, 10, 14, 1, 15, 3, 5, 7, 9, 11, 13):
-            angle = turn * math.pi / 8
-            dx = math.cos(angle) * (away + width / 2) - width / 2
-            dy = math.sin(angle) * (away + height / 2) - height / 2
-            left, bottom = at[0] + dx, at[1] + dy
-            box = (left, bottom, left + width, bottom + height)
-            outside = (
-                box[0] < inside[0] or box[1] < inside[1] or box[2] > inside[2] or box[3] > inside[3]
-            )
-            if outside:
-                continue
-            covered = sum(_overlap(box, other) for other in taken)
-            if covered == 0.0:
-                return dx, dy
-            if covered < least:
-                best, least = (dx, dy), covered
-    return best
-
-
-def _overlap(a: Box, b: Box) -> float:
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    return width * height if width > 0 and height > 0 else 0.0
+def _along(line: Sequence[tuple[float, float]]) -> list[Box]:
+    """Small boxes along a line of points in pixels."""
+    boxes: list[Box] = []
+    for begin, end in itertools.pairwise(line):
+        steps = max(1, round(math.dist(begin, end) / 6.0))
+        for x, y in np.linspace(begin, end, steps + 1).tolist():
+            boxes.append((x - 2.0, y - 2.0, x + 2.0, y + 2.0))
+    return boxes
