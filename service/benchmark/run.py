@@ -96,10 +96,10 @@ def run_bench(options: BenchOptions, tell: Callable[[str], None]) -> Bench:
         ladder = rungs(scene.models)
         tasks = [Task(scene, options.seconds, draw, ladder) for draw in range(options.draws)]
         draws: list[Drawn] = []
-        for drawn in _drawn(tasks, options.jobs):
-            draws.append(drawn)
+        for one in drawn(tasks, options.jobs):
+            draws.append(one)
             tell(f"{scene.name}: {len(draws)} of {options.draws} draws")
-        draws.sort(key=lambda drawn: drawn.draw)
+        draws.sort(key=lambda one: one.draw)
         scenes.append(_figures(scene, ladder, draws, options, tell))
     made = datetime.now(UTC).isoformat(timespec="seconds")
     return Bench(options, made, SOFTWARE, machine(), tuple(scenes))
@@ -112,8 +112,8 @@ def _figures(
     options: BenchOptions,
     tell: Callable[[str], None],
 ) -> SceneFigures:
-    failures = [failure for drawn in draws for failure in drawn.failures]
-    good = [drawn for drawn in draws if drawn.accuracy]
+    failures = [failure for one in draws for failure in one.failures]
+    good = [one for one in draws if one.accuracy]
     if not good:
         raise FootTileError(
             f"none of {len(draws)} draws gave a figure: {failures[0].what}: {failures[0].why}",
@@ -130,7 +130,7 @@ def _figures(
         absent_models=absent(scene.models),
         assumed_scale=_is_assumed(recording),
         draws=len(good),
-        frames=Spread.of([float(drawn.frames) for drawn in good]),
+        frames=Spread.of([float(one.frames) for one in good]),
         rungs=ladder,
         measured=measured_of(ladder, good, times_ns),
         failures=(*failures, *not_timed),
@@ -142,7 +142,7 @@ def _is_assumed(recording: Recording) -> bool:
     return any(entry.absolute_scale == "assumed" for entry in entries)
 
 
-def _drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
+def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
     """Every draw as it is finished."""
     if jobs == 1:
         yield from map(run_draw, tasks)
