@@ -41,7 +41,8 @@ def plan_of(models: tuple[str, ...]) -> EstimationPlan:
         models=models,
     )  # fmt: skip
     baseline_kpa, noise_kpa = np.full(TILES, 100.0), np.full(TILES, 0.165)
-    tare = Tare(baseline_kpa, noise_kpa / 20, noise_kpa, 0, 0.0, 1.0, 400, "lead")
+    tadc = np.full(TILES, 480.0)
+    tare = Tare(baseline_kpa, noise_kpa / 20, noise_kpa, tadc, 0, 0.0, 1.0, 400, "lead")
     return make_plan(info, paper_eq2_shape(), tare, models=models, lag_ms=10.0)
 
 

@@ -83,7 +83,7 @@ class EstimateStream:
                 expected="BEGIN,END in seconds from the first frame, BEGIN before END",
             )
         nothing = np.zeros(len(info.tiles))
-        self._make_plan(Tare(nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
+        self._make_plan(Tare(nothing, nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
 
     def run(
         self, pieces: Iterable[tuple[FrameBatch, Extra]]

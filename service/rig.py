@@ -93,19 +93,20 @@ class Rig:
             self._servo(scene.servo, world, stack) if scene.servo is not None else None
         )
         self._renew_at_ns = 0
+        # Before the world begins: on a busy machine the trial would use up the lead.
+        bus_hz = self._bus_hz(self._ready.array)
         if world is not None:
             world.begin()
             if options.emulated:
                 self._lead_end_ns = world.epoch_ns + round(options.lead_s * 1e9)
-        self._begin_stream(is_new=False)
+        self._begin_stream(bus_hz, is_new=False)
         if not options.emulated:
             # Last, and only this thread: an emulated world would starve the rest of the machine.
             run_before_others()
 
-    def _begin_stream(self, *, is_new: bool) -> None:
+    def _begin_stream(self, bus_hz: float, *, is_new: bool) -> None:
         scene, ready = self._options.scene, self._ready
         anchor = UtcAnchor.now(clock_set=clock_is_set())
-        bus_hz = self._bus_hz(ready.array)
         self.info: ArrayInfo = describe(
             scene,
             ready.tiles,
@@ -172,7 +173,7 @@ class Rig:
             self._renew_at_ns = self._clock.now_ns() + _RENEW_AGAIN_NS
             self._ready.array.begin()
             return False
-        self._begin_stream(is_new=True)
+        self._begin_stream(self._bus_hz(self._ready.array), is_new=True)
         return True
 
     def _world(self, options: RigOptions, stack: ExitStack) -> World | None:

@@ -47,6 +47,7 @@ class Tare:
         baseline_kpa: absolute pressure unloaded.
         baseline_sigma_kpa: its standard uncertainty.
         noise_kpa: standard deviation of a single reading.
+        tadc_counts: mean temperature counts; NaN in tares of older versions, which kept none.
         t_ns: instant at which the interval ended, in UTC.
         begin_s: begin of the interval, in seconds from the first frame.
         end_s: its end.
@@ -57,6 +58,7 @@ class Tare:
     baseline_kpa: Floats
     baseline_sigma_kpa: Floats
     noise_kpa: Floats
+    tadc_counts: Floats
     t_ns: int
     begin_s: float
     end_s: float
@@ -64,11 +66,13 @@ class Tare:
     source: Source
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """For JSON, which has no NaN: `None`."""
+        content = {f.name: getattr(self, f.name) for f in fields(self)}
         return {
-            f.name: value.tolist() if isinstance(value, np.ndarray) else value
-            for f in fields(self)
-            for value in (getattr(self, f.name),)
+            name: [None if np.isnan(x) else x for x in value.tolist()]
+            if isinstance(value, np.ndarray)
+            else value
+            for name, value in content.items()
         }
 
     @classmethod
@@ -86,6 +90,10 @@ class Tare:
                 values[name] = np.array(content[name], dtype=np.float64)
                 if values[name].shape != (tiles,) or not np.isfinite(values[name]).all():
                     raise ValueError(f"{name} is not that of {tiles} tiles")  # noqa: TRY301
+            counts = content.get("tadc_counts") or [None] * tiles
+            values["tadc_counts"] = np.array(counts, dtype=np.float64)  # None becomes NaN
+            if values["tadc_counts"].shape != (tiles,):
+                raise ValueError(f"tadc_counts are not those of {tiles} tiles")  # noqa: TRY301
             return cls(**values)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise TareError(f"a recorded tare is not readable: {error}") from error
@@ -153,13 +161,15 @@ def tare_from_rows(
             )
     # A perfectly quiet reading is still rounded to a count.
     tadc = np.where(np.isfinite(kpa), frames.tadc[rows], np.nan)
-    floor_kpa = compensation.rounding_kpa(np.nanmean(tadc, axis=0))
+    tadc_counts = np.nanmean(tadc, axis=0)
+    floor_kpa = compensation.rounding_kpa(tadc_counts)
     noise_kpa = np.maximum(np.nanstd(kpa, axis=0, ddof=1), floor_kpa)
     t_s = (frames.t_ns[rows] - frames.t_ns[0]) * 1e-9
     return Tare(
         baseline_kpa=np.nanmean(kpa, axis=0),
         baseline_sigma_kpa=noise_kpa / np.sqrt(readable),
         noise_kpa=noise_kpa,
+        tadc_counts=tadc_counts,
         t_ns=int(frames.t_ns[rows][-1]),
         begin_s=float(t_s[0]),
         end_s=float(t_s[-1]),

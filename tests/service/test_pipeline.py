@@ -351,6 +351,7 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
         baseline_kpa=np.array(kept["baseline_kpa"]),
         baseline_sigma_kpa=np.array(kept["baseline_sigma_kpa"]),
         noise_kpa=np.array(kept["noise_kpa"]),
+        tadc_counts=np.array(kept["tadc_counts"]),
         t_ns=kept["t_ns"],
         begin_s=kept["begin_s"],
         end_s=kept["end_s"],
@@ -408,7 +409,7 @@ def test_estimate_columns_are_those_of_the_estimates_without_number_and_time() -
     plan = make_plan(
         array(),
         calibration(),
-        Tare(np.zeros(2), np.zeros(2), np.ones(2), 0, 0.0, 0.0, 0, "interval"),
+        Tare(np.zeros(2), np.zeros(2), np.ones(2), np.zeros(2), 0, 0.0, 0.0, 0, "interval"),
         models=("static",),
     )
     estimates, _ = step(plan, frames(np.zeros((3, 2))), EstimationState())
@@ -436,6 +437,7 @@ def taken_at(t_ns: int, counts: float) -> Tare:
         baseline_kpa=np.full(2, UNLOADED_KPA + counts * COUNT_KPA),
         baseline_sigma_kpa=np.full(2, 0.001),
         noise_kpa=np.full(2, COUNT_KPA),
+        tadc_counts=np.full(2, 480.0),
         t_ns=10**18 + t_ns,
         begin_s=0.0,
         end_s=0.25,

@@ -57,6 +57,7 @@ def tare(t_ns: int = 0, *, tiles: int = 2) -> Tare:
         baseline_kpa=100.0 + np.arange(tiles) / 3,
         baseline_sigma_kpa=np.full(tiles, 0.01),
         noise_kpa=np.full(tiles, 1 / 7),
+        tadc_counts=480.0 + np.arange(tiles) / 7,
         t_ns=t_ns,
         begin_s=0.1,
         end_s=0.35,
@@ -256,6 +257,8 @@ DAMAGES: dict[str, dict[str, Any]] = {
     "no baselines": {"tare": {"baseline_kpa": None}},
     "noise that is no number": {"tare": {"noise_kpa": [1.0, float("nan")]}},
     "one noise for all": {"tare": {"noise_kpa": 1.0}},
+    "a temperature too many": {"tare": {"tadc_counts": [1.0, 2.0, 3.0]}},
+    "words for temperatures": {"tare": {"tadc_counts": ["warm", "cold"]}},
     "another shape": {"tare": {"baseline_sigma_kpa": [[1.0, 1.0]]}},
     "words for an instant": {"tare": {"t_ns": "yesterday"}},
     "no instant": {"tare": {"t_ns": None}},
@@ -287,6 +290,19 @@ def test_an_entry_that_lacks_something_is_damaged(tmp_path: Path, missing: str) 
     del (content[0] if missing in content[0] else content[0]["tare"])[missing]
     path.write_text(json.dumps(content))
     assert_damaged(path)
+
+
+def test_tares_of_an_older_version_have_no_temperature_and_are_readable(tmp_path: Path) -> None:
+    history(tmp_path, 1)
+    path = tmp_path / "node" / "tares.json"
+    content = json.loads(path.read_bytes())
+    del content[0]["tare"]["tadc_counts"]
+    path.write_text(json.dumps(content))
+    (old,) = history(tmp_path).all
+    assert np.isnan(old.tare.tadc_counts).tolist() == [True, True]
+    history(tmp_path).add(tare(2), INFO)  # and can be written again, as JSON that has no NaN
+    json.loads(path.read_bytes(), parse_constant=pytest.fail)
+    assert np.isnan(history(tmp_path).all[0].tare.tadc_counts).all()
 
 
 @pytest.mark.parametrize("content", [b"null", b"7", b'"tares"', b"{}", b"[7]", b"[null]", b"\xff"])

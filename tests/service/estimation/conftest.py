@@ -117,6 +117,7 @@ def _plan(
         baseline_kpa=np.full(n, UNLOADED_KPA),
         baseline_sigma_kpa=np.zeros(n),
         noise_kpa=np.full(n, sigma_n * COUNT_KPA),
+        tadc_counts=np.full(n, 480.0),
         t_ns=UTC_NS,
         begin_s=0.0,
         end_s=1.0,

@@ -202,6 +202,7 @@ def plan_with(
             baseline_kpa=np.array([100.30127, 99.87654321, 101.7, 98.0 + 1 / 3]),
             baseline_sigma_kpa=np.array([0.0071, 0.0073, 0.007, 0.0069]),
             noise_kpa=np.array([0.165, 0.171, 0.163, 0.168]),
+            tadc_counts=np.array([480.3, 481.7, 479.0, 500 / 3]),
             t_ns=1_577_836_800_000_000_000,
             begin_s=0.0,
             end_s=1.0,

@@ -58,6 +58,7 @@ def present(counts: float = 0.0, *, tiles: int = 2, noise_counts: float = 1.0) -
         baseline_kpa=np.full(tiles, UNLOADED_KPA + counts * COUNT_KPA),
         baseline_sigma_kpa=np.full(tiles, 0.01),
         noise_kpa=np.full(tiles, noise_counts * COUNT_KPA),
+        tadc_counts=np.full(tiles, 480.0),
         t_ns=0,
         begin_s=0.0,
         end_s=1.0,

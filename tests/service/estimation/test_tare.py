@@ -93,6 +93,18 @@ def test_a_reading_that_never_moves_still_has_the_noise_of_rounding(
     assert tare.baseline_sigma_kpa == pytest.approx([COUNT_KPA / np.sqrt(1200)] * 2, rel=1e-12)
 
 
+def test_the_temperature_is_the_mean_of_the_readings_that_count(
+    frames_of: FramesOf, tare_of: TareOf
+) -> None:
+    # T01 warms by two counts halfway; T02 does so too, but was not readable before
+    tadc = np.full((100, 2), 480)
+    tadc[50:] = 478
+    forces_n = noise_counts(100, 2)
+    forces_n[:50, 1] = np.nan
+    tare = tare_of(frames_of(forces_n, tadc=tadc), (0.0, 1.0))
+    assert tare.tadc_counts == pytest.approx([479.0, 478.0], abs=1e-12)
+
+
 @pytest.mark.parametrize(
     "bit",
     [TileStatus.NO_ANSWER, TileStatus.STALE, TileStatus.IMPLAUSIBLE, TileStatus.NOT_CONVERTED],
