@@ -157,14 +157,14 @@ class StaticKernel:
             arm = self.plan.positions_m[:, axis, None]
             np.multiply(force, arm, out=u)
             np.add.reduce(u, axis=0, out=at)
-            at /= divisor
+            np.divide(at, divisor, out=at)
             np.subtract(arm, at, out=u)
             u *= sigma
             u *= u
             np.add.reduce(u, axis=0, out=at_sigma)
             np.sqrt(at_sigma, out=at_sigma)
             np.abs(divisor, out=nothing)
-            at_sigma /= nothing
+            np.divide(at_sigma, nothing, out=at_sigma)
         if self.plan.grid is not None:
             np.add.reduce(gauge, axis=0, out=nothing)
             for weights in self.plan.grid:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from devices.scene import load_scene
 from service.benchmark.draws import Task, run_draw
-from service.benchmark.rungs import rungs
 from service.benchmark.run import drawn
+from service.benchmark.rungs import rungs
 
 
 def test_draws_in_processes_of_their_own_give_the_same() -> None:

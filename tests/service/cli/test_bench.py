@@ -47,9 +47,7 @@ def test_bench_writes_json_tables_and_plot(run, scene, tmp_path):
 
 
 def test_goals_that_are_not_met_are_named_and_code_3_if_asked_for(run, scene):
-    outcome = run(
-        "bench", "--scene", scene, "--draws", 1, *QUICK, "--out", "o", "--check-goals"
-    )
+    outcome = run("bench", "--scene", scene, "--draws", 1, *QUICK, "--out", "o", "--check-goals")
     assert outcome.code == 3
     assert outcome.out.startswith("# Speed against error")
     # The paper's curve has another scale than the emulated domes.
