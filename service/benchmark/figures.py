@@ -17,6 +17,10 @@ MAGNITUDES = ("flight_mean_n", "grf_bias_n")
 """Figures with a sign: of them the magnitude is taken, or draws of both signs would cancel."""
 
 
+BUDGETED = ("grf_mae_n", "cop_p95_m")
+"""Figures that are compared with those of the whole ladder, draw by draw."""
+
+
 @dataclass(frozen=True)
 class Spread:
     """A figure over draws or repetitions: median, 5th and 95th percentile, and of how many."""
@@ -51,12 +55,15 @@ class Measured:
         figures: over draws, by the names of `Accuracy`; magnitudes of those that have a sign.
         coverage: pooled over all frames of all draws: GRF in all frames and in each of `PHASES`,
             and "cop_x".
+        beyond_whole: how much greater `BUDGETED` figures are than those of the whole ladder in the
+            same draw, over draws.
     """
 
     lag_ms: float
     ns_per_frame: Spread
     figures: Mapping[str, Spread]
     coverage: Mapping[str, Covered]
+    beyond_whole: Mapping[str, Spread]
 
 
 @dataclass(frozen=True)
@@ -113,6 +120,7 @@ def _as_dict(m: Measured) -> dict[str, Any]:
         "ns_per_frame": m.ns_per_frame.as_dict(),
         "figures": {name: spread.as_dict() for name, spread in m.figures.items()},
         "coverage": {name: covered.as_dict() for name, covered in m.coverage.items()},
+        "beyond_whole": {name: spread.as_dict() for name, spread in m.beyond_whole.items()},
     }
 
 
@@ -123,15 +131,25 @@ def measured_of(
 ) -> dict[tuple[str, str], Measured]:
     """Every rung in every mode, by mode and label."""
     measured = {}
+    whole = next(rung for rung in rungs if rung.is_default)
     for rung in rungs:
         for mode, lag_ms in LAGS_MS.items():
             key = mode, rung.label
             judged = [d.accuracy[key] for d in draws if key in d.accuracy]
+            both = [
+                (d.accuracy[key], d.accuracy[mode, whole.label])
+                for d in draws
+                if key in d.accuracy and (mode, whole.label) in d.accuracy
+            ]
             measured[key] = Measured(
                 lag_ms,
                 Spread.of(times_ns.get(key, ())),
                 figures_of(judged),
                 coverage_of(judged),
+                {
+                    name: Spread.of([getattr(a, name) - getattr(b, name) for a, b in both])
+                    for name in BUDGETED
+                },
             )
     return measured
 

@@ -17,6 +17,7 @@ from service.benchmark.draws import LAGS_MS
 from service.benchmark.figures import SceneFigures, Spread, pareto
 from service.benchmark.goals import GRF_MAE_N
 from service.benchmark.placing import Box, free_place
+from service.benchmark.report import draws_text
 from service.benchmark.rungs import Rung
 from service.plots import DPI, new_figure, png_of
 
@@ -59,7 +60,7 @@ def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
         right.tick_params(axis="y", length=0, labelleft=False)
         right.spines["left"].set_visible(False)
         left.set_title(
-            f"{figures.scene}: {figures.tiles} tiles, median of {figures.draws} draws",
+            f"{figures.scene}: {figures.tiles} tiles, median of {draws_text(figures.draws)}",
             loc="left",
             fontsize=12,
             pad=22,

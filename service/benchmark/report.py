@@ -62,8 +62,8 @@ def _scene(figures: SceneFigures) -> list[str]:
     lines = [
         f"## {figures.scene}",
         "",
-        f"{figures.tiles} tiles at {figures.rate_hz:.0f} frames/s, {figures.draws} draws of "
-        f"{figures.frames.median:.0f} frames. Its whole ladder: "
+        f"{figures.tiles} tiles at {figures.rate_hz:.0f} frames/s, {draws_text(figures.draws)} "
+        f"of {figures.frames.median:.0f} frames. Its whole ladder: "
         f"{', '.join(figures.default.models)}.",
     ]
     if figures.absent_models:
@@ -113,24 +113,26 @@ def _coverage(figures: SceneFigures) -> list[str]:
 
 
 def _budget(figures: SceneFigures) -> list[str]:
-    """What each model takes away: the error without it beside that of the whole ladder."""
+    """What each model takes away: how much greater the error is without it."""
     rows = []
     for rung in figures.rungs:
         if rung.lacks is None:
             continue
         row = [rung.lacks]
         for mode in LAGS_MS:
-            without = figures.measured[mode, rung.label]
-            whole = figures.measured[mode, figures.default.label]
-            for name, scale, digits in (("grf_mae_n", 1.0, 3), ("cop_p95_m", 1e3, 2)):
-                value = scale * without.figures[name].median
-                more = value - scale * whole.figures[name].median
-                row.append("-" if math.isnan(more) else f"{value:.{digits}f} ({more:+.{digits}f})")
+            more = figures.measured[mode, rung.label].beyond_whole
+            row += [
+                spread_text(more["grf_mae_n"], 1.0, 3, sign="+"),
+                spread_text(more["cop_p95_m"], 1e3, 2, sign="+"),
+            ]
         rows.append(row)
     if not rows:
         return ["No model of this ladder can be left out."]
     head = [f"{q}, {mode}" for mode in LAGS_MS for q in ("GRF mean abs N", "COP p95 mm")]
-    text = "Without each model, in brackets how much more than the whole ladder."
+    text = (
+        "How much greater the error is without each model than with the whole ladder; the median "
+        "of the differences draw by draw, and their range."
+    )
     return [text, "", *table(("without", *head), rows)]
 
 
@@ -160,12 +162,19 @@ def _cells(m: Measured, columns: Sequence[tuple[str, str, float, int]]) -> list[
     return [spread_text(m.figures[name], scale, digits) for _, name, scale, digits in columns]
 
 
-def spread_text(spread: Spread, scale: float, digits: int) -> str:
-    """Median and range in one cell."""
+def spread_text(spread: Spread, scale: float, digits: int, *, sign: str = "") -> str:
+    """Median and range in one cell; `sign` "+": with the sign also of what is positive."""
     if not spread.n:
         return "-"
-    low, median, high = (scale * v for v in (spread.low, spread.median, spread.high))
-    return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+    low, median, high = (
+        f"{scale * v:{sign}.{digits}f}" for v in (spread.low, spread.median, spread.high)
+    )
+    return f"{median} ({low} to {high})"
+
+
+def draws_text(n: int) -> str:
+    """So many draws."""
+    return "1 draw" if n == 1 else f"{n} draws"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -22,22 +22,19 @@ class Rung:
     Attributes:
         label: short name for tables and plots.
         models: the models, in the order of `MODELS`.
-        adds: what it has more than the rung before it; None for the first rung, and for one that
-            is only there as the whole ladder less a model.
+        is_built_up: it is the first rung, or one more than the rung before; else it is only there
+            as the whole ladder less a model.
+        adds: what it has more than the rung before it; None for the first and what is not built up.
         lacks: what the whole ladder has more, if that is one model that can be left out.
         is_default: it is the scene's whole ladder.
     """
 
     label: str
     models: tuple[str, ...]
+    is_built_up: bool
     adds: str | None
     lacks: str | None
     is_default: bool
-
-    @property
-    def is_built_up(self) -> bool:
-        """Whether it is the first rung, or one more than the rung before."""
-        return self.adds is not None or self.lacks is None
 
 
 def rungs(models_of_scene: Sequence[str], existing: Sequence[str] = MODELS) -> tuple[Rung, ...]:
@@ -62,10 +59,10 @@ def rungs(models_of_scene: Sequence[str], existing: Sequence[str] = MODELS) -> t
         label = "+".join(models) if added is None else f"+{added}"
         if models == whole:
             label = f"{label} (whole)" if added is None else f"whole ({label})"
-        built.append(Rung(label, models, added, less.get(models), models == whole))
+        built.append(Rung(label, models, True, added, less.get(models), models == whole))
     seen = {rung.models for rung in built}
     ablated = [
-        Rung(f"whole -{name}", models, None, name, is_default=False)
+        Rung(f"whole -{name}", models, False, None, name, False)
         for models, name in less.items()
         if models not in seen
     ]

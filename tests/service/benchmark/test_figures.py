@@ -71,6 +71,20 @@ def test_a_rung_that_failed_in_one_draw_has_the_figures_of_the_others() -> None:
     assert measured["live", ladder[1].label].figures["grf_mae_n"].n == 0
 
 
+def test_a_model_left_out_is_compared_draw_by_draw() -> None:
+    ladder = rungs(("unwrap", "static"), existing=("unwrap", "static"))
+    whole, less = (("live", rung.label) for rung in ladder)
+    draws = [
+        Drawn(0, 20, {whole: accuracy(0.1), less: accuracy(0.3)}, ()),
+        Drawn(1, 20, {whole: accuracy(0.5), less: accuracy(0.8)}, ()),
+        Drawn(2, 20, {less: accuracy(9.0)}, ()),
+    ]
+    measured = measured_of(ladder, draws, {})
+    more = measured[less].beyond_whole["grf_mae_n"]
+    assert (more.n, more.median) == (2, pytest.approx(0.25))
+    assert measured[whole].beyond_whole["cop_p95_m"].median == 0.0
+
+
 def test_figures_are_json() -> None:
     figures = {n: s.as_dict() for n, s in figures_of([accuracy(0.1)]).items()}
     assert json.loads(json.dumps(figures, allow_nan=False))["grf_mae_n"]["n"] == 1

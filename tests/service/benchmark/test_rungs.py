@@ -52,6 +52,13 @@ def test_the_rung_before_the_last_is_also_the_whole_without_the_last() -> None:
     assert (before.adds, before.lacks, before.is_built_up) == ("denoise", "gas", True)
 
 
+def test_the_first_rung_is_built_up_even_if_it_lacks_but_one_model() -> None:
+    first, whole, less = rungs(("unwrap", "static", "denoise"), existing=LADDER)
+    assert (first.models, first.is_built_up, first.lacks) == (("unwrap", "static"), True, "denoise")
+    assert (whole.is_default, whole.adds) == (True, "denoise")
+    assert (less.lacks, less.is_built_up) == ("unwrap", False)
+
+
 def test_models_that_there_are_not_are_left_out_and_named() -> None:
     existing = ("unwrap", "gas", "static")
     (default,) = (rung for rung in rungs(LADDER, existing=existing) if rung.is_default)

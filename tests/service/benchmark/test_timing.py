@@ -43,7 +43,7 @@ def test_every_rung_is_timed_in_both_modes_as_often_as_asked(recording: Recordin
 
 
 def test_a_rung_that_cannot_be_timed_is_named(recording: Recording) -> None:
-    broken = Rung("broken", ("nonsense",), None, None, is_default=True)
+    broken = Rung("broken", ("nonsense",), True, None, None, True)
     times, failures = time_rungs(recording, [broken], {"live": 10, "offline": 10}, 1)
     assert not times
     assert [f.what for f in failures] == ["time of broken, live", "time of broken, offline"]
