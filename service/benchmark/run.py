@@ -7,9 +7,10 @@ import os
 import platform
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -148,8 +149,9 @@ def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
         yield from map(run_draw, tasks)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_quietly) as pool:
-        futures = {pool.submit(run_draw, task): task for task in tasks}
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_when_told) as pool:
+        with _interrupts_ignored():
+            futures = {pool.submit(_run_draw, task): task for task in tasks}
         try:
             for future in as_completed(futures):
                 try:
@@ -157,14 +159,35 @@ def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
                 except Exception as error:  # a process that was killed takes its draw with it
                     draw = futures[future].draw
                     yield Drawn(draw, 0, {}, (Failure(f"draw {draw}", reason(error)),))
-        finally:
+        except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
 
 
-def _end_quietly() -> None:
-    # Ctrl-C reaches every process: each cleans up, and only the first says something.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: sys.exit(1))
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Processes that are started meanwhile know no Ctrl-C: we tell them when to end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _end_when_told() -> None:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+
+
+def _run_draw(task: Task) -> Drawn:
+    try:
+        return run_draw(task)
+    except SystemExit:
+        os._exit(1)  # what it had open is cleaned up; the pool would give it another draw
 
 
 def machine() -> str:
