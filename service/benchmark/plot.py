@@ -137,7 +137,7 @@ def _scales(axes: Axes, figures: SceneFigures, times_ns: Sequence[float]) -> Non
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(time_text)
     axes.tick_params(labelsize=9)
-    axes.set_xlabel("time per frame")
+    axes.set_xlabel("CPU time per frame")
     axes.grid(visible=True, color="#E6E6E6")
     axes.set_axisbelow(True)
     for side in ("top", "right"):

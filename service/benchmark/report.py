@@ -45,7 +45,7 @@ def markdown(bench: Bench) -> str:
         "",
         f"Each error is the median over draws of tiles, calibration and noise ({o.draws} of each "
         "scene), in brackets its 5 to 95 % range over them; signs are dropped. Coverage is pooled "
-        f"over the frames of all draws. Times are medians of {o.repetitions} repetitions with "
+        f"over the frames of all draws. Times are CPU time, medians of {o.repetitions} repetitions with "
         f"their 5 to 95 % range: live {o.live_frames} frames in batches of {BATCH['live']}, "
         f"offline {o.offline_frames} frames in chunks of {BATCH['offline']}; the estimate alone, "
         "nothing read or written. The look-ahead of live estimates is "

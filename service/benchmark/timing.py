@@ -1,7 +1,9 @@
 """What an estimate costs per frame: `step` and `finish` alone, without reading or writing.
 
-Rungs and modes take turns, several times, so that a machine that is busy for a moment is busy for
-all of them. A first turn is not counted: models may be compiled in it.
+It is the CPU time of the thread that estimates: on an idle machine that is the time it takes, and on
+a busy one it does not grow by what others take. Rungs and modes take turns, several times, so that
+what is left of a busy moment is there for all of them. A first turn is not counted: models may be
+compiled in it.
 """
 
 from __future__ import annotations
@@ -96,14 +98,14 @@ def plan_of(recording: Recording, models: tuple[str, ...], lag_ms: float) -> Est
 
 
 def ns_per_frame(plan: EstimationPlan, stream: Endless, frames: int, batch: int) -> float:
-    """Time of estimating the first `frames` frames of a stream, `batch` of them a step."""
+    """CPU time of estimating the first `frames` frames of a stream, `batch` of them a step."""
     state = EstimationState()
     spent_ns = 0
     for begin in range(0, frames, batch):
         rows = stream.rows(begin, min(begin + batch, frames))
-        began_ns = time.perf_counter_ns()
+        began_ns = time.thread_time_ns()
         _, state = step(plan, rows, state)
-        spent_ns += time.perf_counter_ns() - began_ns
-    began_ns = time.perf_counter_ns()
+        spent_ns += time.thread_time_ns() - began_ns
+    began_ns = time.thread_time_ns()
     finish(plan, state)
-    return (spent_ns + time.perf_counter_ns() - began_ns) / frames
+    return (spent_ns + time.thread_time_ns() - began_ns) / frames
