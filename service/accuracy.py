@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,34 @@ GRF_FROM_N = 0.5
 COP_FROM_N = 3.0
 STANCE_MIN_NS = 50_000_000
 INTERVAL_95 = 1.96
+STEEP = 2.0
+"""Of a foot that bears load, loading and unloading are where the true force changes by more than so
+many peaks of that load per its duration: of half a sine the outer 28 % each."""
+PHASES = ("flight", "loading", "mid_stance", "unloading")
+
+
+@dataclass(frozen=True)
+class Covered:
+    """Frames of one phase, and in how many of them the truth lies within 1.96 sigma.
+
+    Counts, so that recordings can be pooled by adding them.
+    """
+
+    frames: int
+    within: int
+
+    @property
+    def share(self) -> float:
+        """The part within; NaN if there are no frames."""
+        return self.within / self.frames if self.frames else math.nan
+
+    def __add__(self, other: Covered) -> Covered:
+        return Covered(self.frames + other.frames, self.within + other.within)
+
+    def as_dict(self) -> dict[str, float | int | None]:
+        """For JSON."""
+        share = self.share if self.frames else None
+        return {"frames": self.frames, "within": self.within, "coverage_95": share}
 
 
 @dataclass(frozen=True)
@@ -43,7 +71,8 @@ class Accuracy:
     """Errors of one recording. NaN where there is nothing to judge.
 
     GRF: frames with more than 0.5 N of truth and no saturated or missing tile. COP: frames with
-    more than 3 N of truth in which it is stated. Flight: frames without any load.
+    more than 3 N of truth in which it is stated. Flight: frames without any load. `grf_phases`: all
+    frames without a saturated or missing tile, by what the true force does.
     """
 
     frames: int
@@ -54,7 +83,15 @@ class Accuracy:
     grf_coverage_95: float
     """Part of the GRF frames whose truth lies within 1.96 sigma."""
     grf_sigma_median_n: float
+    grf_sigma_mid_stance_n: float
+    """Median of sigma in mid-stance."""
+    grf_published_mae_n: float
+    """Mean absolute error against the truth of the instant at which an estimate is published, `lag`
+    after the one it is about; over the GRF frames whose instant of publication is recorded."""
+    grf_phases: Mapping[str, Covered]
+    """Coverage separately in each of `PHASES`."""
     flight_mean_n: float
+    flight_mae_n: float
     peak_error_n: float
     """Mean over stances of |estimated peak - true peak|."""
     impulse_error_ns: float
@@ -65,24 +102,37 @@ class Accuracy:
     cop_p95_m: float
     cop_coverage_95: float
     """Part of the COP frames whose true x lies within 1.96 sigma."""
+    cop_covered: Covered
+    """The same as counts."""
     cop_masked_frames: int
     """Frames with more than 3 N of truth in which no COP is stated."""
+    cop_masked_share: float
+    """The same as a part of all frames with more than 3 N of truth."""
     saturated_frames: int
 
-    def as_dict(self) -> dict[str, float | int | None]:
+    def as_dict(self) -> dict[str, Any]:
         """For JSON: what is not finite is null."""
-        return {n: value if math.isfinite(value) else None for n, value in asdict(self).items()}
+        numbers = {
+            f.name: value if math.isfinite(value) else None
+            for f in fields(self)
+            for value in (getattr(self, f.name),)
+            if isinstance(value, float | int)
+        }
+        phases = {name: covered.as_dict() for name, covered in self.grf_phases.items()}
+        return {**numbers, "grf_phases": phases, "cop_covered": self.cop_covered.as_dict()}
 
 
-def judge(c: Mapping[str, npt.NDArray[Any]]) -> Accuracy:
+def judge(c: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0) -> Accuracy:
     """Compare estimates with truth.
 
     Args:
-        c: the columns `JUDGED`, one value per frame.
+        c: the columns `JUDGED`, one value per frame, at least one.
+        lag_ms: look-ahead of the estimates: how long after its frame one is published.
     """
     true_n, error_n = c["true_grf_n"], c["grf_n"] - c["true_grf_n"]
     saturated = (c["estimate_status"] & EstimateStatus.SATURATED) != 0
-    judged = (true_n > GRF_FROM_N) & ~saturated & np.isfinite(error_n)
+    usable = ~saturated & np.isfinite(error_n)
+    judged = (true_n > GRF_FROM_N) & usable
     heavy = true_n > COP_FROM_N
     stated = heavy & np.isfinite(c["cop_x_m"])
     off_m = np.hypot(
@@ -96,6 +146,10 @@ def judge(c: Mapping[str, npt.NDArray[Any]]) -> Accuracy:
     )
     peaks_n, impulses_ns = _stances(c["t_ns"], true_n, c["grf_n"])
     flight = error_n[(true_n == 0.0) & np.isfinite(error_n)]
+    phases = phases_of(c["t_ns"], true_n)
+    covered = np.abs(error_n) <= INTERVAL_95 * c["grf_sigma_n"]
+    steady = usable & (phases == PHASES.index("mid_stance"))
+    cop_masked = int((heavy & ~stated).sum())
     return Accuracy(
         frames=len(true_n),
         grf_frames=int(judged.sum()),
@@ -103,8 +157,16 @@ def judge(c: Mapping[str, npt.NDArray[Any]]) -> Accuracy:
         grf_rms_n=float(np.sqrt(_mean(error_n[judged] ** 2))),
         grf_bias_n=_mean(error_n[judged]),
         grf_coverage_95=_mean(within),
-        grf_sigma_median_n=float(np.median(c["grf_sigma_n"][judged])) if judged.any() else np.nan,
+        grf_sigma_median_n=_median(c["grf_sigma_n"][judged]),
+        grf_sigma_mid_stance_n=_median(c["grf_sigma_n"][steady]),
+        grf_published_mae_n=_mean(_published_error_n(c, round(lag_ms * 1e6), judged)),
+        grf_phases={
+            name: Covered(int(rows.sum()), int((rows & covered).sum()))
+            for i, name in enumerate(PHASES)
+            for rows in (usable & (phases == i),)
+        },
         flight_mean_n=_mean(flight),
+        flight_mae_n=_mean(np.abs(flight)),
         peak_error_n=_mean(np.abs(peaks_n)),
         impulse_error_ns=_mean(np.abs(impulses_ns)),
         stances=len(peaks_n),
@@ -112,9 +174,51 @@ def judge(c: Mapping[str, npt.NDArray[Any]]) -> Accuracy:
         cop_mean_m=_mean(off_m),
         cop_p95_m=float(np.percentile(off_m, 95)) if len(off_m) else np.nan,
         cop_coverage_95=_mean(within_x),
-        cop_masked_frames=int((heavy & ~stated).sum()),
+        cop_covered=Covered(len(within_x), int(within_x.sum())),
+        cop_masked_frames=cop_masked,
+        cop_masked_share=cop_masked / int(heavy.sum()) if heavy.any() else math.nan,
         saturated_frames=int(saturated.sum()),
     )
+
+
+def phases_of(t_ns: npt.NDArray[np.int64], true_n: Floats) -> npt.NDArray[np.intp]:
+    """Index into `PHASES` of every frame, by the truth alone.
+
+    Flight is where the true force is exactly zero. Each stretch between two flights is judged by
+    itself, whatever its load and length; see `STEEP`.
+    """
+    phases = np.full(len(true_n), PHASES.index("flight"))
+    t_s = (t_ns - t_ns[0]) * 1e-9
+    bears = np.concatenate([[False], true_n != 0.0, [False]])
+    begins = np.flatnonzero(~bears[:-1] & bears[1:])
+    ends = np.flatnonzero(bears[:-1] & ~bears[1:])
+    for begin, end in zip(begins, ends, strict=True):
+        # With a frame of flight on each side, so that a touch has a slope, too.
+        first, last = max(int(begin) - 1, 0), min(int(end) + 1, len(true_n))
+        inner = slice(begin - first, end - first)
+        duration_s = t_s[last - 1] - t_s[first]
+        if duration_s == 0.0:
+            phases[begin:end] = PHASES.index("mid_stance")
+            continue
+        rate = np.gradient(true_n[first:last], t_s[first:last])[inner]
+        steep = STEEP * np.abs(true_n[begin:end]).max() / duration_s
+        phases[begin:end] = np.select(
+            [rate > steep, rate < -steep],
+            [PHASES.index("loading"), PHASES.index("unloading")],
+            PHASES.index("mid_stance"),
+        )
+    return phases
+
+
+def _published_error_n(
+    c: Mapping[str, npt.NDArray[Any]], lag_ns: int, rows: npt.NDArray[np.bool_]
+) -> Floats:
+    # Counted from the first frame: float64 does not hold nanoseconds since 1970.
+    since_ns = (c["t_ns"] - c["t_ns"][0]).astype(np.float64)
+    published_ns = since_ns[rows] + lag_ns
+    seen = published_ns <= since_ns[-1]
+    then_n = np.interp(published_ns[seen], since_ns, c["true_grf_n"])
+    return np.asarray(np.abs(c["grf_n"][rows][seen] - then_n))
 
 
 def _stances(t_ns: Floats, true_n: Floats, grf_n: Floats) -> tuple[Floats, Floats]:
@@ -134,4 +238,8 @@ def _stances(t_ns: Floats, true_n: Floats, grf_n: Floats) -> tuple[Floats, Float
 
 
 def _mean(values: npt.NDArray[Any]) -> float:
-    return float(np.mean(values)) if len(values) else float("nan")
+    return float(np.mean(values)) if len(values) else math.nan
+
+
+def _median(values: Floats) -> float:
+    return float(np.median(values)) if len(values) else math.nan

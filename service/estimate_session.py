@@ -12,13 +12,13 @@ import numpy.typing as npt
 from devices.errors import CalibrationError, FileFormatError, TareError, UsageError
 from devices.frames import ArrayInfo
 from devices.scene import Scene, load_scene
-from service.accuracy import JUDGED, Accuracy, judge
+from service.accuracy import JUDGED, Accuracy
 from service.calibrations import BENCH, find_calibration
 from service.estimation.calibration import Calibration
 from service.estimation.plan import EstimationPlan
 from service.estimation.tare import Tare
 from service.pipeline import EstimateOptions, EstimateStream, notes_of
-from service.simulate import joined
+from service.simulate import judged_of
 from storage.schema import MILL, PARTS, TRUTH
 from storage.session_file import SessionReader, SessionWriter
 
@@ -74,7 +74,7 @@ def estimate_session(
                     judged.append({name: columns[name] for name in JUDGED})
     if stream.plan is None:
         raise FileFormatError("the session has no frames", where=str(source))
-    return Estimated(frames, stream.plan, judge(joined(judged)) if judged else None)
+    return Estimated(frames, stream.plan, judged_of(judged, stream))
 
 
 def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,11 +16,15 @@ from service.estimation.indentation import Indentation, strokes
 from service.estimation.models.static import StaticCurves
 from storage.session_file import SessionReader
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 INTERVAL_95 = 1.96
+DPI = 120
 
 
-def plot_calibration(calibration: Calibration, recordings: Sequence[Path]) -> bytes:
-    """Curve with 95 % band, measured strokes and residuals of every tile, as a PNG.
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure of that size in inches.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -31,14 +36,30 @@ def plot_calibration(calibration: Calibration, recordings: Sequence[Path]) -> by
         raise UsageError(
             "plots need matplotlib", remedy="Install the extra: pip install '.[plot]'"
         ) from error
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
 
+
+def png_of(figure: Figure) -> bytes:
+    """A figure as a PNG."""
+    png = BytesIO()
+    figure.savefig(png, dpi=DPI, format="png")
+    return png.getvalue()
+
+
+def plot_calibration(calibration: Calibration, recordings: Sequence[Path]) -> bytes:
+    """Curve with 95 % band, measured strokes and residuals of every tile, as a PNG.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+    """
     indentations: dict[str, Indentation] = {}
     for path in recordings:
         with SessionReader(path) as session:
             indentations |= {tile.serial: tile for tile in read_indentations(session)}
     tiles = calibration.tiles
-    figure = Figure(figsize=(1.0 + 3.4 * len(tiles), 5.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(1.0 + 3.4 * len(tiles), 5.6)
     axes = figure.subplots(
         2,
         len(tiles),
@@ -91,6 +112,4 @@ def plot_calibration(calibration: Calibration, recordings: Sequence[Path]) -> by
         "dashed: end of range",
         fontsize=9,
     )
-    png = BytesIO()
-    figure.savefig(png, dpi=120, format="png")
-    return png.getvalue()
+    return png_of(figure)

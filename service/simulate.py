@@ -53,6 +53,8 @@ class SimulateOptions:
 
     scene: Scene
     seconds: float | None = None
+    otherwise_s: float | None = None
+    """Length of a scene that has no end of its own, if `seconds` does not say one either."""
     schedule: AnySchedule | None = None
     seed: int = 0
     parts_seed: int = 0
@@ -216,7 +218,7 @@ def simulate(
             if any(i == tile for i, _ in flagged)
         },
         pressed=simulation.pressed,
-        accuracy=judge(joined(judged)) if judged else None,
+        accuracy=judged_of(judged, stream),
         wall_s=time.perf_counter() - began_s,
     )
 
@@ -233,13 +235,23 @@ def _flags(batch: FrameBatch) -> dict[tuple[int, str], int]:
     return counts
 
 
+def judged_of(
+    pieces: list[Mapping[str, npt.NDArray[Any]]], stream: EstimateStream | None
+) -> Accuracy | None:
+    """How far off the estimates of a stream were; None if there is no truth to compare with."""
+    if not pieces or stream is None or stream.plan is None:
+        return None
+    return judge(joined(pieces), lag_ms=stream.plan.lag_ns * 1e-6)
+
+
 def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArray[Any]]:
     """Columns of all pieces, one after another."""
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
 def _duration_ns(options: SimulateOptions, ground_s: float | None) -> int:
-    seconds = options.seconds if options.seconds is not None else ground_s
+    lengths_s = (options.seconds, ground_s, options.otherwise_s)
+    seconds = next((s for s in lengths_s if s is not None), None)
     if seconds is None:
         raise UsageError(
             f"scene {options.scene.name!r} has no end of its own", remedy="Add --seconds S"

@@ -30,6 +30,25 @@ SeedOption = Annotated[int, typer.Option(min=0, help="Draws noise and ground, no
 PartsSeedOption = Annotated[int, typer.Option(min=0, help="Draws other parts.")]
 
 
+def check_emulated(scene: Scene) -> None:
+    """Refuse a scene of real hardware in a command that only emulates.
+
+    Raises:
+        UsageError: its bus or its servo is real.
+    """
+    if scene.array.bus != EMULATED:
+        raise UsageError(
+            f"scene {scene.name!r} is for {scene.array.bus}, and this command only emulates",
+            remedy='Set array.bus = "emulated"',
+        )
+    if scene.servo is not None and scene.servo.port != EMULATED:
+        raise UsageError(
+            f"the servo of scene {scene.name!r} is at {scene.servo.port}, and this command only "
+            "emulates",
+            remedy='Set servo.port = "emulated"',
+        )
+
+
 def check_load(load_scale: float, cop_scale: float, lead_s: float) -> None:
     """Refuse numbers that cannot be meant.
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from devices.errors import FootTileError
+from service.cli.bench import bench_command
 from service.cli.calibrate import calibrate_command
 from service.cli.demo import demo_command
 from service.cli.doctor import doctor_command
@@ -39,6 +40,7 @@ app.command("simulate")(simulate_command)
 app.command("estimate")(estimate_command)
 app.command("calibrate")(calibrate_command)
 app.command("doctor")(doctor_command)
+app.command("bench")(bench_command)
 
 
 def _print_version(wanted: bool) -> None:

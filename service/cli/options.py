@@ -6,7 +6,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -69,9 +69,14 @@ def output_path(path: Path, *inputs: Path) -> Path:
     return target
 
 
+def json_text(value: object) -> str:
+    """A JSON document; NaN has no place in it."""
+    return json.dumps(value, indent=2, allow_nan=False) + "\n"
+
+
 def print_json(value: object) -> None:
-    """One JSON document on stdout; NaN has no place in it."""
-    sys.stdout.write(json.dumps(value, indent=2, allow_nan=False) + "\n")
+    """One JSON document on stdout."""
+    sys.stdout.write(json_text(value))
 
 
 @contextmanager
@@ -82,6 +87,16 @@ def progress(message: str) -> Iterator[None]:
         return
     with stderr.status(message):
         yield
+
+
+@contextmanager
+def telling(message: str) -> Iterator[Callable[[str], None]]:
+    """A function that says how far it is: in one line on a terminal, else a line each on stderr."""
+    if not stderr.is_terminal:
+        yield remark
+        return
+    with stderr.status(message) as status:
+        yield status.update
 
 
 def say(message: str) -> None:

@@ -10,6 +10,12 @@ from rich.table import Table
 from service.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
 from service.estimation.calibration import Calibration
 
+PHASES = {
+    "flight": "in flight",
+    "loading": "while loading",
+    "mid_stance": "in mid-stance",
+    "unloading": "while unloading",
+}
 EMULATED = "Errors of an emulated foot; the paper's 1 N and 4 mm are a real one's."
 
 
@@ -27,8 +33,15 @@ def accuracy_table(a: Accuracy) -> Table:
         ("GRF RMS", a.grf_rms_n, "N", grf),
         ("GRF bias", a.grf_bias_n, "N", grf),
         ("GRF within 1.96 sigma", 100 * a.grf_coverage_95, "%", grf),
+        *(
+            (f"  {PHASES[phase]}", 100 * c.share, "%", f"{c.frames} frames, unsaturated")
+            for phase, c in a.grf_phases.items()
+        ),
         ("GRF sigma, median", a.grf_sigma_median_n, "N", grf),
+        ("  in mid-stance", a.grf_sigma_mid_stance_n, "N", "frames in mid-stance"),
+        ("GRF when published", a.grf_published_mae_n, "N", "the truth one look-ahead later"),
         ("GRF in flight, mean", a.flight_mean_n, "N", "frames without load"),
+        ("GRF in flight, mean absolute", a.flight_mae_n, "N", "frames without load"),
         ("GRF peak", a.peak_error_n, "N", stances),
         ("GRF impulse", a.impulse_error_ns, "N s", stances),
         ("COP mean", 1e3 * a.cop_mean_m, "mm", cop),
@@ -36,7 +49,11 @@ def accuracy_table(a: Accuracy) -> Table:
         ("COP x within 1.96 sigma", 100 * a.cop_coverage_95, "%", cop),
     ):
         table.add_row(name, "-" if math.isnan(value) else f"{value:.3f} {unit}", over)
-    table.add_row("COP not stated", str(a.cop_masked_frames), f"frames above {COP_FROM_N} N")
+    heavy = a.cop_frames + a.cop_masked_frames
+    share = "" if math.isnan(a.cop_masked_share) else f" ({100 * a.cop_masked_share:.1f} %)"
+    table.add_row(
+        "COP not stated", f"{a.cop_masked_frames}{share}", f"{heavy} frames above {COP_FROM_N} N"
+    )
     table.add_row("saturated", str(a.saturated_frames), f"{a.frames} frames")
     return table
 

@@ -18,6 +18,7 @@ from service.cli.emulation import (
     LoadScaleOption,
     PartsSeedOption,
     SeedOption,
+    check_emulated,
     check_load,
 )
 from service.cli.options import (
@@ -182,17 +183,7 @@ def _schedule(name: str | None) -> AnySchedule | None:
 def _check(
     scene: Scene, seconds: float | None, lead_s: float, load_scale: float, cop_scale: float
 ) -> None:
-    if scene.array.bus != "emulated":
-        raise UsageError(
-            f"scene {scene.name!r} is for {scene.array.bus}, and simulate only emulates",
-            remedy='Set array.bus = "emulated"',
-        )
-    if scene.servo is not None and scene.servo.port != "emulated":
-        raise UsageError(
-            f"the servo of scene {scene.name!r} is at {scene.servo.port}, and simulate only "
-            "emulates",
-            remedy='Set servo.port = "emulated"',
-        )
+    check_emulated(scene)
     if seconds is not None and not 0.0 < seconds < 1e9:
         raise UsageError(f"--seconds {seconds:g}", expected="a sensible positive number")
     check_load(load_scale, cop_scale, lead_s)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.accuracy import JUDGED, Accuracy, judge
+from service.accuracy import JUDGED, PHASES, Accuracy, Covered, judge, phases_of
 from service.estimation.estimates import EstimateStatus
 
 PERIOD_NS = 10_000_000
@@ -121,6 +121,68 @@ def test_masked_centres_are_counted_under_load_only() -> None:
     assert (a.cop_frames, a.cop_masked_frames) == (1, 1)
 
 
+def named_phases(true_n: list[float]) -> list[str]:
+    t_ns = PERIOD_NS * np.arange(len(true_n), dtype=np.int64)
+    return [PHASES[i] for i in phases_of(t_ns, np.array(true_n))]
+
+
+def test_phases_are_told_by_the_truth_and_each_stance_by_its_own_peak_and_duration() -> None:
+    up, mid, down = ["loading"] * 2, ["mid_stance"] * 6, ["unloading"] * 2
+    stance = [5.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 5.0]
+    flight = ["flight"] * 2
+    expected = [*flight, *up, *mid, *down, *flight]
+    assert named_phases([0.0, 0.0, *stance, 0.0, 0.0]) == expected
+    # A hundredth of the load, as steep for its size, beside the great one
+    small = [0.01 * force for force in stance]
+    both = named_phases([0.0, 0.0, *stance, 0.0, 0.0, *small, 0.0, 0.0])
+    assert both == [*expected, *up, *mid, *down, *flight]
+
+
+def test_suction_is_no_flight_and_a_recording_may_be_one_stance_or_one_frame() -> None:
+    assert named_phases([0.0, -0.1, -0.1, 0.0]).count("flight") == 2
+    assert named_phases([10.0] * 5) == ["mid_stance"] * 5
+    assert named_phases([10.0]) == ["mid_stance"]
+    assert named_phases([0.0]) == ["flight"]
+
+
+def test_coverage_is_counted_in_each_phase_over_all_unsaturated_frames() -> None:
+    true_n = [0.0, 0.0, 5.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 5.0, 0.0]
+    grf_n = np.array(true_n)
+    grf_n[[1, 2, 5]] += [0.3, -0.3, 0.3]  # 1.96 sigma is 0.196 N
+    status = np.zeros(12, dtype=np.uint16)
+    status[6] = EstimateStatus.SATURATED
+    grf_n[7] = np.nan
+    a = judge(columns(true_n, grf_n=grf_n, estimate_status=status))
+    assert a.grf_phases == {
+        "flight": Covered(3, 2),
+        "loading": Covered(2, 1),
+        "mid_stance": Covered(3, 2),
+        "unloading": Covered(2, 2),
+    }
+    assert sum((c for c in a.grf_phases.values()), Covered(0, 0)) == Covered(10, 7)
+
+
+def test_the_share_of_unstated_centres_and_their_coverage_as_counts() -> None:
+    a = judge(columns([10.0] * 4, cop_x_m=[np.nan, 0.0, 0.001, 0.01]))
+    assert a.cop_masked_share == pytest.approx(0.25)
+    assert a.cop_covered == Covered(3, 2)
+
+
+def test_sigma_in_mid_stance_leaves_loading_out() -> None:
+    sigma_n = [9.0, 9.0, 9.0, 0.1, 0.2, 0.3, 0.2, 0.2, 9.0, 9.0]
+    true_n = [0.0, 5.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 0.0]
+    assert judge(columns(true_n, grf_sigma_n=sigma_n)).grf_sigma_mid_stance_n == pytest.approx(0.2)
+
+
+def test_a_published_estimate_is_compared_with_the_truth_one_look_ahead_later() -> None:
+    true_n = [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert judge(columns(true_n)).grf_published_mae_n == 0.0
+    # 15 ms are a frame and a half; the last two frames are published after the end
+    late = judge(columns(true_n), lag_ms=15.0)
+    assert late.grf_published_mae_n == pytest.approx(1.5)
+    assert late.grf_mae_n == 0.0
+
+
 def test_where_there_is_nothing_to_judge_figures_are_nan_and_null_in_json() -> None:
     a = judge(columns([0.4, 0.4], cop_x_m=[np.nan, np.nan]))
     assert (a.grf_frames, a.cop_frames, a.stances) == (0, 0, 0)
@@ -132,13 +194,17 @@ def test_where_there_is_nothing_to_judge_figures_are_nan_and_null_in_json() -> N
         "grf_bias_n",
         "grf_coverage_95",
         "grf_sigma_median_n",
+        "grf_published_mae_n",
         "flight_mean_n",
+        "flight_mae_n",
         "peak_error_n",
         "impulse_error_ns",
         "cop_mean_m",
         "cop_p95_m",
         "cop_coverage_95",
+        "cop_masked_share",
     }
+    assert figures["grf_phases"]["loading"] == {"frames": 0, "within": 0, "coverage_95": None}
     assert json.loads(json.dumps(figures, allow_nan=False))["frames"] == 2
 
 
