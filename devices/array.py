@@ -134,14 +134,19 @@ class TileArray:
         )
 
     def begin(self) -> None:
-        """A stream begins, or goes on after something else used the bus.
-
-        Its first frame reads all temperatures, and nothing is taken to be as it was left.
-        """
+        """A stream begins: its first frame reads all temperatures, and nothing has gone wrong."""
         self._frames = 0
         self._ports.router.forget()
         for health in self.health:
             health.counts.clear()
+
+    def resume(self) -> None:
+        """The stream goes on after something else used the bus.
+
+        Nothing is taken to be as it was left, and what was converting is too old to be read.
+        """
+        self._ports.router.forget()
+        self._running = [False] * len(self.tiles)
 
     def troubles(self) -> dict[str, str]:
         """What is wrong now, in words: by serial, and under "" what is wrong with the bus."""

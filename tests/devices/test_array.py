@@ -769,3 +769,37 @@ def test_a_single_tile_that_comes_and_goes_is_found_again(schedule: ScheduleName
     for _ in range(SETTLED + 100):
         scan = array.scan()
     assert scan.status == [0]
+
+
+# A stream begins, and goes on
+
+
+@every_schedule
+def test_after_something_else_used_the_bus_nothing_is_read_that_was_started_before(
+    schedule: ScheduleName,
+) -> None:
+    wires = Wires(TWO_MUXES)
+    array = settled(wires, schedule)
+    wires.bus.transfer(i2c_msg.write(0x73, [0xFF]))
+    wires.clock.sleep_until_ns(wires.clock.now_ns() + 1_000_000_000)
+    resumed_ns = wires.clock.now_ns()
+    array.resume()
+    scan = array.scan()
+    for i in range(4):
+        read = scan.padc[i] != NOT_READ
+        assert scan.status[i] == (0 if read else TileStatus.NOT_CONVERTED)
+        assert scan.convert_stop_ns[i] > resumed_ns or not read
+    assert array.scan().status == [0] * 4
+
+
+def test_what_went_wrong_is_counted_from_the_begin_of_a_stream_and_on_when_it_goes_on() -> None:
+    wires = Wires(FOUR)
+    array = settled(wires)
+    with wires.fault("no_answer", "T03"):
+        array.scan()
+    counted = dict(array.health[2].counts)
+    assert counted["no_answer"] == 1
+    array.resume()
+    assert dict(array.health[2].counts) == counted
+    array.begin()
+    assert not array.health[2].counts
