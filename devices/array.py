@@ -150,7 +150,10 @@ class TileArray:
 
     def troubles(self) -> dict[str, str]:
         """What is wrong now, in words: by serial, and under "" what is wrong with the bus."""
-        found = {"": "the bus is stuck or cut"} if self.bus.is_down else {}
+        found: dict[str, str] = {}
+        if self.bus.is_down:
+            unhelped = f" and could not be helped: {self.bus.problem}" if self.bus.problem else ""
+            found[""] = f"the bus is stuck or cut{unhelped}"
         for tile, health in zip(self.tiles, self.health, strict=True):
             where = f"tile {tile.serial} (mux 0x{tile.mux:02x} channel {tile.channel})"
             if health.replaced:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from devices.array import TileArray
 from devices.budget import BusTiming, Choice, choose, frame_s
 from devices.bus_recovery import BusRecovery
-from devices.bus_watch import help_bus
+from devices.bus_watch import Help, help_bus
 from devices.clock import Clock
 from devices.errors import BusFaultError, SceneError
 from devices.frames import TileInfo
@@ -73,24 +73,34 @@ def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
     """Make sure that the wires move at all: a slave may hang in a byte since the last run.
 
     Raises:
-        BusFaultError: SDA is stuck low, and nobody or nothing could free it.
+        BusFaultError: SDA or SCL is stuck low, and nobody or nothing could free it.
     """
     router = MuxRouter(bus, [tile.mux for tile in scene.tile])
-    for helped in (False, True):
+    fault: BusFaultError | None = None
+
+    def moves() -> bool:
+        nonlocal fault
         try:
+            # If nobody answers it moves: whose fault that is, identification says.
             if router.echoes() or router.refused is not None:
-                return  # it moves, or nobody answers: whose fault that is, identification says
-        except BusFaultError:
-            if helped or recovery is None:
-                raise
-        if helped or recovery is None or not help_bus(recovery):
-            break
-    raise BusFaultError(
-        "the multiplexers acknowledge, and none keeps what is written to it",
-        where=bus.name,
-        remedy="SDA is stuck low: pull the tiles' plugs one by one, cycle their supply, or wire "
-        "[recovery]",
-    )
+                return True
+            fault = BusFaultError(
+                "the multiplexers acknowledge, and none keeps what is written to it",
+                where=bus.name,
+                remedy="SDA is stuck low: pull the tiles' plugs one by one, cycle their supply, or "
+                "wire [recovery]",
+            )
+        except BusFaultError as error:
+            fault = error
+        return False
+
+    given = Help(worked=moves())
+    if not given.worked and recovery is not None:
+        given = help_bus(recovery, moves)
+    if not given.worked and fault is not None:
+        if given.problem:
+            fault.remedy += f". It could not be freed: {given.problem}"
+        raise fault
 
 
 def renew(

@@ -771,6 +771,33 @@ def test_a_single_tile_that_comes_and_goes_is_found_again(schedule: ScheduleName
     assert scan.status == [0]
 
 
+# What is wrong, in words
+
+
+class NoLines:
+    """A recovery whose lines are somebody else's."""
+
+    def clock_out(self) -> bool:
+        raise BusSetupError("GPIO lines cannot be used (EBUSY)", where="/dev/gpiochip0, lines 2, 3")
+
+    def reset_muxes(self) -> bool:
+        return False
+
+
+def test_a_stuck_bus_is_said_and_what_kept_it_from_being_helped() -> None:
+    wires = Wires(FOUR)
+    plain, helped = array_on(wires), array_on(wires, recovery=NoLines())
+    for array in (plain, helped):
+        with wires.fault("sda_low"):
+            frames(array, 3)
+            assert list(array.troubles()) == [""]
+            text = array.troubles()[""]
+        frames(array, 200)
+        assert array.troubles() == {}
+        assert text.startswith("the bus is stuck or cut")
+        assert ("GPIO lines cannot be used" in text) == (array is helped)
+
+
 # A stream begins, and goes on
 
 
