@@ -17,12 +17,7 @@ from devices.bus_recovery import BusRecovery
 from devices.bus_watch import BusWatch
 from devices.clock import Clock
 from devices.conversion_watch import ConversionWatch
-from devices.errors import (
-    BusMisuseError,
-    BusSetupError,
-    I2cError,
-    NoAcknowledgeError,
-)
+from devices.errors import BusFaultError, NoAcknowledgeError
 from devices.frames import NOT_READ, TileInfo, TileStatus
 from devices.health import TileHealth
 from devices.i2c import I2cBus
@@ -280,12 +275,10 @@ class TileArray:
                 if scan.given_up:
                     break
                 transfers()
-            except (BusMisuseError, BusSetupError):
-                raise
             except NoAcknowledgeError:
                 self._ports.forget(tiles)
                 scan.budget_ns -= self._clock.now_ns() - self._busy_since_ns
-            except I2cError:
+            except BusFaultError:
                 self._ports.router.forget()
                 scan.note_bus_fault()
             else:
@@ -339,11 +332,9 @@ class TileArray:
                 self._watch.try_conversion(tile)
                 self._running[tile] = False
                 self.convert(scan, [tile])
-        except (BusMisuseError, BusSetupError):
-            raise
         except NoAcknowledgeError:  # the next frame will see who it is
             self._ports.router.forget()
-        except I2cError:
+        except BusFaultError:
             scan.note_bus_fault()
 
     def _look_again(self, scan: Scan, tiles: Sequence[int]) -> None:
@@ -355,11 +346,9 @@ class TileArray:
             return
         try:
             self._watch.look_again(tile, self._words[tile])
-        except (BusMisuseError, BusSetupError):
-            raise
         except NoAcknowledgeError:  # reading it will tell
             self._ports.forget([tile])
-        except I2cError:
+        except BusFaultError:
             scan.note_bus_fault()
 
     def _conclude(self, scan: Scan) -> None:
