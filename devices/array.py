@@ -25,6 +25,7 @@ from devices.judge import Judge
 from devices.mpl115a2 import SAMPLE_PART_OF_CONVERSION
 from devices.scan import Scan
 from devices.scene import ScheduleName
+from devices.schedules import SCHEDULES
 from devices.search import Search
 from devices.tile_ports import TilePorts
 
@@ -73,9 +74,6 @@ class TileArray:
         recovery: BusRecovery | None = None,
         beside: Callable[[], float] | None = None,
     ) -> None:
-        # Here, because schedules are written in terms of arrays.
-        from devices.schedules import SCHEDULES
-
         muxes = [tile.mux for tile in tiles]
         check_broadcast(schedule, muxes, broadcast_channels)
         self.tiles = tuple(tiles)
@@ -83,7 +81,6 @@ class TileArray:
         self.by_mux = tuple(
             tuple(i for i in self.indices if muxes[i] == mux) for mux in sorted(set(muxes))
         )
-        self.schedule_name = schedule
         self.sample_delay_ns = tuple(
             round(tile.conversion_ms * 1e6) // SAMPLE_PART_OF_CONVERSION for tile in tiles
         )

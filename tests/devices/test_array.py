@@ -123,11 +123,10 @@ def test_a_wait_that_is_too_short_gives_the_conversion_before() -> None:
     assert second.padc[0] != 2
 
 
-def test_an_array_knows_the_name_of_its_schedule_and_its_tiles() -> None:
+def test_an_array_knows_its_tiles_and_which_are_behind_one_mux() -> None:
     for name in SCHEDULES:
         wires = Wires(TWO_MUXES)
         array = array_on(wires, name)
-        assert array.schedule_name == name
         assert array.tiles == wires.infos
         assert array.by_mux == ((0, 1), (2, 3))
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from devices import schedules
 from devices.clock import VirtualClock
 from devices.emulation.parts import draw_chip
 from devices.emulation.world import World
@@ -114,7 +115,8 @@ def test_auto_takes_what_is_best_for_these_tiles_and_says_why(
 ) -> None:
     array = {"wait_ms": 1.6, "conversion_ms": 1.6}
     ready, *_ = started(scene_of(full(tiles), array=array))
-    assert ready.choice.schedule == ready.array.schedule_name == schedule
+    assert ready.choice.schedule == schedule
+    assert ready.array._schedule is schedules.SCHEDULES[ready.choice.schedule]
     muxes = (tiles + 7) // 8
     assert ready.choice.reason.startswith(
         f"{tiles} tile{'s' * (tiles > 1)} on {muxes} mux{'es' * (muxes > 1)}: {schedule} gives "
