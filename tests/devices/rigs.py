@@ -183,7 +183,7 @@ def array_on(
 
 def settled(wires: Wires, schedule: ScheduleName = "simultaneous", **options: object) -> TileArray:
     """The same, after the frames in which every reading is read twice."""
-    array = array_on(wires, schedule, **options)  # type: ignore[arg-type]
+    array = array_on(wires, schedule, **options)  # type: ignore[arg-type]  # as there
     for _ in range(SETTLED + 1):
         array.scan()
     return array

@@ -81,7 +81,7 @@ def test_a_failure_names_the_bus_and_the_address_and_keeps_both_through_pickling
 ) -> None:
     write, read = i2c_msg.write(0x73, [0]), i2c_msg.read(0x73, 1)
     error = failure_of(OSError(number, name), write, read)
-    again = pickle.loads(pickle.dumps(error))  # noqa: S301
+    again = pickle.loads(pickle.dumps(error))  # noqa: S301  # our own
     for one in (error, again):
         assert type(one) is kind
         assert str(one).startswith("/dev/i2c-7, address 0x73: ")
