@@ -29,7 +29,7 @@ class Ready:
         timing: of the bus and the parts.
         choice: the schedule, and why.
         predicted_hz: frames a second that it should give.
-        unmeasured: serials whose conversion time could not be measured.
+        unmeasured: serials whose conversion time could not be measured; they are given 3 ms.
     """
 
     array: TileArray
