@@ -91,12 +91,7 @@ class TileArray:
         self.bus = BusWatch(self._ports.router, clock, recovery)
         self._judge = Judge(self._ports, clock, self.health, self.bus)
         self._search = Search(self._ports, clock, self.health)
-        self._watch = ConversionWatch(
-            self._ports,
-            clock,
-            self.health,
-            [round(wait_s * 1e9) for wait_s in timing.conversions_s],
-        )
+        self._watch = ConversionWatch(self._ports, clock, self.health, timing)
         self._schedule = SCHEDULES[schedule]
         self._audit_due_ns = clock.now_ns() + AUDIT_NS
         self._turns_ns = [round(turn_s * 1e9) for turn_s in turns_s(timing)]
