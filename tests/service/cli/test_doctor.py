@@ -145,12 +145,14 @@ def test_a_bus_that_does_not_exist_is_a_failure_in_one_line(run):
     assert outcome.err.count("\n") == 1
 
 
+@pytest.mark.real_time
 def test_the_servo_of_the_scene_is_found_and_named(run):
     found = json.loads(run("doctor", "--scene", "rolling", "--json").out)["servo"]
     assert found["is_well"] is True
     assert found["verdict"].startswith("MX-28, protocol 2, 1000000 baud, id 1.")
 
 
+@pytest.mark.real_time
 def test_a_servo_that_is_not_what_the_scene_says_is_said(run, tmp_path, monkeypatch):
     from devices.clock import SystemClock
     from devices.emulation.dynamixel import EmulatedServo
