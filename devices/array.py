@@ -17,12 +17,7 @@ from devices.bus_recovery import BusRecovery
 from devices.bus_watch import BusWatch
 from devices.clock import Clock
 from devices.conversion_watch import ConversionWatch
-from devices.errors import (
-    BusMisuseError,
-    BusSetupError,
-    I2cError,
-    NoAcknowledgeError,
-)
+from devices.errors import BusFaultError, NoAcknowledgeError
 from devices.frames import NOT_READ, TileInfo, TileStatus
 from devices.health import TileHealth
 from devices.i2c import I2cBus
@@ -30,6 +25,7 @@ from devices.judge import Judge
 from devices.mpl115a2 import SAMPLE_PART_OF_CONVERSION
 from devices.scan import Scan
 from devices.scene import ScheduleName
+from devices.schedules import SCHEDULES
 from devices.search import Search
 from devices.tile_ports import TilePorts
 
@@ -78,9 +74,6 @@ class TileArray:
         recovery: BusRecovery | None = None,
         beside: Callable[[], float] | None = None,
     ) -> None:
-        # Here, because schedules are written in terms of arrays.
-        from devices.schedules import SCHEDULES
-
         muxes = [tile.mux for tile in tiles]
         check_broadcast(schedule, muxes, broadcast_channels)
         self.tiles = tuple(tiles)
@@ -88,7 +81,6 @@ class TileArray:
         self.by_mux = tuple(
             tuple(i for i in self.indices if muxes[i] == mux) for mux in sorted(set(muxes))
         )
-        self.schedule_name = schedule
         self.sample_delay_ns = tuple(
             round(tile.conversion_ms * 1e6) // SAMPLE_PART_OF_CONVERSION for tile in tiles
         )
@@ -99,12 +91,7 @@ class TileArray:
         self.bus = BusWatch(self._ports.router, clock, recovery)
         self._judge = Judge(self._ports, clock, self.health, self.bus)
         self._search = Search(self._ports, clock, self.health)
-        self._watch = ConversionWatch(
-            self._ports,
-            clock,
-            self.health,
-            [round(wait_s * 1e9) for wait_s in timing.conversions_s],
-        )
+        self._watch = ConversionWatch(self._ports, clock, self.health, timing)
         self._schedule = SCHEDULES[schedule]
         self._audit_due_ns = clock.now_ns() + AUDIT_NS
         self._turns_ns = [round(turn_s * 1e9) for turn_s in turns_s(timing)]
@@ -134,18 +121,26 @@ class TileArray:
         )
 
     def begin(self) -> None:
-        """A stream begins, or goes on after something else used the bus.
-
-        Its first frame reads all temperatures, and nothing is taken to be as it was left.
-        """
+        """A stream begins: its first frame reads all temperatures, and nothing has gone wrong."""
         self._frames = 0
         self._ports.router.forget()
         for health in self.health:
             health.counts.clear()
 
+    def resume(self) -> None:
+        """The stream goes on after something else used the bus.
+
+        Nothing is taken to be as it was left, and what was converting is too old to be read.
+        """
+        self._ports.router.forget()
+        self._running = [False] * len(self.tiles)
+
     def troubles(self) -> dict[str, str]:
         """What is wrong now, in words: by serial, and under "" what is wrong with the bus."""
-        found = {"": "the bus is stuck or cut"} if self.bus.is_down else {}
+        found: dict[str, str] = {}
+        if self.bus.is_down:
+            unhelped = f" and could not be helped: {self.bus.problem}" if self.bus.problem else ""
+            found[""] = f"the bus is stuck or cut{unhelped}"
         for tile, health in zip(self.tiles, self.health, strict=True):
             where = f"tile {tile.serial} (mux 0x{tile.mux:02x} channel {tile.channel})"
             if health.replaced:
@@ -272,12 +267,10 @@ class TileArray:
                 if scan.given_up:
                     break
                 transfers()
-            except (BusMisuseError, BusSetupError):
-                raise
             except NoAcknowledgeError:
                 self._ports.forget(tiles)
                 scan.budget_ns -= self._clock.now_ns() - self._busy_since_ns
-            except I2cError:
+            except BusFaultError:
                 self._ports.router.forget()
                 scan.note_bus_fault()
             else:
@@ -331,11 +324,9 @@ class TileArray:
                 self._watch.try_conversion(tile)
                 self._running[tile] = False
                 self.convert(scan, [tile])
-        except (BusMisuseError, BusSetupError):
-            raise
         except NoAcknowledgeError:  # the next frame will see who it is
             self._ports.router.forget()
-        except I2cError:
+        except BusFaultError:
             scan.note_bus_fault()
 
     def _look_again(self, scan: Scan, tiles: Sequence[int]) -> None:
@@ -347,11 +338,9 @@ class TileArray:
             return
         try:
             self._watch.look_again(tile, self._words[tile])
-        except (BusMisuseError, BusSetupError):
-            raise
         except NoAcknowledgeError:  # reading it will tell
             self._ports.forget([tile])
-        except I2cError:
+        except BusFaultError:
             scan.note_bus_fault()
 
     def _conclude(self, scan: Scan) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from devices.bus_recovery import BusRecovery
 from devices.clock import Clock
@@ -14,16 +15,33 @@ _RECOVERY_NS = (10_000_000, 1_000_000_000)
 """A stuck bus is helped at once, then ever more rarely."""
 
 
-def help_bus(recovery: BusRecovery) -> bool:
-    """Nine clocks, and if nobody lets go of them the multiplexers' RESET; whether one of it worked.
+@dataclass(frozen=True)
+class Help:
+    """What became of an attempt to free the bus.
 
-    A line that cannot be had now may be had the next time.
+    Attributes:
+        worked: does it move now?
+        problem: why something could not even be tried; empty if all could.
     """
+
+    worked: bool
+    problem: str = ""
+
+
+def help_bus(recovery: BusRecovery, moves: Callable[[], bool]) -> Help:
+    """Nine clocks, and if the bus does not move after them, the multiplexers' RESET.
+
+    Lines that are high are no proof that it moves: a slave may pull them low again. A line that
+    cannot be had now may be had the next time.
+    """
+    problems = []
     for help_ in (recovery.clock_out, recovery.reset_muxes):
-        with suppress(I2cError):
-            if help_():
-                return True
-    return False
+        try:
+            if help_() and moves():
+                return Help(worked=True)
+        except I2cError as error:
+            problems.append(str(error))
+    return Help(worked=False, problem="; ".join(problems))
 
 
 class BusWatch:
@@ -38,6 +56,8 @@ class BusWatch:
         self.is_down = False
         self.recoveries = 0
         """How often a stuck bus was helped."""
+        self.problem = ""
+        """Why it could not be helped the last time; empty if it could, or nobody can."""
         self._router = router
         self._clock = clock
         self._recovery = recovery
@@ -51,6 +71,7 @@ class BusWatch:
     def fall(self) -> None:
         """The bus has failed: nothing is asked of the tiles until it is back."""
         self.is_down = True
+        self.problem = ""
         self._wait_ns, self._due_ns = _RECOVERY_NS[0], 0
 
     def comes_back(self) -> bool:
@@ -58,7 +79,8 @@ class BusWatch:
         back = self._moves()
         if not back and self._recovery is not None and self._clock.now_ns() >= self._due_ns:
             self.recoveries += 1
-            back = help_bus(self._recovery) and self._moves()
+            given = help_bus(self._recovery, self._moves)
+            back, self.problem = given.worked, given.problem
             self._due_ns = self._clock.now_ns() + self._wait_ns
             self._wait_ns = min(2 * self._wait_ns, _RECOVERY_NS[1])
         self.is_down = not back

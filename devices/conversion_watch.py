@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+from devices.budget import BusTiming
 from devices.clock import Clock
 from devices.frames import NOT_READ
 from devices.health import TileHealth
@@ -12,6 +14,9 @@ from devices.tile_ports import TilePorts
 
 SLOW_AUDIT_NS = 500_000_000
 """A part that was found to be slow is tried so often, to notice when it no longer is."""
+
+_HESITATION_NS = 100_000
+"""A read that came so much later than it was meant to does not show what it was meant to."""
 
 _TRIES, _SLOW_TRIES, _SAME_MAX = 8, 2, 3
 """Every second pair of healthy readings has the same temperature: eight are one in 250. One that is
@@ -34,14 +39,16 @@ class ConversionWatch:
         ports: TilePorts,
         clock: Clock,
         health: Sequence[TileHealth],
-        measured_ns: Sequence[int],
+        timing: BusTiming,
     ) -> None:
-        self.wait_ns = list(measured_ns)
+        self._measured_ns = tuple(round(wait_s * 1e9) for wait_s in timing.conversions_s)
+        self.wait_ns = list(self._measured_ns)
         """How long to wait for each tile's conversion."""
         self._ports = ports
         self._clock = clock
         self._health = health
-        self._measured_ns = tuple(measured_ns)
+        whole = replace(timing, bytes_read=4.0)
+        self._wires_ns = round((whole.convert_s + whole.read_s) * 1e9)
         self._suspects: list[int] = []
         self._slow_due_ns = 0
         self._tries = 0
@@ -87,21 +94,25 @@ class ConversionWatch:
         """
         health = self._health[tile]
         tries = _SLOW_TRIES if health.slow else _TRIES
-        settled = [self._converted(tile, CONVERSION_MAX_NS)]
-        early = []
+        settled = [self._settled(tile)]
+        early: list[tuple[int, int]] = []
         for _ in range(tries):
-            early.append(self._converted(tile, self._measured_ns[tile]))
+            words, in_time = self._converted(tile, self._measured_ns[tile])
+            if not in_time:
+                settled[-1] = self._settled(tile)
+                continue
+            early.append(words)
             if early[-1][1] != settled[-1][1]:
                 self._believe(tile)  # the temperature is loaded last: this one was finished
                 return
-            settled.append(self._converted(tile, CONVERSION_MAX_NS))
+            settled.append(self._settled(tile))
             if len(early) >= _SAME_MAX and early == settled[: len(early)]:
                 break  # not a word of it has changed: it is late
         if len({tadc for _, tadc in settled}) == 1 and any(
             words != before for words, before in zip(early, settled, strict=False)
         ):
             self._believe(tile)  # its temperature never changes, so its pressure has to tell
-        elif len(set(settled)) > 1 and not health.slow:
+        elif len(early) >= _SAME_MAX and len(set(settled)) > 1 and not health.slow:
             # It does finish, but late. (If it never does, nothing is worth waiting for.)
             health.slow = True
             self.wait_ns[tile] = max(self._measured_ns[tile], CONVERSION_MAX_NS)
@@ -111,11 +122,21 @@ class ConversionWatch:
         self._health[tile].slow = False
         self.wait_ns[tile] = self._measured_ns[tile]
 
-    def _converted(self, tile: int, delay_ns: int) -> tuple[int, int]:
-        """What is read so long after a CONVERT; the conversion is given its time in any case."""
+    def _settled(self, tile: int) -> tuple[int, int]:
+        """The words of a conversion that was given all its time."""
+        return self._converted(tile, CONVERSION_MAX_NS)[0]
+
+    def _converted(self, tile: int, delay_ns: int) -> tuple[tuple[int, int], bool]:
+        """What is read so long after a CONVERT, and whether it was not read later than that.
+
+        A busy machine may hesitate before either transfer, so all of the time counts that the wires
+        themselves did not take. The conversion is given its time in any case.
+        """
+        begin_ns = self._clock.now_ns()
         self._ports.convert([tile])
         stop_ns = self._clock.now_ns()
         self._clock.sleep_until_ns(stop_ns + delay_ns)
         words = self._ports.read(with_temperature=True)
+        waited_ns = self._clock.now_ns() - begin_ns - self._wires_ns
         self._clock.sleep_until_ns(stop_ns + CONVERSION_MAX_NS)
-        return words
+        return words, waited_ns <= delay_ns + _HESITATION_NS

@@ -94,19 +94,20 @@ class PatientBus(I2cBus):
 
     def __init__(self, bus: I2cBus) -> None:
         super().__init__(bus._adapter, bus.name)  # noqa: SLF001  # the same class
-        self.lost = 0
-        """Transfers that were not acknowledged and then were."""
+        self.repeated = 0
+        """Transfers that were not acknowledged at once, and then were."""
 
     def transfer(self, *messages: i2c_msg) -> None:
         """As `I2cBus.transfer`, up to `TRIES` times."""
-        for _ in range(self.TRIES - 1):
+        for attempt in range(self.TRIES):
             try:
                 super().transfer(*messages)
             except NoAcknowledgeError:
-                self.lost += 1
+                if attempt + 1 == self.TRIES:
+                    raise
             else:
+                self.repeated += attempt > 0
                 return
-        super().transfer(*messages)
 
 
 def _classified(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cError:

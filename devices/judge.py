@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from devices.bus_watch import BusWatch
 from devices.clock import Clock
-from devices.errors import BusMisuseError, BusSetupError, I2cError, NoAcknowledgeError
+from devices.errors import BusFaultError, NoAcknowledgeError
 from devices.frames import TileStatus
 from devices.health import TileHealth, is_impossible
 from devices.scan import Scan
@@ -116,11 +116,9 @@ class Judge:
         try:
             self._ports.connect(tile)
             words = self._ports.read(with_temperature)
-        except (BusMisuseError, BusSetupError):
-            raise
         except NoAcknowledgeError:
             pass
-        except I2cError:
+        except BusFaultError:
             scan.note_bus_fault()
         scan.budget_ns -= self._clock.now_ns() - begin_ns
         return words
@@ -132,11 +130,9 @@ class Judge:
         found = b""
         try:
             found = self._ports.read_coefficients()
-        except (BusMisuseError, BusSetupError):
-            raise
         except NoAcknowledgeError:
             pass
-        except I2cError:
+        except BusFaultError:
             scan.note_bus_fault()
         if found != health.coefficient_bytes:
             self._ports.router.forget()

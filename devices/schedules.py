@@ -8,13 +8,18 @@ second, `simultaneous` 395, `pipelined` 544 (hardware.md 4, strategies a, b, c; 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-from devices.array import TileArray
-from devices.scan import Scan
 from devices.scene import ScheduleName
 
-Schedule = Callable[[TileArray, Scan], None]
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from devices.array import TileArray
+    from devices.scan import Scan
+
+    Schedule = Callable[[TileArray, Scan], None]
 
 
 def sequential(array: TileArray, scan: Scan) -> None:

@@ -9,13 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from devices.clock import Clock
-from devices.errors import (
-    BusMisuseError,
-    BusSetupError,
-    I2cError,
-    NoAcknowledgeError,
-    TileSetupError,
-)
+from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
 from devices.frames import TileStatus
 from devices.health import TileHealth
 from devices.scan import Scan
@@ -47,15 +41,13 @@ class Search:
                 health.find()
             else:
                 health.lose(self._clock.now_ns())
-        except (BusMisuseError, BusSetupError):
-            raise
         except TileSetupError:
             scan.flag(tile, TileStatus.IMPLAUSIBLE)
             health.lose(self._clock.now_ns())
         except NoAcknowledgeError:
             self._ports.forget([tile])
             health.lose(self._clock.now_ns())
-        except I2cError:
+        except BusFaultError:
             scan.note_bus_fault()
         scan.budget_ns -= self._clock.now_ns() - begin_ns
 

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from devices.array import TileArray
 from devices.budget import BusTiming, Choice, choose, frame_s
 from devices.bus_recovery import BusRecovery
-from devices.bus_watch import help_bus
+from devices.bus_watch import Help, help_bus
 from devices.clock import Clock
 from devices.errors import BusFaultError, SceneError
 from devices.frames import TileInfo
 from devices.i2c import I2cBus, PatientBus
-from devices.mpl115a2 import CONVERSION_MAX_NS, CONVERSION_TYPICAL_NS
-from devices.scene import AnySchedule, Scene
-from devices.self_test import identify, measure_conversion_ns, measure_wires
+from devices.mpl115a2 import CONVERSION_MAX_NS
+from devices.scene import AnySchedule, ArrayScene, Scene
+from devices.self_test import WireTiming, identify, measure_conversion_ns, measure_wires
 from devices.tca9548a import MuxRouter
 
 
@@ -29,7 +29,7 @@ class Ready:
         timing: of the bus and the parts.
         choice: the schedule, and why.
         predicted_hz: frames a second that it should give.
-        unmeasured: serials whose conversion time could not be measured.
+        unmeasured: serials whose conversion time could not be measured; they are given 3 ms.
     """
 
     array: TileArray
@@ -73,24 +73,34 @@ def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
     """Make sure that the wires move at all: a slave may hang in a byte since the last run.
 
     Raises:
-        BusFaultError: SDA is stuck low, and nobody or nothing could free it.
+        BusFaultError: SDA or SCL is stuck low, and nobody or nothing could free it.
     """
     router = MuxRouter(bus, [tile.mux for tile in scene.tile])
-    for helped in (False, True):
+    fault: BusFaultError | None = None
+
+    def moves() -> bool:
+        nonlocal fault
         try:
+            # If nobody answers it moves: whose fault that is, identification says.
             if router.echoes() or router.refused is not None:
-                return  # it moves, or nobody answers: whose fault that is, identification says
-        except BusFaultError:
-            if helped or recovery is None:
-                raise
-        if helped or recovery is None or not help_bus(recovery):
-            break
-    raise BusFaultError(
-        "the multiplexers acknowledge, and none keeps what is written to it",
-        where=bus.name,
-        remedy="SDA is stuck low: pull the tiles' plugs one by one, cycle their supply, or wire "
-        "[recovery]",
-    )
+                return True
+            fault = BusFaultError(
+                "the multiplexers acknowledge, and none keeps what is written to it",
+                where=bus.name,
+                remedy="SDA is stuck low: pull the tiles' plugs one by one, cycle their supply, or "
+                "wire [recovery]",
+            )
+        except BusFaultError as error:
+            fault = error
+        return False
+
+    given = Help(worked=moves())
+    if not given.worked and recovery is not None:
+        given = help_bus(recovery, moves)
+    if not given.worked and fault is not None:
+        if given.problem:
+            fault.remedy += f". It could not be freed: {given.problem}"
+        raise fault
 
 
 def renew(
@@ -218,23 +228,41 @@ def measured(bus: I2cBus, scene: Scene, clock: Clock) -> Measured:
     tiles = list(identify(bus, scene.tile))
     wires = measure_wires(bus, clock, tiles[0])
     unmeasured = []
-    waits_ns = []
-    for index, tile in enumerate(tiles):
-        if scene.array.wait_ms is not None:
-            waits_ns.append(round(scene.array.wait_ms * 1e6))
-            continue
-        wait_ns = measure_conversion_ns(bus, clock, tile, wires)
-        if wait_ns is None:
-            unmeasured.append(tile.serial)
-        waits_ns.append(CONVERSION_MAX_NS if wait_ns is None else wait_ns)
-        conversion_ms = (CONVERSION_TYPICAL_NS if wait_ns is None else wait_ns) / 1e6
-        tiles[index] = tile.model_copy(update={"conversion_ms": conversion_ms})
-    every = scene.array.temperature_every
-    timing = BusTiming(
+    conversions_ns: list[int | None] = [None] * len(tiles)
+    if scene.array.wait_ms is None:
+        for index, tile in enumerate(tiles):
+            conversion_ns = measure_conversion_ns(bus, clock, tile, wires)
+            conversions_ns[index] = conversion_ns
+            if conversion_ns is None:
+                unmeasured.append(tile.serial)
+            else:
+                tiles[index] = tile.model_copy(update={"conversion_ms": conversion_ns / 1e6})
+    timing = timing_of(scene.array, wires, [tile.mux for tile in tiles], conversions_ns)
+    return Measured(tuple(tiles), timing, tuple(unmeasured))
+
+
+def timing_of(
+    array: ArrayScene,
+    wires: WireTiming,
+    muxes: Sequence[int],
+    conversions_ns: Sequence[int | None],
+) -> BusTiming:
+    """The timing by which tiles are asked: waits as the scene says, else as measured.
+
+    Args:
+        array: what the scene says.
+        wires: as measured.
+        muxes: which mux each tile is behind.
+        conversions_ns: of each tile, as measured; None, where it is not known, is the data sheet's
+            longest.
+    """
+    if array.wait_ms is not None:
+        conversions_ns = [round(array.wait_ms * 1e6)] * len(muxes)
+    waits_ns = [CONVERSION_MAX_NS if known is None else known for known in conversions_ns]
+    return BusTiming(
         scl_hz=wires.scl_hz,
         conversions_s=tuple(wait_ns * 1e-9 for wait_ns in waits_ns),
-        muxes=tuple(tile.mux for tile in tiles),
-        bytes_read=2.0 + 2.0 / every,
+        muxes=tuple(muxes),
+        bytes_read=2.0 + 2.0 / array.temperature_every,
         transaction_s=wires.transaction_s,
     )
-    return Measured(tuple(tiles), timing, tuple(unmeasured))

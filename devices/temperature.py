@@ -50,7 +50,10 @@ def hold_temperature(
     if not len(frames):
         return frames, held
     unusable = (frames.status & np.uint8(TileStatus.UNUSABLE)) != 0
-    known = (frames.tadc != NOT_READ) & ~unusable
+    missing = frames.tadc == NOT_READ
+    known = ~(missing | unusable)
+    if known.all():  # as nearly always: nothing has to be looked up
+        return frames, HeldTemperature(frames.tadc[-1].copy(), np.full(tiles, frames.t_mono_ns[-1]))
     # Row 0 is what came before; every row then looks up the last one that is known.
     tadc = np.concatenate([held.tadc[None], frames.tadc])
     t_mono_ns = np.concatenate(
@@ -60,7 +63,6 @@ def hold_temperature(
     newest = np.maximum.accumulate(rows, axis=0)
     columns = np.arange(tiles)
     last = HeldTemperature(tadc[newest[-1], columns], t_mono_ns[newest[-1], columns])
-    missing = frames.tadc == NOT_READ
     if not missing.any():
         return frames, last
     found = tadc[newest, columns]

@@ -7,7 +7,7 @@ fit into the bound is evicted, oldest first, and counted.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 BYTES_MAX = 64 << 20
@@ -39,14 +39,23 @@ class Backlog:
         """The oldest frame that is kept."""
         return self._batches[0].seq_first if self._batches else self.next_seq
 
+    @property
+    def kept_bytes(self) -> int:
+        """What is kept, in bytes of payload."""
+        return self._bytes
+
     def append(self, batch: EncodedBatch) -> None:
         """Keep a batch, which comes after all others; make room for it if need be."""
         self._batches.append(batch)
         self._bytes += len(batch.payload)
         self.next_seq = batch.seq_last + 1
         while self._bytes > self._bytes_max and len(self._batches) > 1:
-            oldest = self._drop_oldest()
-            self.evicted_frames += oldest.seq_last - oldest.seq_first + 1
+            self.evict_oldest()
+
+    def evict_oldest(self) -> None:
+        """Give up the oldest batch that is kept, and count its frames."""
+        oldest = self._drop_oldest()
+        self.evicted_frames += oldest.seq_last - oldest.seq_first + 1
 
     def acknowledge(self, seq_first: int, seq_last: int) -> None:
         """Forget batches that lie within `seq_first` to `seq_last`."""
@@ -72,3 +81,18 @@ class Backlog:
         oldest = self._batches.popleft()
         self._bytes -= len(oldest.payload)
         return oldest
+
+
+def make_room(backlogs: Sequence[Backlog], batch: EncodedBatch, bytes_max: int = BYTES_MAX) -> None:
+    """Have several streams keep no more together than one alone may, with a batch to come.
+
+    Args:
+        backlogs: in the order of the streams; the oldest frames of all are evicted.
+        batch: will be appended to the last one, which bounds itself.
+        bytes_max: what they may keep.
+    """
+    for backlog in backlogs[:-1]:
+        while backlog.kept_bytes and (
+            sum(each.kept_bytes for each in backlogs) + len(batch.payload) > bytes_max
+        ):
+            backlog.evict_oldest()

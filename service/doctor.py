@@ -13,10 +13,10 @@ from devices.clock import Clock
 from devices.errors import I2cError
 from devices.frames import TileInfo
 from devices.i2c import I2cBus, PatientBus
-from devices.mpl115a2 import CONVERSION_MAX_NS, CONVERSION_TYPICAL_NS
+from devices.mpl115a2 import CONVERSION_TYPICAL_NS
 from devices.scene import ArrayScene, Scene, ScheduleName, TileScene
 from devices.self_test import Plug, find_tiles, measure_conversion_ns, measure_wires
-from devices.startup import chosen
+from devices.startup import chosen, timing_of
 
 _AS_ASKED = 0.95
 _PI_TRAP = 0.625  # core clock 250 MHz where the kernel believes in 400 MHz (hardware.md 3.2)
@@ -84,37 +84,35 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
         BusSetupError: it cannot be used.
     """
     array = scene.array if scene is not None else ArrayScene()
-    findings = _findings(find_tiles(PatientBus(bus)), scene.tile if scene is not None else ())
+    bus = PatientBus(bus)
+    findings = _findings(find_tiles(bus), scene.tile if scene is not None else ())
     well = [(finding, _info(finding)) for finding in findings if not finding.problem]
     if not well:
         return Diagnosis(
             findings, None, array.scl_hz, 0.0, {}, None, holds=False, verdict=_nobody(findings)
         )
-    bus = PatientBus(bus)
     wires = measure_wires(bus, clock, well[0][1])
     measured: dict[tuple[int, int], TileFinding] = {}
+    conversions_ns: list[int | None] = []
     for finding, info in well:
         try:
-            wait_ns = measure_conversion_ns(bus, clock, info, wires)
-            problem = "" if wait_ns is not None else "its words never change: is it converting?"
+            conversion_ns = measure_conversion_ns(bus, clock, info, wires)
+            never = "its words never change: is it converting?"
+            problem = "" if conversion_ns is not None else never
         except I2cError as error:
-            wait_ns, problem = None, f"it went silent while it was measured: {error}"
+            conversion_ns, problem = None, f"it went silent while it was measured: {error}"
+        conversions_ns.append(conversion_ns)
         measured[finding.mux, finding.channel] = TileFinding(
             finding.serial,
             finding.mux,
             finding.channel,
             finding.coefficient_words,
-            None if wait_ns is None else wait_ns / 1e6,
+            None if conversion_ns is None else conversion_ns / 1e6,
             problem,
         )
     findings = tuple(measured.get((f.mux, f.channel), f) for f in findings)
-    timing = BusTiming(
-        scl_hz=wires.scl_hz,
-        conversions_s=tuple(_wait_s(f, array) for f in measured.values()),
-        muxes=tuple(f.mux for f in measured.values()),
-        bytes_read=2.0 + 2.0 / array.temperature_every,
-        transaction_s=wires.transaction_s,
-    )
+    asked = tuple(measured.values())
+    timing = timing_of(array, wires, [f.mux for f in asked], conversions_ns)
     rates: dict[ScheduleName, float | None] = {
         name: rate if broadcast_width(name, timing.muxes) <= array.broadcast_channels else None
         for name, rate in rates_hz(timing).items()
@@ -126,6 +124,11 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
         has_reference = scene.reference is not None
         schedule = chosen(scene, timing, has_reference=has_reference, asked_hz=asked_hz).schedule
     advice = _advice(findings, timing, rates, array, asked_hz, choice.schedule, schedule)
+    hints = (
+        *advice.hints,
+        _pace_setter(asked, timing, schedule, rates[schedule]),
+        _disturbance(bus.repeated),
+    )
     return Diagnosis(
         findings,
         wires.scl_hz,
@@ -134,14 +137,8 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
         rates,
         choice.schedule,
         holds=not advice.wrong,
-        verdict=" ".join((advice.summary, *advice.wrong, *advice.hints)),
+        verdict=" ".join(filter(None, (advice.summary, *advice.wrong, *hints))),
     )
-
-
-def _wait_s(finding: TileFinding, array: ArrayScene) -> float:
-    """How long a node would wait for a tile: as the scene says, else as measured."""
-    wait_ms = array.wait_ms if array.wait_ms is not None else finding.conversion_ms
-    return CONVERSION_MAX_NS * 1e-9 if wait_ms is None else wait_ms * 1e-3
 
 
 def _findings(plugs: tuple[Plug, ...], wanted: tuple[TileScene, ...]) -> tuple[TileFinding, ...]:
@@ -246,28 +243,40 @@ def _advice(
         summary += f" The {asked_hz:g} frames/s asked for will hold."
     elif chosen != best:
         hints.append(f"Schedule {best} would give {best_hz:.0f}.")
-    if hint := _pace_setter(findings, timing, chosen, rate):
-        hints.append(hint)
     return _Advice(summary, tuple(wrong), tuple(hints))
 
 
 def _pace_setter(
-    findings: tuple[TileFinding, ...], timing: BusTiming, chosen: ScheduleName, rate_hz: float
+    asked: tuple[TileFinding, ...],
+    timing: BusTiming,
+    schedule: ScheduleName,
+    rate_hz: float | None,
 ) -> str:
-    """Which part holds all others up, if one does."""
+    """Which part holds all others up, if one does; `asked` are those that `timing` is of."""
     slowest_s = max(timing.conversions_s)
+    slow = asked[timing.conversions_s.index(slowest_s)]
+    if rate_hz is None or slow.conversion_ms is None:
+        return ""
     usual_s = sorted(timing.conversions_s)[len(timing.conversions_s) // 2]
     like_others = replace(
         timing, conversions_s=tuple(min(wait_s, usual_s) for wait_s in timing.conversions_s)
     )
-    without_hz = 1.0 / frame_s(chosen, like_others)
-    slow = next(
-        (f for f in findings if f.conversion_ms and f.conversion_ms / slowest_s > 999.9), None
-    )
-    if slow is None or without_hz < _WORTH_SAYING * rate_hz:
+    without_hz = 1.0 / frame_s(schedule, like_others)
+    if without_hz < _WORTH_SAYING * rate_hz:
         return ""
     name = slow.serial or f"The tile at 0x{slow.mux:02x} channel {slow.channel}"
     return (
         f"{name} converts slowest ({slowest_s * 1e3:.2f} ms) and sets the pace: with a part like "
         f"the others it would be {without_hz:.0f}."
+    )
+
+
+def _disturbance(repeated: int) -> str:
+    """What transfers that were acknowledged only when they were repeated say of the wires."""
+    if not repeated:
+        return ""
+    transfers = "1 transfer was" if repeated == 1 else f"{repeated} transfers were"
+    return (
+        f"{transfers} acknowledged only when repeated: look for a loose plug, and keep the leads "
+        "short and away from motors."
     )

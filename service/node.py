@@ -10,7 +10,7 @@ from itertools import count
 
 from devices.frames import ArrayInfo
 from service.acquirer import AcquisitionProcess, Batch, Failed, Health, Message, Started
-from service.backlog import Backlog
+from service.backlog import Backlog, make_room
 from service.estimation.calibration import Calibration
 from service.link import PROTOCOL, Hello, Status, StreamEnd
 from service.publisher import Publisher
@@ -89,6 +89,7 @@ async def run_node(
         while not isinstance(message := await messages.get(), Failed):
             stream = streams[-1]
             if isinstance(message, Batch):
+                make_room([each.backlog for each in streams], message.batch)
                 stream.backlog.append(message.batch)
                 stream.missed_slots = message.missed_slots
                 stream.health = message.health

@@ -171,7 +171,7 @@ class Rig:
             )
         except (I2cError, TileSetupError):  # it is being plugged: go on with the others
             self._renew_at_ns = self._clock.now_ns() + _RENEW_AGAIN_NS
-            self._ready.array.begin()
+            self._ready.array.resume()
             return False
         self._begin_stream(self._bus_hz(self._ready.array), is_new=True)
         return True

@@ -76,6 +76,8 @@ class Simulated:
     choice: Choice
     replaced: tuple[str, ...]
     """Serials in whose place another part answered."""
+    unmeasured: tuple[str, ...]
+    """Serials whose conversion time could not be measured: they were given 3 ms."""
     flags: Mapping[str, Mapping[str, int]]
     """Frames in which a tile was flagged, by serial and reason."""
     pressed: PressedTrace | None
@@ -119,6 +121,7 @@ class Simulation:
             beside=reference_of(scene, self._clock, self._world, stack),
         )
         self.choice = ready.choice
+        self.unmeasured = ready.unmeasured
         self.array = ready.array
         # The machine was switched on earlier, the session and its scene begin now.
         self._world.begin()
@@ -212,6 +215,7 @@ def simulate(
         missed_slots=simulation.acquisition.missed_slots,
         choice=simulation.choice,
         replaced=simulation.array.replaced,
+        unmeasured=simulation.unmeasured,
         flags={
             serial: {reason: n for (i, reason), n in sorted(flagged.items()) if i == tile}
             for tile, serial in enumerate(simulation.info.serials)

@@ -166,7 +166,7 @@ def _read(path: Path) -> list[RecordedTare]:
     try:
         content = json.loads(path.read_bytes())
         if not isinstance(content, list):
-            raise TypeError("it is no list")  # noqa: TRY301
+            raise TypeError("it is no list")  # noqa: TRY301  # caught with the others
         return [
             RecordedTare(
                 str(entry["id"]),

@@ -51,6 +51,12 @@ def test_help_does_not_wait_for_heavy_libraries() -> None:
     assert done.stdout.decode().strip() == "[]"
 
 
+def test_a_node_of_real_tiles_does_not_wait_for_scipy() -> None:
+    code = "import sys; import service.cli.node, service.node; print('scipy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+    assert done.stdout.decode().strip() == "False"
+
+
 def test_ctrl_c_leaves_no_file_and_a_failing_exit_code(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from service.cli.main import main; main()", "simulate"]
     arguments = ["--scene", "standing", "--seconds", "100000", "--no-estimates"]

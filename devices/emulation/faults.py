@@ -8,10 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from typing import NamedTuple
 
 from devices.scene import BUS, RATE, FaultKind, FaultScene
 
 _BEFORE_NS = 2**62
+
+
+class _Window(NamedTuple):
+    """From when to when a fault is there, and how often it happens meanwhile."""
+
+    begin_ns: int
+    end_ns: int
+    rate: float
 
 
 class Fault:
@@ -19,15 +28,20 @@ class Fault:
 
     Args:
         windows_s: begins and ends, in seconds of the scene.
-        rate: how often, for faults that come and go by chance while they are there.
+        rates: of each window, how often, for faults that come and go by chance while they are
+            there; default: `RATE`.
     """
 
-    def __init__(self, windows_s: Sequence[tuple[float, float]] = (), rate: float = 0.0) -> None:
-        self.rate = rate
+    def __init__(
+        self, windows_s: Sequence[tuple[float, float]] = (), rates: Sequence[float] | None = None
+    ) -> None:
         self._windows_s = tuple(windows_s)
+        self._rates = tuple(rates) if rates is not None else (RATE,) * len(self._windows_s)
         # What is there from the scene's first instant on was there before it.
-        self._windows_ns: tuple[tuple[int, int], ...] = tuple(
-            (0, _BEFORE_NS) for begin, _ in windows_s if begin == 0.0
+        self._windows_ns = tuple(
+            _Window(0, _BEFORE_NS, rate)
+            for (begin, _), rate in zip(self._windows_s, self._rates, strict=True)
+            if begin == 0.0
         )
         self._depth = 0
         self._was_injected = False
@@ -41,8 +55,8 @@ class Fault:
     def begin(self, epoch_ns: int) -> None:
         """The scene's time begins at this instant of the clock."""
         self._windows_ns = tuple(
-            (epoch_ns + round(begin * 1e9), epoch_ns + round(end * 1e9))
-            for begin, end in self._windows_s
+            _Window(epoch_ns + round(begin * 1e9), epoch_ns + round(end * 1e9), rate)
+            for (begin, end), rate in zip(self._windows_s, self._rates, strict=True)
         )
 
     def __call__(self, t_ns: int) -> bool:
@@ -51,26 +65,35 @@ class Fault:
             return True
         if not self._windows_ns:  # asked at every START
             return False
-        return any(begin <= t_ns < end for begin, end in self._windows_ns)
+        return any(window.begin_ns <= t_ns < window.end_ns for window in self._windows_ns)
+
+    def rate(self, t_ns: int) -> float:
+        """How often it happens at `t_ns`: the most often of what is there, 0 of nothing."""
+        by_hand = RATE if self._depth else 0.0
+        if not self._windows_ns:  # asked at every byte
+            return by_hand
+        there = [w.rate for w in self._windows_ns if w.begin_ns <= t_ns < w.end_ns]
+        return max(there, default=by_hand)
 
     def struck(self, since_ns: int, t_ns: int) -> bool:
         """Was it there at any time after `since_ns` and not after `t_ns`?"""
         if self._depth or self._was_injected:
             self._was_injected = False
             return True
-        return any(begin <= t_ns and end > since_ns for begin, end in self._windows_ns)
+        return any(w.begin_ns <= t_ns and w.end_ns > since_ns for w in self._windows_ns)
 
     def set_in(self, since_ns: int, t_ns: int) -> bool:
         """Did it begin after `since_ns` and not after `t_ns`? By hand: once for every block."""
         if self._is_new:
             self._is_new = False
             return True
-        return any(since_ns < begin <= t_ns for begin, _ in self._windows_ns)
+        return any(since_ns < window.begin_ns <= t_ns for window in self._windows_ns)
 
     def clear(self, t_ns: int) -> None:
         """End what is there at `t_ns`: somebody mended it."""
         self._windows_ns = tuple(
-            (begin, min(end, t_ns) if begin <= t_ns else end) for begin, end in self._windows_ns
+            w._replace(end_ns=min(w.end_ns, t_ns)) if w.begin_ns <= t_ns else w
+            for w in self._windows_ns
         )
         self._depth = 0
 
@@ -100,7 +123,8 @@ class Faults:
         """The fault of one kind and target: a tile's serial, a mux as "0x70", or the bus."""
         if (kind, target) not in self._faults:
             mine = [f for f in self._scenes if f.kind == kind and f.target == target]
-            fault = Fault([(f.t_s, f.t_s + f.duration_s) for f in mine], _rate(mine))
+            windows_s = [(f.t_s, f.t_s + f.duration_s) for f in mine]
+            fault = Fault(windows_s, [f.rate for f in mine])
             if self._epoch_ns is not None:
                 fault.begin(self._epoch_ns)
             self._faults[kind, target] = fault
@@ -116,7 +140,3 @@ class Faults:
         self._epoch_ns = epoch_ns
         for fault in self._faults.values():
             fault.begin(epoch_ns)
-
-
-def _rate(scenes: Sequence[FaultScene]) -> float:
-    return scenes[0].rate if scenes else RATE

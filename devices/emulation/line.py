@@ -2,17 +2,17 @@
 
 `sda_low`: a slave holds SDA: every bit reads as 0, so every acknowledge is there, every byte reads
 00, and nobody hears anything (hardware.md 3.2). It hangs in the middle of a byte and lets go after
-nine clocks. `sda_high`: SDA is open and reads as 1: nobody acknowledges. `scl_low`: nothing moves,
-the adapter gives up after its time-out. `adapter_timeout`: the same once, by chance. `nack_storm`
-and `bit_errors`: single acknowledges and bits are lost by chance, on every byte with the fault's
-rate; there is no checksum in this protocol.
+the clocks that are left of it. `sda_high`: SDA is open and reads as 1: nobody acknowledges.
+`scl_low`: nothing moves, the adapter gives up after its time-out. `adapter_timeout`: the same once,
+by chance. `nack_storm` and `bit_errors`: single acknowledges and bits are lost by chance, on every
+byte with the fault's rate; there is no checksum in this protocol.
 """
 
 from __future__ import annotations
 
 import random
 
-from devices.emulation.faults import Faults
+from devices.emulation.faults import Fault, Faults
 
 _ADDRESS_BITS = 8
 
@@ -41,14 +41,18 @@ class Line:
         """Does a transfer that begins now end in the adapter's time-out?"""
         if self.scl_low(t_ns):
             return True
-        return self.adapter_timeout(t_ns) and self._rng.random() < self.adapter_timeout.rate
+        return self._happens(self.adapter_timeout, t_ns)
 
     def loses_acknowledge(self, t_ns: int) -> bool:
         """Is this acknowledge not seen?"""
-        return self._nack_storm(t_ns) and self._rng.random() < self._nack_storm.rate
+        return self._happens(self._nack_storm, t_ns)
 
     def disturbed(self, value: int, t_ns: int) -> int:
         """The byte as it arrives: with one bit turned over, by chance."""
-        if self._bit_errors(t_ns) and self._rng.random() < self._bit_errors.rate:
+        if self._happens(self._bit_errors, t_ns):
             return value ^ 1 << self._rng.randrange(_ADDRESS_BITS)
         return value
+
+    def _happens(self, fault: Fault, t_ns: int) -> bool:
+        rate = fault.rate(t_ns)
+        return rate > 0.0 and self._rng.random() < rate

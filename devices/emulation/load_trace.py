@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import nnls
 
 from devices.errors import LoadTraceError, UsageError
 
@@ -188,6 +187,8 @@ def _share(
 
 def _least_squares_shares(positions_m: Floats, cop_m: Floats) -> tuple[Floats, bool]:
     """Non-negative shares of sum one with their centroid at `cop_m` or nearest to it."""
+    from scipy.optimize import nnls
+
     tiles, axes = positions_m.shape
     scale_m = np.abs(positions_m).max() if axes else 1.0
     rows = np.vstack([np.ones(tiles), positions_m.T / scale_m])

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.clock import Clock
+from devices.dynamixel_models import COUNTS_PER_TURN
 from devices.emulation.dome import Domes
 from devices.emulation.dynamixel import EmulatedServo
 from devices.emulation.faults import Faults
@@ -34,7 +35,6 @@ from devices.emulation.surroundings import Surroundings
 from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.scene import BUS, FaultKind, MudGround, Scene, ServoScene, TileFault
 
-_COUNTS_PER_TURN = 4096
 _FORESIGHT_S = 0.4
 
 
@@ -260,4 +260,4 @@ class World:
         angle = self.ground.angle_rad(self._seconds(np.array([t_ns])))
         angle_rad = 0.0 if angle is None else float(angle[0])
         turns = angle_rad / (2 * math.pi) / (servo.sign * servo.ratio)
-        return servo.zero_counts + math.floor(turns * _COUNTS_PER_TURN + 0.5)
+        return servo.zero_counts + math.floor(turns * COUNTS_PER_TURN + 0.5)

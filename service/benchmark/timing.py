@@ -1,9 +1,9 @@
 """What an estimate costs per frame: `step` and `finish` alone, without reading or writing.
 
 It is the CPU time of the thread that estimates: on an idle machine that is the time it takes, and
-on a busy one it does not grow by what others take. Rungs and modes take turns, several times, so that
-what is left of a busy moment is there for all of them. A first turn is not counted: models may be
-compiled in it.
+on a busy one it does not grow by what others take. Rungs and modes take turns, several times, so
+that what is left of a busy moment is there for all of them. A first turn is not counted: models may
+be compiled in it.
 """
 
 from __future__ import annotations

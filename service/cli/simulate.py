@@ -136,6 +136,7 @@ def _as_json(result: Simulated, path: Path) -> dict[str, object]:
         "seconds": result.seconds,
         "rate_hz": result.rate_hz,
         "schedule": result.choice.schedule,
+        "unmeasured": list(result.unmeasured),
         "flags": {serial: dict(flags) for serial, flags in result.flags.items()},
         "missed_slots": result.missed_slots,
         "bytes": path.stat().st_size,
@@ -155,6 +156,8 @@ def _print(result: Simulated, path: Path) -> None:
         f"{result.wall_s:.1f} s of wall time, {result.seconds / result.wall_s:.1f} times real time"
     )
     remark(f"schedule {result.choice.schedule}: {result.choice.reason}")
+    for serial in result.unmeasured:
+        say(f"tile {serial}: its conversion time could not be measured, so it was given 3 ms")
     for serial, flags in result.flags.items():
         said = ", ".join(f"{n} {reason}" for reason, n in flags.items())
         say(f"tile {serial}: of {result.frames} frames {said}")

@@ -92,11 +92,11 @@ class Tare:
             for name in ("baseline_kpa", "baseline_sigma_kpa", "noise_kpa"):
                 values[name] = np.array(content[name], dtype=np.float64)
                 if values[name].shape != (tiles,) or not np.isfinite(values[name]).all():
-                    raise ValueError(f"{name} is not that of {tiles} tiles")  # noqa: TRY301
+                    raise ValueError(f"{name} is not that of {tiles} tiles")  # noqa: TRY301  # caught with the others
             counts = content.get("tadc_counts") or [None] * tiles
             values["tadc_counts"] = np.array(counts, dtype=np.float64)  # None becomes NaN
             if values["tadc_counts"].shape != (tiles,):
-                raise ValueError(f"tadc_counts are not those of {tiles} tiles")  # noqa: TRY301
+                raise ValueError(f"tadc_counts are not those of {tiles} tiles")  # noqa: TRY301  # caught with the others
             return cls(**values)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise TareError(f"a recorded tare is not readable: {error}") from error

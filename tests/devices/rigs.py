@@ -10,6 +10,7 @@ from smbus2 import i2c_msg
 
 from devices.array import TileArray
 from devices.budget import BusTiming
+from devices.bus_recovery import BusRecovery
 from devices.clock import VirtualClock
 from devices.emulation.faults import Faults
 from devices.emulation.i2c_bus import EmulatedI2cAdapter
@@ -157,6 +158,7 @@ def array_on(
     waits_ns: Sequence[int] | None = None,
     temperature_every: int = 1,
     broadcast_channels: int = 64,
+    recovery: BusRecovery | None = None,
     beside: Callable[[], float] | None = None,
 ) -> TileArray:
     """An array that waits exactly as long as each part converts, unless it is told otherwise."""
@@ -174,13 +176,14 @@ def array_on(
         timing=timing,
         temperature_every=temperature_every,
         broadcast_channels=broadcast_channels,
+        recovery=recovery,
         beside=beside,
     )
 
 
 def settled(wires: Wires, schedule: ScheduleName = "simultaneous", **options: object) -> TileArray:
     """The same, after the frames in which every reading is read twice."""
-    array = array_on(wires, schedule, **options)  # type: ignore[arg-type]
+    array = array_on(wires, schedule, **options)  # type: ignore[arg-type]  # as there
     for _ in range(SETTLED + 1):
         array.scan()
     return array

@@ -123,11 +123,10 @@ def test_a_wait_that_is_too_short_gives_the_conversion_before() -> None:
     assert second.padc[0] != 2
 
 
-def test_an_array_knows_the_name_of_its_schedule_and_its_tiles() -> None:
+def test_an_array_knows_its_tiles_and_which_are_behind_one_mux() -> None:
     for name in SCHEDULES:
         wires = Wires(TWO_MUXES)
         array = array_on(wires, name)
-        assert array.schedule_name == name
         assert array.tiles == wires.infos
         assert array.by_mux == ((0, 1), (2, 3))
 
@@ -769,3 +768,64 @@ def test_a_single_tile_that_comes_and_goes_is_found_again(schedule: ScheduleName
     for _ in range(SETTLED + 100):
         scan = array.scan()
     assert scan.status == [0]
+
+
+# What is wrong, in words
+
+
+class NoLines:
+    """A recovery whose lines are somebody else's."""
+
+    def clock_out(self) -> bool:
+        raise BusSetupError("GPIO lines cannot be used (EBUSY)", where="/dev/gpiochip0, lines 2, 3")
+
+    def reset_muxes(self) -> bool:
+        return False
+
+
+def test_a_stuck_bus_is_said_and_what_kept_it_from_being_helped() -> None:
+    wires = Wires(FOUR)
+    plain, helped = array_on(wires), array_on(wires, recovery=NoLines())
+    for array in (plain, helped):
+        with wires.fault("sda_low"):
+            frames(array, 3)
+            assert list(array.troubles()) == [""]
+            text = array.troubles()[""]
+        frames(array, 200)
+        assert array.troubles() == {}
+        assert text.startswith("the bus is stuck or cut")
+        assert ("GPIO lines cannot be used" in text) == (array is helped)
+
+
+# A stream begins, and goes on
+
+
+@every_schedule
+def test_after_something_else_used_the_bus_nothing_is_read_that_was_started_before(
+    schedule: ScheduleName,
+) -> None:
+    wires = Wires(TWO_MUXES)
+    array = settled(wires, schedule)
+    wires.bus.transfer(i2c_msg.write(0x73, [0xFF]))
+    wires.clock.sleep_until_ns(wires.clock.now_ns() + 1_000_000_000)
+    resumed_ns = wires.clock.now_ns()
+    array.resume()
+    scan = array.scan()
+    for i in range(4):
+        read = scan.padc[i] != NOT_READ
+        assert scan.status[i] == (0 if read else TileStatus.NOT_CONVERTED)
+        assert scan.convert_stop_ns[i] > resumed_ns or not read
+    assert array.scan().status == [0] * 4
+
+
+def test_what_went_wrong_is_counted_from_the_begin_of_a_stream_and_on_when_it_goes_on() -> None:
+    wires = Wires(FOUR)
+    array = settled(wires)
+    with wires.fault("no_answer", "T03"):
+        array.scan()
+    counted = dict(array.health[2].counts)
+    assert counted["no_answer"] == 1
+    array.resume()
+    assert dict(array.health[2].counts) == counted
+    array.begin()
+    assert not array.health[2].counts

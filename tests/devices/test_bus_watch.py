@@ -14,7 +14,7 @@ MS = 1_000_000
 
 
 class Helper:
-    """A recovery that notes when it is asked, and may fail itself."""
+    """A recovery that notes when it is asked, may fail itself, and may free SDA."""
 
     def __init__(self, wires: Wires) -> None:
         self.wires = wires
@@ -22,16 +22,26 @@ class Helper:
         self.resets = 0
         self.fails = False
         self.lets_go = True
+        self.clocks_free = False
+        self.reset_frees = False
+        self.reset_is_wired = True
 
     def clock_out(self) -> bool:
         self.asked_ns.append(self.wires.clock.now_ns())
         if self.fails:
             raise BusSetupError("the lines are somebody else's", where="gpio", errno=16)
+        if self.clocks_free:
+            self.free()
         return self.lets_go
 
     def reset_muxes(self) -> bool:
         self.resets += 1
-        return True
+        if self.reset_frees:
+            self.free()
+        return self.reset_is_wired
+
+    def free(self) -> None:
+        self.wires.adapter.line.sda_low.clear(self.wires.clock.now_ns())
 
 
 def watch_on(wires: Wires, helper: Helper | None = None) -> BusWatch:
@@ -100,19 +110,48 @@ def test_a_stuck_bus_is_helped_at_once_and_then_ever_more_rarely() -> None:
     )
     assert len(waits_ms) >= 9
     assert watch.recoveries == len(helper.asked_ns)
-    assert helper.resets == 0, "the clocks were enough, as far as anybody could see"
+    assert helper.resets == len(helper.asked_ns), "neither of them was enough"
 
 
-@pytest.mark.parametrize("fails", [False, True])
-def test_reset_is_for_a_bus_that_nine_clocks_did_not_free(fails: bool) -> None:
+def test_clocks_that_free_the_bus_are_all_that_is_done() -> None:
     wires = Wires(TWO_MUXES)
     helper = Helper(wires)
-    helper.fails, helper.lets_go = fails, False
+    helper.clocks_free = True
     watch = watch_on(wires, helper)
     with wires.fault("sda_low"):
         watch.fall()
-        assert not watch.comes_back()
+        assert watch.comes_back()
+    assert (len(helper.asked_ns), helper.resets) == (1, 0)
+
+
+@pytest.mark.parametrize("lets_go", [False, True])
+@pytest.mark.parametrize("fails", [False, True])
+def test_reset_is_for_a_bus_that_does_not_move_after_nine_clocks(
+    fails: bool, lets_go: bool
+) -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    helper.fails, helper.lets_go, helper.reset_frees = fails, lets_go, True
+    watch = watch_on(wires, helper)
+    with wires.fault("sda_low"):
+        watch.fall()
+        assert watch.comes_back()
     assert len(helper.asked_ns) == helper.resets == 1
+
+
+def test_what_kept_the_bus_from_being_helped_is_told_until_it_is_back() -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    helper.fails, helper.reset_is_wired = True, False
+    watch = watch_on(wires, helper)
+    with wires.fault("sda_low"):
+        watch.fall()
+        assert watch.problem == ""
+        assert not watch.comes_back()
+        assert watch.problem == "gpio: the lines are somebody else's"
+    watch.fall()
+    assert watch.comes_back()
+    assert watch.problem == ""
 
 
 def test_after_it_was_well_a_stuck_bus_is_helped_at_once_again() -> None:

@@ -82,4 +82,4 @@ def test_an_anchor_carries_one_clock_over_to_the_other(t_mono_ns: int, t_ns: int
 def test_an_anchor_cannot_be_moved() -> None:
     anchor = UtcAnchor.of(0, 1, clock_set=True)
     with pytest.raises(dataclasses.FrozenInstanceError):
-        anchor.offset_ns = 2  # type: ignore[misc]
+        anchor.offset_ns = 2  # type: ignore[misc]  # it is frozen

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from smbus2 import i2c_msg
 
+from devices.budget import BusTiming
 from devices.conversion_watch import ConversionWatch
+from devices.emulation.parts import random_of
 from devices.errors import NoAcknowledgeError
 from devices.health import TileHealth
 from devices.tile_ports import TilePorts
@@ -16,7 +19,8 @@ LONGEST_NS = 3_000_000  # MPL115A2 data sheet, table 10
 def watched(wires: Wires) -> tuple[ConversionWatch, TilePorts, list[TileHealth]]:
     ports = TilePorts(wires.bus, wires.infos)
     health = [TileHealth(info) for info in wires.infos]
-    return ConversionWatch(ports, wires.clock, health, [TYPICAL_NS] * 4), ports, health
+    timing = BusTiming(wires.scl_hz, (TYPICAL_NS * 1e-9,) * 4, tuple(mux for mux, _ in FOUR))
+    return ConversionWatch(ports, wires.clock, health, timing), ports, health
 
 
 def tried(watch: ConversionWatch, ports: TilePorts, tile: int) -> None:
@@ -95,3 +99,54 @@ def test_a_part_that_does_not_answer_is_somebody_elses_business() -> None:
     with wires.fault("no_answer", "T02"), pytest.raises(NoAcknowledgeError):
         tried(watch, ports, 1)
     assert watch.wait_ns == [TYPICAL_NS] * 4
+
+
+# A busy machine
+
+
+def hesitating(wires: Wires, seed: int) -> None:
+    """Now and then the machine hesitates before a transfer, for longer than a conversion lasts."""
+    rng = random_of(f"machine {seed}")
+
+    def hesitate(_: int, __: tuple[i2c_msg, ...]) -> None:
+        if rng.random() < 0.05:
+            late_ns = int(rng.integers(500_000, 5_000_000))
+            wires.clock.sleep_until_ns(wires.clock.now_ns() + late_ns)
+
+    wires.on_transaction = hesitate
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_machine_that_hesitates_does_not_make_a_slow_part_look_as_quick_as_it_was(
+    seed: int,
+) -> None:
+    wires = Wires(FOUR, tc_ns=2_000_000)
+    watch, ports, health = watched(wires)
+    tried(watch, ports, 2)
+    assert health[2].slow
+    hesitating(wires, seed)
+    for _ in range(20):
+        tried(watch, ports, 2)
+        assert health[2].slow
+        assert watch.wait_ns[2] == LONGEST_NS
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_machine_that_hesitates_does_not_make_a_part_look_slow(seed: int) -> None:
+    wires = Wires(FOUR)
+    watch, ports, health = watched(wires)
+    hesitating(wires, seed)
+    for _ in range(20):
+        tried(watch, ports, 2)
+        assert not health[2].slow
+
+
+def test_a_machine_that_is_always_late_shows_nothing() -> None:
+    wires = Wires(FOUR)
+    watch, ports, health = watched(wires)
+    wires.on_transaction = lambda _, __: wires.clock.sleep_until_ns(wires.clock.now_ns() + 500_000)
+    tried(watch, ports, 2)
+    assert not health[2].slow
+    health[2].slow = True
+    tried(watch, ports, 2)
+    assert health[2].slow

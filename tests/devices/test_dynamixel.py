@@ -169,7 +169,7 @@ def test_silence_is_a_timeout_that_says_what_to_check_and_takes_its_time() -> No
         assert thing in str(caught.value)
     assert clock.now_ns() == 7 + 20_000_000
     assert isinstance(caught.value, TimeoutError)
-    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301  # our own
 
 
 def test_half_an_answer_is_a_timeout_that_tells_of_it() -> None:

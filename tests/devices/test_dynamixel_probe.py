@@ -14,6 +14,7 @@ from devices.errors import ServoSetupError
 TIMEOUT_S = 0.1
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(
     ("protocol", "model", "number"),
     [(1, "MX-28", 29), (1, "MX-64", 310), (2, "MX-28", 30), (2, "MX-64", 311)],

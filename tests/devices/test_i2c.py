@@ -24,7 +24,7 @@ from devices.errors import (
     NoAcknowledgeError,
     UsageError,
 )
-from devices.i2c import I2cBus, open_bus
+from devices.i2c import I2cBus, PatientBus, open_bus
 
 
 class BrokenAdapter:
@@ -81,7 +81,7 @@ def test_a_failure_names_the_bus_and_the_address_and_keeps_both_through_pickling
 ) -> None:
     write, read = i2c_msg.write(0x73, [0]), i2c_msg.read(0x73, 1)
     error = failure_of(OSError(number, name), write, read)
-    again = pickle.loads(pickle.dumps(error))  # noqa: S301
+    again = pickle.loads(pickle.dumps(error))  # noqa: S301  # our own
     for one in (error, again):
         assert type(one) is kind
         assert str(one).startswith("/dev/i2c-7, address 0x73: ")
@@ -262,3 +262,36 @@ def test_an_adapter_that_knows_no_time_out_is_closed_again(
     with pytest.raises(BusSetupError, match="ENOTTY"):
         open_bus("/dev/i2c-1")
     assert pi.closed >= 1
+
+
+# A patient bus
+
+
+class Hesitant(BrokenAdapter):
+    """Nobody acknowledges the first so many transactions."""
+
+    def __init__(self, deaf: int) -> None:
+        super().__init__(OSError(errno.EREMOTEIO, "nobody"))
+        self.deaf = deaf
+        self.asked = 0
+
+    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
+        self.asked += 1
+        if self.asked <= self.deaf:
+            raise self.error
+
+
+@pytest.mark.parametrize("deaf", range(4))
+def test_a_patient_bus_asks_up_to_four_times_and_counts_what_then_went_well(deaf: int) -> None:
+    bus = PatientBus(I2cBus(adapter := Hesitant(deaf), "emulated"))
+    bus.transfer(i2c_msg.write(0x70, [0]))
+    assert (adapter.asked, bus.repeated) == (deaf + 1, int(deaf > 0))
+    bus.transfer(i2c_msg.write(0x70, [0]))
+    assert (adapter.asked, bus.repeated) == (deaf + 2, int(deaf > 0))
+
+
+def test_who_is_not_there_is_no_disturbance() -> None:
+    bus = PatientBus(I2cBus(adapter := Hesitant(100), "emulated"))
+    with pytest.raises(NoAcknowledgeError):
+        bus.transfer(i2c_msg.write(0x77, [0]))
+    assert (adapter.asked, bus.repeated) == (4, 0)

@@ -24,7 +24,7 @@ def read_bytes(wires: Wires, tile: int, tamper: Tamper) -> None:
             tamper(next(count), raw)
         return bytes(raw)
 
-    part.read = read  # type: ignore[method-assign,assignment]
+    part.read = read  # type: ignore[method-assign,assignment]  # for this part only
 
 
 def quiet_frame(array: TileArray) -> None:

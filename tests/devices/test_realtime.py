@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 
 import pytest
 
@@ -17,10 +18,10 @@ from devices import realtime
 PR_GET_TIMERSLACK = 30
 
 
-def in_a_thread(body: object) -> object:
+def in_a_thread(body: Callable[[], object]) -> object:
     """Settings of a thread end with it."""
     result: list[object] = []
-    thread = threading.Thread(target=lambda: result.append(body()))  # type: ignore[operator]
+    thread = threading.Thread(target=lambda: result.append(body()))
     thread.start()
     thread.join()
     return result[0]

@@ -310,20 +310,25 @@ def test_a_machine_that_sleeps_too_long_measures_too_long_and_never_too_short() 
     assert 1_600_000 <= found <= 1.015 * 1_600_000 + 80_000
 
 
+def hesitating(wires: Wires, seed: int) -> None:
+    """Now and then the machine hesitates before a transfer."""
+    rng = random_of(f"machine {seed}")
+
+    def hesitate(_: int, __: tuple[i2c_msg, ...]) -> None:
+        if rng.random() < 0.05:
+            late_ns = int(rng.integers(100_000, 5_000_000))
+            wires.clock.sleep_until_ns(wires.clock.now_ns() + late_ns)
+
+    wires.on_transaction = hesitate
+
+
 @pytest.mark.parametrize("mode", ["stale", "abort", "torn"])
 def test_a_machine_that_hesitates_before_a_transfer_never_measures_too_short(
     mode: ReadDuringConversion,
 ) -> None:
     for seed in range(30):
         wires = part_with(1_600_000, mode, noisy(f"hesitates {seed}"), 400_000)
-        rng = random_of(f"machine {seed}")
-
-        def hesitate(_: int, __: tuple[i2c_msg, ...]) -> None:
-            if rng.random() < 0.05:  # noqa: B023  # called within this round only
-                late_ns = int(rng.integers(100_000, 5_000_000))  # noqa: B023
-                wires.clock.sleep_until_ns(wires.clock.now_ns() + late_ns)  # noqa: B023
-
-        wires.on_transaction = hesitate
+        hesitating(wires, seed)
         wires_timing = WireTiming(400_000, 0.0)
         found = measure_conversion_ns(wires.bus, wires.clock, wires.infos[0], wires_timing)
         assert found is not None

@@ -46,7 +46,7 @@ def devices(monkeypatch: pytest.MonkeyPatch) -> list[FakeSpiDev]:
         return made[-1]
 
     library = ModuleType("spidev")
-    library.SpiDev = make  # type: ignore[attr-defined]
+    library.SpiDev = make  # type: ignore[attr-defined]  # a module of our own
     monkeypatch.setitem(sys.modules, "spidev", library)
     return made
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
+from devices import schedules
 from devices.clock import VirtualClock
 from devices.emulation.parts import draw_chip
 from devices.emulation.world import World
-from devices.errors import SceneError, TileSetupError
+from devices.errors import BusFaultError, BusSetupError, SceneError, TileSetupError
 from devices.i2c import I2cBus, open_bus
-from devices.scene import Scene, ScheduleName, load_scene
-from devices.startup import Ready, make_ready, measured, renew
+from devices.scene import FaultKind, Scene, ScheduleName, load_scene
+from devices.startup import Ready, free_bus, make_ready, measured, renew
 from tests.devices.rigs import ONE, SCHEDULES, Plugs, full
 
 SceneOf = Callable[..., Scene]
@@ -113,7 +115,8 @@ def test_auto_takes_what_is_best_for_these_tiles_and_says_why(
 ) -> None:
     array = {"wait_ms": 1.6, "conversion_ms": 1.6}
     ready, *_ = started(scene_of(full(tiles), array=array))
-    assert ready.choice.schedule == ready.array.schedule_name == schedule
+    assert ready.choice.schedule == schedule
+    assert ready.array._schedule is schedules.SCHEDULES[ready.choice.schedule]
     muxes = (tiles + 7) // 8
     assert ready.choice.reason.startswith(
         f"{tiles} tile{'s' * (tiles > 1)} on {muxes} mux{'es' * (muxes > 1)}: {schedule} gives "
@@ -195,6 +198,63 @@ def test_measuring_leaves_no_tile_with_a_conversion_of_its_own(scene_of: SceneOf
     clock = VirtualClock()
     found = measured(open_bus("emulated", World(scene, clock).i2c_adapter), scene, clock)
     assert found.tiles[0].conversion_ms * 1e-3 == pytest.approx(found.timing.conversions_s[0])
+
+
+# A bus that hangs since the last run
+
+
+class Recovery:
+    """Clocks that bring the lines up, as far as they can tell, and a RESET that may free SDA."""
+
+    def __init__(self, world: World, *, reset_frees: bool = False, taken: bool = False) -> None:
+        self.sda_low = world.i2c_adapter.line.sda_low
+        self.reset_frees = reset_frees
+        self.taken = taken
+
+    def clock_out(self) -> bool:
+        if self.taken:
+            raise BusSetupError("GPIO lines cannot be used (EBUSY)", where="/dev/gpiochip0")
+        return True
+
+    def reset_muxes(self) -> bool:
+        if self.reset_frees:
+            self.sda_low.clear(0)
+        return True
+
+
+def hanging(scene: Scene) -> tuple[World, I2cBus]:
+    world = World(scene, VirtualClock())
+    return world, open_bus("emulated", world.i2c_adapter)
+
+
+@pytest.mark.parametrize("helped", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "told"), [("sda_low", "SDA is stuck low"), ("scl_low", "the bus failed (ETIMEDOUT)")]
+)
+def test_a_bus_that_cannot_be_freed_is_told_by_the_wire_that_is_stuck(
+    scene_of: SceneOf, kind: FaultKind, told: str, helped: bool
+) -> None:
+    world, bus = hanging(scene := scene_of())
+    with world.fault(kind), pytest.raises(BusFaultError, match=re.escape(told)) as caught:
+        free_bus(bus, scene, Recovery(world) if helped else None)
+    assert ("SDA is stuck low" in str(caught.value)) == (kind == "sda_low")
+
+
+@pytest.mark.parametrize("taken", [False, True])
+def test_a_bus_that_nine_clocks_do_not_move_is_freed_by_reset(
+    scene_of: SceneOf, taken: bool
+) -> None:
+    world, bus = hanging(scene := scene_of())
+    with world.fault("sda_low"):
+        free_bus(bus, scene, Recovery(world, reset_frees=True, taken=taken))
+        assert not world.i2c_adapter.line.sda_low(0)
+
+
+def test_what_kept_a_bus_from_being_freed_is_told(scene_of: SceneOf) -> None:
+    world, bus = hanging(scene := scene_of())
+    with world.fault("sda_low"), pytest.raises(BusFaultError) as caught:
+        free_bus(bus, scene, Recovery(world, taken=True))
+    assert "could not be freed: /dev/gpiochip0: GPIO lines cannot be used" in str(caught.value)
 
 
 # Another part

@@ -54,6 +54,16 @@ def test_what_was_read_is_never_changed() -> None:
     assert hold_temperature(batch)[0] is batch, "nothing to do, nothing copied"
 
 
+def test_the_last_of_temperatures_that_were_all_read_is_held_and_is_no_part_of_the_frames() -> None:
+    batch = frames([[500, 600], [510, 601]], [7, 9])
+    last = hold_temperature(batch)[1]
+    assert last.tadc.tolist() == [510, 601]
+    assert last.t_mono_ns.tolist() == [9 * MS, 9 * MS]
+    assert (last.tadc.dtype, last.t_mono_ns.dtype) == (np.uint16, np.int64)
+    assert not np.shares_memory(last.tadc, batch.tadc)
+    assert held(frames([[N, N]], [10]), last) == [[510, 601]]
+
+
 def test_the_frames_themselves_keep_what_was_read() -> None:
     batch = frames([[500], [N]])
     hold_temperature(batch)

@@ -8,7 +8,7 @@ from itertools import accumulate, pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.backlog import Backlog, EncodedBatch
+from service.backlog import Backlog, EncodedBatch, make_room
 
 batches = st.lists(st.tuples(st.integers(1, 5), st.integers(0, 40)), max_size=30)
 """Frames and bytes of each batch."""
@@ -127,3 +127,32 @@ def test_a_late_acknowledgement_of_what_was_evicted_takes_nothing_else() -> None
     backlog.acknowledge(0, 9)
     backlog.acknowledge(0, 24)
     assert numbers(backlog) == list(range(20, 40))
+
+
+# Several streams
+
+
+@given(st.lists(batches, min_size=1, max_size=4), st.integers(0, 200))
+def test_streams_together_keep_no_more_than_one_alone_and_the_oldest_frames_go(
+    streams: list[list[tuple[int, int]]], bytes_max: int
+) -> None:
+    backlogs: list[Backlog] = []
+    for sizes in streams:
+        backlogs.append(Backlog(bytes_max))
+        for batch in made(sizes):
+            make_room(backlogs, batch, bytes_max)
+            backlogs[-1].append(batch)
+            held = sum(backlog.kept_bytes for backlog in backlogs)
+            assert held <= bytes_max or held == len(batch.payload)  # the newest stays
+    for sizes, backlog in zip(streams, backlogs, strict=True):
+        frames = sum(count for count, _ in sizes)
+        assert numbers(backlog) == list(range(backlog.first_seq, frames))
+        assert backlog.evicted_frames == backlog.first_seq
+    for older, newer in pairwise(backlogs):
+        assert not (older.kept_bytes and newer.evicted_frames), "older frames go first"
+
+
+def test_one_stream_alone_is_bounded_by_itself() -> None:
+    backlog = filled([(10, 100)] * 4)
+    make_room([backlog], EncodedBatch(40, 49, bytes(100)), 200)
+    assert backlog.kept_bytes == 400

@@ -94,6 +94,7 @@ def test_the_age_of_a_frame_is_known_once_the_clocks_are(
     assert -100 < frame["age_ms"] < 2000
 
 
+@pytest.mark.real_time
 def test_frames_come_at_the_rate_that_was_asked_for(
     running: Running, tared: FakeNode, play: Callable[..., Any]
 ) -> None:
@@ -127,6 +128,7 @@ def test_a_spike_of_one_frame_between_two_messages_is_not_hidden(
     assert frame["force_max_n"][0] < 15.0
 
 
+@pytest.mark.real_time
 def test_a_heartbeat_comes_each_second(running: Running, tared: FakeNode) -> None:
     with running.socket(LIVE) as live:
         first, second = next_of(live, "heartbeat"), next_of(live, "heartbeat")
@@ -216,6 +218,7 @@ def test_only_the_node_that_was_asked_for_is_shown(
         assert next_of(live, "frame")["node"] == "bench"
 
 
+@pytest.mark.real_time
 def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
     running: Running,
     tared: FakeNode,
@@ -251,6 +254,7 @@ def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
         assert running.node()["lost_frames"] == 0
 
 
+@pytest.mark.real_time
 def test_who_joins_late_sees_the_picture_at_once(
     running: Running, tared: FakeNode, play: Callable[..., Any]
 ) -> None:

@@ -18,6 +18,8 @@ import pytest
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus, TileStatus
 from storage.session_file import SessionReader
 
+pytestmark = pytest.mark.real_time
+
 Running = Any
 Until = Callable[..., Any]
 Foottile = Callable[..., Any]

@@ -182,7 +182,7 @@ def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
     node = node_of(running)
 
     async def scenario() -> list[str]:
-        async with Publishing(node, running.url, token="wrong") as publishing:  # noqa: S106
+        async with Publishing(node, running.url, token="wrong") as publishing:  # noqa: S106  # of this test
             await publishing.until(lambda: publishing.reports)
             await asyncio.sleep(0.5)  # several attempts
             return publishing.reports
@@ -199,7 +199,7 @@ def test_a_right_token_is_taken(
     node = node_of(running)
 
     async def scenario() -> None:
-        async with Publishing(node, running.url, token="right") as publishing:  # noqa: S106
+        async with Publishing(node, running.url, token="right") as publishing:  # noqa: S106  # of this test
             publishing.take(20)
             await publishing.emptied()
 

@@ -146,7 +146,7 @@ def test_only_a_folder_can_be_synced_as_one(tmp_path: Path) -> None:
 
 
 def test_an_error_of_the_system_becomes_one_that_names_the_path() -> None:
-    with pytest.raises(StorageError, match="No space left") as caught:  # noqa: SIM117
+    with pytest.raises(StorageError, match="No space left") as caught:  # noqa: SIM117  # it is the inner one's error
         with storage_errors(Path("/data/x")):
             raise OSError(28, "No space left on device")
     assert caught.value.where == "/data/x"

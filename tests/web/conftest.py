@@ -98,8 +98,8 @@ class Field:
 
 
 @pytest.fixture(scope="session")
-def field_environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    return {**os.environ, "XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
+def field_environment(bench_cache: Path) -> dict[str, str]:
+    return {**os.environ, "XDG_CACHE_HOME": str(bench_cache)}
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,8 @@ from playwright.sync_api import Page, expect
 
 from tests.web.conftest import Field, wait_until
 
+pytestmark = pytest.mark.real_time
+
 OpenPage = Callable[..., Page]
 
 PRESSED_N = (0.0, 6.0, 12.0, 18.0)

@@ -1,8 +1,8 @@
 """`denoise`: white noise averaged away over as long as nothing happens.
 
 Around every sample a line and a parabola are fitted to windows that grow, up to the look-ahead on
-one side and `PAST_NS` on the other. The longest one is taken whose value still agrees with those of all
-shorter ones (intersection of confidence intervals, Goldenshluger and Nemirovski 1997; Katkovnik
+one side and `PAST_NS` on the other. The longest one is taken whose value still agrees with those of
+all shorter ones (intersection of confidence intervals, Goldenshluger and Nemirovski 1997; Katkovnik
 1999). A window never crosses a gap.
 """
 

@@ -1,10 +1,10 @@
 """`temperature`: the baseline of a sealed bubble, which follows p/T of its gas (hardware.md 9).
 
 `tadc` is the chip's temperature. The gas follows its chip with one lag of some seconds, measured
-per tile in the bench's soak, in which the half count of noise of `tadc` drowns: it needs no smoothing,
-which would only be late in a cold shock. Pressure is taken back to what it would be at the tare's
-temperature, in proportion to itself, because a warmer gas answers a squeeze more strongly, too.
-While chip and gas differ, how far is itself uncertain.
+per tile in the bench's soak, in which the half count of noise of `tadc` drowns: it needs no
+smoothing, which would only be late in a cold shock. Pressure is taken back to what it would be at
+the tare's temperature, in proportion to itself, because a warmer gas answers a squeeze more
+strongly, too. While chip and gas differ, how far is itself uncertain.
 """
 
 from __future__ import annotations

@@ -117,10 +117,26 @@ def test_a_fault_strikes_the_target_and_in_the_way_that_the_scene_says() -> None
     }
 
 
-def test_the_rate_of_a_fault_by_chance_is_the_scenes() -> None:
-    faults = Faults([FaultScene(kind="bit_errors", t_s=0.0, duration_s=1.0, rate=0.25)])
-    assert faults.of("bit_errors").rate == 0.25
-    assert faults.of("nack_storm").rate == 0.01, "one by hand has the scene file's default"
+def test_the_rate_of_a_fault_by_chance_is_that_of_its_window() -> None:
+    faults = Faults(
+        [
+            FaultScene(kind="bit_errors", t_s=0.0, duration_s=2.0, rate=0.25),
+            FaultScene(kind="bit_errors", t_s=1.0, duration_s=2.0, rate=0.5),
+            FaultScene(kind="bit_errors", t_s=5.0, duration_s=1.0, rate=0.125),
+        ]
+    )
+    assert faults.of("bit_errors").rate(EPOCH_NS) == 0.25, "as at the scene's first instant"
+    faults.begin(EPOCH_NS)
+    rates = [faults.of("bit_errors").rate(EPOCH_NS + round(t_s * S)) for t_s in (-1, 0, 1, 2, 3, 5)]
+    # Where two overlap it happens as often as in the worse one.
+    assert rates == [0.0, 0.25, 0.5, 0.5, 0.0, 0.125]
+
+
+def test_a_fault_by_chance_by_hand_has_the_scene_files_default() -> None:
+    faults = Faults([])
+    assert faults.of("nack_storm").rate(0) == 0.0
+    with faults.injected("nack_storm", "bus"):
+        assert faults.of("nack_storm").rate(0) == 0.01
 
 
 def test_a_fault_by_hand_lasts_as_long_as_its_block() -> None:

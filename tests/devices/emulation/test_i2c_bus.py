@@ -376,7 +376,7 @@ def test_a_broadcast_convert_reaches_all_open_tiles() -> None:
 
 
 def silent(part: EmulatedMpl115a2) -> EmulatedMpl115a2:
-    part.start = lambda reading, t_ns: False  # type: ignore[method-assign]
+    part.start = lambda reading, t_ns: False  # type: ignore[method-assign]  # for this part only
     return part
 
 

@@ -24,22 +24,16 @@ class Outcome:
 Run = Callable[..., Outcome]
 
 
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One bench for all tests: pressing a tile takes a second."""
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture
 def run(
     tmp_path: Path,
-    cache: Path,
+    bench_cache: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> Run:
     """Run `foottile ARGUMENTS` in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(bench_cache))
     monkeypatch.setenv("COLUMNS", "200")
 
     def run_foottile(*arguments: object) -> Outcome:

@@ -103,13 +103,31 @@ def test_an_axis_name_that_is_none_is_refused(run, tmp_path):
     assert "--cop-axes" in outcome.err
 
 
+def made_once(run, folder: Path, name: str, *arguments: object) -> bytes:
+    """What `foottile simulate` writes; the same command always gives the same bytes."""
+    kept = folder / name
+    if not kept.exists():
+        assert run("simulate", *arguments, "--out", kept).code == 0
+    return kept.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("kept")
+
+
 @pytest.fixture
-def session(run, tmp_path) -> Path:
-    outcome = run(
-        *("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
-    )
-    assert outcome.code == 0
-    return tmp_path / "s.parquet"
+def session(run, tmp_path, kept) -> Path:
+    arguments = ("--scene", "standing", "--seconds", 2, "--no-estimates")
+    path = tmp_path / "s.parquet"
+    path.write_bytes(made_once(run, kept, "s.parquet", *arguments))
+    return path
+
+
+@pytest.fixture
+def bench(run, kept) -> bytes:
+    """A recording of tile T01 under the mill."""
+    return made_once(run, kept, "bench.parquet", "--scene", "indentation", "--tiles", "T01")
 
 
 @pytest.mark.parametrize(
@@ -178,9 +196,9 @@ def test_calibrate_refuses_an_indentation_that_never_loads_the_tile(run, tmp_pat
     assert left(tmp_path, "scene.toml", "bench.parquet") == []
 
 
-def test_calibrate_refuses_one_tile_from_two_files(run, tmp_path):
+def test_calibrate_refuses_one_tile_from_two_files(run, tmp_path, bench):
     for name in ("a.parquet", "b.parquet"):
-        run("simulate", "--scene", "indentation", "--tiles", "T01", "--out", name)
+        (tmp_path / name).write_bytes(bench)
     outcome = run("calibrate", "a.parquet", "b.parquet", "--out", "cal.json")
     assert outcome.code == 1
     assert "T01" in outcome.err
@@ -244,16 +262,16 @@ def test_a_wrong_list_of_tiles_is_refused(run, tmp_path, tiles):
     assert left(tmp_path) == []
 
 
-def test_a_reference_with_brackets_is_printed_as_it_is(run, tmp_path):
-    run("simulate", "--scene", "indentation", "--tiles", "T01", "--out", "bench.parquet")
+def test_a_reference_with_brackets_is_printed_as_it_is(run, tmp_path, bench):
+    (tmp_path / "bench.parquet").write_bytes(bench)
     reference = "load cell [/dev/ttyUSB0]"
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--reference", reference)
     assert outcome.code == 0, outcome.err
     assert reference in outcome.out
 
 
-def test_a_calibration_of_another_part_with_the_same_serial_is_refused(run, tmp_path):
-    run("simulate", "--scene", "indentation", "--tiles", "T01", "--out", "bench.parquet")
+def test_a_calibration_of_another_part_with_the_same_serial_is_refused(run, tmp_path, bench):
+    (tmp_path / "bench.parquet").write_bytes(bench)
     assert run("calibrate", "bench.parquet", "--out", "cal.json").code == 0
     other = ("--tiles", "T01", "--parts-seed", 3, "--seconds", 2, "--out", "other.parquet")
     assert run("simulate", "--scene", "indentation", *other).code == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib import resources
 
 import pytest
@@ -45,6 +46,7 @@ def test_a_healthy_bus_is_said_to_be_well_and_how_fast_it_is(run):
         assert 0.99 * limit_hz < found["rates_hz"][schedule] <= limit_hz
     assert found["schedule"] == "pipelined"
     assert "pipelined gives 541 frames/s" in found["verdict"]
+    assert "repeated" not in found["verdict"], "channels without a tile are no disturbance"
 
 
 def test_what_people_read_says_the_same(run):
@@ -102,6 +104,11 @@ def test_a_part_that_does_not_convert_needs_attention(doctor):
     assert "never change" in tile["problem"]
 
 
+def test_a_part_that_does_not_convert_is_not_said_to_set_the_pace(doctor):
+    _, found = doctor(scene_text("standing") + faulty("stale", tile="T03"))
+    assert "converts slowest" not in found["verdict"]
+
+
 def test_a_bus_on_which_nobody_answers_is_a_failure_with_advice(doctor):
     outcome, found = doctor(scene_text("standing") + faulty("sda_high"))
     assert outcome.code == 1
@@ -138,12 +145,14 @@ def test_a_bus_that_does_not_exist_is_a_failure_in_one_line(run):
     assert outcome.err.count("\n") == 1
 
 
+@pytest.mark.real_time
 def test_the_servo_of_the_scene_is_found_and_named(run):
     found = json.loads(run("doctor", "--scene", "rolling", "--json").out)["servo"]
     assert found["is_well"] is True
     assert found["verdict"].startswith("MX-28, protocol 2, 1000000 baud, id 1.")
 
 
+@pytest.mark.real_time
 def test_a_servo_that_is_not_what_the_scene_says_is_said(run, tmp_path, monkeypatch):
     from devices.clock import SystemClock
     from devices.emulation.dynamixel import EmulatedServo
@@ -171,6 +180,7 @@ def test_single_lost_acknowledges_do_not_make_tiles_look_ill(doctor):
     outcome, found = doctor(scene_text("standing") + faulty("nack_storm", rate=0.002))
     assert outcome.code == 0, found
     assert not any(tile["problem"] for tile in found["tiles"])
+    assert re.search(r"\d+ transfers were acknowledged only when repeated", found["verdict"])
 
 
 def test_a_bus_that_hangs_since_the_last_run_is_freed_before_the_start(run, tmp_path):

@@ -103,6 +103,7 @@ def session(demo: Demo) -> str:
     return str(stopped["id"])
 
 
+@pytest.mark.real_time
 def test_sessions_lists_what_the_server_has_and_what_the_folder_has(
     demo: Demo, session: str
 ) -> None:
@@ -115,6 +116,7 @@ def test_sessions_lists_what_the_server_has_and_what_the_folder_has(
     assert "=1+1 [b]" in table.stdout
 
 
+@pytest.mark.real_time
 def test_pull_brings_the_file_verified_and_at_once_the_second_time(
     demo: Demo, session: str, tmp_path: Path
 ) -> None:
@@ -133,6 +135,7 @@ def test_pull_brings_the_file_verified_and_at_once_the_second_time(
     assert (folder / "frames.parquet").stat().st_mtime_ns == before
 
 
+@pytest.mark.real_time
 def test_pull_of_what_is_not_there_says_so(demo: Demo, tmp_path: Path) -> None:
     done = run("pull", "../../etc", "--server", demo.url, "--out", str(tmp_path))
     assert done.returncode == 2
@@ -142,6 +145,7 @@ def test_pull_of_what_is_not_there_says_so(demo: Demo, tmp_path: Path) -> None:
     assert "no session" in done.stderr
 
 
+@pytest.mark.real_time
 def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path: Path) -> None:
     tables = {}
     for name in ("parquet", "arrow", "csv"):
@@ -166,6 +170,7 @@ def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path
     assert tables["arrow"].schema.field("force_n_0").metadata[b"unit"] == b"N"
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -183,6 +188,7 @@ def test_an_export_that_cannot_be_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.real_time
 def test_a_second_server_on_the_same_port_or_folder_is_refused(demo: Demo, tmp_path: Path) -> None:
     port = demo.url.rsplit(":", 1)[1]
     done = run("serve", "--port", port, "--data", str(tmp_path / "other"))
@@ -194,6 +200,7 @@ def test_a_second_server_on_the_same_port_or_folder_is_refused(demo: Demo, tmp_p
     assert "another foottile server uses this data folder" in done.stderr
 
 
+@pytest.mark.real_time
 def test_a_second_node_of_the_same_name_is_told_why_it_is_not_let_in(
     demo: Demo, tmp_path: Path
 ) -> None:
@@ -221,6 +228,7 @@ def test_a_second_node_of_the_same_name_is_told_why_it_is_not_let_in(
     assert demo.get("/nodes/demo").json()["connected"]
 
 
+@pytest.mark.real_time
 def test_ctrl_c_seals_what_is_being_recorded(tmp_path: Path) -> None:
     demo = start_demo(tmp_path)
     started = demo.post("/sessions", {"node": "demo", "name": "cut short"}).json()
@@ -232,6 +240,7 @@ def test_ctrl_c_seals_what_is_being_recorded(tmp_path: Path) -> None:
         demo.get("/health")
 
 
+@pytest.mark.real_time
 def test_a_demo_ends_by_itself_after_its_seconds(tmp_path: Path) -> None:
     demo = start_demo(tmp_path, "--seconds", "3", tared=False)
     assert ended(demo.process) == 0

@@ -250,3 +250,16 @@ def test_what_befell_a_tile_is_said_on_the_terminal(run, tmp_path):
     assert list(flags) == ["T02"]
     # Half a second at 540 frames a second, and until it is found again.
     assert 250 < flags["T02"]["no_answer"] < 500
+
+
+def test_a_part_that_could_not_be_measured_is_said_on_the_terminal(run, tmp_path):
+    (tmp_path / "faulty.toml").write_text(
+        scene_text("standing")
+        + '[[fault]]\nkind = "stale"\ntile = "T03"\nt_s = 0.0\nduration_s = 0.5\n'
+    )
+    arguments = ("simulate", "--scene", "faulty.toml", "--seconds", 1, "--no-estimates")
+    said = "tile T03: its conversion time could not be measured, so it was given 3 ms"
+    assert said in run(*arguments).out
+    assert json.loads(run(*arguments, "--json").out)["unmeasured"] == ["T03"]
+    healthy = run("simulate", "--scene", "standing", "--seconds", 1, "--no-estimates", "--json")
+    assert json.loads(healthy.out)["unmeasured"] == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from random import Random
 
 import numpy as np
 import pytest
@@ -100,10 +101,10 @@ def test_grid_indices_count_from_one_along_each_axis() -> None:
 
 @given(st.integers(1, 4), st.integers(1, 4), st.randoms(use_true_random=False))
 def test_tiles_of_a_grid_have_their_indices_in_whatever_order_they_are_listed(
-    columns: int, rows: int, random: object
+    columns: int, rows: int, random: Random
 ) -> None:
     places = [(i, j) for i in range(1, columns + 1) for j in range(1, rows + 1)]
-    random.shuffle(places)  # type: ignore[attr-defined]
+    random.shuffle(places)
     grid = grid_indices(np.array([(0.013 * i - 0.1, 0.02 * j) for i, j in places]))
     assert grid is not None
     assert list(zip(*(axis.tolist() for axis in grid), strict=True)) == places

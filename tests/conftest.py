@@ -1,0 +1,20 @@
+"""What all tests share: one emulated bench, and hypothesis without a stopwatch."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# Beside other tests on the same cores the time that an example takes says nothing.
+settings.register_profile("foottile", settings(), deadline=None)
+settings.load_profile("foottile")
+
+
+@pytest.fixture(scope="session")
+def bench_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's cache folder for all tests: to press a tile on the emulated bench takes seconds."""
+    given = os.environ.get("FOOTTILE_TEST_CACHE")
+    return Path(given) if given else tmp_path_factory.mktemp("cache")
