@@ -187,12 +187,17 @@ def curve_at_zero(x: list[Exact], y: list[Exact], degree: int) -> tuple[Exact, E
     # Orthogonal polynomials (Gram-Schmidt), so that nothing of normal equations is shared.
     basis: list[list[Exact]] = []
     at_zero: list[Exact] = []
+    told = mpf(1)
     for k in range(degree + 1):
         column, zero = [v**k for v in x], mpf(1 if k == 0 else 0)
         for q, q0 in zip(basis, at_zero, strict=True):
             share = mp.fdot(column, q) / mp.fdot(q, q)
             column = [a - share * b for a, b in zip(column, q, strict=True)]
             zero -= share * q0
+        norm = mp.fsum(v ** (2 * k) for v in x)
+        told *= mp.fdot(column, column) / norm if norm != 0 else 0
+        if told <= mpf(denoise.SINGULAR):
+            return None
         basis.append(column)
         at_zero.append(zero)
     pairs = list(zip(basis, at_zero, strict=True))

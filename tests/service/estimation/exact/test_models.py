@@ -147,19 +147,23 @@ def test_ambient_is_within_a_micropascal(equations: SimpleNamespace, seed: int) 
 
 
 @pytest.mark.parametrize("look_ms", [0, 3, 10, 100])
-@pytest.mark.parametrize("kind", ["still", "moving", "uneven", "few"])
+@pytest.mark.parametrize("kind", ["still", "moving", "uneven", "few", "crowded"])
 def test_denoise_is_within_a_nanonewton(
     equations: SimpleNamespace, look_ms: int, kind: str
 ) -> None:
     rng = np.random.default_rng([look_ms, len(kind)])
     n = 90
-    swing_n = {"still": 0.0, "moving": 25.0, "uneven": 5.0, "few": 1.0}[kind]
+    swing_n = {"still": 0.0, "moving": 25.0, "uneven": 5.0, "few": 1.0, "crowded": 0.0}[kind]
     values = 30.0 + swing_n * np.sin(np.arange(n) / 9.0) + rng.normal(0, 0.3, n)
-    steps_ns = rng.choice([2_000_000] * 20 + [1, 40_000_000], n) if kind == "uneven" else 2_000_000
-    frame_ns = np.cumsum(np.broadcast_to(steps_ns, n)).astype(np.int64)
-    t_ns = frame_ns + rng.choice([0, 700_000], n)
+    steps_ns = np.full(n, 2_000_000)
+    if kind == "uneven":
+        steps_ns = rng.choice([2_000_000] * 20 + [1, 40_000_000], n)
+    if kind == "crowded":  # at two instants that are six digits further apart than each is wide
+        steps_ns = np.tile([17, 17, 17, 17, 1_800_000], n // 5)
+    frame_ns = np.cumsum(steps_ns)
+    t_ns = frame_ns + (0 if kind == "crowded" else rng.choice([0, 700_000], n))
     missing = rng.random(n) < (0.6 if kind == "few" else 0.05)
-    run = np.cumsum(rng.random(n) < 0.03)
+    run = np.arange(n) // 10 if kind == "crowded" else np.cumsum(rng.random(n) < 0.03)
     column = np.where(missing, NAN, values)
     averaged, left = denoise.denoised(
         column[:, None],
