@@ -6,17 +6,37 @@ however a recording is cut into batches.
 
 from __future__ import annotations
 
+import contextlib
+import pickle
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import FunctionCache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
     """`function` as machine code, made at its first call and kept on disk where that can be."""
-    try:
-        return cast("F", numba.njit(cache=True, nogil=True)(function))
-    except RuntimeError:  # nowhere to keep it: no home and a read-only installation
-        return cast("F", numba.njit(nogil=True)(function))
+    dispatcher: Any = numba.njit(nogil=True)(function)
+    with contextlib.suppress(RuntimeError):  # nowhere to keep it: no home, read-only installation
+        # As numba.njit(cache=True) does, which stops at a cache that it cannot read or write.
+        dispatcher._cache = _Kept(function)  # type: ignore[no-untyped-call]  # noqa: SLF001
+    return cast("F", dispatcher)
+
+
+class _Kept(FunctionCache):
+    """Machine code on disk; a full disk, or a file that a power cut left, costs a second."""
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError):
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        except (OSError, EOFError, pickle.UnpicklingError):
+            with contextlib.suppress(OSError):
+                self.flush()  # type: ignore[no-untyped-call]  # it is written anew
+            return None
