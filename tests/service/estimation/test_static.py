@@ -167,3 +167,25 @@ def test_what_is_no_number_makes_no_exception(tile_of: TileOf, value: float) -> 
     force_n = at(tile, value).force_n[0, 0]
     expected_n = {np.inf: by_definition_n(15.0)}.get(value, value)
     assert force_n == pytest.approx(expected_n, nan_ok=True)
+
+
+@given(
+    slopes=st.tuples(st.floats(0.01, 5), st.floats(0, 5), st.floats(0, 5)),
+    offset_kpa=st.floats(-5, 0),
+    gauge_kpa=st.lists(st.floats(-10, 30), min_size=2, max_size=30),
+)
+def test_more_pressure_is_never_less_force_where_the_curve_rises(
+    tile_of: TileOf,
+    slopes: tuple[float, float, float],
+    offset_kpa: float,
+    gauge_kpa: list[float],
+) -> None:
+    tile = tile_of(
+        "T01",
+        coefficients=(0.0, *slopes),
+        p_offset_kpa=offset_kpa,
+        p_scale_kpa=4.0,
+        range_kpa=(0.0, 15.0),
+    )
+    force_n = at(tile, *sorted(gauge_kpa)).force_n[:, 0]
+    assert (np.diff(force_n) >= -1e-12 * np.abs(force_n).max()).all()

@@ -1,0 +1,94 @@
+"""Effects of a dome: intervals, and values that could not be undone are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.effects import (
+    WALL_PER_KPA,
+    Effects,
+    GasEffect,
+    HysteresisEffect,
+    Parameter,
+    RubberEffect,
+    TemperatureEffect,
+)
+
+
+def p(value: float) -> Parameter:
+    return Parameter(value=value, sigma=0.1)
+
+
+def gas(*, gamma: float = 1.28, tau_s: float = 0.011) -> GasEffect:
+    return GasEffect(gamma=p(gamma), tau_s=p(tau_s), misfit=0.0)
+
+
+def rubber(part: tuple[float, ...], tau_s: tuple[float, ...]) -> RubberEffect:
+    return RubberEffect(
+        part=tuple(map(p, part)),
+        tau_s=tuple(map(p, tau_s)),
+        coefficients=(0.0, 1.0, 0.0, 0.0),
+        covariance=((0.0,) * 3,) * 3,
+        scatter=0.0,
+        misfit=0.0,
+        curve_misfit_n=0.0,
+    )
+
+
+def temperature(*, kpa_per_k: float = 0.3, lag_s: float = 3.0) -> TemperatureEffect:
+    return TemperatureEffect(kpa_per_k=p(kpa_per_k), lag_s=p(lag_s), wall_per_kpa=p(0.002))
+
+
+def test_nineteen_of_twenty_lie_within_two_sigma() -> None:
+    assert Parameter(value=5.0, sigma=0.5).interval_95 == pytest.approx((4.02, 5.98))
+
+
+def test_the_walls_give_is_that_of_the_soak_or_of_the_material() -> None:
+    assert Effects(temperature=temperature()).wall_per_kpa == 0.002
+    assert Effects().wall_per_kpa == WALL_PER_KPA == 0.00124
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: gas(gamma=0.99),
+        lambda: gas(tau_s=0.0),
+        lambda: rubber((0.5, 0.5), (1.0, 2.0)),
+        lambda: rubber((-0.01,), (1.0,)),
+        lambda: rubber((0.1, 0.1), (1.0, 0.0)),
+        lambda: rubber((0.1, 0.1), (1.0,)),
+        lambda: HysteresisEffect(part=(p(0.4), p(0.4), p(0.2))),
+        lambda: HysteresisEffect(part=(p(-0.1),)),
+        lambda: temperature(kpa_per_k=0.0),
+        lambda: temperature(lag_s=0.0),
+        lambda: Parameter(value=float("nan"), sigma=0.0),
+        lambda: Parameter(value=1.0, sigma=float("inf")),
+        lambda: Parameter(value=1.0, sigma=-1.0),
+    ],
+)
+def test_what_could_not_be_undone_is_refused(make: Callable[[], Any]) -> None:
+    with pytest.raises(ValidationError):
+        make()
+
+
+def test_the_limits_themselves_are_accepted() -> None:
+    assert gas(gamma=1.0).gamma.value == 1.0
+    assert rubber((0.0, 0.99), (1e-9, 1e9)).part[1].value == 0.99
+    assert HysteresisEffect(part=(p(0.0), p(0.0), p(0.999))).part[2].value == 0.999
+
+
+def test_effects_survive_a_calibration_file_to_the_bit(
+    tile_of: Callable[..., TileCalibration],
+    effects_of: Callable[..., Effects],
+    calibration_of: Callable[..., Calibration],
+) -> None:
+    effects = effects_of(refused={"ambient": "for a test"})
+    calibration = calibration_of(tile_of("T01", effects=effects))
+    again = Calibration.from_json(calibration.to_json(), where="a file")
+    assert again.of("T01").effects == effects
+    assert again.id == calibration.id
