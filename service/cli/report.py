@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from statistics import median
 
 from rich.markup import escape
 from rich.table import Table
 
 from service.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
 from service.estimation.calibration import Calibration
+from service.estimation.stances import Stance
 
 PHASES = {
     "flight": "in flight",
@@ -111,3 +114,35 @@ def calibration_json(calibration: Calibration) -> dict[str, object]:
 
 def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def stances_json(stances: Sequence[Stance]) -> list[dict[str, float | int | bool | None]]:
+    """One entry a stance; a peak that is not known is null."""
+    return [
+        {
+            "begin_t_ns": s.begin_t_ns,
+            "duration_s": s.duration_s,
+            "peak_n": s.peak_n if math.isfinite(s.peak_n) else None,
+            "peak_t_ns": s.peak_t_ns,
+            "impulse_ns": s.impulse_ns,
+            "unknown_frames": s.unknown_frames,
+            "begun": s.begun,
+            "ended": s.ended,
+        }
+        for s in stances
+    ]
+
+
+def stances_line(stances: Sequence[Stance]) -> str:
+    """How often the foot stood, and how hard."""
+    whole = [s for s in stances if s.begun and s.ended and math.isfinite(s.peak_n)]
+    said = f"{len(stances)} stance{'s' if len(stances) != 1 else ''}"
+    if len(whole) < len(stances):
+        said += f", {len(whole)} of them from beginning to end"
+    if not whole:
+        return said
+    return (
+        f"{said}: median peak {median(s.peak_n for s in whole):.2f} N, impulse "
+        f"{median(s.impulse_ns for s in whole):.2f} Ns, duration "
+        f"{median(s.duration_s for s in whole):.2f} s"
+    )
