@@ -28,7 +28,9 @@ class Felt:
         gauge_kpa: (n, all tiles), pressure above the baseline.
         felt_n: force by the static curve.
         noise_n: standard deviation that a single reading's noise gives it; averages away.
-        sigma_n: standard uncertainty from all else; does not.
+        sigma_n: standard uncertainty from all else but the gas; does not.
+        gas_n: standard uncertainty that the gas' correction leaves, with the correction's sign: all
+            tiles err to the same side.
         t_mono_ns: when it was sampled.
         beyond: beyond the calibrated range: a lower bound.
         status: (n,), bits of `EstimateStatus` that these frames have by themselves.
@@ -38,6 +40,7 @@ class Felt:
     felt_n: Floats
     noise_n: Floats
     sigma_n: Floats
+    gas_n: Floats
     t_mono_ns: npt.NDArray[np.int64]
     beyond: Bools
     status: npt.NDArray[np.uint16]
@@ -126,9 +129,6 @@ def felt(
         settled_kpa, warm = ladder.gas.settled(
             bearing_kpa, t_mono_ns, state.gas or gas.at_rest(len(columns))
         )
-        baseline_variance = (
-            baseline_variance + (ladder.gas_misfit * (settled_kpa - bearing_kpa)) ** 2
-        )
         state = replace(state, gas=warm)
     static_kpa = settled_kpa - plan.baseline_kpa
     static = ladder.curves.force(static_kpa)
@@ -149,6 +149,7 @@ def felt(
         felt_n=felt_n,
         noise_n=np.abs(static.slope_n_per_kpa) * plan.noise_kpa,
         sigma_n=np.sqrt(static.slope_n_per_kpa**2 * baseline_variance + static.fit_sigma_n**2),
+        gas_n=static.slope_n_per_kpa * ladder.gas_misfit * (settled_kpa - bearing_kpa),
         t_mono_ns=t_mono_ns,
         beyond=beyond,
         status=status,

@@ -29,10 +29,19 @@ class UpperState:
 
 @dataclass(frozen=True)
 class Forces:
-    """Force on the bearing tiles and its standard uncertainty, (n, bearing tiles)."""
+    """Force on the bearing tiles and its standard uncertainty, (n, bearing tiles).
+
+    Attributes:
+        force_n: forces.
+        sigma_n: standard uncertainties.
+        own_n: their part that is every tile's own.
+        common_n: the rest, one array for each effect that all tiles share the error of, signed.
+    """
 
     force_n: Floats
     sigma_n: Floats
+    own_n: Floats
+    common_n: tuple[Floats, ...]
 
 
 def forces(
@@ -81,18 +90,21 @@ def forces(
         )
         felt_n = np.where(np.isnan(averaged_n), felt_n, averaged_n)
         noise_n = noise_n * np.sqrt(np.where(np.isnan(left), 1.0, left))
-    variance = noise_n**2 + now.sigma_n**2
+    own_n = np.sqrt(noise_n**2 + now.sigma_n**2)
+    averaged_n = felt_n
     if ladder.hysteresis is not None:
         plays_n = ladder.hysteresis.at_rest() if state.plays_n is None else state.plays_n
         felt_n, plays_n = ladder.hysteresis.unfelt(felt_n, plays_n)
         state = replace(state, plays_n=plays_n)
     if ladder.rubber is not None:
         before = ladder.rubber.at_rest() if state.rubber is None else state.rubber
-        force_n, crept = ladder.rubber.unfelt(felt_n, t_mono_ns, before)
-        variance = variance + (ladder.rubber_misfit * (force_n - felt_n)) ** 2
-        felt_n, state = force_n, replace(state, rubber=crept)
+        felt_n, crept = ladder.rubber.unfelt(felt_n, t_mono_ns, before)
+        state = replace(state, rubber=crept)
+    rubber_n = ladder.rubber_misfit * (felt_n - averaged_n)
     # A lower bound has no standard uncertainty.
-    return Forces(felt_n, np.where(now.beyond, np.nan, np.sqrt(variance))), state
+    own_n = np.where(now.beyond, np.nan, own_n)
+    sigma_n = np.sqrt(own_n**2 + now.gas_n**2 + rubber_n**2)
+    return Forces(felt_n, sigma_n, own_n, (now.gas_n, rubber_n)), state
 
 
 @dataclass(frozen=True)
@@ -113,15 +125,22 @@ def foot_of(plan: EstimationPlan, tiles: Forces) -> Foot:
     for axis in range(3):
         arm_m = plan.positions_m[plan.bearing, axis]
         at_m = summed(tiles.force_n * arm_m) / divisor_n
-        variance = summed(((arm_m - at_m[:, None]) * tiles.sigma_n) ** 2)
         centre_m.append(at_m)
-        sigma_m.append(np.sqrt(variance) / np.abs(divisor_n))
+        sigma_m.append(_sigma_of_sum(tiles, arm_m - at_m[:, None]) / np.abs(divisor_n))
     return Foot(
         grf_n=grf_n,
-        grf_sigma_n=np.sqrt(summed(tiles.sigma_n**2)),
+        grf_sigma_n=_sigma_of_sum(tiles, np.ones(tiles.force_n.shape)),
         cop_m=(centre_m[0], centre_m[1], centre_m[2]),
         cop_sigma_m=(sigma_m[0], sigma_m[1], sigma_m[2]),
     )
+
+
+def _sigma_of_sum(tiles: Forces, weights: Floats) -> Floats:
+    """Standard uncertainty of a weighted sum over tiles, (n,), to first order."""
+    variance = summed((weights * tiles.own_n) ** 2)
+    for common_n in tiles.common_n:
+        variance = variance + summed(weights * common_n) ** 2
+    return np.sqrt(variance)
 
 
 def grid_index(plan: EstimationPlan, gauge_kpa: Floats) -> tuple[Floats, Floats]:
