@@ -30,6 +30,7 @@ from service.estimation.calibration import Calibration, TileCalibration, paper_e
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.lower import Felt
+from service.estimation.models.temperature import Temperature
 from service.estimation.plan import EstimationPlan, make_plan
 from service.estimation.tare import take_tare
 
@@ -560,7 +561,10 @@ def test_a_tare_at_another_temperature_is_flagged_like_an_old_one(
     frames = replace(frames_of(held([9] * 4)), tadc=tadc.astype(np.uint16))
     status = estimate(plan, frames).estimate_status
     assert np.flatnonzero(status & EstimateStatus.TARE_OLD).tolist() == [4, 6]
-    corrected = replace(plan, models=(*plan.models, "temperature"))
+    model = Temperature(
+        *(np.zeros(3), np.zeros(3), np.ones(3), np.zeros(3)), np.full(3, 480.0), np.full(3, 100.0)
+    )
+    corrected = replace(plan, ladder=replace(plan.ladder, temperature=model))
     assert not (estimate(corrected, frames).estimate_status & EstimateStatus.TARE_OLD).any()
     unknown = replace(plan, tare=replace(plan.tare, tadc_counts=np.full(4, np.nan)))
     assert not (estimate(unknown, frames).estimate_status & EstimateStatus.TARE_OLD).any()
