@@ -21,6 +21,8 @@ from service.estimation.effects import Effects
 ANY_SERIAL = "*"
 LOOP_OPENS_N = 1.0
 CURVE_OPENS_N = 0.2
+"""Forces at which a loop, and what a cubic misses of a curve, have opened by half: at zero load there
+is neither."""
 BASIS = 3
 """A cubic without constant term has three coefficients to be uncertain about."""
 
@@ -171,11 +173,6 @@ class Calibration(BaseModel):
 def loop_share(force_n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """How far a hysteresis loop is open at a force: closed at zero, half open at one newton."""
     return np.asarray(1.0 - LOOP_OPENS_N / (np.abs(force_n) + LOOP_OPENS_N))
-
-
-def curve_share(force_n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """How much of a cubic's misfit there is at a force: none at zero, half of it at 0.2 N."""
-    return np.asarray(1.0 - CURVE_OPENS_N / (np.abs(force_n) + CURVE_OPENS_N))
 
 
 def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) -> bool:

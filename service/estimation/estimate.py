@@ -276,7 +276,7 @@ def _no_estimates(plan: EstimationPlan) -> Estimates:
 def _cop_masked(plan: EstimationPlan, foot: Foot) -> npt.NDArray[np.bool_]:
     """Where a centre of pressure would be more doubtful than useful."""
     normals, offsets_m = plan.hull
-    (x_m, y_m, _), (sigma_x_m, sigma_y_m, _) = foot.cop_m, foot.cop_sigma_m
+    (x_m, y_m, _), (sigma_x_m, sigma_y_m) = foot.cop_m, foot.cop_sigma_m
     with np.errstate(invalid="ignore"):
         good = (
             (foot.grf_n >= SIGMAS * foot.grf_sigma_n)
