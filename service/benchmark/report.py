@@ -53,6 +53,10 @@ def markdown(bench: Bench) -> str:
         "",
         EMULATED,
     ]
+    if not o.as_scenes_say:
+        said = {"repeatability": o.repeatability, "noise correlated over ms": o.correlated_ms}
+        named = ", ".join(f"{name} {value:g}" for name, value in said.items() if value is not None)
+        lines += ["", f"The emulation differs from that of the scenes: {named}."]
     for figures in bench.scenes:
         lines += ["", *_scene(figures)]
     return "\n".join(lines) + "\n"

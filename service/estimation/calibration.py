@@ -21,8 +21,8 @@ from service.estimation.effects import Effects
 ANY_SERIAL = "*"
 LOOP_OPENS_N = 1.0
 CURVE_OPENS_N = 0.2
-"""Forces at which a loop, and what a cubic misses of a curve, have opened by half: at zero load there
-is neither."""
+"""Forces at which a loop, and what a cubic misses of a curve, have opened by half: at zero load
+there is neither."""
 BASIS = 3
 """A cubic without constant term has three coefficients to be uncertain about."""
 
