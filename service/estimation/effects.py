@@ -6,9 +6,9 @@ model that needs it is not offered for that tile, and `refused` says why.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 WALL_PER_KPA = 0.00124
 """Part of the bubble's volume that the wall gives way for a kPa: elastic estimate for Vytaflex 60
@@ -43,6 +43,12 @@ class GasEffect(_Effect):
     misfit: float = Field(ge=0)
     """Part of the correction that the bench shows to be wrong, root mean square."""
 
+    @model_validator(mode="after")
+    def _can_be_undone(self) -> Self:
+        if not (self.gamma.value >= 1.0 and self.tau_s.value > 0.0):
+            raise ValueError("a gas has a gamma of 1 or more and a tau above 0")
+        return self
+
 
 class RubberEffect(_Effect):
     """Of the model `rubber`, with the curve of forces that have lasted, beneath creep and loop.
@@ -61,11 +67,23 @@ class RubberEffect(_Effect):
     curve_misfit_n: float = Field(ge=0)
     """How far a cubic is off where slow strokes agree with one another, root mean square."""
 
+    @model_validator(mode="after")
+    def _can_be_undone(self) -> Self:
+        if len(self.part) != len(self.tau_s) or not all(tau.value > 0.0 for tau in self.tau_s):
+            raise ValueError("every creeping part has a time above 0")
+        _leave_something("creeping parts", self.part)
+        return self
+
 
 class HysteresisEffect(_Effect):
     """Of the model `hysteresis`: parts of its plays."""
 
     part: tuple[Parameter, ...]
+
+    @model_validator(mode="after")
+    def _can_be_undone(self) -> Self:
+        _leave_something("parts of the plays", self.part)
+        return self
 
 
 class TemperatureEffect(_Effect):
@@ -77,6 +95,12 @@ class TemperatureEffect(_Effect):
     """How long the gas follows its chip."""
     wall_per_kpa: Parameter
     """Part of the volume that the wall gives way for a kPa, by how much less than p/T it is."""
+
+    @model_validator(mode="after")
+    def _can_be_undone(self) -> Self:
+        if not (self.kpa_per_k.value > 0.0 and self.lag_s.value > 0.0):
+            raise ValueError("a sealed gas has a rise per kelvin and a lag above 0")
+        return self
 
 
 class Effects(_Effect):
@@ -92,3 +116,8 @@ class Effects(_Effect):
     def wall_per_kpa(self) -> float:
         """As measured in the soak, else the estimate for the material."""
         return WALL_PER_KPA if self.temperature is None else self.temperature.wall_per_kpa.value
+
+
+def _leave_something(what: str, parts: tuple[Parameter, ...]) -> None:
+    if not all(part.value >= 0.0 for part in parts) or sum(part.value for part in parts) >= 1.0:
+        raise ValueError(f"{what} are 0 or more, and in sum below 1: else no force follows")

@@ -74,14 +74,14 @@ class _Known:
 
     def after(self, given: int, *, reach_back: bool) -> _Known:
         """Without the first `given` frames, but for what averages will reach back to."""
-        first = self.before + given
-        keep = first
-        if reach_back and first < len(self.t_mono_ns):
-            oldest_ns = self.t_mono_ns[first] - denoise.PAST_NS
+        keep = first = self.before + given
+        end = len(self.t_mono_ns)
+        if reach_back:
+            # The next one may not be here yet; it will be no earlier than the last that is.
+            oldest_ns = self.t_mono_ns[min(first, end - 1)] - denoise.PAST_NS
             keep = max(
                 int(np.searchsorted(self.t_mono_ns, oldest_ns)), first - int(denoise.REACHES[-1])
             )
-        end = len(self.t_mono_ns)
         return _Known(
             felt=self.felt.rows(keep, end),
             t_mono_ns=self.t_mono_ns[keep:],

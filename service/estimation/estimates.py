@@ -36,7 +36,7 @@ class EstimateStatus(IntFlag):
     COP_MASKED = 16
     """No centre of pressure: no contact, or it would be too uncertain."""
     TILE_MISSING = 32
-    """A tile gave no pressure, so there is no sum."""
+    """A tile gave no pressure, or no bare one has told what is around, so there is no sum."""
     ASSUMED_SCALE = 64
     """The calibration's scale is assumed: newtons are not to be trusted."""
     TARE_OLD = 128

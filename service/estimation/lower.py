@@ -132,6 +132,7 @@ def felt(
         state = replace(state, gas=warm)
     static_kpa = settled_kpa - plan.baseline_kpa
     static = ladder.curves.force(static_kpa)
+    status[np.isnan(static.force_n).any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
     beyond = static_kpa > ladder.curves.high_kpa
     status[beyond.any(axis=1)] |= np.uint16(EstimateStatus.SATURATED)
     low_kpa = ladder.curves.low_kpa - SIGMAS * plan.still_kpa
@@ -162,7 +163,6 @@ def _frame_status(
 ) -> npt.NDArray[np.uint16]:
     status = np.zeros(len(frames), dtype=np.uint16)
     known = ~np.isnan(kpa)
-    status[~known[:, plan.bearing].all(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
     status[broken] |= np.uint16(EstimateStatus.GAP)
     doubtful = frames.t_ns - plan.tare.t_ns > TARE_OLD_NS
     if plan.ladder.temperature is None:

@@ -76,11 +76,12 @@ def _averaged(
     out: Floats,
 ) -> tuple[float, int]:
     for i in range(len(kpa)):
-        if not math.isnan(kpa[i]):
+        if math.isfinite(kpa[i]):
             if math.isnan(value):
                 value = kpa[i]
             else:
-                value -= math.expm1(-(t_ns[i] - last_ns) * 1e-9 / SMOOTHING_S) * (kpa[i] - value)
+                passed_s = max(0.0, (t_ns[i] - last_ns) * 1e-9)
+                value -= math.expm1(-passed_s / SMOOTHING_S) * (kpa[i] - value)
             last_ns = t_ns[i]
         out[i] = value
     return value, last_ns

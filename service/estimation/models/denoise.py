@@ -24,6 +24,10 @@ REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
 AGREE = 1.0
 """In standard uncertainties: how far the value of a longer window may be from that of any shorter
 one. A compromise between noise in quiet stance and lag at an impact."""
+SINGULAR = 1e-5
+"""A determinant so small, relative to its first term, says that samples lie too close together for
+such a curve, as at two instants a parabola; for windows of equal steps it is a hundred times more.
+"""
 
 
 @compiled
@@ -144,7 +148,7 @@ def _add(moments: Floats, time: float, value: float) -> None:
 def _line(m: Floats) -> tuple[float, float]:
     """Value of the fitted line at time 0, and its variance in units of a sample's."""
     det = m[0] * m[2] - m[1] * m[1]
-    if m[0] < 3.0 or det <= 0.0:
+    if m[0] < 3.0 or det <= SINGULAR * m[0] * m[2]:
         return math.nan, 0.0
     return (m[2] * m[5] - m[1] * m[6]) / det, m[2] / det
 
@@ -154,6 +158,6 @@ def _parabola(m: Floats) -> tuple[float, float]:
     """Likewise of the fitted parabola, by the cofactors of its normal equations."""
     a0, a1, a2 = m[2] * m[4] - m[3] * m[3], m[2] * m[3] - m[1] * m[4], m[1] * m[3] - m[2] * m[2]
     det = m[0] * a0 + m[1] * a1 + m[2] * a2
-    if m[0] < 4.0 or det <= 0.0:
+    if m[0] < 4.0 or det <= SINGULAR * m[0] * m[2] * m[4]:
         return math.nan, 0.0
     return (a0 * m[5] + a1 * m[6] + a2 * m[7]) / det, a0 / det

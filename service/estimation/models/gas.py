@@ -116,7 +116,7 @@ def _settle(
         now, before, before_ns = temperature[j], ln_kpa[j], last_ns[j]
         for i in range(n):
             p = kpa[i, j]
-            if not p > 0.0:
+            if not 0.0 < p < math.inf:
                 out[i, j] = math.nan
                 continue
             ln_p = math.log(p)

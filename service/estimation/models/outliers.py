@@ -45,8 +45,8 @@ def despiked(kpa: Floats, before: Floats, after: Floats, noise_kpa: Floats) -> t
 
 
 def _is_spike(before: Floats, kpa: Floats, after: Floats, noise_kpa: Floats) -> Bools:
-    off_kpa = np.abs(kpa - 0.5 * (before + after))
     with np.errstate(invalid="ignore"):
+        off_kpa = np.abs(kpa - 0.5 * (before + after))
         return np.asarray(
             (off_kpa > FAR * _ABOUT_MEAN * noise_kpa) & (np.abs(after - before) < off_kpa)
         )

@@ -96,7 +96,7 @@ def _unfelt(
         before, before_ns = force[j], last_ns[j]
         for i in range(n):
             felt = felt_n[i, j]
-            if math.isnan(felt):
+            if not math.isfinite(felt):
                 out[i, j] = math.nan
                 continue
             if math.isnan(before):  # the first reading: at rest without a force

@@ -96,12 +96,13 @@ class Temperature:
             chip,
         )
         warmed_kpa = self.kpa_per_count * (gas - self.tare_counts)
-        part = warmed_kpa / self.baseline_kpa
+        scale = 1.0 + warmed_kpa / self.baseline_kpa
         sigma_kpa = np.hypot(
             self.relative_sigma * warmed_kpa,
             self.relative_lag_sigma * self.kpa_per_count * (chip - gas),
         )
-        return kpa / (1.0 + part), sigma_kpa, after
+        # Counts that would be below absolute zero are none.
+        return kpa / np.where(scale > 0.0, scale, np.nan), sigma_kpa, after
 
 
 @compiled
@@ -121,7 +122,7 @@ def _follow(
         now, before = gas_counts[j], chip_counts[j]
         for i in range(n):
             counts = tadc[i, j]
-            if not math.isnan(counts):
+            if math.isfinite(counts):
                 if math.isnan(now):  # as warm as its chip, as far as one can know
                     now, first_ns[j] = counts, t_ns[i, j]
                 else:

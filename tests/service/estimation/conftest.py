@@ -25,6 +25,14 @@ from devices.frames import (
     TileStatus,
 )
 from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.effects import (
+    Effects,
+    GasEffect,
+    HysteresisEffect,
+    Parameter,
+    RubberEffect,
+    TemperatureEffect,
+)
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
@@ -98,6 +106,35 @@ def _tile(serial: str, **changes: object) -> TileCalibration:
         "noise_kpa": COUNT_KPA,
     }
     return TileCalibration.model_validate(entry | changes)
+
+
+def _effects(**changes: object) -> Effects:
+    def parameters(*values: float) -> tuple[Parameter, ...]:
+        return tuple(Parameter(value=value, sigma=0.01 * value) for value in values)
+
+    known: dict[str, object] = {
+        "gas": GasEffect(
+            gamma=Parameter(value=1.28, sigma=0.01),
+            tau_s=Parameter(value=0.011, sigma=0.0004),
+            misfit=0.12,
+        ),
+        "rubber": RubberEffect(
+            part=parameters(0.05, 0.04),
+            tau_s=parameters(0.06, 1.1),
+            coefficients=(0.0, 1.0, 0.0, 0.0),
+            covariance=((0.0,) * 3,) * 3,
+            scatter=0.004,
+            misfit=0.1,
+            curve_misfit_n=0.05,
+        ),
+        "hysteresis": HysteresisEffect(part=parameters(0.05, 0.04, 0.03)),
+        "temperature": TemperatureEffect(
+            kpa_per_k=Parameter(value=0.3, sigma=0.003),
+            lag_s=Parameter(value=3.3, sigma=0.2),
+            wall_per_kpa=Parameter(value=0.0013, sigma=0.0002),
+        ),
+    }
+    return Effects.model_validate(known | changes)
 
 
 def _calibration(*tiles: TileCalibration) -> Calibration:
@@ -183,6 +220,12 @@ def info_of() -> Callable[..., ArrayInfo]:
 def tile_of() -> Callable[..., TileCalibration]:
     """A calibration entry of one newton a count, with changes."""
     return _tile
+
+
+@pytest.fixture(scope="session")
+def effects_of() -> Callable[..., Effects]:
+    """Everything that a bench can find out about a dome, with changes."""
+    return _effects
 
 
 @pytest.fixture(scope="session")

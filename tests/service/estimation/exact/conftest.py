@@ -1,0 +1,263 @@
+"""The ladder's equations at fifty digits.
+
+Written from the docstrings of the models and the design, not from the code. Numbers are mpmath's;
+None stands for none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from mpmath import mp, mpf
+
+from service.estimation.models import ambient, denoise
+from service.estimation.models.hysteresis import OPENS, WIDTHS_N
+
+Exact = Any
+"""A number of fifty digits, or None."""
+
+
+@pytest.fixture(autouse=True, scope="session")
+def fifty_digits() -> Iterator[None]:
+    before, mp.dps = mp.dps, 50
+    yield
+    mp.dps = before
+
+
+@pytest.fixture(scope="session")
+def equations() -> SimpleNamespace:
+    """All of the functions below, by their names."""
+    return SimpleNamespace(
+        gas=gas,
+        rubber=rubber,
+        hysteresis=hysteresis,
+        temperature=temperature,
+        ambient=around,
+        denoise=averaged,
+        exact=exact,
+        apart=apart,
+    )
+
+
+def exact(values: Any) -> list[Exact]:
+    return [mpf(float(v)) if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
+
+
+def apart(estimated: Any, expected: list[Exact]) -> float:
+    """Greatest distance; undefined must meet undefined."""
+    worst = 0.0
+    for e, x in zip(np.ravel(estimated), expected, strict=True):
+        assert np.isnan(e) == (x is None)
+        worst = worst if x is None else max(worst, float(abs(mpf(float(e)) - x)))
+    return worst
+
+
+def gas(
+    kpa: list[Exact], t_ns: list[int], gamma: Exact, tau_s: Exact, c: Exact, p0: Exact
+) -> list[Exact]:
+    """`gamma dT/dt = (gamma - 1) T d(ln p)/dt - (T - 1)/tau`, ln p linear, by its own integral."""
+    k = (gamma - 1) / gamma
+    out: list[Exact] = []
+    temperature, before, before_ns = mpf(1), None, 0
+    for p, now_ns in zip(kpa, t_ns, strict=True):
+        if p is None:
+            out.append(None)
+            continue
+        h = mpf(now_ns - before_ns) / 10**9 / (gamma * tau_s)
+        if before is None or not 0 <= h <= 5:
+            temperature = mpf(1)
+        else:
+            # Over s from 0 to h: T' = -T x/h + 1 with x = h - k ln(p/before), so that
+            # T(h) = exp(-x) T(0) + (integral of exp(-x s/h) over s).
+            x = h - k * mp.log(p / before)
+            warming = h * (1 - mp.exp(-x)) / x if x != 0 else h
+            temperature = mp.exp(-x) * temperature + warming
+        before, before_ns = p, now_ns
+        iso = p / temperature
+        out.append(iso * (1 + c * (p - p0)) / (1 + c * (iso - p0)))
+    return out
+
+
+def rubber(
+    felt: list[Exact], t_ns: list[int], parts: list[Exact], taus_s: list[Exact]
+) -> list[Exact]:
+    """`felt = F - sum g (F - z)`, `tau z' = F - z`, F linear between readings, from 0 at first."""
+    z = [mpf(0) for _ in parts]
+    before, before_ns = mpf(0), None
+    out: list[Exact] = []
+    for value, now_ns in zip(felt, t_ns, strict=True):
+        if value is None:
+            out.append(None)
+            continue
+        passed = mpf(max(0, now_ns - before_ns)) / 10**9 if before_ns is not None else mpf(0)
+        # z after the step is held + share F, linear in the F that is looked for.
+        held, share = [], []
+        for m, tau in enumerate(taus_s):
+            h = passed / tau
+            decay = mp.exp(-h)
+            mean = (1 - decay) / h if h != 0 else mpf(1)
+            held.append(decay * z[m] + (mean - decay) * before)
+            share.append(1 - mean)
+        left = 1 - sum(g * (1 - s) for g, s in zip(parts, share, strict=True))
+        force = (value - sum(g * x for g, x in zip(parts, held, strict=True))) / left
+        z = [x + s * force for x, s in zip(held, share, strict=True)]
+        before, before_ns = force, now_ns
+        out.append(force)
+    return out
+
+
+def hysteresis(felt: list[Exact], parts: list[Exact]) -> list[Exact]:
+    """`felt = F + sum w (y - F)` solved on the pieces of the broken line that it is."""
+    opens, widths = mpf(OPENS), [mpf(float(w)) for w in WIDTHS_N]
+
+    def play(force: Exact, width: Exact, before: Exact) -> Exact:
+        half = min(width, opens * max(force, mpf(0)))
+        return min(max(before, force - half), force + half)
+
+    plays = [mpf(0) for _ in widths]
+    out: list[Exact] = []
+    for value in felt:
+        if value is None:
+            out.append(None)
+            continue
+
+        def lagging(force: Exact, plays: list[Exact] = plays) -> Exact:
+            moved = zip(parts, widths, plays, strict=True)
+            return force + sum(g * (play(force, w, y) - force) for g, w, y in moved)
+
+        kinks = {mpf(0)}
+        for width, y in zip(widths, plays, strict=True):
+            kinks |= {width / opens, y / (1 + opens), y / (1 - opens), y - width, y + width}
+        places = [min(kinks) - 1, *sorted(kinks), max(kinks) + 1]
+        right = next((i for i in range(1, len(places) - 1) if lagging(places[i]) >= value), -1)
+        a, b = places[right - 1], places[right]
+        slope = (lagging(b) - lagging(a)) / (b - a)
+        force = a + (value - lagging(a)) / slope
+        plays = [play(force, w, y) for w, y in zip(widths, plays, strict=True)]
+        out.append(force)
+    return out
+
+
+def temperature(counts: list[Exact], t_ns: list[int], lag_s: Exact) -> list[Exact]:
+    """`lag x' = chip - x`, chip linear between readings; for half a second a plain mean."""
+    out: list[Exact] = []
+    now = before = None
+    first_ns = last_ns = 0
+    for value, at_ns in zip(counts, t_ns, strict=True):
+        if value is not None:
+            if now is None:
+                now, first_ns = value, at_ns
+            else:
+                passed = max(mpf(0), mpf(at_ns - last_ns) / 10**9)
+                known = mpf(at_ns - first_ns) / 10**9
+                lag = lag_s if known > mpf("0.5") else min(lag_s, max(passed, known))
+                if passed > 0:
+                    h = passed / lag
+                    decay, mean = mp.exp(-h), (1 - mp.exp(-h)) / h
+                    now = decay * now + (mean - decay) * before + (1 - mean) * value
+            before, last_ns = value, at_ns
+        out.append(now)
+    return out
+
+
+def around(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:
+    """A low-pass of 30 ms that holds where there is no reading."""
+    out: list[Exact] = []
+    value, last_ns = None, 0
+    for p, now_ns in zip(kpa, t_ns, strict=True):
+        if p is not None:
+            if value is None:
+                value = p
+            else:
+                passed = max(mpf(0), mpf(now_ns - last_ns) / 10**9)
+                value += (1 - mp.exp(-passed / mpf(ambient.SMOOTHING_S))) * (p - value)
+            last_ns = now_ns
+        out.append(value)
+    return out
+
+
+def curve_at_zero(x: list[Exact], y: list[Exact], degree: int) -> tuple[Exact, Exact] | None:
+    """Value at 0 of the curve fitted to points, and its variance; None if they do not tell."""
+    if len(x) < degree + 2:
+        return None
+    # Orthogonal polynomials (Gram-Schmidt), so that nothing of normal equations is shared.
+    basis: list[list[Exact]] = []
+    at_zero: list[Exact] = []
+    told = mpf(1)
+    for k in range(degree + 1):
+        column, zero = [v**k for v in x], mpf(1 if k == 0 else 0)
+        for q, q0 in zip(basis, at_zero, strict=True):
+            share = mp.fdot(column, q) / mp.fdot(q, q)
+            column = [a - share * b for a, b in zip(column, q, strict=True)]
+            zero -= share * q0
+        norm = mp.fsum(v ** (2 * k) for v in x)
+        told *= mp.fdot(column, column) / norm if norm != 0 else 0
+        if told <= mpf(denoise.SINGULAR):
+            return None
+        basis.append(column)
+        at_zero.append(zero)
+    pairs = list(zip(basis, at_zero, strict=True))
+    value = sum(q0 * mp.fdot(q, y) / mp.fdot(q, q) for q, q0 in pairs)
+    return value, sum(q0**2 / mp.fdot(q, q) for q, q0 in pairs)
+
+
+def averaged(
+    values: list[Exact],
+    sigmas: list[Exact],
+    t_ns: list[int],
+    frame_ns: list[int],
+    at_ns: list[int],
+    run: list[int],
+    look_ns: int,
+) -> list[tuple[Exact, Exact] | None]:
+    """Growing windows, a parabola and a line in each; the longest that agrees with all shorter."""
+    out: list[tuple[Exact, Exact] | None] = []
+    for i, own in enumerate(values):
+        if own is None:
+            out.append(None)
+            continue
+        sigma = sigmas[i]
+        reachable = [
+            j
+            for j in range(len(values))
+            if run[j] == run[i]
+            and frame_ns[i] - denoise.PAST_NS
+            <= frame_ns[j]
+            <= max(frame_ns[i] + look_ns, frame_ns[i])
+        ]
+        history = [(own, mpf(1))] * 3
+        least, most = own - sigma, own + sigma
+        straight, window = True, [i]
+        for reach in denoise.REACHES:
+            wider = [j for j in reachable if abs(j - i) <= reach]
+            if wider == window:
+                break
+            window = wider
+            good = [j for j in window if values[j] is not None]
+            x = [mpf(t_ns[j] - at_ns[i]) / 10**6 for j in good]
+            y = [values[j] for j in good]
+            accepted, refused = None, False
+            for degree in (2, 1) if straight else (2,):
+                found = curve_at_zero(x, y, degree)
+                if found is None:
+                    continue
+                value, variance = found
+                spread = sigma * mp.sqrt(variance)
+                if value - spread > most or value + spread < least:
+                    straight, refused = False, degree == 2
+                    break
+                least, most = max(least, value - spread), min(most, value + spread)
+                accepted = found
+            if refused:
+                break
+            if accepted is not None and accepted[1] < history[-1][1]:
+                history = [*history[1:], accepted]
+        (best, variance), (old, old_variance) = history[-1], history[0]
+        if sigma > 0:
+            variance += max(mpf(0), ((best - old) / sigma) ** 2 - (old_variance - variance))
+        out.append((best, variance))
+    return out

@@ -1,0 +1,192 @@
+"""Every model of the ladder against its equations at fifty digits, in the hard cases.
+
+The same float64 readings go in. Goal of the design: less than 1e-9 N apart.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mpmath import mpf
+
+from service.estimation.models import ambient, denoise, gas, rubber, temperature
+from service.estimation.models.hysteresis import Hysteresis
+
+GOAL = 1e-9
+NAN = float("nan")
+STEPS_NS = [2_000_000] * 8 + [0, 1, 1000, 17_000_000, 200_000_000, 60 * 10**9, -3_000_000]
+
+
+def wild_instants(rng: np.random.Generator, n: int) -> np.ndarray:
+    """With gaps of a minute, steps of nothing and of a nanosecond, and some backwards."""
+    return np.cumsum(rng.choice(STEPS_NS, n)).astype(np.int64)
+
+
+def with_holes(rng: np.random.Generator, values: np.ndarray) -> np.ndarray:
+    """Some are NaN, some infinite, as from a bad file."""
+    return np.where(rng.random(values.shape) < 0.1, rng.choice([NAN, np.inf, -np.inf]), values)
+
+
+def in_two_parts(n: int) -> list[slice]:
+    """A model goes on where the batch before has ended."""
+    return [slice(0, n // 3), slice(n // 3, n)]
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=15)
+@given(
+    gamma=st.sampled_from([1.0, 1.0 + 1e-12, 1.001, 1.28, 1.6]),
+    tau_s=st.sampled_from([1e-9, 0.0005, 0.012, 0.042, 100.0]),
+    seed=seeds,
+)
+def test_gas_is_within_a_micropascal(
+    equations: SimpleNamespace, gamma: float, tau_s: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    kpa = with_holes(rng, 100.0 + np.cumsum(rng.normal(0, 2.0, 40)))
+    t_ns = wild_instants(rng, 40)
+    model = gas.Gas(*(np.array([x]) for x in (gamma, tau_s, 0.00124, 100.1)))
+    state, out = gas.at_rest(1), []
+    for rows in in_two_parts(40):
+        settled, state = model.settled(kpa[rows, None], t_ns[rows, None], state)
+        out.append(settled)
+    parameters = (mpf(gamma), mpf(tau_s), mpf(0.00124), mpf(100.1))
+    expected = equations.gas(equations.exact(kpa), t_ns.tolist(), *parameters)
+    assert equations.apart(np.concatenate(out), expected) < GOAL
+
+
+@settings(max_examples=15)
+@given(
+    parts=st.sampled_from([(0.05, 0.04), (0.0, 0.0), (0.4, 0.4), (0.9, 0.05)]),
+    taus_s=st.sampled_from([(0.06, 1.1), (1e-9, 1e-6), (1e3, 1e6), (0.05, 0.05)]),
+    seed=seeds,
+)
+def test_rubber_is_within_a_nanonewton(
+    equations: SimpleNamespace, parts: tuple[float, float], taus_s: tuple[float, float], seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    felt_n = with_holes(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
+    t_ns = wild_instants(rng, 40)
+    model = rubber.Rubber(np.array([parts]), np.array([taus_s]))
+    state, out = model.at_rest(), []
+    for rows in in_two_parts(40):
+        force_n, state = model.unfelt(felt_n[rows, None], t_ns[rows, None], state)
+        out.append(force_n)
+    expected = equations.rubber(
+        equations.exact(felt_n),
+        t_ns.tolist(),
+        [mpf(g) for g in parts],
+        [mpf(tau) for tau in taus_s],
+    )
+    assert equations.apart(np.concatenate(out), expected) < GOAL
+
+
+@settings(max_examples=15)
+@given(
+    parts=st.sampled_from([(0.05, 0.04, 0.03), (0.0, 0.0, 0.0), (0.3, 0.3, 0.3), (0, 0, 0.999)]),
+    swing_n=st.sampled_from([0.01, 0.5, 5.0, 1e4]),
+    seed=seeds,
+)
+def test_hysteresis_is_within_a_nanonewton(
+    equations: SimpleNamespace, parts: tuple[float, float, float], swing_n: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    felt_n = with_holes(rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40)))
+    model = Hysteresis(np.array([parts], dtype=float))
+    plays_n, out = model.at_rest(), []
+    for rows in in_two_parts(40):
+        force_n, plays_n = model.unfelt(felt_n[rows, None], plays_n)
+        out.append(force_n)
+    expected = equations.hysteresis(equations.exact(felt_n), [mpf(w) for w in parts])
+    assert equations.apart(np.concatenate(out), expected) < GOAL * max(1.0, swing_n)
+
+
+@settings(max_examples=15)
+@given(lag_s=st.sampled_from([1e-9, 0.3, 3.3, 30.0, 1e9]), seed=seeds)
+def test_temperature_is_within_a_billionth_of_a_count(
+    equations: SimpleNamespace, lag_s: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    tadc = with_holes(rng, 480.0 - rng.integers(0, 40, 60))
+    t_ns = wild_instants(rng, 60)
+    # A kilopascal a count at 1 kPa: what it corrects shows the counts of the gas.
+    ones = np.ones(1)
+    model = temperature.Temperature(
+        ones, 0.0 * ones, np.array([lag_s]), 0.0 * ones, 400.0 * ones, ones
+    )
+    state, out = temperature.at_rest(1), []
+    for rows in in_two_parts(60):
+        one = np.ones((len(t_ns[rows]), 1))
+        kpa, _, state = model.at_tare(one, tadc[rows, None], t_ns[rows, None], state)
+        out.append(kpa)
+    counts = equations.temperature(equations.exact(tadc), t_ns.tolist(), mpf(lag_s))
+    expected = [None if x is None else 1 / (1 + (x - 400)) for x in counts]
+    assert equations.apart(np.concatenate(out), expected) < GOAL / 100**2
+
+
+@settings(max_examples=15)
+@given(seed=seeds)
+def test_ambient_is_within_a_micropascal(equations: SimpleNamespace, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    kpa = with_holes(rng, rng.normal(0, 1.0, 60))
+    t_ns = wild_instants(rng, 60)
+    model = ambient.Ambient(passed=np.array([0.11]), relative_sigma=0.1)
+    state, out = ambient.AT_REST, []
+    for rows in in_two_parts(60):
+        felt_kpa, _, state = model.felt(kpa[rows], t_ns[rows], state)
+        out.append(felt_kpa)
+    averaged = equations.ambient(equations.exact(kpa), t_ns.tolist())
+    expected = [None if x is None else mpf(0.11) * x for x in averaged]
+    assert equations.apart(np.concatenate(out), expected) < GOAL
+
+
+@pytest.mark.parametrize("look_ms", [0, 3, 10, 100])
+@pytest.mark.parametrize("kind", ["still", "moving", "uneven", "few", "crowded"])
+def test_denoise_is_within_a_nanonewton(
+    equations: SimpleNamespace, look_ms: int, kind: str
+) -> None:
+    rng = np.random.default_rng([look_ms, len(kind)])
+    n = 90
+    swing_n = {"still": 0.0, "moving": 25.0, "uneven": 5.0, "few": 1.0, "crowded": 0.0}[kind]
+    values = 30.0 + swing_n * np.sin(np.arange(n) / 9.0) + rng.normal(0, 0.3, n)
+    steps_ns = np.full(n, 2_000_000)
+    if kind == "uneven":
+        steps_ns = rng.choice([2_000_000] * 20 + [1, 40_000_000], n)
+    if kind == "crowded":  # at two instants that are six digits further apart than each is wide
+        steps_ns = np.tile([17, 17, 17, 17, 1_800_000], n // 5)
+    frame_ns = np.cumsum(steps_ns)
+    t_ns = frame_ns + (0 if kind == "crowded" else rng.choice([0, 700_000], n))
+    missing = rng.random(n) < (0.6 if kind == "few" else 0.05)
+    run = np.arange(n) // 10 if kind == "crowded" else np.cumsum(rng.random(n) < 0.03)
+    column = np.where(missing, NAN, values)
+    averaged, left = denoise.denoised(
+        column[:, None],
+        np.full((n, 1), 0.3),
+        t_ns[:, None],
+        frame_ns,
+        frame_ns[:, None].copy(),
+        run,
+        0,
+        n,
+        look_ms * 1_000_000,
+        denoise.PAST_NS,
+        denoise.REACHES,
+        denoise.AGREE,
+    )
+    found = equations.denoise(
+        equations.exact(column),
+        [mpf(0.3)] * n,
+        t_ns.tolist(),
+        frame_ns.tolist(),
+        frame_ns.tolist(),
+        run.tolist(),
+        look_ms * 1_000_000,
+    )
+    assert equations.apart(averaged, [None if x is None else x[0] for x in found]) < GOAL
+    assert equations.apart(left, [None if x is None else x[1] for x in found]) < GOAL

@@ -1,0 +1,76 @@
+"""`ambient`: a bare tile tells of weather and water."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devices.errors import UsageError
+from devices.frames import ArrayInfo
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.effects import Effects
+from service.estimation.models.ambient import AT_REST, SMOOTHING_S, Ambient
+from service.estimation.plan import EstimationPlan
+
+MODEL = Ambient(passed=np.array([1.0, 0.1]), relative_sigma=0.2)
+
+
+def head(kpa: Any, t_s: Any) -> np.ndarray:
+    """Averaged pressure around the foot."""
+    t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
+    felt_kpa, sigma_kpa, _ = MODEL.felt(np.asarray(kpa, dtype=float), t_ns, AT_REST)
+    np.testing.assert_array_equal(felt_kpa[:, 1], 0.1 * felt_kpa[:, 0])
+    np.testing.assert_array_equal(sigma_kpa, np.abs(0.2 * felt_kpa))
+    return felt_kpa[:, 0]
+
+
+def test_water_that_comes_at_once_is_known_after_thirty_milliseconds_to_two_thirds() -> None:
+    t_s = np.array([0.0, 0.001, 0.031, 0.061, 60.0])
+    expected = 1 - np.exp(-t_s[1:] / SMOOTHING_S)
+    assert head([0.0, 1.0, 1.0, 1.0, 1.0], t_s)[1:] == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_first_reading_counts_at_once_and_the_last_holds() -> None:
+    out = head([math.nan, 0.7, math.nan, math.inf, math.nan], 10.0 * np.arange(5))
+    assert np.isnan(out[0])
+    assert out[1:].tolist() == [0.7] * 4
+
+
+@pytest.mark.parametrize("back_s", [0.0, 0.001, 60.0])
+def test_time_that_stands_still_or_goes_back_changes_nothing(back_s: float) -> None:
+    assert head([0.0, 0.0, 1.0], [0.0, 100.0, 100.0 - back_s]).tolist() == [0.0] * 3
+
+
+@given(
+    kpa=st.lists(st.floats(-5, 5), min_size=1, max_size=40),
+    step_s=st.sampled_from([-60.0, 0.0, 1e-9, 0.002, 60.0]),
+)
+def test_it_is_never_outside_what_was_read(kpa: list[float], step_s: float) -> None:
+    out = head(kpa, step_s * np.arange(len(kpa)))
+    assert (out >= min(kpa) - 1e-12).all()
+    assert (out <= max(kpa) + 1e-12).all()
+
+
+def test_a_dome_passes_on_what_its_wall_gives_way_to(
+    info_of: Callable[..., ArrayInfo],
+    tile_of: Callable[..., TileCalibration],
+    effects_of: Callable[..., Effects],
+    plan_of: Callable[..., EstimationPlan],
+    calibration_of: Callable[..., Calibration],
+) -> None:
+    # hardware.md 9: c p/(1 + c p), a ninth of it with 0.00124 per kPa at 100 kPa
+    tiles = [tile_of("T01", effects=effects_of())]
+    bare = info_of([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)], references=[1])
+    plan = plan_of(bare, models=("static", "ambient"), tiles=tiles)
+    assert plan.ladder.ambient is not None
+    give = 0.0013 * plan.baseline_kpa[0]
+    assert plan.ladder.ambient.passed == pytest.approx([give / (1 + give)])
+    assert plan.ladder.ambient.relative_sigma == pytest.approx(0.0002 / 0.0013)
+    with pytest.raises(UsageError, match="bare reference tile"):
+        plan_of(info_of([(0.0, 0.0, 0.0)]), models=("static", "ambient"), tiles=tiles)

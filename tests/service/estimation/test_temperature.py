@@ -1,0 +1,113 @@
+"""`temperature`: the gas follows its chip with one lag, and its baseline follows the gas."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.estimation.models.temperature import SETTLE_S, Temperature, at_rest
+
+LAG_S, KPA_PER_COUNT, BASE_KPA, TARE = 3.0, -0.056, 100.0, 480.0
+
+
+def model(*, lag_s: float = LAG_S, kpa_per_count: float = KPA_PER_COUNT) -> Temperature:
+    values = (kpa_per_count, 0.02, lag_s, 0.1, TARE, BASE_KPA)
+    return Temperature(*(np.array([x]) for x in values))
+
+
+def followed(
+    tadc: Any, t_s: Any, kpa: float = BASE_KPA, **changes: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Counts of the gas that the corrected pressures show, and their uncertainty."""
+    tadc = np.asarray(tadc, dtype=float)[:, None]
+    t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)[:, None]
+    out, sigma_kpa, _ = model(**changes).at_tare(np.full(tadc.shape, kpa), tadc, t_ns, at_rest(1))
+    per_count = changes.get("kpa_per_count", KPA_PER_COUNT)
+    counts = TARE + BASE_KPA / per_count * (kpa / out[:, 0] - 1)
+    return counts, sigma_kpa[:, 0]
+
+
+def test_behind_a_chip_that_warms_evenly_the_gas_is_late_by_its_lag() -> None:
+    # lag x' = chip - x: behind by rate lag (1 - exp(-t/lag)); irregular steps are no matter.
+    rng = np.random.default_rng(0)
+    still_s = np.linspace(0.0, 2 * SETTLE_S, 50)
+    ramp_s = np.cumsum(rng.choice([0.001, 0.002, 0.3], 100))
+    chip = np.concatenate([np.full(50, TARE), TARE - 2.0 * ramp_s])
+    counts, _ = followed(chip, np.concatenate([still_s, still_s[-1] + ramp_s]))
+    expected = TARE - 2.0 * (ramp_s - LAG_S * (1 - np.exp(-ramp_s / LAG_S)))
+    assert counts[50:] == pytest.approx(expected, abs=1e-9)
+
+
+def test_pressure_is_taken_back_in_proportion_to_itself() -> None:
+    # Ten counts colder are 0.56 kPa at the baseline, and a fifth more at 120 kPa.
+    tadc, t_ns = np.full((5, 1), TARE + 10), np.arange(5)[:, None]
+    out, _, _ = model().at_tare(np.full((5, 1), 119.328), tadc, t_ns, at_rest(1))
+    assert out == pytest.approx(np.full((5, 1), 120.0), abs=1e-12)
+
+
+def test_at_first_the_gas_is_taken_to_be_as_warm_as_the_mean_of_its_chip() -> None:
+    # Noise of the first count would otherwise stay for the whole lag.
+    tadc = TARE + np.array([8.0, *np.tile([-1.0, 1.0], 120)])
+    counts, _ = followed(tadc, 0.002 * np.arange(241))
+    assert abs(counts[-1] - TARE) < 0.1
+
+
+def test_while_chip_and_gas_differ_how_far_is_uncertain() -> None:
+    chip = np.where(np.arange(2000) < 1000, TARE, TARE - 20)
+    counts, sigma_kpa = followed(chip, 0.002 * np.arange(2000))
+    expected = np.hypot(
+        0.02 * KPA_PER_COUNT * (counts - TARE), 0.1 * KPA_PER_COUNT * (chip - counts)
+    )
+    assert sigma_kpa == pytest.approx(expected, abs=1e-9)
+    assert sigma_kpa[1000] == pytest.approx(0.1 * 0.056 * 20, rel=0.01)
+    assert sigma_kpa[999] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("back_s", [0.0, 0.001, 100.0])
+def test_time_that_stands_still_or_goes_back_warms_nothing(back_s: float) -> None:
+    counts, _ = followed([TARE, TARE, TARE - 30], [0.0, 2.0, 2.0 - back_s])
+    assert counts == pytest.approx([TARE] * 3, abs=1e-9)
+
+
+@pytest.mark.parametrize("nothing", [math.nan, math.inf, -math.inf])
+def test_a_temperature_that_is_none_leaves_the_gas_as_it_was(nothing: float) -> None:
+    chip = TARE - np.arange(9.0)
+    chip[4] = nothing
+    t_s, rest = 1.5 * np.arange(9), np.arange(9) != 4
+    counts, _ = followed(chip, t_s)
+    assert counts[4] == counts[3]
+    assert counts[rest].tolist() == followed(chip[rest], t_s[rest])[0].tolist()
+
+
+def test_before_the_first_temperature_there_is_no_pressure() -> None:
+    out, _, _ = model().at_tare(
+        np.full((2, 1), 100.0), np.array([[math.nan], [TARE]]), np.arange(2)[:, None], at_rest(1)
+    )
+    assert np.isnan(out).ravel().tolist() == [True, False]
+
+
+def test_counts_below_absolute_zero_are_none() -> None:
+    # 0.2 kPa a count over 543 counts is more than the whole baseline.
+    out, _, _ = model(kpa_per_count=-0.2).at_tare(
+        np.full((1, 1), 100.0), np.full((1, 1), 1023.0), np.zeros((1, 1), np.int64), at_rest(1)
+    )
+    assert np.isnan(out).all()
+
+
+@given(
+    tadc=st.lists(st.integers(0, 1023), min_size=1, max_size=40),
+    step_s=st.sampled_from([0.0, 1e-9, 0.002, 1.0, 60.0, 1e6]),
+    lag_s=st.sampled_from([1e-9, 0.3, 30.0, 1e9]),
+)
+def test_the_gas_is_never_outside_what_its_chip_has_been(
+    tadc: list[int], step_s: float, lag_s: float
+) -> None:
+    t_s = step_s * np.arange(len(tadc))
+    counts, _ = followed(tadc, t_s, lag_s=lag_s, kpa_per_count=-0.05)
+    assert (counts >= min(tadc) - 1e-9).all()
+    assert (counts <= max(tadc) + 1e-9).all()
