@@ -6,6 +6,7 @@ hide; holds, releases and taps are kept reading by reading. Spikes are left out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ Floats = npt.NDArray[np.float64]
 BLOCK = 10
 _NOISE_MIN_KPA = 0.03
 """Rounding to a count alone leaves this much."""
+_APART_S = 600.0
+"""Between two recordings the rubber forgets."""
 
 
 @dataclass(frozen=True)
@@ -83,4 +86,23 @@ def presses(recording: Indentation, zero: Unloaded) -> Presses:
         weight=np.sqrt(counted) / max(zero.noise_kpa, _NOISE_MIN_KPA),
         loading=loading[last],
         fast=fast[last],
+    )
+
+
+def joined(parts: Sequence[Presses]) -> Presses:
+    """Several recordings as one run of loadings, far enough apart to know nothing of each other."""
+    begin_s, loadings = 0.0, 0
+    t_s, loading = [], []
+    for part in parts:
+        t_s.append(part.t_s + begin_s)
+        loading.append(part.loading + loadings)
+        begin_s = float(t_s[-1][-1]) + _APART_S
+        loadings += part.loadings
+    return Presses(
+        t_s=np.concatenate(t_s),
+        force_n=np.concatenate([part.force_n for part in parts]),
+        kpa=np.concatenate([part.kpa for part in parts]),
+        weight=np.concatenate([part.weight for part in parts]),
+        loading=np.concatenate(loading),
+        fast=np.concatenate([part.fast for part in parts]),
     )
