@@ -82,6 +82,8 @@ class Simulated:
     """Frames in which a tile was flagged, by serial and reason."""
     pressed: PressedTrace | None
     accuracy: Accuracy | None
+    assumed_scale: bool | None
+    """Whether newtons rest on an assumed scale; None without estimates."""
     wall_s: float
     """What taking, estimating and writing the frames took, set-up and bench left out."""
 
@@ -223,6 +225,7 @@ def simulate(
         },
         pressed=simulation.pressed,
         accuracy=judged_of(judged, stream),
+        assumed_scale=stream.plan.assumed_scale if stream and stream.plan else None,
         wall_s=time.perf_counter() - began_s,
     )
 

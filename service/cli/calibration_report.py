@@ -8,13 +8,13 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
+from service.cli.report import ASSUMED_SCALE
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.confidence import student_t_95
 from service.estimation.effects import Effects, Parameter
 from service.estimation.models.hysteresis import WIDTHS_N
 
 INTERVAL_95 = 1.96
-ASSUMED = "scale ASSUMED, not measured: do not trust the newtons"
 
 
 def calibration_tables(calibration: Calibration) -> list[Table]:
@@ -46,7 +46,7 @@ def _curves(calibration: Calibration) -> Table:
             "fit has not seen; mean, new: half width at full load of the 95 % band of",
             "the mean curve, and of a new loading; loop: hysteresis",
             f"reference: {calibration.reference}; {calibration.date}",
-            *([ASSUMED] if assumed else []),
+            *([ASSUMED_SCALE] if assumed else []),
         ],
         *("tile", "R2", "of mean", "RMSE\nN", "left out\nN", "mean\nN", "new\nN", "loop\nN"),
         *("rises", "repeats"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
@@ -60,7 +59,7 @@ def domes_command(
             title="Domes",
             title_justify="left",
         )
-        headings = ["dome", "material", "mm", "MPa", "full scale N", "known from", "sees outside"]
+        headings = ["dome", "material", "mm", "MPa", "full scale N", "from", "outside"]
         for heading in [*headings, *([] if load_n is None else [f"{load_n:g} N"])]:
             table.add_column(heading, no_wrap=True)
         for found in ranges():
@@ -86,7 +85,7 @@ _NOTES = """\
 Full scale: a slow load that takes the chip to its 115 kPa. The paper states it for
 v60-11; the others are scaled by modulus and area: press one before you rely on it.
 A load that comes within milliseconds reaches full scale at about {fast:.0f} % of it.
-Sees outside: estimated part of a change of air or water pressure that a tile reads."""
+Outside: estimated part of a change of air or water pressure that a tile reads."""
 
 
 def _answer(chosen: DomeRange | None, load_n: float) -> str:

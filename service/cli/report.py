@@ -14,6 +14,7 @@ PHASES = {
     "mid_stance": "in mid-stance",
     "unloading": "while unloading",
 }
+ASSUMED_SCALE = "The scale of this calibration is assumed: do not trust the newtons."
 EMULATED = "Errors of an emulated foot; the paper's 1 N and 4 mm are a real one's."
 
 
