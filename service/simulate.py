@@ -84,6 +84,8 @@ class Simulated:
     pressed: PressedTrace | None
     stances: tuple[Stance, ...]
     accuracy: Accuracy | None
+    assumed_scale: bool | None
+    """Whether newtons rest on an assumed scale; None without estimates."""
     wall_s: float
     """What taking, estimating and writing the frames took, set-up and bench left out."""
 
@@ -229,6 +231,7 @@ def simulate(
         pressed=simulation.pressed,
         stances=stances.finish(),
         accuracy=judged_of(judged, stream),
+        assumed_scale=stream.plan.assumed_scale if stream and stream.plan else None,
         wall_s=time.perf_counter() - began_s,
     )
 

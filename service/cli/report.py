@@ -6,11 +6,9 @@ import math
 from collections.abc import Sequence
 from statistics import median
 
-from rich.markup import escape
 from rich.table import Table
 
 from service.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
-from service.estimation.calibration import Calibration
 from service.estimation.stances import Stance
 
 PHASES = {
@@ -19,6 +17,7 @@ PHASES = {
     "mid_stance": "in mid-stance",
     "unloading": "while unloading",
 }
+ASSUMED_SCALE = "The scale of this calibration is assumed: do not trust the newtons."
 EMULATED = "Errors of an emulated foot; the paper's 1 N and 4 mm are a real one's."
 
 
@@ -59,61 +58,6 @@ def accuracy_table(a: Accuracy) -> Table:
     )
     table.add_row("saturated", str(a.saturated_frames), f"{a.frames} frames")
     return table
-
-
-def calibration_table(calibration: Calibration) -> Table:
-    """Quality of every tile's fit."""
-    table = Table(
-        title=escape(f"Calibration {calibration.name} ({calibration.id})"),
-        caption=escape(
-            "left out: error on a repeat the fit has not seen; loop: hysteresis\n"
-            f"reference: {calibration.reference}; {calibration.date}"
-        ),
-        title_justify="left",
-    )
-    for heading in (
-        "tile",
-        "R2",
-        "RMSE N",
-        "left out N",
-        "loop N",
-        "range kPa",
-        "rises",
-        "repeats",
-    ):
-        table.add_column(heading, justify="left" if heading == "tile" else "right")
-    for tile in calibration.tiles:
-        table.add_row(
-            tile.serial,
-            _number(tile.r2, 5),
-            _number(tile.rmse_n, 3),
-            _number(tile.cv_rmse_n, 3),
-            _number(tile.hysteresis_n, 3),
-            f"{tile.range_kpa[0]:.0f} to {tile.range_kpa[1]:.2f}",
-            "yes" if tile.monotonic else "NO",
-            str(tile.repeats),
-        )
-    return table
-
-
-def calibration_json(calibration: Calibration) -> dict[str, object]:
-    """The contract's shape of a calibration's quality."""
-    fields = (
-        "serial",
-        "r2",
-        "rmse_n",
-        "cv_rmse_n",
-        "hysteresis_n",
-        "range_kpa",
-        "monotonic",
-        "coefficients",
-    )
-    tiles = [{name: getattr(tile, name) for name in fields} for tile in calibration.tiles]
-    return {"id": calibration.id, "tiles": tiles}
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def stances_json(stances: Sequence[Stance]) -> list[dict[str, float | int | bool | None]]:

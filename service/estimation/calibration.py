@@ -16,6 +16,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from devices.errors import CalibrationError
+from service.estimation.bench_facts import BenchFacts
 from service.estimation.effects import Effects
 
 ANY_SERIAL = "*"
@@ -72,6 +73,8 @@ class TileCalibration(BaseModel):
     None: for any chip, as a preset is."""
     effects: Effects = Effects()
     """What of the dome beside its static curve is known."""
+    bench: BenchFacts | None = None
+    """What the recordings were like; None for a preset."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -103,6 +106,8 @@ class Calibration(BaseModel):
     date: str
     """ISO 8601, of the recordings."""
     tiles: tuple[TileCalibration, ...]
+    refused: dict[str, str] = {}
+    """Serials that were pressed as well, and why they have no curve."""
 
     @property
     def id(self) -> str:
@@ -125,8 +130,9 @@ class Calibration(BaseModel):
         if (found := self.find(serial)) is not None:
             return found
         known = ", ".join(tile.serial for tile in self.tiles)
+        why = f": it was refused ({self.refused[serial]})" if serial in self.refused else ""
         raise CalibrationError(
-            f"no calibration for tile {serial}",
+            f"no calibration for tile {serial}{why}",
             where=f"calibration {self.name} ({self.id})",
             expected=f"one of {known}",
             remedy="Press the tile on the bench and run `foottile calibrate`, or name another "
