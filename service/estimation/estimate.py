@@ -183,7 +183,8 @@ def _taken(
         turn = plan.info.servo.counts_per_turn
         readings = readings_of(frames, broken, state.last_reading, turn)
     run = state.runs + np.cumsum(broken)
-    new = _Known(now, frames.t_mono_ns, run, frames.seq, frames.t_ns, readings, loaded, since_ns)
+    t_mono_ns = np.array(frames.t_mono_ns)  # owned, as what is compiled wants it
+    new = _Known(now, t_mono_ns, run, frames.seq, frames.t_ns, readings, loaded, since_ns)
     return replace(
         state,
         known=new if state.known is None else state.known.followed_by(new),

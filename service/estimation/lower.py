@@ -100,11 +100,12 @@ def felt(
     if ladder.denoise and neighbours is not None:
         kpa, replaced = despiked(kpa, *neighbours, plan.tare.noise_kpa)
         status[replaced[:, columns].any(axis=1)] |= np.uint16(EstimateStatus.OUTLIER_REPLACED)
-    t_mono_ns = (frames.t_mono_ns[:, None] + 1000 * frames.sample_offset_us.astype(np.int64))[
-        :, columns
-    ]
+    # Owned, in row order: what is compiled is compiled for that.
+    frame_t_ns = np.array(frames.t_mono_ns)
+    offset_ns = 1000 * frames.sample_offset_us[:, columns].astype(np.int64, order="C")
+    t_mono_ns = frame_t_ns[:, None] + offset_ns
     gauge_kpa = kpa - plan.tare.baseline_kpa
-    bearing_kpa = kpa[:, columns]
+    bearing_kpa = np.ascontiguousarray(kpa[:, columns])
     baseline_variance = np.broadcast_to(plan.baseline_sigma_kpa**2, bearing_kpa.shape)
     if ladder.temperature is not None:
         before = state.temperature or temperature.at_rest(len(columns))
@@ -116,7 +117,7 @@ def felt(
         state = replace(state, temperature=after)
     if ladder.ambient is not None:
         felt_kpa, sigma_kpa, outside = ladder.ambient.felt(
-            _mean_of(gauge_kpa, plan.references), frames.t_mono_ns, state.ambient
+            _mean_of(gauge_kpa, plan.references), frame_t_ns, state.ambient
         )
         bearing_kpa = bearing_kpa - felt_kpa
         baseline_variance = baseline_variance + sigma_kpa**2

@@ -164,7 +164,7 @@ def grid_index(plan: EstimationPlan, gauge_kpa: Floats) -> tuple[Floats, Floats]
     if plan.grid is None:
         nothing = np.full(len(gauge_kpa), np.nan)
         return nothing, nothing
-    weight_kpa = gauge_kpa[:, plan.bearing]
+    weight_kpa = np.ascontiguousarray(gauge_kpa[:, plan.bearing])
     total_kpa = summed(weight_kpa)
     divisor_kpa = np.where(total_kpa == 0.0, np.nan, total_kpa)
     x, y = (summed(weight_kpa * index) / divisor_kpa for index in plan.grid)
