@@ -53,7 +53,7 @@ class StaticKernel:
             _column([t.coefficients[k] * t.f_scale_n for t in entries]) for k in (1, 2, 3)
         )
         self.u0 = -self.offset * self.per_kpa
-        self.slope_at_zero = _column(plan.curves.slope_at_zero_n_per_kpa)
+        self.slope_at_zero = _column(plan.ladder.curves.slope_at_zero_n_per_kpa)
         self.misfit = _column([t.relative_misfit for t in entries])
         self.loop_n = _column([t.loop_misfit_n for t in entries])
         # The matrix is symmetric: six terms instead of nine.

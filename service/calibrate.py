@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 from devices.compensation import Compensation
 from devices.errors import CalibrationError
 from devices.frames import NOT_READ, FrameBatch
+from devices.mpl115a2 import PRESSURE_MIN_KPA
 from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects_fit import fit_effects
@@ -19,54 +21,122 @@ from service.estimation.indentation import Indentation
 from storage.session_file import SessionReader
 
 
+@dataclass(frozen=True)
+class Pressed:
+    """A tile's part of one file, and the chip and stream it came from."""
+
+    indentation: Indentation
+    chip: tuple[int, int, int, int]
+    boot_id: str
+    seq: tuple[int, int]
+    """First and last frame."""
+
+
 def calibrate(paths: Sequence[Path], *, name: str, reference: str) -> Calibration:
-    """Fit every tile that was pressed in the recordings.
+    """Fit every tile that was pressed in the files; see `calibrate_recordings`.
+
+    Raises:
+        FileFormatError: a file is no such recording.
+        CalibrationError: files contradict one another, or no tile has a curve.
+    """
+    return calibrate_recordings(read_recordings(paths), name=name, reference=reference)
+
+
+def calibrate_recordings(
+    recordings: Mapping[str, Sequence[Pressed]], *, name: str, reference: str
+) -> Calibration:
+    """Fit every tile that was pressed.
+
+    Repeats of a tile may be spread over several files: each has its own baseline and reference
+    zero. A tile without a believable curve is left out, with the reason in `refused`.
 
     Args:
-        paths: sealed sessions with `reference_force_n`, `pressed_tile` and `phase`.
+        recordings: of each serial.
         name: for people.
         reference: the force sensor.
 
     Raises:
-        FileFormatError: a file is no such recording.
-        CalibrationError: no tile was pressed, one was pressed in two files, or a fit fails.
+        CalibrationError: no tile has a curve.
     """
-    recordings: dict[str, Indentation] = {}
-    chips: dict[str, tuple[int, int, int, int]] = {}
-    newest_ns = 0
-    for path in paths:
-        with SessionReader(path) as session:
-            chips |= {tile.serial: tile.coefficient_words for tile in session.info.tiles}
-            for recording in read_indentations(session):
-                if recording.serial in recordings:
-                    raise CalibrationError(
-                        f"tile {recording.serial} is pressed in "
-                        f"{recordings[recording.serial].where} and in {recording.where}",
-                        remedy="Calibrate from one recording per tile",
-                    )
-                recordings[recording.serial] = recording
-                newest_ns = max(newest_ns, int(recording.t_ns[-1]))
+    tiles: list[TileCalibration] = []
+    refused: dict[str, str] = {}
+    for serial, pressed in recordings.items():
+        try:
+            tiles.append(_fitted(pressed))
+        except CalibrationError as error:
+            if len(recordings) == 1:
+                raise
+            refused[serial] = str(error)
+    if not tiles:
+        raise CalibrationError(
+            "no tile has a curve: "
+            + "; ".join(f"{serial}: {reason}" for serial, reason in refused.items())
+        )
+    newest_ns = max(
+        int(pressed.indentation.t_ns[-1]) for all_of in recordings.values() for pressed in all_of
+    )
     return Calibration(
         name=name,
         reference=reference,
         date=datetime.fromtimestamp(newest_ns // 1_000_000_000, tz=UTC).isoformat(),
-        tiles=tuple(_fitted(recordings[serial], chips[serial]) for serial in sorted(recordings)),
+        tiles=tuple(tiles),
+        refused=refused,
     )
 
 
-def _fitted(recording: Indentation, chip: tuple[int, int, int, int]) -> TileCalibration:
-    tile = fit_tile(recording)
-    return tile.model_copy(
-        update={"coefficient_words": chip, "effects": fit_effects(recording, tile)}
-    )
-
-
-def read_indentations(session: SessionReader) -> list[Indentation]:
-    """Every tile's part of a bench recording.
+def read_recordings(paths: Sequence[Path]) -> dict[str, list[Pressed]]:
+    """Every tile's recordings, by serial.
 
     Raises:
-        CalibrationError: it is not one: a column is missing, or no tile was pressed.
+        FileFormatError: a file is no session.
+        CalibrationError: a file is no indentation, a serial stands for two chips, or the same
+            frames are given twice.
     """
+    found: dict[str, list[Pressed]] = {}
+    for path in paths:
+        with SessionReader(path) as session:
+            chips = {tile.serial: tile.coefficient_words for tile in session.info.tiles}
+            indentations, seq = _read(session)
+            for indentation in indentations:
+                pressed = Pressed(indentation, chips[indentation.serial], session.info.boot_id, seq)
+                others = found.setdefault(indentation.serial, [])
+                for other in others:
+                    _refuse_contradiction(other, pressed)
+                others.append(pressed)
+    return dict(sorted(found.items()))
+
+
+def _refuse_contradiction(one: Pressed, other: Pressed) -> None:
+    serial, files = one.indentation.serial, f"{one.indentation.where} and {other.indentation.where}"
+    if one.chip != other.chip:
+        raise CalibrationError(
+            f"tile {serial} has another chip in each of two recordings: coefficients {one.chip} "
+            f"and {other.chip}",
+            where=files,
+            remedy="Give the replaced part a serial of its own, and calibrate each by itself",
+        )
+    # A repeat that counts twice would look like agreement.
+    if one.boot_id == other.boot_id and one.seq[0] <= other.seq[1] and other.seq[0] <= one.seq[1]:
+        raise CalibrationError(
+            f"tile {serial}: the same frames are given twice",
+            where=files,
+            remedy="Name each recording once",
+        )
+
+
+def _fitted(pressed: Sequence[Pressed]) -> TileCalibration:
+    recordings = [each.indentation for each in pressed]
+    tile = fit_tile(*recordings)
+    return tile.model_copy(
+        update={
+            "coefficient_words": pressed[0].chip,
+            "effects": fit_effects(recordings, tile),
+        }
+    )
+
+
+def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
+    """Every tile's part of a bench recording, and its first and last frame."""
     if not session.has("pressed_tile", "phase"):
         raise CalibrationError(
             "not an indentation recording",
@@ -79,7 +149,10 @@ def read_indentations(session: SessionReader) -> list[Indentation]:
     pressed = np.concatenate([extra["pressed_tile"] for _, extra in pieces])
     phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
     held, _ = hold_temperature(frames)
-    kpa = Compensation(session.info.tiles).readable_kpa(held)
+    readable_kpa = Compensation(session.info.tiles).readable_kpa(held)
+    # A count that ran past its end reads as next to no pressure (model `unwrap`): here it says
+    # only that the tile was pressed beyond what its chip can tell.
+    kpa = np.where(readable_kpa < PRESSURE_MIN_KPA, np.inf, readable_kpa)
     tiles = [
         Indentation(
             serial=serial,
@@ -100,4 +173,4 @@ def read_indentations(session: SessionReader) -> list[Indentation]:
             where=str(session.path),
             expected="pressed_tile naming one of " + ", ".join(session.info.serials),
         )
-    return tiles
+    return tiles, (int(frames.seq[0]), int(frames.seq[-1]))

@@ -16,6 +16,7 @@ from service.accuracy import JUDGED, Accuracy
 from service.calibrations import BENCH, find_calibration
 from service.estimation.calibration import Calibration
 from service.estimation.plan import EstimationPlan
+from service.estimation.stances import Stance, Stances
 from service.estimation.tare import Tare
 from service.pipeline import EstimateOptions, EstimateStream, notes_of
 from service.simulate import judged_of
@@ -29,6 +30,7 @@ class Estimated:
 
     frames: int
     plan: EstimationPlan
+    stances: tuple[Stance, ...]
     accuracy: Accuracy | None
 
 
@@ -62,6 +64,7 @@ def estimate_session(
         judging = all(c.name in kept for c in TRUTH)
         stream = EstimateStream(info, options)
         judged: list[Mapping[str, npt.NDArray[Any]]] = []
+        stances = Stances()
         frames = 0
         with SessionWriter(out, info, session.notes) as writer:
             for batch, extra in stream.run(session.batches(*kept)):
@@ -69,12 +72,13 @@ def estimate_session(
                     writer.add_notes(notes_of(stream.plan, options.tares))
                 writer.append(batch, extra)
                 frames += len(batch)
+                stances.feed(batch.t_ns, extra["grf_n"], extra["contact"])
                 if judging:
                     columns = {"t_ns": batch.t_ns, **extra}
                     judged.append({name: columns[name] for name in JUDGED})
     if stream.plan is None:
         raise FileFormatError("the session has no frames", where=str(source))
-    return Estimated(frames, stream.plan, judged_of(judged, stream))
+    return Estimated(frames, stream.plan, stances.finish(), judged_of(judged, stream))
 
 
 def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:

@@ -15,6 +15,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from devices.errors import LinkError
+from service.estimation.warm import warm_up
 from service.guard import is_loopback
 from service.link import MESSAGE_BYTES_MAX
 from storage.durable import storage_errors, write_whole
@@ -89,7 +90,8 @@ def token_for(host: str, given: str | None, data: Path) -> str | None:
 
 @asynccontextmanager
 async def serving(app: FastAPI, listening: socket.socket) -> AsyncIterator[None]:
-    """Serve while the block runs."""
+    """Serve while the block runs; on a new machine the models are compiled before, in seconds."""
+    await asyncio.to_thread(warm_up)
     config = uvicorn.Config(
         app,
         log_level="warning",

@@ -33,6 +33,7 @@ from devices.startup import make_ready
 from service.accuracy import JUDGED, Accuracy, judge
 from service.beside import recovery_of, reference_of
 from service.describe import describe
+from service.estimation.stances import Stance, Stances
 from service.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
 from storage.session_file import SessionWriter
 
@@ -81,7 +82,10 @@ class Simulated:
     flags: Mapping[str, Mapping[str, int]]
     """Frames in which a tile was flagged, by serial and reason."""
     pressed: PressedTrace | None
+    stances: tuple[Stance, ...]
     accuracy: Accuracy | None
+    assumed_scale: bool | None
+    """Whether newtons rest on an assumed scale; None without estimates."""
     wall_s: float
     """What taking, estimating and writing the frames took, set-up and bench left out."""
 
@@ -187,6 +191,7 @@ def simulate(
     frames = 0
     first_ns = last_ns = 0
     flagged: Counter[tuple[int, str]] = Counter()
+    stances = Stances()
     with ExitStack() as stack:
         simulation = Simulation(options, stack)
         pieces: Iterator[tuple[FrameBatch, Extra]] = simulation.pieces()
@@ -204,6 +209,8 @@ def simulate(
             last_ns = int(batch.t_ns[-1])
             frames += len(batch)
             flagged.update(_flags(batch))
+            if stream is not None:
+                stances.feed(batch.t_ns, extra["grf_n"], extra["contact"])
             if options.truth and estimate is not None:
                 columns = {"t_ns": batch.t_ns, **extra}
                 judged.append({name: columns[name] for name in JUDGED})
@@ -222,7 +229,9 @@ def simulate(
             if any(i == tile for i, _ in flagged)
         },
         pressed=simulation.pressed,
+        stances=stances.finish(),
         accuracy=judged_of(judged, stream),
+        assumed_scale=stream.plan.assumed_scale if stream and stream.plan else None,
         wall_s=time.perf_counter() - began_s,
     )
 

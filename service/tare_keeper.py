@@ -16,6 +16,7 @@ from service.estimation.automatic import APART_NS, SETTLE_NS, Look
 from service.estimation.drift import expected_shift_kpa, has_warmed, warmer_k
 from service.estimation.flight import WINDOW_NS
 from service.estimation.plan import TARE_OLD_NS
+from service.estimation.tare import Tare
 from service.live_estimates import LiveEstimates
 from service.tares import RecordedTare, TareHistory
 from storage.journal import Journal
@@ -76,21 +77,27 @@ class TareKeeper:
         age_ns = newest_t_ns - tare.t_ns
         if age_ns > TARE_OLD_NS:
             said.append(f"tared {age_ns / 60e9:.0f} min ago: {_BY_HAND}")
-        tadc = self._live.recent_tadc()
-        bears = np.array([not tile.reference for tile in self._info.tiles])
-        if "temperature" not in self._info.models and has_warmed(tare, tadc)[bears].any():
-            warmer = warmer_k(tare, tadc)
-            most = int(np.nanargmax(np.where(bears, np.abs(warmer), np.nan)))
-            shift_n = self._live.newtons(expected_shift_kpa(tare, warmer))
-            about = "" if shift_n is None else f", about {shift_n:+.1f} N on the foot"
-            said.append(
-                f"{self._info.serials[most]} is {abs(warmer[most]):.1f} K "
-                f"{'warmer' if warmer[most] > 0 else 'colder'} than when it was tared{about}: "
-                f"{_BY_HAND}"
-            )
+        if "temperature" not in self._info.models and (warmed := self._warmed(tare)) is not None:
+            said.append(warmed)
         if self._doubt is not None:
             said.append(self._doubt)
         return said
+
+    def _warmed(self, tare: Tare) -> str | None:
+        tadc = self._live.recent_tadc()
+        bears = np.array([not tile.reference for tile in self._info.tiles])
+        tiles = np.flatnonzero(has_warmed(tare, tadc) & bears)
+        if not len(tiles):
+            return None
+        warmer = warmer_k(tare, tadc)
+        mean_k = float(warmer[tiles].mean())
+        who = f"tile {self._info.serials[tiles[0]]} is" if len(tiles) == 1 else "the tiles are"
+        shift_n = self._live.newtons(expected_shift_kpa(tare, warmer))
+        about = "" if shift_n is None else f", about {shift_n:+.1f} N on the foot"
+        return (
+            f"{who} {abs(mean_k):.1f} K {'warmer' if mean_k > 0 else 'colder'} than when tared"
+            f"{about}: {_BY_HAND}"
+        )
 
     def by_hand(self, reason: str = "") -> RecordedTare:
         """Tare from an unloaded interval of the last seconds, and put it in force.

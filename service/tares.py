@@ -11,6 +11,7 @@ import json
 import uuid
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from devices.errors import FileFormatError, TareError, UnknownError
 from devices.frames import ArrayInfo
@@ -39,6 +40,12 @@ class RecordedTare:
     undone: bool = False
     reason: str = ""
     """In words."""
+    chips: tuple[tuple[int, ...], ...] | None = None
+    """Coefficients of the tiles' chips; None in tares of older versions, which kept none."""
+
+    def is_of(self, info: ArrayInfo) -> bool:
+        """Is it of these very tiles? A swapped part has the same serial and another chip."""
+        return self.serials == info.serials and self.chips in (None, _chips(info))
 
     @property
     def is_automatic(self) -> bool:
@@ -75,7 +82,7 @@ class TareHistory:
     def is_automatic_paused(self, info: ArrayInfo) -> bool:
         """Was an automatic one undone, and none taken otherwise since?"""
         for recorded in reversed(self._tares):
-            if recorded.serials != info.serials:
+            if not recorded.is_of(info):
                 continue
             if recorded.is_automatic and recorded.undone:
                 return True
@@ -110,7 +117,9 @@ class TareHistory:
             StorageError: it cannot be kept; it is not in force then.
         """
         reason = (reason or _REASONS.get(tare.source, tare.source))[:REASON_LENGTH_MAX]
-        recorded = RecordedTare(uuid.uuid4().hex[:12], info.serials, tare, reason=reason)
+        recorded = RecordedTare(
+            uuid.uuid4().hex[:12], info.serials, tare, reason=reason, chips=_chips(info)
+        )
         self._keep(_bounded([*self._tares, recorded]))
         return recorded
 
@@ -128,7 +137,7 @@ class TareHistory:
         )
 
     def _of(self, info: ArrayInfo) -> list[RecordedTare]:
-        return [t for t in self._tares if t.serials == info.serials and not t.undone]
+        return [t for t in self._tares if t.is_of(info) and not t.undone]
 
     def _keep(self, tares: list[RecordedTare]) -> None:
         content = [
@@ -137,6 +146,7 @@ class TareHistory:
                 "serials": t.serials,
                 "undone": t.undone,
                 "reason": t.reason,
+                "chips": t.chips,
                 "tare": t.tare.as_dict(),
             }
             for t in tares
@@ -145,6 +155,14 @@ class TareHistory:
             self._path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(self._path, json.dumps(content).encode())
         self._tares = tares
+
+
+def _chips(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
+    return tuple(tuple(tile.coefficient_words) for tile in info.tiles)
+
+
+def _read_chips(content: Any) -> tuple[tuple[int, ...], ...] | None:
+    return None if content is None else tuple(tuple(int(w) for w in words) for words in content)
 
 
 def _bounded(tares: list[RecordedTare]) -> list[RecordedTare]:
@@ -174,6 +192,7 @@ def _read(path: Path) -> list[RecordedTare]:
                 Tare.from_dict(entry["tare"], tiles=len(entry["serials"])),
                 bool(entry["undone"]),
                 str(entry.get("reason") or _REASONS.get(entry["tare"]["source"], "")),
+                _read_chips(entry.get("chips")),
             )
             for entry in content
         ]

@@ -20,6 +20,8 @@ from devices.scene import (
     EmulationScene,
     FaultScene,
     GroundScene,
+    MudGround,
+    PoppyGround,
     RecoveryScene,
     ReferenceScene,
     Scene,
@@ -93,6 +95,16 @@ def test_documented_defaults_are_the_defaults(heading: str, section: type[BaseMo
             else:
                 assert float(shown) == field.default, key
     assert compared >= 3
+
+
+def test_documented_defaults_of_hops_are_the_defaults() -> None:
+    part = SCENES.split("### Hops")[1].split("\n##")[0]
+    cells = [[cell.strip() for cell in row.split("|")] for row in part.splitlines() if "| `" in row]
+    documented = {row[1].strip("`"): row[2] for row in cells}
+    for ground in (PoppyGround, MudGround):
+        for key, field in ground.model_fields.items():
+            if key != "kind":
+                assert f"{field.default:g}" in documented[key].split(), key
 
 
 def test_every_column_is_documented_with_its_unit() -> None:

@@ -47,7 +47,10 @@ class Load(Protocol):
 
 
 class Domes:
-    """All domes of a foot under one load, integrated forward in blocks."""
+    """All domes of a foot under one load, integrated forward in blocks.
+
+    A place may be `bare`: its chip has no dome, and senses what is around it.
+    """
 
     def __init__(
         self,
@@ -57,7 +60,9 @@ class Domes:
         scene: EmulationScene,
         surroundings: Surroundings,
         label: str,
+        bare: Sequence[bool] = (),
     ) -> None:
+        self._bare = np.flatnonzero(bare)
         self._parts = parts
         self._load = load
         self._scene = scene
@@ -85,7 +90,9 @@ class Domes:
         self._extend(0)
 
     def pressure_kpa(self, dome: int, t_s: float) -> float:
-        """Absolute gas pressure of one dome. Times may not go back by more than a block.
+        """Absolute gas pressure of one dome, or around a bare chip.
+
+        Times may not go back by more than a block.
 
         Raises:
             ValueError: `t_s` lies before what is still kept.
@@ -119,6 +126,8 @@ class Domes:
         felt_n = self._hysteresis(self._creeping(force_n))
         lost = self._stiffening * np.log1p(felt_n / self._knee_n) * self._loading_gains(force_n)
         kpa = self._gas(t_s, 1.0 - lost)
+        around_kpa = self._surroundings.bare_kpa(t_s)
+        kpa[:, self._bare] = np.broadcast_to(around_kpa, kpa.shape)[:, self._bare]
         self._last_force_n = force_n[-1]
         before = self._kept[1][-_BLOCK:]
         self._kept = (self._next - len(before), before + kpa.tolist())

@@ -75,7 +75,10 @@ class Surroundings:
         own_kpa = np.where(t_s >= self._scene.head_s, self._scene.head_kpa, 0.0)[:, None]
         return own_kpa if self._submersion is None else own_kpa + self._submersion.head_kpa(t_s)
 
-    def bare_kpa(self, tile: int, t_s: float) -> float:
-        """What a tile without a dome senses: the atmosphere and the head on it."""
-        head_kpa = self.head_kpa(np.array([t_s]))[0]
-        return self.ambient_kpa + float(head_kpa[tile if len(head_kpa) > 1 else 0])
+    def bare_kpa(self, t_s: Floats) -> Floats:
+        """What tiles without a dome would sense: the atmosphere and the head on each.
+
+        Returns:
+            As `head_kpa`.
+        """
+        return self.ambient_kpa + self.head_kpa(t_s)

@@ -98,20 +98,21 @@ class World:
         # By scene too: a tile on the bench and in the field must not see the same noise again.
         draw = f"{scene.name}/{seed}"
         surroundings = self._surroundings(draw)
-        self._domes = Domes(domes, serials, self.ground, scene.emulation, surroundings, draw)
+        bare = [tile.reference for tile in scene.tile]
+        self._domes = Domes(
+            domes, serials, self.ground, scene.emulation, surroundings, draw, bare=bare
+        )
         self._faults = Faults(scene.fault)
         self._front_ends: list[FrontEnd] = []
 
         def silicon(index: int, serial: str) -> Silicon:
             """The chip of a serial under a dome of this foot, or bare if it is for reference."""
-            bare = scene.tile[index].reference
-            pressure_kpa = surroundings.bare_kpa if bare else self._domes.pressure_kpa
             chip = draw_chip(serial, parts_seed)
             fixed_ms = scene.array.conversion_ms
             sense = FrontEnd(
                 chip,
                 domes[index],
-                partial(pressure_kpa, index),
+                partial(self._domes.pressure_kpa, index),
                 surroundings,
                 scene.emulation,
                 f"noise/{draw}/{serial}",

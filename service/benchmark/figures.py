@@ -106,6 +106,7 @@ class SceneFigures:
                     "models": list(rung.models),
                     "adds": rung.adds,
                     "lacks": rung.lacks,
+                    "spare": rung.spare,
                     "default": rung.is_default,
                     **{mode: _as_dict(self.measured[mode, rung.label]) for mode in LAGS_MS},
                 }

@@ -41,7 +41,9 @@ class _Mark:
 
     @property
     def name(self) -> str:
-        return self.rung.label if self.rung.is_built_up else f"\N{MINUS SIGN}{self.rung.lacks}"
+        if self.rung.is_built_up:
+            return self.rung.label
+        return f"++{self.rung.spare}" if self.rung.spare else f"\N{MINUS SIGN}{self.rung.lacks}"
 
 
 def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:

@@ -53,6 +53,10 @@ def markdown(bench: Bench) -> str:
         "",
         EMULATED,
     ]
+    if not o.as_scenes_say:
+        said = {"repeatability": o.repeatability, "noise correlated over ms": o.correlated_ms}
+        named = ", ".join(f"{name} {value:g}" for name, value in said.items() if value is not None)
+        lines += ["", f"The emulation differs from that of the scenes: {named}."]
     for figures in bench.scenes:
         lines += ["", *_scene(figures)]
     return "\n".join(lines) + "\n"
@@ -116,9 +120,9 @@ def _budget(figures: SceneFigures) -> list[str]:
     """What each model takes away: how much greater the error is without it."""
     rows = []
     for rung in figures.rungs:
-        if rung.lacks is None:
+        if rung.lacks is None and rung.spare is None:
             continue
-        row = [rung.lacks]
+        row = [f"without {rung.lacks}" if rung.lacks else f"with {rung.spare}, too"]
         for mode in LAGS_MS:
             more = figures.measured[mode, rung.label].beyond_whole
             row += [
@@ -130,10 +134,10 @@ def _budget(figures: SceneFigures) -> list[str]:
         return ["No model of this ladder can be left out."]
     head = [f"{q}, {mode}" for mode in LAGS_MS for q in ("GRF mean abs N", "COP p95 mm")]
     text = (
-        "How much greater the error is without each model than with the whole ladder; the median "
-        "of the differences draw by draw, and their range."
+        "How much greater the error is without each model, or with one more, than with the whole "
+        "ladder; the median of the differences draw by draw, and their range."
     )
-    return [text, "", *table(("without", *head), rows)]
+    return [text, "", *table(("ladder", *head), rows)]
 
 
 def _goals(goals: Sequence[Goal], draws: int) -> list[str]:

@@ -25,6 +25,8 @@ from service.benchmark.figures import SceneFigures, Spread, measured_of
 from service.benchmark.goals import Goal, goals_of
 from service.benchmark.rungs import Rung, absent, rungs
 from service.benchmark.timing import BATCH, time_rungs
+from service.estimation.calibration import PRESETS
+from service.estimation.ladder import MODELS
 from service.version import SOFTWARE
 
 
@@ -39,6 +41,24 @@ class BenchOptions:
     offline_frames: int
     live_frames: int
     repetitions: int
+    whole_only: bool = False
+    """Only the scenes' whole ladders, for many draws."""
+    repeatability: float | None = None
+    """Of the emulated domes, instead of the scenes'."""
+    correlated_ms: float | None = None
+    """Of the emulated noise, likewise."""
+
+    def emulated(self, scene: Scene) -> Scene:
+        """The scene with the emulation that is asked for."""
+        asked = {"repeatability": self.repeatability, "correlated_ms": self.correlated_ms}
+        given = {name: value for name, value in asked.items() if value is not None}
+        emulation = scene.emulation.model_copy(update=given)
+        return scene.model_copy(update={"emulation": emulation})
+
+    @property
+    def as_scenes_say(self) -> bool:
+        """Is the emulation that of the scenes?"""
+        return self.repeatability is None and self.correlated_ms is None
 
 
 @dataclass(frozen=True)
@@ -70,6 +90,10 @@ class Bench:
             "made": self.made,
             "machine": self.machine,
             "draws": options.draws,
+            "emulation": {
+                "repeatability": options.repeatability,
+                "correlated_ms": options.correlated_ms,
+            },
             "timed": {
                 "live": {"frames": options.live_frames, "batch": BATCH["live"]},
                 "offline": {"frames": options.offline_frames, "batch": BATCH["offline"]},
@@ -93,8 +117,10 @@ def run_bench(options: BenchOptions, tell: Callable[[str], None]) -> Bench:
         FootTileError: no draw of a scene gave a figure.
     """
     scenes = []
-    for scene in options.scenes:
-        ladder = rungs(scene.models)
+    for scene in map(options.emulated, options.scenes):
+        ladder = rungs(scene.models, offered=_offered(scene))
+        if options.whole_only:
+            ladder = tuple(rung for rung in ladder if rung.is_default)
         tasks = [Task(scene, options.seconds, draw, ladder) for draw in range(options.draws)]
         draws: list[Drawn] = []
         for one in drawn(tasks, options.jobs):
@@ -104,6 +130,13 @@ def run_bench(options: BenchOptions, tell: Callable[[str], None]) -> Bench:
         scenes.append(_figures(scene, ladder, draws, options, tell))
     made = datetime.now(UTC).isoformat(timespec="seconds")
     return Bench(options, made, SOFTWARE, machine(), tuple(scenes))
+
+
+def _offered(scene: Scene) -> tuple[str, ...]:
+    has_bare_tile = any(tile.reference for tile in scene.tile)
+    if scene.calibration in PRESETS:  # which know of a static curve only
+        return ("skew", "denoise")
+    return tuple(name for name in MODELS if name != "ambient" or has_bare_tile)
 
 
 def _figures(

@@ -26,6 +26,7 @@ class Rung:
             as the whole ladder less a model.
         adds: what it has more than the rung before it; None for the first and what is not built up.
         lacks: what the whole ladder has more, if that is one model that can be left out.
+        spare: what it has more than the whole ladder: a model that the scene does without.
         is_default: it is the scene's whole ladder.
     """
 
@@ -35,17 +36,24 @@ class Rung:
     adds: str | None
     lacks: str | None
     is_default: bool
+    spare: str | None = None
 
 
-def rungs(models_of_scene: Sequence[str], existing: Sequence[str] = MODELS) -> tuple[Rung, ...]:
+def rungs(
+    models_of_scene: Sequence[str],
+    existing: Sequence[str] = MODELS,
+    offered: Sequence[str] = (),
+) -> tuple[Rung, ...]:
     """The ladders to compare for a scene, each once.
 
     First those that are built up, ending with the scene's whole ladder, then those that lack one
-    of its models. Models that do not exist are left out; `absent` names them.
+    of its models, then those that have one more than it names: what it was right or wrong to do
+    without. Models that do not exist are left out; `absent` names them.
 
     Args:
         models_of_scene: the models that the scene names, `static` among them.
         existing: all models there are, in the order in which they are applied.
+        offered: models that the array and its calibration could do as well.
     """
     whole = tuple(name for name in existing if name in models_of_scene)
     later = [name for name in existing if name not in (*FOUNDATION, *BY_WHAT_MATTERS)]
@@ -66,7 +74,20 @@ def rungs(models_of_scene: Sequence[str], existing: Sequence[str] = MODELS) -> t
         for models, name in less.items()
         if models not in seen
     ]
-    return (*built, *ablated)
+    more = [
+        Rung(
+            f"whole +{name}",
+            tuple(m for m in existing if m in (*whole, name)),
+            is_built_up=False,
+            adds=None,
+            lacks=None,
+            is_default=False,
+            spare=name,
+        )
+        for name in existing
+        if name in offered and name not in whole
+    ]
+    return (*built, *ablated, *more)
 
 
 def absent(models_of_scene: Sequence[str], existing: Sequence[str] = MODELS) -> tuple[str, ...]:

@@ -50,6 +50,25 @@ def bench_command(
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Draws at the same time; default: one per core.")
     ] = None,
+    whole_only: Annotated[
+        bool, typer.Option("--whole-only", help="Only the scenes' whole ladders, for many draws.")
+    ] = False,
+    repeatability: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=0.2,
+            help="Of the emulated domes, instead of the scene's; the paper's: 0.03.",
+        ),
+    ] = None,
+    correlated_ms: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1000.0,
+            help="Correlation time of the emulated noise, instead of the scene's.",
+        ),
+    ] = None,
     check_goals: Annotated[
         bool, typer.Option("--check-goals", help="Exit code 3 if a goal is not met.")
     ] = False,
@@ -86,6 +105,9 @@ def bench_command(
         offline_frames=frames or (QUICK_FRAMES if quick else FRAMES),
         live_frames=QUICK_LIVE_FRAMES if quick else LIVE_FRAMES,
         repetitions=QUICK_REPETITIONS if quick else REPETITIONS,
+        whole_only=whole_only,
+        repeatability=repeatability,
+        correlated_ms=correlated_ms,
     )
     with telling("starting") as tell:
         bench = run_bench(options, tell)

@@ -27,7 +27,7 @@ from service.cli.emulation import (
 )
 from service.cli.node import calibration_of
 from service.cli.options import remark
-from service.cli.serve import announce
+from service.cli.serve import PREPARING, announce
 
 if TYPE_CHECKING:
     from service.server import Server
@@ -111,6 +111,7 @@ async def _demo(
     with listen(host, port) as listening:
         server = Server(data)
         token = token_for(host, os.environ.get("FOOTTILE_TOKEN"), data)
+        remark(PREPARING)
         async with serving(make_app(server, token=token), listening):
             urls = urls_of(listening, host)
             node = await _start_node(urls[-1], token, node_arguments)

@@ -51,7 +51,7 @@ def estimate_command(
     The tare comes from --tare-s, else from frames flagged as lead, else from the first interval
     that can be recognised as unloaded. Exit codes: 0 good, 1 failed, 2 wrong usage.
     """
-    from service.cli.report import accuracy_table
+    from service.cli.report import ASSUMED_SCALE, accuracy_table, stances_json, stances_line
     from service.estimate_session import estimate_session
 
     # The session itself may be written anew: it is replaced whole, and nothing raw is lost.
@@ -82,6 +82,7 @@ def estimate_command(
                     "begin_s": plan.tare.begin_s,
                     "end_s": plan.tare.end_s,
                 },
+                "stances": stances_json(result.stances),
                 "accuracy": result.accuracy.as_dict() if result.accuracy else None,
             }
         )
@@ -92,6 +93,8 @@ def estimate_command(
         f"{plan.tare.begin_s:.2f} to {plan.tare.end_s:.2f} s"
     )
     if plan.assumed_scale:
-        say("The scale of this calibration is assumed: do not trust the newtons.")
+        say(ASSUMED_SCALE)
+    if result.stances:
+        say(stances_line(result.stances))
     if result.accuracy is not None:
         stdout.print(accuracy_table(result.accuracy))

@@ -13,6 +13,7 @@ from service.cli.bench import bench_command
 from service.cli.calibrate import calibrate_command
 from service.cli.demo import demo_command
 from service.cli.doctor import doctor_command
+from service.cli.domes import domes_command
 from service.cli.estimate import estimate_command
 from service.cli.node import node_command
 from service.cli.serve import serve_command
@@ -39,6 +40,7 @@ app.command("export")(export_command)
 app.command("simulate")(simulate_command)
 app.command("estimate")(estimate_command)
 app.command("calibrate")(calibrate_command)
+app.command("domes")(domes_command)
 app.command("doctor")(doctor_command)
 app.command("bench")(bench_command)
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from statistics import median
 
-from rich.markup import escape
 from rich.table import Table
 
 from service.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
-from service.estimation.calibration import Calibration
+from service.estimation.stances import Stance
 
 PHASES = {
     "flight": "in flight",
@@ -16,6 +17,7 @@ PHASES = {
     "mid_stance": "in mid-stance",
     "unloading": "while unloading",
 }
+ASSUMED_SCALE = "The scale of this calibration is assumed: do not trust the newtons."
 EMULATED = "Errors of an emulated foot; the paper's 1 N and 4 mm are a real one's."
 
 
@@ -58,56 +60,33 @@ def accuracy_table(a: Accuracy) -> Table:
     return table
 
 
-def calibration_table(calibration: Calibration) -> Table:
-    """Quality of every tile's fit."""
-    table = Table(
-        title=escape(f"Calibration {calibration.name} ({calibration.id})"),
-        caption=escape(
-            "left out: error on a repeat the fit has not seen; loop: hysteresis\n"
-            f"reference: {calibration.reference}; {calibration.date}"
-        ),
-        title_justify="left",
+def stances_json(stances: Sequence[Stance]) -> list[dict[str, float | int | bool | None]]:
+    """One entry a stance; a peak that is not known is null."""
+    return [
+        {
+            "begin_t_ns": s.begin_t_ns,
+            "duration_s": s.duration_s,
+            "peak_n": s.peak_n if math.isfinite(s.peak_n) else None,
+            "peak_t_ns": s.peak_t_ns,
+            "impulse_ns": s.impulse_ns,
+            "unknown_frames": s.unknown_frames,
+            "begun": s.begun,
+            "ended": s.ended,
+        }
+        for s in stances
+    ]
+
+
+def stances_line(stances: Sequence[Stance]) -> str:
+    """How often the foot stood, and how hard."""
+    whole = [s for s in stances if s.begun and s.ended and math.isfinite(s.peak_n)]
+    said = f"{len(stances)} stance{'s' if len(stances) != 1 else ''}"
+    if len(whole) < len(stances):
+        said += f", {len(whole)} of them from beginning to end"
+    if not whole:
+        return said
+    return (
+        f"{said}: median peak {median(s.peak_n for s in whole):.2f} N, impulse "
+        f"{median(s.impulse_ns for s in whole):.2f} Ns, duration "
+        f"{median(s.duration_s for s in whole):.2f} s"
     )
-    for heading in (
-        "tile",
-        "R2",
-        "RMSE N",
-        "left out N",
-        "loop N",
-        "range kPa",
-        "rises",
-        "repeats",
-    ):
-        table.add_column(heading, justify="left" if heading == "tile" else "right")
-    for tile in calibration.tiles:
-        table.add_row(
-            tile.serial,
-            _number(tile.r2, 5),
-            _number(tile.rmse_n, 3),
-            _number(tile.cv_rmse_n, 3),
-            _number(tile.hysteresis_n, 3),
-            f"{tile.range_kpa[0]:.0f} to {tile.range_kpa[1]:.2f}",
-            "yes" if tile.monotonic else "NO",
-            str(tile.repeats),
-        )
-    return table
-
-
-def calibration_json(calibration: Calibration) -> dict[str, object]:
-    """The contract's shape of a calibration's quality."""
-    fields = (
-        "serial",
-        "r2",
-        "rmse_n",
-        "cv_rmse_n",
-        "hysteresis_n",
-        "range_kpa",
-        "monotonic",
-        "coefficients",
-    )
-    tiles = [{name: getattr(tile, name) for name in fields} for tile in calibration.tiles]
-    return {"id": calibration.id, "tiles": tiles}
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

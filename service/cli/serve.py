@@ -51,9 +51,13 @@ async def _serve(settings: Settings) -> None:
         server = Server(settings.data)
         token = token_for(settings.host, settings.token, settings.data)
         app = make_app(server, hosts=settings.allow_host, token=token)
+        remark(PREPARING)
         async with serving(app, listening):
             announce(urls_of(listening, settings.host), settings.data, token)
             await stop.wait()
+
+
+PREPARING = "preparing the models; on a new machine that takes some ten seconds"
 
 
 def announce(urls: list[str], data: Path, token: str | None) -> None:

@@ -56,13 +56,14 @@ def sessions_command(
         )
     for session in found:
         lossy = ", lossy" if session["complete"] == "lossy" else ""
+        assumed = ", scale assumed" if session["absolute_scale"] == "assumed" else ""
         table.add_row(
             session["id"],
             escape(session["name"]),
             session["node"],
             f"{session['duration_s']:.1f}",
             str(session["frames"]),
-            session["state"] + lossy,
+            session["state"] + lossy + assumed,
         )
     stdout.print(table)
 

@@ -31,7 +31,7 @@ from service.cli.options import (
     say,
     stdout,
 )
-from service.cli.report import accuracy_table
+from service.cli.report import ASSUMED_SCALE, accuracy_table, stances_json, stances_line
 
 if TYPE_CHECKING:
     from service.simulate import Simulated
@@ -142,6 +142,12 @@ def _as_json(result: Simulated, path: Path) -> dict[str, object]:
         "bytes": path.stat().st_size,
         "moved_to_edge": pressed.moved_to_edge if pressed else None,
         "limited": pressed.limited if pressed else None,
+        "absolute_scale": None
+        if result.assumed_scale is None
+        else "assumed"
+        if result.assumed_scale
+        else "measured",
+        "stances": stances_json(result.stances),
         "accuracy": result.accuracy.as_dict() if result.accuracy else None,
     }
 
@@ -170,6 +176,10 @@ def _print(result: Simulated, path: Path) -> None:
             f"load: {result.pressed.moved_to_edge} samples had their COP moved to the hull's edge, "
             f"{result.pressed.limited} had a tile's force limited"
         )
+    if result.assumed_scale:
+        say(ASSUMED_SCALE)
+    if result.stances:
+        say(stances_line(result.stances))
     if result.accuracy is not None:
         stdout.print(accuracy_table(result.accuracy))
 

@@ -6,6 +6,7 @@ hide; holds, releases and taps are kept reading by reading. Spikes are left out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ Floats = npt.NDArray[np.float64]
 BLOCK = 10
 _NOISE_MIN_KPA = 0.03
 """Rounding to a count alone leaves this much."""
+_APART_S = 600.0
+"""Between two recordings the rubber forgets."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,9 @@ def presses(recording: Indentation, zero: Unloaded) -> Presses:
     t_s = (recording.t_ns[rows] - recording.t_ns[rows][0]) * 1e-9
     force_n = recording.reference_n[rows] - zero.reference_zero_n
     kpa, phase = recording.kpa[rows], recording.phase[rows]
-    kpa = np.where(spikes(kpa[:, None], np.array([zero.noise_kpa]))[:, 0], np.nan, kpa)
+    # What the reference explains is no spike: the top of a tap is a single reading, too.
+    unexplained_kpa = kpa - _kpa_per_n(kpa, force_n) * force_n
+    kpa = np.where(spikes(unexplained_kpa[:, None], np.array([zero.noise_kpa]))[:, 0], np.nan, kpa)
     active = phase != "rest"
     begins = active & ~np.concatenate([[False], active[:-1]])
     loading = np.maximum(np.cumsum(begins) - 1, 0)
@@ -83,4 +88,31 @@ def presses(recording: Indentation, zero: Unloaded) -> Presses:
         weight=np.sqrt(counted) / max(zero.noise_kpa, _NOISE_MIN_KPA),
         loading=loading[last],
         fast=fast[last],
+    )
+
+
+def _kpa_per_n(kpa: Floats, force_n: Floats) -> float:
+    """Slope of pressure over force, all in all; 0 without any load."""
+    good = np.isfinite(kpa)
+    spread_n = force_n[good] - force_n[good].mean() if good.any() else np.zeros(1)
+    square = float((spread_n**2).sum())
+    return float((spread_n * kpa[good]).sum()) / square if square > 0.0 else 0.0
+
+
+def joined(parts: Sequence[Presses]) -> Presses:
+    """Several recordings as one run of loadings, far enough apart to know nothing of each other."""
+    begin_s, loadings = 0.0, 0
+    t_s, loading = [], []
+    for part in parts:
+        t_s.append(part.t_s + begin_s)
+        loading.append(part.loading + loadings)
+        begin_s = float(t_s[-1][-1]) + _APART_S
+        loadings += part.loadings
+    return Presses(
+        t_s=np.concatenate(t_s),
+        force_n=np.concatenate([part.force_n for part in parts]),
+        kpa=np.concatenate([part.kpa for part in parts]),
+        weight=np.concatenate([part.weight for part in parts]),
+        loading=np.concatenate(loading),
+        fast=np.concatenate([part.fast for part in parts]),
     )

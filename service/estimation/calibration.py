@@ -16,11 +16,14 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from devices.errors import CalibrationError
+from service.estimation.bench_facts import BenchFacts
 from service.estimation.effects import Effects
 
 ANY_SERIAL = "*"
 LOOP_OPENS_N = 1.0
 CURVE_OPENS_N = 0.2
+"""Forces at which a loop, and what a cubic misses of a curve, have opened by half: at zero load
+there is neither."""
 BASIS = 3
 """A cubic without constant term has three coefficients to be uncertain about."""
 
@@ -70,6 +73,8 @@ class TileCalibration(BaseModel):
     None: for any chip, as a preset is."""
     effects: Effects = Effects()
     """What of the dome beside its static curve is known."""
+    bench: BenchFacts | None = None
+    """What the recordings were like; None for a preset."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -101,6 +106,8 @@ class Calibration(BaseModel):
     date: str
     """ISO 8601, of the recordings."""
     tiles: tuple[TileCalibration, ...]
+    refused: dict[str, str] = {}
+    """Serials that were pressed as well, and why they have no curve."""
 
     @property
     def id(self) -> str:
@@ -123,8 +130,9 @@ class Calibration(BaseModel):
         if (found := self.find(serial)) is not None:
             return found
         known = ", ".join(tile.serial for tile in self.tiles)
+        why = f": it was refused ({self.refused[serial]})" if serial in self.refused else ""
         raise CalibrationError(
-            f"no calibration for tile {serial}",
+            f"no calibration for tile {serial}{why}",
             where=f"calibration {self.name} ({self.id})",
             expected=f"one of {known}",
             remedy="Press the tile on the bench and run `foottile calibrate`, or name another "
@@ -171,11 +179,6 @@ class Calibration(BaseModel):
 def loop_share(force_n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """How far a hysteresis loop is open at a force: closed at zero, half open at one newton."""
     return np.asarray(1.0 - LOOP_OPENS_N / (np.abs(force_n) + LOOP_OPENS_N))
-
-
-def curve_share(force_n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """How much of a cubic's misfit there is at a force: none at zero, half of it at 0.2 N."""
-    return np.asarray(1.0 - CURVE_OPENS_N / (np.abs(force_n) + CURVE_OPENS_N))
 
 
 def is_monotonic(coefficients: Sequence[float], range_u: tuple[float, float]) -> bool:

@@ -1,7 +1,8 @@
 """Recursions over time, compiled: a Python loop per frame does not do ten million of them.
 
 Compiled without fast-math, so that a loop gives the same bits as the same arithmetic in Python,
-however a recording is cut into batches.
+however a recording is cut into batches. A division by zero is infinite or NaN, as in numpy, and no
+exception.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def compiled(function: F) -> F:
     """`function` as machine code, made at its first call and kept on disk where that can be."""
-    dispatcher: Any = numba.njit(nogil=True)(function)
+    dispatcher: Any = numba.njit(nogil=True, error_model="numpy")(function)
     with contextlib.suppress(RuntimeError):  # nowhere to keep it: no home, read-only installation
         # As numba.njit(cache=True) does, which stops at a cache that it cannot read or write.
         dispatcher._cache = _Kept(function)  # type: ignore[no-untyped-call]  # noqa: SLF001

@@ -2,33 +2,39 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import replace
 
-from service.estimation.bench_press import presses
+import numpy as np
+import numpy.typing as npt
+
+from service.estimation.bench_press import Presses, joined, presses
 from service.estimation.calibration import TileCalibration, is_monotonic
 from service.estimation.effects import Effects, TemperatureEffect
 from service.estimation.identify import identify
 from service.estimation.indentation import Indentation, soak, unloaded
 from service.estimation.soak import fit_soak
 
+Floats = npt.NDArray[np.float64]
+
 _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])
 """Takes a cubic in x = gauge / range without constant term to u = 2 x - 1, as far as it varies."""
 
 
-def fit_effects(recording: Indentation, tile: TileCalibration) -> Effects:
-    """Gas, rubber, hysteresis and temperature, as far as the recording determines them.
+def fit_effects(recordings: Sequence[Indentation], tile: TileCalibration) -> Effects:
+    """Gas, rubber, hysteresis and temperature, as far as the recordings determine them.
 
     Args:
-        recording: of the tile on the bench.
-        tile: its static curve, from the same recording.
+        recordings: of the tile on the bench, all on one chip.
+        tile: its static curve, from the same recordings.
     """
-    zero = unloaded(recording)
-    warm = fit_soak(soak(recording, zero))
+    points, baseline_kpa = loadings(recordings)
+    warm = _best([fit_soak(soak(recording, unloaded(recording))) for recording in recordings])
     effects = identify(
-        presses(recording, zero),
+        points,
         scale_kpa=tile.range_kpa[1],
-        baseline_kpa=zero.baseline_kpa,
-        first_curve=np.linalg.solve(_U_OF_X, np.array(tile.coefficients[1:])),
+        baseline_kpa=baseline_kpa,
+        first_curve=curve_over_range(tile.coefficients),
         temperature=warm if isinstance(warm, TemperatureEffect) else None,
         why_no_temperature="" if isinstance(warm, TemperatureEffect) else warm,
     )
@@ -50,3 +56,25 @@ def fit_effects(recording: Indentation, tile: TileCalibration) -> Effects:
         }
     )
     return effects.model_copy(update={"rubber": in_u})
+
+
+def loadings(recordings: Sequence[Indentation]) -> tuple[Presses, float]:
+    """Every loading of a tile above one common baseline in kPa, and that baseline."""
+    zeros = [unloaded(recording) for recording in recordings]
+    baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
+    parts = []
+    for recording, zero in zip(recordings, zeros, strict=True):
+        part = presses(recording, zero)
+        parts.append(replace(part, kpa=part.kpa - (zero.baseline_kpa - baseline_kpa)))
+    return joined(parts), baseline_kpa
+
+
+def curve_over_range(coefficients: Sequence[float]) -> Floats:
+    """c1, c2, c3 over x = gauge / range of a curve whose variable is centred in that range."""
+    return np.asarray(np.linalg.solve(_U_OF_X, np.array(coefficients[1:])))
+
+
+def _best(soaks: Sequence[TemperatureEffect | str]) -> TemperatureEffect | str:
+    """The soak that tells the rise with temperature best; without any, the last one's reason."""
+    told = [warm for warm in soaks if isinstance(warm, TemperatureEffect)]
+    return min(told, key=lambda warm: warm.kpa_per_k.sigma) if told else soaks[-1]

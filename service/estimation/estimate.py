@@ -183,7 +183,8 @@ def _taken(
         turn = plan.info.servo.counts_per_turn
         readings = readings_of(frames, broken, state.last_reading, turn)
     run = state.runs + np.cumsum(broken)
-    new = _Known(now, frames.t_mono_ns, run, frames.seq, frames.t_ns, readings, loaded, since_ns)
+    t_mono_ns = np.array(frames.t_mono_ns)  # owned, as what is compiled wants it
+    new = _Known(now, t_mono_ns, run, frames.seq, frames.t_ns, readings, loaded, since_ns)
     return replace(
         state,
         known=new if state.known is None else state.known.followed_by(new),
@@ -276,7 +277,7 @@ def _no_estimates(plan: EstimationPlan) -> Estimates:
 def _cop_masked(plan: EstimationPlan, foot: Foot) -> npt.NDArray[np.bool_]:
     """Where a centre of pressure would be more doubtful than useful."""
     normals, offsets_m = plan.hull
-    (x_m, y_m, _), (sigma_x_m, sigma_y_m, _) = foot.cop_m, foot.cop_sigma_m
+    (x_m, y_m, _), (sigma_x_m, sigma_y_m) = foot.cop_m, foot.cop_sigma_m
     with np.errstate(invalid="ignore"):
         good = (
             (foot.grf_n >= SIGMAS * foot.grf_sigma_n)

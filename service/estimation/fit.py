@@ -11,18 +11,36 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from devices.errors import CalibrationError
+from devices.mpl115a2 import PRESSURE_MAX_KPA, indicative_degc
+from service.estimation.bench_checks import (
+    baseline_drift_kpa,
+    before_saturation,
+    refuse_contradictions,
+    refuse_poor_fit,
+    refuse_saturated_reference,
+    refuse_unloaded,
+)
+from service.estimation.bench_facts import BandPoint, BenchFacts
 from service.estimation.calibration import (
     LOOP_OPENS_N,
     TileCalibration,
     is_monotonic,
     loop_share,
 )
-from service.estimation.indentation import Indentation, Strokes, place, strokes, unloaded
+from service.estimation.confidence import curve_n, mean_band_n, new_loading_band_n
+from service.estimation.indentation import (
+    Indentation,
+    Strokes,
+    place,
+    stroke_rows,
+    strokes,
+    unloaded,
+)
 
 Floats = npt.NDArray[np.float64]
 
-LOADED_N = 1.0
-LOADED_KPA = 1.0
+BAND_STEPS = 10
+MEAN_STEPS = 30
 
 
 class _Cubic:
@@ -44,28 +62,46 @@ class _Cubic:
         return np.asarray(blocks.force_n - self.design(blocks.gauge_kpa) @ coefficients)
 
 
-def fit_tile(recording: Indentation) -> TileCalibration:
-    """Fit the static curve of one tile.
+def fit_tile(*recordings: Indentation) -> TileCalibration:
+    """Fit the static curve of one tile to all its slow strokes, in one file or several.
 
     Raises:
-        CalibrationError: no slow strokes, fewer than two repeats, the tile is never loaded, or the
-            curve is not monotonic.
+        CalibrationError: there is no curve that could be believed (see `bench_checks`).
     """
-    blocks = strokes(recording)
+    where = ", ".join(place(recording) for recording in recordings)
+    zeros = [unloaded(recording) for recording in recordings]
+    noise_kpa = _rms(np.array([zero.noise_kpa for zero in zeros]))
+    blocks = strokes(*recordings)
+    refuse_saturated_reference(recordings, blocks)
+    blocks, by_chip = before_saturation(recordings, blocks, noise_kpa)
+    refuse_unloaded(blocks, where)
+    drift_kpa = baseline_drift_kpa(recordings)
     repeats = np.unique(blocks.repeat)
-    _refuse_unloaded(blocks, len(repeats), place(recording))
     # Every repeat reaches the end of the range on average: beyond it there is nothing to go by.
     high_kpa = float(np.mean([blocks.gauge_kpa[blocks.repeat == r].max() for r in repeats]))
     cubic = _Cubic(high_kpa)
     coefficients = cubic.solve(blocks)
     c1, c2, c3 = (float(c) for c in coefficients)
     polynomial = (0.0, c1, c2, c3)
+    fitted_n = blocks.force_n - cubic.residual_n(blocks, coefficients)
+    gains = np.array(
+        [
+            (blocks.force_n * fitted_n)[blocks.repeat == r].sum()
+            / (fitted_n**2)[blocks.repeat == r].sum()
+            for r in repeats
+        ]
+    )
+    refuse_contradictions(gains, where)
     if not is_monotonic(polynomial, (cubic.u0, 1.0)):
         raise CalibrationError(
             "the fitted curve is not monotonic: force would fall while pressure rises",
-            where=place(recording),
+            where=where,
             remedy="Look at the recording for slips of the spindle or a leaking dome",
         )
+    residual_n = cubic.residual_n(blocks, coefficients)
+    spread_n = blocks.force_n - blocks.force_n.mean()
+    r2 = float(1 - (residual_n**2).sum() / (spread_n**2).sum())
+    refuse_poor_fit(r2, where)
     # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
     without = np.stack([cubic.solve(blocks.rows(blocks.repeat != r)) for r in repeats])
     left_out = [blocks.rows(blocks.repeat == r) for r in repeats]
@@ -75,13 +111,11 @@ def fit_tile(recording: Indentation) -> TileCalibration:
     left_out_force_n = np.concatenate([part.force_n for part in left_out])
     deviation = without - without.mean(axis=0)
     covariance = (len(repeats) - 1) / len(repeats) * deviation.T @ deviation
-    residual_n = cubic.residual_n(blocks, coefficients)
-    spread_n = blocks.force_n - blocks.force_n.mean()
     loop = cubic.solve(blocks.rows(blocks.loading)) - cubic.solve(blocks.rows(~blocks.loading))
     relative_misfit, loop_misfit_n = _misfit(left_out_force_n, left_out_n)
-    zero = unloaded(recording)
-    return TileCalibration(
-        serial=recording.serial,
+    baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
+    tile = TileCalibration(
+        serial=recordings[0].serial,
         p_input="gauge_kpa",
         p_offset_kpa=cubic.offset_kpa,
         p_scale_kpa=cubic.scale_kpa,
@@ -95,14 +129,53 @@ def fit_tile(recording: Indentation) -> TileCalibration:
         covariance=tuple(tuple(float(c) for c in row) for row in covariance),
         relative_misfit=relative_misfit,
         loop_misfit_n=loop_misfit_n,
-        r2=float(1 - (residual_n**2).sum() / (spread_n**2).sum()),
+        r2=r2,
         rmse_n=_rms(residual_n),
         cv_rmse_n=_rms(left_out_n),
         hysteresis_n=float(np.abs(cubic.design(np.linspace(0, high_kpa, 101)) @ loop).max()),
         repeats=len(repeats),
-        baseline_kpa=zero.baseline_kpa,
-        noise_kpa=zero.noise_kpa,
+        baseline_kpa=baseline_kpa,
+        noise_kpa=noise_kpa,
     )
+    tadc = [zero.tadc_counts for zero in zeros if zero.tadc_counts is not None]
+    tadc_counts = float(np.mean(tadc)) if tadc else None
+    steps_kpa = np.linspace(0.0, high_kpa, BAND_STEPS + 1)
+    bands = (steps_kpa, curve_n(tile, steps_kpa), *_bands_n(tile, steps_kpa))
+    facts = BenchFacts(
+        recordings=sum(bool(stroke_rows(recording)) for recording in recordings),
+        end_n=float(np.mean([blocks.force_n[blocks.repeat == r].max() for r in repeats])),
+        end_absolute_kpa=baseline_kpa + high_kpa,
+        spare_kpa=PRESSURE_MAX_KPA - baseline_kpa - high_kpa,
+        ended_by="chip" if by_chip else "load",
+        tadc_counts=tadc_counts,
+        degc=None if tadc_counts is None else float(indicative_degc(tadc_counts)),
+        r2_of_mean=_r2_of_mean(cubic, coefficients, blocks),
+        repeat_gains=tuple(float(gain) for gain in gains),
+        baseline_drift_kpa=drift_kpa,
+        band_95=tuple(
+            BandPoint(gauge_kpa=p, force_n=f, mean_n=m, new_loading_n=n)
+            for p, f, m, n in zip(*(values.tolist() for values in bands), strict=True)
+        ),
+    )
+    return tile.model_copy(update={"bench": facts})
+
+
+def _bands_n(tile: TileCalibration, gauge_kpa: Floats) -> tuple[Floats, Floats]:
+    return mean_band_n(tile, gauge_kpa), new_loading_band_n(tile, gauge_kpa)
+
+
+def _r2_of_mean(cubic: _Cubic, coefficients: Floats, blocks: Strokes) -> float:
+    """R2 of the cubic to the mean over repeats and branches, in equal steps of pressure."""
+    step = np.minimum(
+        (blocks.gauge_kpa / (2 * cubic.scale_kpa) * MEAN_STEPS).astype(np.int64), MEAN_STEPS - 1
+    )
+    step = np.maximum(step, 0)
+    count = np.bincount(step, minlength=MEAN_STEPS)
+    full = count > 0
+    mean_n = np.bincount(step, blocks.force_n, MEAN_STEPS)[full] / count[full]
+    left_n = cubic.residual_n(blocks, coefficients)
+    mean_left_n = np.bincount(step, left_n, MEAN_STEPS)[full] / count[full]
+    return float(1 - (mean_left_n**2).sum() / ((mean_n - mean_n.mean()) ** 2).sum())
 
 
 def _misfit(force_n: Floats, residual_n: Floats) -> tuple[float, float]:
@@ -116,24 +189,6 @@ def _misfit(force_n: Floats, residual_n: Floats) -> tuple[float, float]:
     variances, _ = nnls(parts * weight[:, None], residual_n**2 * weight)
     relative, loop = np.sqrt(variances)
     return float(relative), float(loop)
-
-
-def _refuse_unloaded(blocks: Strokes, repeats: int, where: str) -> None:
-    most_n, most_kpa = blocks.force_n.max(), blocks.gauge_kpa.max()
-    if most_n < LOADED_N or most_kpa < LOADED_KPA:
-        raise CalibrationError(
-            f"the indentation never loads the tile: at most {most_n:.2f} N on the reference and "
-            f"{most_kpa:.2f} kPa in the tile",
-            where=where,
-            expected=f"more than {LOADED_N} N and {LOADED_KPA} kPa",
-            remedy="Check that the spindle stands over this tile and that the dome is sealed",
-        )
-    if repeats < 2:
-        raise CalibrationError(
-            f"{repeats} slow repeat",
-            where=where,
-            expected="at least two, so that one can be predicted from the others",
-        )
 
 
 def _rms(values: Floats) -> float:

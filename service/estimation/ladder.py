@@ -42,6 +42,11 @@ MODELS = (
 """In the order in which they are applied."""
 
 
+MISFIT_MIN = 0.1
+"""No correction is better than this, however well it fits a bench: a single time stands for a
+sphere's many, two terms for a spectrum, three plays for a continuum."""
+
+
 @dataclass(frozen=True)
 class Ladder:
     """Constants of the models; None for what is not named. Arrays over bearing tiles.
@@ -57,7 +62,7 @@ class Ladder:
         denoise: is noise averaged away, and are outliers replaced?
         hysteresis: of the rubber.
         rubber: its creep.
-        rubber_misfit: part of the creep's correction that is uncertain.
+        rubber_misfit: part of creep's and loop's correction that is uncertain.
     """
 
     unwrap: bool
@@ -109,7 +114,7 @@ def make_ladder(
         )
         if "gas" in models
         else None,
-        gas_misfit=np.array([0.0 if g is None else g.misfit for g in gas]) * ones,
+        gas_misfit=np.array([0.0 if g is None else max(g.misfit, MISFIT_MIN) for g in gas]) * ones,
         curves=StaticCurves(tiles, lasting="rubber" in models),
         skew="skew" in models,
         denoise="denoise" in models,
@@ -130,7 +135,8 @@ def make_ladder(
         )
         if "rubber" in models
         else None,
-        rubber_misfit=np.array([0.0 if r is None else r.misfit for r in rubber]) * ones,
+        rubber_misfit=np.array([0.0 if r is None else max(r.misfit, MISFIT_MIN) for r in rubber])
+        * ones,
     )
 
 

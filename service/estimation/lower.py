@@ -28,7 +28,9 @@ class Felt:
         gauge_kpa: (n, all tiles), pressure above the baseline.
         felt_n: force by the static curve.
         noise_n: standard deviation that a single reading's noise gives it; averages away.
-        sigma_n: standard uncertainty from all else; does not.
+        sigma_n: standard uncertainty from all else but the gas; does not.
+        gas_n: standard uncertainty that the gas' correction leaves, with the correction's sign: all
+            tiles err to the same side.
         t_mono_ns: when it was sampled.
         beyond: beyond the calibrated range: a lower bound.
         status: (n,), bits of `EstimateStatus` that these frames have by themselves.
@@ -38,6 +40,7 @@ class Felt:
     felt_n: Floats
     noise_n: Floats
     sigma_n: Floats
+    gas_n: Floats
     t_mono_ns: npt.NDArray[np.int64]
     beyond: Bools
     status: npt.NDArray[np.uint16]
@@ -97,11 +100,12 @@ def felt(
     if ladder.denoise and neighbours is not None:
         kpa, replaced = despiked(kpa, *neighbours, plan.tare.noise_kpa)
         status[replaced[:, columns].any(axis=1)] |= np.uint16(EstimateStatus.OUTLIER_REPLACED)
-    t_mono_ns = (frames.t_mono_ns[:, None] + 1000 * frames.sample_offset_us.astype(np.int64))[
-        :, columns
-    ]
+    # Owned, in row order: what is compiled is compiled for that.
+    frame_t_ns = np.array(frames.t_mono_ns)
+    offset_ns = 1000 * frames.sample_offset_us[:, columns].astype(np.int64, order="C")
+    t_mono_ns = frame_t_ns[:, None] + offset_ns
     gauge_kpa = kpa - plan.tare.baseline_kpa
-    bearing_kpa = kpa[:, columns]
+    bearing_kpa = np.ascontiguousarray(kpa[:, columns])
     baseline_variance = np.broadcast_to(plan.baseline_sigma_kpa**2, bearing_kpa.shape)
     if ladder.temperature is not None:
         before = state.temperature or temperature.at_rest(len(columns))
@@ -113,7 +117,7 @@ def felt(
         state = replace(state, temperature=after)
     if ladder.ambient is not None:
         felt_kpa, sigma_kpa, outside = ladder.ambient.felt(
-            _mean_of(gauge_kpa, plan.references), frames.t_mono_ns, state.ambient
+            _mean_of(gauge_kpa, plan.references), frame_t_ns, state.ambient
         )
         bearing_kpa = bearing_kpa - felt_kpa
         baseline_variance = baseline_variance + sigma_kpa**2
@@ -125,9 +129,6 @@ def felt(
     if ladder.gas is not None:
         settled_kpa, warm = ladder.gas.settled(
             bearing_kpa, t_mono_ns, state.gas or gas.at_rest(len(columns))
-        )
-        baseline_variance = (
-            baseline_variance + (ladder.gas_misfit * (settled_kpa - bearing_kpa)) ** 2
         )
         state = replace(state, gas=warm)
     static_kpa = settled_kpa - plan.baseline_kpa
@@ -150,6 +151,7 @@ def felt(
         felt_n=felt_n,
         noise_n=np.abs(static.slope_n_per_kpa) * plan.noise_kpa,
         sigma_n=np.sqrt(static.slope_n_per_kpa**2 * baseline_variance + static.fit_sigma_n**2),
+        gas_n=static.slope_n_per_kpa * ladder.gas_misfit * (settled_kpa - bearing_kpa),
         t_mono_ns=t_mono_ns,
         beyond=beyond,
         status=status,

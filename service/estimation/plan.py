@@ -58,6 +58,8 @@ class EstimationPlan:
     """Standard deviation of a single unloaded reading about the true baseline."""
     positions_m: Floats
     """(all tiles, 3)."""
+    bearing_m: Floats
+    """(bearing tiles, 3)."""
     hull: tuple[Floats, Floats]
     grid: tuple[Floats, Floats] | None
     contact: ContactRule
@@ -135,6 +137,7 @@ def make_plan(
         noise_kpa=tare.noise_kpa[bearing],
         still_kpa=still_kpa,
         positions_m=positions_m,
+        bearing_m=positions_m[bearing],
         hull=hull(positions_m[bearing, :2]),
         grid=grid_indices(positions_m[bearing, :2]),
         contact=ContactRule(

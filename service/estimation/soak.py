@@ -23,6 +23,10 @@ _LAG_S = (0.3, 30.0)
 _BIN_S = 0.1
 _SIGMA_MAX = 0.1
 _KELVIN = 273.15
+_T_SIGMA = 5.0 / 298.0
+"""The chip's thermometer is not calibrated: it may be off by 5 K (hardware.md 1.3)."""
+_RECOVERS_S = 5.0
+"""A dome that was pressed before creeps back; so long it is left alone."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +87,17 @@ def fit_soak(soak: Soak) -> TemperatureEffect | str:
     return TemperatureEffect(
         kpa_per_k=Parameter(value=kpa_per_k, sigma=float(sigma[1])),
         lag_s=Parameter(value=lag_s, sigma=lag_s * float(sigma[2])),
-        wall_per_kpa=Parameter(value=wall, sigma=float(rigid / kpa_per_k**2 * sigma[1] / base_kpa)),
+        wall_per_kpa=Parameter(
+            value=wall,
+            sigma=rigid / kpa_per_k / base_kpa * float(np.hypot(sigma[1] / kpa_per_k, _T_SIGMA)),
+        ),
     )
 
 
 def _binned(soak: Soak) -> tuple[Floats, Floats, Floats, Floats] | None:
     """Means over tenths of a second: instants, kPa, counts, and standard uncertainty."""
     good = np.isfinite(soak.kpa) & np.isfinite(soak.tadc)
+    good &= soak.t_s >= soak.t_s[:1] + _RECOVERS_S
     if good.sum() < 100:
         return None
     t_s, kpa, tadc = soak.t_s[good], soak.kpa[good], soak.tadc[good]

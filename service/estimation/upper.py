@@ -6,11 +6,13 @@ round in another order, and a matrix product does for one row and for many.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from service.estimation.compiled import compiled
 from service.estimation.lower import Felt
 from service.estimation.models import denoise
 from service.estimation.models.rubber import RubberState
@@ -29,10 +31,19 @@ class UpperState:
 
 @dataclass(frozen=True)
 class Forces:
-    """Force on the bearing tiles and its standard uncertainty, (n, bearing tiles)."""
+    """Force on the bearing tiles and its standard uncertainty, (n, bearing tiles).
+
+    Attributes:
+        force_n: forces.
+        sigma_n: standard uncertainties.
+        own_n: their part that is every tile's own.
+        common_n: the rest, of gas and of rubber: all tiles share the error, so these are signed.
+    """
 
     force_n: Floats
     sigma_n: Floats
+    own_n: Floats
+    common_n: tuple[Floats, Floats]
 
 
 def forces(
@@ -81,18 +92,21 @@ def forces(
         )
         felt_n = np.where(np.isnan(averaged_n), felt_n, averaged_n)
         noise_n = noise_n * np.sqrt(np.where(np.isnan(left), 1.0, left))
-    variance = noise_n**2 + now.sigma_n**2
+    own_n = np.sqrt(noise_n**2 + now.sigma_n**2)
+    averaged_n = felt_n
     if ladder.hysteresis is not None:
         plays_n = ladder.hysteresis.at_rest() if state.plays_n is None else state.plays_n
         felt_n, plays_n = ladder.hysteresis.unfelt(felt_n, plays_n)
         state = replace(state, plays_n=plays_n)
     if ladder.rubber is not None:
         before = ladder.rubber.at_rest() if state.rubber is None else state.rubber
-        force_n, crept = ladder.rubber.unfelt(felt_n, t_mono_ns, before)
-        variance = variance + (ladder.rubber_misfit * (force_n - felt_n)) ** 2
-        felt_n, state = force_n, replace(state, rubber=crept)
+        felt_n, crept = ladder.rubber.unfelt(felt_n, t_mono_ns, before)
+        state = replace(state, rubber=crept)
+    rubber_n = ladder.rubber_misfit * (felt_n - averaged_n)
     # A lower bound has no standard uncertainty.
-    return Forces(felt_n, np.where(now.beyond, np.nan, np.sqrt(variance))), state
+    own_n = np.where(now.beyond, np.nan, own_n)
+    sigma_n = np.sqrt(own_n**2 + now.gas_n**2 + rubber_n**2)
+    return Forces(felt_n, sigma_n, own_n, (now.gas_n, rubber_n)), state
 
 
 @dataclass(frozen=True)
@@ -102,26 +116,47 @@ class Foot:
     grf_n: Floats
     grf_sigma_n: Floats
     cop_m: tuple[Floats, Floats, Floats]
-    cop_sigma_m: tuple[Floats, Floats, Floats]
+    cop_sigma_m: tuple[Floats, Floats]
 
 
 def foot_of(plan: EstimationPlan, tiles: Forces) -> Foot:
     """Sum of the tile forces, and the force-weighted mean of the tiles' places."""
-    grf_n = summed(tiles.force_n)
-    divisor_n = np.where(grf_n == 0.0, np.nan, grf_n)
-    centre_m, sigma_m = [], []
-    for axis in range(3):
-        arm_m = plan.positions_m[plan.bearing, axis]
-        at_m = summed(tiles.force_n * arm_m) / divisor_n
-        variance = summed(((arm_m - at_m[:, None]) * tiles.sigma_n) ** 2)
-        centre_m.append(at_m)
-        sigma_m.append(np.sqrt(variance) / np.abs(divisor_n))
-    return Foot(
-        grf_n=grf_n,
-        grf_sigma_n=np.sqrt(summed(tiles.sigma_n**2)),
-        cop_m=(centre_m[0], centre_m[1], centre_m[2]),
-        cop_sigma_m=(sigma_m[0], sigma_m[1], sigma_m[2]),
-    )
+    columns = _foot(tiles.force_n, tiles.own_n, *tiles.common_n, plan.bearing_m)
+    grf_n, sigma_n, x_m, y_m, z_m, sigma_x_m, sigma_y_m = columns.T
+    return Foot(grf_n, sigma_n, (x_m, y_m, z_m), (sigma_x_m, sigma_y_m))
+
+
+@compiled
+def _foot(
+    force_n: Floats, own_n: Floats, gas_n: Floats, rubber_n: Floats, places_m: Floats
+) -> Floats:
+    """GRF and its sigma, centre x, y, z, and the sigmas of x and y, to first order: (n, 7)."""
+    n, tiles = force_n.shape
+    out = np.full((n, 7), math.nan)
+    for i in range(n):
+        total = own = gas = rubber = 0.0
+        for j in range(tiles):
+            total += force_n[i, j]
+            own += own_n[i, j] * own_n[i, j]
+            gas += gas_n[i, j]
+            rubber += rubber_n[i, j]
+        out[i, 0], out[i, 1] = total, math.sqrt(own + gas * gas + rubber * rubber)
+        if total == 0.0:
+            continue
+        for axis in range(3):
+            moment = 0.0
+            for j in range(tiles):
+                moment += force_n[i, j] * places_m[j, axis]
+            out[i, 2 + axis] = moment / total
+        for axis in range(2):
+            own = gas = rubber = 0.0
+            for j in range(tiles):
+                arm_m = places_m[j, axis] - out[i, 2 + axis]
+                own += (arm_m * own_n[i, j]) ** 2
+                gas += arm_m * gas_n[i, j]
+                rubber += arm_m * rubber_n[i, j]
+            out[i, 5 + axis] = math.sqrt(own + gas * gas + rubber * rubber) / abs(total)
+    return out
 
 
 def grid_index(plan: EstimationPlan, gauge_kpa: Floats) -> tuple[Floats, Floats]:
@@ -129,16 +164,19 @@ def grid_index(plan: EstimationPlan, gauge_kpa: Floats) -> tuple[Floats, Floats]
     if plan.grid is None:
         nothing = np.full(len(gauge_kpa), np.nan)
         return nothing, nothing
-    weight_kpa = gauge_kpa[:, plan.bearing]
+    weight_kpa = np.ascontiguousarray(gauge_kpa[:, plan.bearing])
     total_kpa = summed(weight_kpa)
     divisor_kpa = np.where(total_kpa == 0.0, np.nan, total_kpa)
     x, y = (summed(weight_kpa * index) / divisor_kpa for index in plan.grid)
     return x, y
 
 
+@compiled
 def summed(values: Floats) -> Floats:
     """Sum over tiles, (n,)."""
-    total = np.zeros(len(values))
-    for tile in range(values.shape[1]):
-        total = total + values[:, tile]
+    n, tiles = values.shape
+    total = np.zeros(n)
+    for i in range(n):
+        for tile in range(tiles):
+            total[i] += values[i, tile]
     return total

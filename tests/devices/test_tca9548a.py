@@ -340,6 +340,8 @@ def test_never_is_more_than_one_mux_open_whatever_fails(
         try:
             muxes.connect_only(address, channel)
         except I2cError:
+            if muxes.silent:
+                return
             continue
         connected = watch.routing()
         # One that refused twice in a row is taken to be without supply.

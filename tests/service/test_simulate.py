@@ -1,14 +1,16 @@
-"""A simulated session's servo, from the emulated shaft to the angle."""
+"""Simulated sessions: the servo, from the emulated shaft to the angle, and hops to their end."""
 
 from __future__ import annotations
 
 from contextlib import ExitStack
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import FrameStatus
+from devices.compensation import Compensation
+from devices.frames import FrameBatch, FrameStatus
 from devices.scene import load_scene
 from service.estimation.geometry import angle_rad
 from service.simulate import SimulateOptions, Simulation
@@ -41,3 +43,28 @@ def test_any_turn_of_the_servo_reaches_frames_and_angle_unharmed(
     # 0.13 rad/s for 13 ms at most, and half a count of 0.15 mrad
     assert np.abs(error_rad[known]).max() < 2.5e-3
     assert np.ptp(frames.servo_counts[known]) > 300, "it has turned"
+
+
+@pytest.mark.parametrize("name", ["poppy", "mud"])
+def test_three_hops_come_to_their_own_end_and_every_frame_has_its_truth(name: str) -> None:
+    scene = load_scene(name)
+    with ExitStack() as stack:
+        simulation = Simulation(SimulateOptions(scene=scene, truth=True), stack)
+        pieces = list(simulation.pieces())
+        tiles = simulation.info.tiles
+    frames = FrameBatch.concatenate([batch for batch, _ in pieces])
+    truth = {key: np.concatenate([extra[key] for _, extra in pieces]) for key in pieces[0][1]}
+    loaded = truth["true_grf_n"] > 0.5
+    lead = (frames.frame_status & FrameStatus.LEAD) != 0
+    assert not loaded[lead].any()
+    landings = np.flatnonzero(loaded[1:] & ~loaded[:-1])
+    assert len(landings) == 3
+    last = int(np.flatnonzero(loaded)[-1])
+    assert frames.t_ns[-1] - frames.t_ns[last] > 1_500_000_000, "in the air at the end"
+    assert (frames.status == 0).all()
+    assert truth["true_plate_n"].max() > truth["true_grf_n"].max()
+    kpa = Compensation(tiles).readable_kpa(frames)
+    if name == "mud":  # the bare tile: nothing in the air, up to 0.8 kPa of head in the mud
+        deep_kpa = kpa[loaded, 4].mean() - kpa[lead, 4].mean()
+        assert deep_kpa == pytest.approx(16.5 * 0.037, abs=0.08)
+        assert abs(kpa[-500:, 4].mean() - kpa[lead, 4].mean()) < 0.05

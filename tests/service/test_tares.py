@@ -68,7 +68,7 @@ def tare(t_ns: int = 0, *, tiles: int = 2, source: Source = "unloaded") -> Tare:
 
 def same(one: RecordedTare, other: RecordedTare) -> None:
     assert (one.id, one.serials, one.undone) == (other.id, other.serials, other.undone)
-    assert one.reason == other.reason
+    assert (one.reason, one.chips) == (other.reason, other.chips)
     for f in fields(Tare):
         a, b = getattr(one.tare, f.name), getattr(other.tare, f.name)
         if isinstance(a, np.ndarray):
@@ -134,6 +134,21 @@ def test_tares_of_other_tiles_do_not_count(tmp_path: Path) -> None:
     assert instants(tares.during(INFO, 0, 100)) == [1]
     for number, info in enumerate(OTHERS):
         assert instants(tares.during(info, 0, 100)) == [10 + number]
+
+
+def test_a_tare_does_not_count_for_a_part_that_was_swapped(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1)
+    other = INFO.tiles[1].model_copy(update={"coefficient_words": (1790 * 8, 0xC000, 0, 0)})
+    swapped = INFO.model_copy(update={"tiles": (INFO.tiles[0], other)})
+    assert tares.in_force(swapped) is None
+    assert tares.during(swapped, 0, 100) == ()
+    tares.add(tare(2), swapped)
+    assert instants(history(tmp_path).during(INFO, 0, 100)) == [1]
+    path = tmp_path / "node" / "tares.json"
+    content = json.loads(path.read_bytes())
+    del content[0]["chips"]  # an older version's knows only serials
+    path.write_text(json.dumps(content))
+    assert instants(history(tmp_path).during(swapped, 0, 100)) == [1, 2]
 
 
 def test_ids_are_all_different(tmp_path: Path) -> None:
@@ -343,6 +358,8 @@ DAMAGES: dict[str, dict[str, Any]] = {
     "words for an instant": {"tare": {"t_ns": "yesterday"}},
     "no instant": {"tare": {"t_ns": None}},
     "other tiles": {"serials": ["T01", "T02", "T03"]},
+    "words for chips": {"chips": [["a"], ["b"]]},
+    "a number for chips": {"chips": 7},
     "a number for serials": {"serials": 7},
 }
 

@@ -7,6 +7,7 @@ shows.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.errors import CalibrationError
-from service.estimation.calibration import BASIS, TileCalibration, curve_share, loop_share
+from service.estimation.calibration import (
+    BASIS,
+    CURVE_OPENS_N,
+    LOOP_OPENS_N,
+    TileCalibration,
+)
+from service.estimation.compiled import compiled
 from service.estimation.effects import RubberEffect
 
 Floats = npt.NDArray[np.float64]
@@ -78,44 +85,72 @@ class StaticCurves:
 
     def force(self, gauge_kpa: Floats) -> StaticForce:
         """Force, slope and calibration uncertainty at gauge pressures of shape (n, tiles)."""
-        inside_kpa = np.minimum(np.maximum(gauge_kpa, 0.0), self.high_kpa)
-        u = (inside_kpa - self._offset_kpa) / self._scale_kpa
-        # The polynomial about u0 rather than about 0: exactly zero at zero pressure.
-        d = u - self._u0
-        curve_n = d * (
-            self._c1
-            + self._c2 * (u + self._u0)
-            + self._c3 * (u * u + u * self._u0 + self._u0 * self._u0)
+        force_n, slope_n_per_kpa, sigma_n = _curve(
+            np.ascontiguousarray(gauge_kpa),
+            self.high_kpa,
+            self._offset_kpa,
+            self._scale_kpa,
+            self._u0,
+            np.stack([self._c1, self._c2, self._c3]),
+            self._zero_n,
+            self.slope_at_zero_n_per_kpa,
+            self._covariance,
+            self._misfit,
+            self._scatter,
+            self._loop_n,
+            self._curve_n,
         )
-        below_kpa = np.minimum(gauge_kpa, 0.0)
-        from_zero_n = curve_n + below_kpa * self.slope_at_zero_n_per_kpa
-        slope_n_per_kpa = self._slope(u)
-        fit_variance = (
-            self._coefficient_variance(u)
-            + (self._misfit * from_zero_n) ** 2
-            + (self._curve_n * curve_share(from_zero_n)) ** 2
-            + (self._scatter * slope_n_per_kpa * inside_kpa) ** 2
-            + (self._loop_n * loop_share(from_zero_n)) ** 2
-        )
-        return StaticForce(
-            force_n=from_zero_n + self._zero_n,
-            slope_n_per_kpa=slope_n_per_kpa,
-            fit_sigma_n=np.sqrt(fit_variance),
-        )
+        return StaticForce(force_n, slope_n_per_kpa, sigma_n)
 
     def _slope(self, u: Floats) -> Floats:
         slope = self._c1 + u * (2.0 * self._c2 + u * (3.0 * self._c3))
         return np.asarray(slope / self._scale_kpa)
 
-    def _coefficient_variance(self, u: Floats) -> Floats:
-        # Term by term: a matrix product would give other bits for one row than for many.
-        d1 = u - self._u0
-        basis = (d1, u * u - self._u0 * self._u0, u * u * u - self._u0 * self._u0 * self._u0)
-        variance = np.zeros_like(u)
-        for i in range(BASIS):
-            for j in range(BASIS):
-                variance = variance + self._covariance[:, i, j] * basis[i] * basis[j]
-        return np.maximum(variance, 0.0)  # rounding may leave a trace below zero
+
+@compiled
+def _curve(
+    gauge_kpa: Floats,
+    high_kpa: Floats,
+    offset_kpa: Floats,
+    scale_kpa: Floats,
+    u_zero: Floats,
+    coefficients: Floats,
+    zero_n: Floats,
+    slope_at_zero: Floats,
+    covariance: Floats,
+    misfit: Floats,
+    scatter: Floats,
+    loop_n: Floats,
+    curve_n: Floats,
+) -> tuple[Floats, Floats, Floats]:
+    n, tiles = gauge_kpa.shape
+    force, slope, sigma = np.empty((n, tiles)), np.empty((n, tiles)), np.empty((n, tiles))
+    basis = np.empty(BASIS)
+    for i in range(n):
+        for j in range(tiles):
+            gauge = gauge_kpa[i, j]
+            inside = gauge if math.isnan(gauge) else min(max(gauge, 0.0), high_kpa[j])
+            u, u0 = (inside - offset_kpa[j]) / scale_kpa[j], u_zero[j]
+            c1, c2, c3 = coefficients[0, j], coefficients[1, j], coefficients[2, j]
+            # The polynomial about u0 rather than about 0: exactly zero at zero pressure.
+            d = u - u0
+            value = d * (c1 + c2 * (u + u0) + c3 * (u * u + u * u0 + u0 * u0))
+            if gauge < 0.0:
+                value += gauge * slope_at_zero[j]
+            rise = (c1 + u * (2.0 * c2 + u * (3.0 * c3))) / scale_kpa[j]
+            basis[0], basis[1], basis[2] = d, u * u - u0 * u0, u * u * u - u0 * u0 * u0
+            variance = 0.0
+            for k in range(BASIS):
+                for m in range(BASIS):
+                    variance += covariance[j, k, m] * basis[k] * basis[m]
+            size = abs(value)
+            variance = max(variance, 0.0)  # rounding may leave a trace below zero
+            variance += (misfit[j] * value) ** 2 + (scatter[j] * rise * inside) ** 2
+            variance += (loop_n[j] * (1.0 - LOOP_OPENS_N / (size + LOOP_OPENS_N))) ** 2
+            variance += (curve_n[j] * (1.0 - CURVE_OPENS_N / (size + CURVE_OPENS_N))) ** 2
+            force[i, j], slope[i, j] = value + zero_n[j], rise
+            sigma[i, j] = math.sqrt(variance)
+    return force, slope, sigma
 
 
 def _rubber(tile: TileCalibration) -> RubberEffect:

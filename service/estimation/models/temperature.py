@@ -77,7 +77,7 @@ class Temperature:
         Returns:
             The pressures, their standard uncertainty from temperature, and the next state.
         """
-        gas, chip = np.empty_like(kpa), np.empty_like(kpa)
+        gas, chip = np.empty(kpa.shape), np.empty(kpa.shape)
         after = TemperatureState(
             state.gas_counts.copy(),
             state.chip_counts.copy(),

@@ -9,7 +9,9 @@ from service.benchmark.rungs import rungs
 
 
 def test_draws_in_processes_of_their_own_give_the_same() -> None:
-    scene = load_scene("rolling").model_copy(update={"calibration": "paper-eq2-shape"})
+    scene = load_scene("rolling").model_copy(
+        update={"calibration": "paper-eq2-shape", "models": ("unwrap", "static")}
+    )
     tasks = [Task(scene, 1.5, draw, rungs(scene.models)) for draw in (0, 1)]
     there = sorted(drawn(tasks, jobs=2), key=lambda d: d.draw)
     assert there == [run_draw(task) for task in tasks]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.benchmark.rungs import absent, rungs
-from service.estimation.plan import MODELS
+from service.estimation.ladder import MODELS
 
 LADDER = (
     *("unwrap", "temperature", "ambient", "gas", "static"),
@@ -73,3 +73,12 @@ def test_a_model_that_nobody_thought_of_comes_last() -> None:
 
 def test_the_ladder_of_today_is_compared() -> None:
     assert rungs(MODELS)[0].models == ("unwrap", "static")
+
+
+def test_models_that_a_scene_does_without_are_tried_on_top_of_its_whole() -> None:
+    made = rungs(("unwrap", "static", "denoise"), existing=LADDER, offered=("gas", "denoise"))
+    more = [rung for rung in made if rung.spare]
+    assert [(rung.label, rung.models) for rung in more] == [
+        ("whole +gas", ("unwrap", "gas", "static", "denoise"))
+    ]
+    assert not any(rung.is_default or rung.is_built_up for rung in more)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib import resources
 from pathlib import Path
 
@@ -15,9 +16,10 @@ QUICK = ("--quick", "--frames", 2000, "--seconds", 2, "--jobs", 1)
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """`rolling` with the paper's curve."""
+    """`rolling` with the paper's curve, and the models that go with it."""
     text = (resources.files("devices") / "scenes" / "rolling.toml").read_text("utf-8")
     path = tmp_path / "rolling.toml"
+    text = re.sub(r"(?m)^models = .*$", 'models = ["unwrap", "static"]', text)
     path.write_text('calibration = "paper-eq2-shape"\n' + text)
     return path
 

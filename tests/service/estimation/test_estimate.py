@@ -27,16 +27,15 @@ from devices.frames import (
     TileStatus,
 )
 from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
-from service.estimation.effects import Effects
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.lower import Felt
+from service.estimation.models.temperature import Temperature
 from service.estimation.plan import EstimationPlan, make_plan
 from service.estimation.tare import take_tare
 
 InfoOf = Callable[..., ArrayInfo]
 TileOf = Callable[..., TileCalibration]
-EffectsOf = Callable[..., Effects]
 PlanOf = Callable[..., EstimationPlan]
 FramesOf = Callable[..., FrameBatch]
 Estimate = Callable[..., Estimates]
@@ -552,12 +551,7 @@ def test_a_tare_is_old_after_half_an_hour(
 
 
 def test_a_tare_at_another_temperature_is_flagged_like_an_old_one(
-    info_of: InfoOf,
-    tile_of: TileOf,
-    effects_of: EffectsOf,
-    plan_of: PlanOf,
-    frames_of: FramesOf,
-    estimate: Estimate,
+    info_of: InfoOf, plan_of: PlanOf, frames_of: FramesOf, estimate: Estimate
 ) -> None:
     # Tared at 480 counts; four are let pass, and a fifth is not, whichever way.
     plan = plan_of(info_of(SQUARE, references=[3]))
@@ -567,8 +561,10 @@ def test_a_tare_at_another_temperature_is_flagged_like_an_old_one(
     frames = replace(frames_of(held([9] * 4)), tadc=tadc.astype(np.uint16))
     status = estimate(plan, frames).estimate_status
     assert np.flatnonzero(status & EstimateStatus.TARE_OLD).tolist() == [4, 6]
-    known = [tile_of(tile.serial, effects=effects_of()) for tile in plan.info.tiles]
-    corrected = plan_of(plan.info, models=(*plan.models, "temperature"), tiles=known)
+    model = Temperature(
+        *(np.zeros(3), np.zeros(3), np.ones(3), np.zeros(3)), np.full(3, 480.0), np.full(3, 100.0)
+    )
+    corrected = replace(plan, ladder=replace(plan.ladder, temperature=model))
     assert not (estimate(corrected, frames).estimate_status & EstimateStatus.TARE_OLD).any()
     unknown = replace(plan, tare=replace(plan.tare, tadc_counts=np.full(4, np.nan)))
     assert not (estimate(unknown, frames).estimate_status & EstimateStatus.TARE_OLD).any()

@@ -93,7 +93,7 @@ def test_a_known_cubic_is_recovered_without_noise() -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(
-    full_kpa=st.floats(1.5, 60.0),
+    full_kpa=st.floats(3.1, 60.0),
     end_n=st.floats(5.0, 60.0),
     bends=st.tuples(st.floats(-0.25, 0.5), st.floats(0.0, 0.5)),
 )

@@ -1,0 +1,212 @@
+"""A calibration as tables for people and as JSON for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
+
+from service.cli.report import ASSUMED_SCALE
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.confidence import student_t_95
+from service.estimation.effects import Effects, Parameter
+from service.estimation.models.hysteresis import WIDTHS_N
+
+INTERVAL_95 = 1.96
+
+
+def calibration_tables(calibration: Calibration) -> list[Table]:
+    """Quality of every tile's curve, where it ends, and what is known of it beside its curve."""
+    return [_curves(calibration), _ranges(calibration), _effects(calibration)]
+
+
+def _table(title: str, notes: Sequence[str], *headings: str) -> Table:
+    table = Table(
+        title=escape(title),
+        caption=escape("\n".join(notes)),
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "tile" else "right", no_wrap=True)
+    return table
+
+
+def _curves(calibration: Calibration) -> Table:
+    assumed = any(tile.absolute_scale == "assumed" for tile in calibration.tiles)
+    table = _table(
+        f"Calibration {calibration.name} ({calibration.id})",
+        [
+            "of mean: R2 of the mean of all repeats; left out: error on a repeat the",
+            "fit has not seen; mean, new: half width at full load of the 95 % band of",
+            "the mean curve, and of a new loading; loop: hysteresis",
+            f"reference: {calibration.reference}; {calibration.date}",
+            *([ASSUMED_SCALE] if assumed else []),
+        ],
+        *("tile", "R2", "of mean", "RMSE\nN", "left out\nN", "mean\nN", "new\nN", "loop\nN"),
+        *("rises", "repeats"),
+    )
+    for tile in calibration.tiles:
+        facts = tile.bench
+        last = facts.band_95[-1] if facts is not None else None
+        files = f" in {facts.recordings}" if facts is not None and facts.recordings > 1 else ""
+        table.add_row(
+            tile.serial,
+            _number(tile.r2, 4),
+            _number(None if facts is None else facts.r2_of_mean, 5),
+            _number(tile.rmse_n, 2),
+            _number(tile.cv_rmse_n, 2),
+            _number(None if last is None else last.mean_n, 2),
+            _number(None if last is None else last.new_loading_n, 2),
+            _number(tile.hysteresis_n, 2),
+            "yes" if tile.monotonic else "NO",
+            f"{tile.repeats}{files}",
+        )
+    return table
+
+
+def _ranges(calibration: Calibration) -> Table:
+    table = _table(
+        "Range",
+        [
+            "end: where the range ends, above the baseline, absolute, and as a force;",
+            "ended by: the load, which went no further, or the chip, whose reading did not",
+        ],
+        *("tile", "end\nkPa", "absolute\nkPa", "left to 115\nkPa", "force\nN", "ended by"),
+        *("drift\nkPa", "tadc\ncounts", "about\ndegC"),
+    )
+    for tile in calibration.tiles:
+        facts = tile.bench
+        if facts is None:
+            table.add_row(tile.serial, _number(tile.range_kpa[1], 2), *["-"] * 7)
+            continue
+        table.add_row(
+            tile.serial,
+            _number(tile.range_kpa[1], 2),
+            _number(facts.end_absolute_kpa, 2),
+            _number(facts.spare_kpa, 2),
+            _number(facts.end_n, 1),
+            facts.ended_by,
+            _number(facts.baseline_drift_kpa, 2),
+            _number(facts.tadc_counts, 0),
+            _number(facts.degc, 0),
+        )
+    return table
+
+
+def _effects(calibration: Calibration) -> Table:
+    table = _table(
+        "Beside the curve",
+        [
+            "each with half its 95 % interval; creep: parts of the force, and their times",
+            *(
+                f"{tile.serial}: no {name}: {reason}"
+                for tile in calibration.tiles
+                for name, reason in tile.effects.refused.items()
+            ),
+        ],
+        *("tile", "gas\ngamma", "gas tau\nms", "creep\n%", "creep\ns", "half loop\nN"),
+        *("warmth\nkPa/K", "gas lag\ns"),
+    )
+    for tile in calibration.tiles:
+        effects = tile.effects
+        gas, rubber, warm = effects.gas, effects.rubber, effects.temperature
+        table.add_row(
+            tile.serial,
+            _interval(gas.gamma, 2) if gas else "-",
+            _interval(gas.tau_s, 1, 1e3) if gas else "-",
+            "\n".join(_interval(part, 1, 100.0) for part in rubber.part) if rubber else "-",
+            "\n".join(_interval(tau, 2) for tau in rubber.tau_s) if rubber else "-",
+            _interval(loop, 2) if (loop := loop_half_width_n(effects)) else "-",
+            _interval(warm.kpa_per_k, 3) if warm else "-",
+            _interval(warm.lag_s, 1) if warm else "-",
+        )
+    return table
+
+
+def loop_half_width_n(effects: Effects) -> Parameter | None:
+    """Half width of a wide open hysteresis loop: the plays' parts times their half widths.
+
+    Its uncertainty takes the parts as independent, which errs on the wide side: neighbouring plays
+    trade with one another.
+    """
+    if effects.hysteresis is None:
+        return None
+    parts = list(zip(effects.hysteresis.part, WIDTHS_N.tolist(), strict=False))
+    return Parameter(
+        value=sum(part.value * width for part, width in parts),
+        sigma=sum((part.sigma * width) ** 2 for part, width in parts) ** 0.5,
+    )
+
+
+def calibration_json(calibration: Calibration) -> dict[str, object]:
+    """The contract's shape of a calibration's quality, with what came later beside it."""
+    return {
+        "id": calibration.id,
+        "name": calibration.name,
+        "reference": calibration.reference,
+        "date": calibration.date,
+        "tiles": [_tile_json(tile) for tile in calibration.tiles],
+        "refused": calibration.refused,
+    }
+
+
+_FIELDS = (
+    "serial",
+    "r2",
+    "rmse_n",
+    "cv_rmse_n",
+    "hysteresis_n",
+    "range_kpa",
+    "monotonic",
+    "coefficients",
+    "absolute_scale",
+    "repeats",
+    "covariance",
+    "baseline_kpa",
+    "noise_kpa",
+)
+
+
+def _tile_json(tile: TileCalibration) -> dict[str, object]:
+    content = tile.model_dump(mode="json")
+    effects = tile.effects
+    gas, rubber, warm = effects.gas, effects.rubber, effects.temperature
+    gamma, tau = (gas.gamma, gas.tau_s) if gas else (None, None)
+    kpa_per_k, lag = (warm.kpa_per_k, warm.lag_s) if warm else (None, None)
+    return {
+        **{name: content[name] for name in _FIELDS},
+        "student_t_95": student_t_95(tile.repeats) if tile.repeats > 1 else None,
+        "bench": content["bench"],
+        "effects": {
+            "gamma": _parameter(gamma),
+            "gas_tau_ms": _parameter(tau, 1e3),
+            "creep_part": [_parameter(part) for part in rubber.part] if rubber else None,
+            "creep_time_s": [_parameter(tau) for tau in rubber.tau_s] if rubber else None,
+            "loop_half_width_n": _parameter(loop_half_width_n(effects)),
+            "kpa_per_k": _parameter(kpa_per_k),
+            "gas_lag_s": _parameter(lag),
+            "refused": dict(effects.refused),
+        },
+    }
+
+
+def _parameter(parameter: Parameter | None, factor: float = 1.0) -> dict[str, object] | None:
+    if parameter is None:
+        return None
+    low, high = parameter.interval_95
+    return {"value": factor * parameter.value, "interval_95": [factor * low, factor * high]}
+
+
+def _interval(parameter: Parameter, digits: int, factor: float = 1.0) -> str:
+    half = INTERVAL_95 * factor * parameter.sigma
+    return f"{factor * parameter.value:.{digits}f}±{half:.{digits}f}"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,105 @@
+"""Has the models compiled before the first frames come.
+
+On a new machine that takes some ten seconds, in which a server that has begun would not answer;
+later it is half a second, because the result is kept.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, TileInfo
+from service.estimation.calibration import Calibration, paper_eq2_shape
+from service.estimation.effects import (
+    Effects,
+    GasEffect,
+    HysteresisEffect,
+    Parameter,
+    RubberEffect,
+    TemperatureEffect,
+)
+from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.ladder import MODELS
+from service.estimation.models.hysteresis import WIDTHS_N
+from service.estimation.plan import make_plan
+from service.estimation.tare import Tare
+
+_CHIP = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
+_FRAMES = 8
+
+
+def warm_up() -> None:
+    """Estimate a few frames of a made-up foot, with all models."""
+    info = ArrayInfo(
+        node="warm-up",
+        boot_id="0" * 32,
+        tiles=tuple(_tile(channel) for channel in range(3)),
+        servo=None,
+        schedule="simultaneous",
+        nominal_rate_hz=500.0,
+        utc_offset_ns=0,
+        clock_set=False,
+        software="warm-up",
+        scene="warm-up",
+        models=MODELS,
+    )
+    kpa, nothing = np.full(3, 97.0), np.zeros(3)
+    tare = Tare(kpa, nothing + 0.01, nothing + 0.1, nothing + 507.0, 0, 0.0, 1.0, 100, "lead")
+    plan = make_plan(info, _calibration(), tare, models=MODELS, lag_ms=4.0)
+    _, state = step(plan, _frames(), EstimationState())
+    finish(plan, state)
+
+
+def _tile(channel: int) -> TileInfo:
+    return TileInfo(
+        serial=f"W{channel}",
+        mux=0x70,
+        channel=channel,
+        coefficient_words=_CHIP,
+        x_m=0.0,
+        y_m=0.0,
+        z_m=-0.15,
+        reference=channel == 2,
+        conversion_ms=1.6,
+    )
+
+
+def _calibration() -> Calibration:
+    one = Parameter(value=0.1, sigma=0.01)
+    curve = paper_eq2_shape().tiles[0]
+    effects = Effects(
+        gas=GasEffect(gamma=Parameter(value=1.3, sigma=0.01), tau_s=one, misfit=0.1),
+        rubber=RubberEffect(
+            part=(one, one),
+            tau_s=(one, one),
+            coefficients=curve.coefficients,
+            covariance=curve.covariance,
+            scatter=0.03,
+            misfit=0.1,
+            curve_misfit_n=0.1,
+        ),
+        hysteresis=HysteresisEffect(part=(one,) * len(WIDTHS_N)),
+        temperature=TemperatureEffect(kpa_per_k=one, lag_s=one, wall_per_kpa=one),
+    )
+    tiles = tuple(
+        curve.model_copy(update={"serial": serial, "effects": effects}) for serial in ("W0", "W1")
+    )
+    return Calibration(name="warm-up", reference="none", date="2020-01-01", tiles=tiles)
+
+
+def _frames() -> FrameBatch:
+    n = _FRAMES
+    t_ns = np.arange(n, dtype=np.int64) * 2_000_000
+    return FrameBatch(
+        seq=np.arange(n, dtype=np.uint64),
+        t_mono_ns=t_ns,
+        t_ns=t_ns,
+        padc=np.full((n, 3), 400, dtype=np.uint16),
+        tadc=np.full((n, 3), 507, dtype=np.uint16),
+        sample_offset_us=np.zeros((n, 3), dtype=np.int32),
+        servo_counts=np.full(n, NO_SERVO_COUNTS, dtype=np.int32),
+        servo_age_us=np.full(n, NO_SERVO_AGE, dtype=np.int32),
+        status=np.zeros((n, 3), dtype=np.uint8),
+        frame_status=np.zeros(n, dtype=np.uint8),
+        reference_force_n=np.full(n, np.nan, dtype=np.float32),
+    )

@@ -1,0 +1,69 @@
+"""The warm-up compiles everything that a stream will need: not a frame waits for a compiler."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import service.estimation
+from devices.frames import FrameBatch
+from service.estimation import warm
+from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.ladder import MODELS
+from service.estimation.plan import make_plan
+from service.estimation.tare import Tare
+from storage.schema import wire_schema
+from storage.wire import decode, encode
+
+
+def compiled_for() -> dict[str, int]:
+    """Of every compiled function, for how many kinds of arguments it is."""
+    found = {}
+    for module in pkgutil.walk_packages(service.estimation.__path__, "service.estimation."):
+        for name, value in vars(importlib.import_module(module.name)).items():
+            if hasattr(value, "signatures"):
+                found[f"{value.py_func.__module__}.{name}"] = len(value.signatures)
+    return found
+
+
+@pytest.mark.parametrize("models", [("unwrap", "static"), ("static", "denoise", "skew"), MODELS])
+def test_nothing_is_compiled_after_the_warm_up(
+    models: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Any] = []
+    original: Callable[..., Any] = make_plan
+    monkeypatch.setattr(warm, "make_plan", lambda *a, **k: made.append((a, k)) or original(*a, **k))
+    warm.warm_up()
+    before = compiled_for()
+    assert before["service.estimation.models.denoise.denoised"] >= 1
+    ((info, calibration, _), _) = made[0]
+    tare = Tare(
+        np.full(3, 97.0), np.full(3, 0.01), np.full(3, 0.1), np.full(3, 507.0), 0, 0, 1, 9, "lead"
+    )
+    plan = make_plan(info, calibration, tare, models=models, lag_ms=10.0)
+    state = EstimationState()
+    first = warm._frames()
+    for number in range(6):  # as they come over the wire: views of what was received, read-only
+        later = FrameBatch(
+            **{
+                name: value + number * len(first) * np.asarray(by, dtype=value.dtype)
+                for name, by in (("seq", 1), ("t_mono_ns", 2_000_000), ("t_ns", 2_000_000))
+                for value in (getattr(first, name),)
+            },
+            **{
+                name: getattr(first, name)
+                for name in (
+                    *("padc", "tadc", "sample_offset_us", "servo_counts", "servo_age_us"),
+                    *("status", "frame_status", "reference_force_n"),
+                )
+            },
+        )
+        schema = wire_schema(info)
+        _, state = step(plan, decode(bytes(encode(later, schema)), schema), state)
+    finish(plan, state)
+    assert compiled_for() == before
