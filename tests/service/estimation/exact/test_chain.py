@@ -79,7 +79,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
     effects = [plan.calibration.of(plan.info.tiles[i].serial).effects for i in domes]
     walls = [e.temperature.wall_per_kpa for e in effects]
     doubt = max(mpf(w.sigma) / mpf(w.value) for w in walls)
-    forces, sigmas = [], []
+    forces, errors = [], []
     for i in domes:
         warm, curve = effects[i].temperature, effects[i].rubber
         counts = [mpf(c) for c in tadc[i]]
@@ -105,6 +105,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
         settled = eq.gas(dry, t_ns[i], mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i])
         entry = plan.calibration.of(plan.info.tiles[i].serial)
         felt, single, beyond, own = [], [], [], []
+        heat_n: list[Exact] = [None] * n
         for k in range(n):
             p = settled[k]
             if p is None:
@@ -117,8 +118,8 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
             felt.append(force)
             single.append(abs(slope) * noise[i])
             beyond.append(p - base[i] > mpf(entry.range_kpa[1]))
-            of_gas_kpa = mpf(hot.misfit) * (p - dry[k])
-            own.append(slope**2 * (variance[k] + of_gas_kpa**2) + fit)
+            heat_n[k] = slope * mpf(hot.misfit) * (p - dry[k])
+            own.append(slope**2 * variance[k] + fit)
         averaged = eq.denoise(
             [None if b else f for f, b in zip(felt, beyond, strict=True)],
             single,
@@ -134,19 +135,25 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
         parts, taus_s = ([mpf(p.value) for p in x] for x in (curve.part, curve.tau_s))
         force_n = eq.rubber(unlooped, frame_ns, parts, taus_s)
         forces.append(force_n)
-        sigmas.append(
-            [
-                None
-                if force_n[k] is None or beyond[k]
-                else mp.sqrt(
-                    single[k] ** 2 * averaged[k][1]
-                    + own[k]
-                    + (mpf(curve.misfit) * (force_n[k] - unlooped[k])) ** 2
-                )
-                for k in range(n)
-            ]
-        )
-    return SimpleNamespace(gauge_kpa=gauge, force_n=forces, force_sigma_n=sigmas)
+        known = [force_n[k] is not None and not beyond[k] for k in range(n)]
+        rubber_n = [
+            mpf(curve.misfit) * (force_n[k] - smooth[k]) if known[k] else None for k in range(n)
+        ]
+        own_n = [
+            mp.sqrt(single[k] ** 2 * averaged[k][1] + own[k]) if known[k] else None
+            for k in range(n)
+        ]
+        errors.append([own_n, heat_n, rubber_n])
+    return SimpleNamespace(gauge_kpa=gauge, force_n=forces, errors=errors)
+
+
+def sigma_of(errors: list[Any], k: int, weights: list[Exact]) -> Exact:
+    """Of a weighted sum over tiles: what is a tile's own adds as squares, gas and rubber as is."""
+    if any(own[k] is None for own, _, _ in errors):
+        return None
+    own = mp.fsum((w * e[0][k]) ** 2 for w, e in zip(weights, errors, strict=True))
+    shared = [mp.fdot(weights, [e[part][k] for e in errors]) for part in (1, 2)]
+    return mp.sqrt(own + shared[0] ** 2 + shared[1] ** 2)
 
 
 def _without_spike(kpa: list[Exact], k: int, run: list[int], far: Exact) -> Exact:
@@ -264,18 +271,27 @@ def test_the_full_ladder_is_within_a_nanonewton(
     exact = chain(plan, frames, run, equations)
     for i in range(4):
         assert equations.apart(e.gauge_kpa[:, i], exact.gauge_kpa[i]) < 1e-10
+    one = [mpf(1)]
     for i in range(3):
         assert equations.apart(e.force_n[:, i], exact.force_n[i]) < 1e-9
-        assert equations.apart(e.force_sigma_n[:, i], exact.force_sigma_n[i]) < 1e-9
+        sigma_n = [sigma_of(exact.errors[i : i + 1], k, one) for k in range(ROWS)]
+        assert equations.apart(e.force_sigma_n[:, i], sigma_n) < 1e-9
     by_frame = list(zip(*exact.force_n, strict=True))
     grf = [None if None in row else sum(row) for row in by_frame]
     assert equations.apart(e.grf_n, grf) < 1e-9
+    sigma_n = [sigma_of(exact.errors, k, 3 * one) for k in range(ROWS)]
+    assert equations.apart(e.grf_sigma_n, sigma_n) < 1e-9
     stated = np.flatnonzero(np.isfinite(e.cop_x_m))
     assert len(stated) > 20
-    for axis, found in enumerate((e.cop_x_m, e.cop_y_m)):
+    for axis, name in enumerate(("x", "y")):
         places = [mpf(position[axis]) for position in POSITIONS_M[:3]]
         centre = [mp.fdot(by_frame[k], places) / grf[k] for k in stated]
-        assert equations.apart(found[stated], centre) < 1e-11
+        assert equations.apart(getattr(e, f"cop_{name}_m")[stated], centre) < 1e-11
+        sigma_m = [
+            sigma_of(exact.errors, k, [(place - at) / grf[k] for place in places])
+            for k, at in zip(stated, centre, strict=True)
+        ]
+        assert equations.apart(getattr(e, f"cop_sigma_{name}_m")[stated], sigma_m) < 1e-11
     flags = EstimateStatus.OUTLIER_REPLACED, EstimateStatus.GAP, EstimateStatus.SATURATED
     for flag in (*flags, EstimateStatus.TILE_MISSING):
         assert (e.estimate_status & flag).any(), flag
