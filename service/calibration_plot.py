@@ -68,7 +68,7 @@ def plot_calibration(
             axis.set_ylabel("gauge pressure, kPa")
         for row in axes:
             _same_scale(row[: len(line)])
-        axes[0, 0].legend(fontsize=7.5, loc="upper left", framealpha=0.9)
+        axes[0, 0].legend(markerscale=2.5, fontsize=7.5, loc="upper left", framealpha=0.9)
         for axis in axes[2:, 0]:
             if axis.get_legend_handles_labels()[0]:
                 axis.legend(fontsize=7.5, loc="upper right", framealpha=0.9)
@@ -99,7 +99,7 @@ def _curve(
             centre_n + mean_n,
             color="#AAAAAA",
             linewidth=0,
-            label=f"95 % of the mean of {tile.repeats}",
+            label="95 % of the mean curve",
         )
         for loading, name, colour, marker in BRANCHES:
             rows = blocks.loading == loading
