@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,7 @@ COLUMNS = 4
 """Tiles side by side; more go on below."""
 FAST = {"release": "release of a held load", "tap": "tap"}
 _HEIGHTS = (3.0, 1.5, 1.5, 1.5)
+_LETTERS_PER_IN = 11.0
 
 
 def plot_calibration(
@@ -43,12 +45,13 @@ def plot_calibration(
     lines = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
     columns = min(COLUMNS, len(tiles))
     heights = _HEIGHTS[: 2 + len(kinds)]
-    figure = new_figure(1.2 + 3.7 * columns, 1.0 + len(lines) * 1.15 * sum(heights))
-    figure.suptitle(
+    width_in = max(6.4, 1.2 + 3.7 * columns)
+    figure = new_figure(width_in, 1.0 + len(lines) * 1.15 * sum(heights))
+    title = (
         f"Calibration {calibration.name} ({calibration.id}), {calibration.date[:10]}, "
-        f"reference: {calibration.reference}",
-        fontsize=11,
+        f"reference: {calibration.reference}"
     )
+    figure.suptitle(fill(title, round(_LETTERS_PER_IN * width_in)), fontsize=10)
     blocks = figure.subfigures(len(lines), 1, squeeze=False)[:, 0]
     for block, line in zip(blocks, lines, strict=True):
         axes = block.subplots(
