@@ -11,7 +11,7 @@ import numpy as np
 from service.estimation.bench_replay import Replay, replays
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.confidence import curve_n, mean_band_n, new_loading_band_n
-from service.estimation.indentation import Indentation, strokes
+from service.estimation.indentation import Indentation, pressed_in, strokes
 from service.plots import new_figure, png_of
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def plot_calibration(
 def _curve(
     curve: Axes, residual: Axes, tile: TileCalibration, recordings: Sequence[Indentation]
 ) -> None:
-    blocks = strokes(*recordings)
+    blocks = strokes(*pressed_in(recordings))
     end_kpa = tile.range_kpa[1]
     grid_kpa = np.linspace(0.0, end_kpa, 200)
     force_n = curve_n(tile, grid_kpa)

@@ -12,6 +12,7 @@ from service.calibrate import calibrate_recordings, read_recordings
 from service.calibrations import with_tiles
 from service.estimation.bench_replay import replays
 from service.estimation.calibration import Calibration
+from service.estimation.effects_fit import fit_effects
 from service.estimation.indentation import Indentation
 from service.simulate import SimulateOptions, simulate
 
@@ -56,6 +57,29 @@ def test_a_recording_without_fast_loads_has_nothing_to_replay(bench: Bench) -> N
         }
     )
     assert replays([only_slow], calibration.of("T01")) == {}
+
+
+def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> None:
+    calibration, (recording,) = bench[0], bench[1]["T01"]
+    soaks = recording.phase == "soak"
+
+    def part(rows: np.ndarray) -> Indentation:
+        return Indentation(
+            **{
+                name: value[rows] if isinstance(value, np.ndarray) else value
+                for name, value in vars(recording).items()
+            }
+        )
+
+    tile = calibration.of("T01")
+    without = fit_effects([part(~soaks)], tile)
+    assert without.temperature is None
+    apart = fit_effects([part(~soaks), part(soaks)], tile)
+    assert apart.temperature is not None
+    assert tile.effects.temperature is not None
+    assert apart.temperature.kpa_per_k.value == pytest.approx(
+        tile.effects.temperature.kpa_per_k.value, rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("tiles", [1, 5])

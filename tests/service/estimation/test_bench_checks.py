@@ -93,9 +93,9 @@ def test_one_repeat_in_each_of_two_files_is_enough() -> None:
 
 
 def test_a_repeat_far_from_the_others_is_a_contradiction_that_is_named() -> None:
-    with pytest.raises(CalibrationError, match=r"contradict one another: repeat 3 takes \+2\d %"):
-        fit_tile(bench(gains=(1.0, 1.0, 1.25, 1.0)))
-    assert fit_tile(bench(gains=(1.0, 1.0, 1.10, 1.0))).repeats == 4
+    with pytest.raises(CalibrationError, match=r"contradict one another: repeat 3 takes \+50 %"):
+        fit_tile(bench(gains=(1.0, 1.0, 1.5, 1.0)))
+    assert fit_tile(bench(gains=(1.0, 1.0, 1.2, 1.0))).repeats == 4
 
 
 def test_a_baseline_that_creeps_away_between_repeats_is_refused_with_its_values() -> None:
@@ -143,7 +143,7 @@ def test_a_recording_that_no_cubic_describes_is_refused_by_its_r2() -> None:
     recording = bench()
     pressed = recording.phase != "rest"
     jumps_n = pressed * np.random.default_rng(1).normal(0.0, 5.0, len(pressed))
-    with pytest.raises(CalibrationError, match=r"R2 = 0\.\d+.*at least 0\.95"):
+    with pytest.raises(CalibrationError, match=r"R2 = 0\.\d+.*at least 0\.9"):
         fit_tile(replace(recording, reference_n=recording.reference_n + jumps_n))
 
 
