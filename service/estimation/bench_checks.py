@@ -32,8 +32,8 @@ R2_MIN = 0.9
 """The paper has 0.9999 for the mean of four; four loadings with its scatter of 0.03 have 0.97 to
 0.997 on the emulated bench."""
 GAIN_OFF_MAX = 0.3
-"""The paper's scatter between loadings is 0.03 of the output, some 0.05 of the force where the curve
-is steep: six times that."""
+"""The paper's scatter between loadings is 0.03 of the output, some 0.05 of the force where the
+curve is steep: six times that."""
 DRIFT_MAX_KPA = 0.4
 """From the second repeat on, when the rubber is as crept as it will be: some 0.8 N."""
 SETTLING_MAX_KPA = 1.0
