@@ -17,7 +17,7 @@ from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects_fit import fit_effects
 from service.estimation.fit import fit_tile
-from service.estimation.indentation import Indentation
+from service.estimation.indentation import Indentation, pressed_in
 from storage.session_file import SessionReader
 
 
@@ -48,7 +48,8 @@ def calibrate_recordings(
     """Fit every tile that was pressed.
 
     Repeats of a tile may be spread over several files: each has its own baseline and reference
-    zero. A tile without a believable curve is left out, with the reason in `refused`.
+    zero. A file that is only a soak counts for every tile that is pressed in another. A tile
+    without a believable curve is left out, with the reason in `refused`.
 
     Args:
         recordings: of each serial.
@@ -103,7 +104,19 @@ def read_recordings(paths: Sequence[Path]) -> dict[str, list[Pressed]]:
                 for other in others:
                     _refuse_contradiction(other, pressed)
                 others.append(pressed)
-    return dict(sorted(found.items()))
+    # Tiles that were only soaked have nothing to be fitted to.
+    bench = {
+        serial: all_of
+        for serial, all_of in sorted(found.items())
+        if pressed_in([one.indentation for one in all_of])
+    }
+    if not bench:
+        raise CalibrationError(
+            "no tile is pressed in any of the recordings",
+            where=", ".join(str(path) for path in paths),
+            expected="phases load and unload, with pressed_tile naming a tile",
+        )
+    return bench
 
 
 def _refuse_contradiction(one: Pressed, other: Pressed) -> None:
@@ -126,7 +139,7 @@ def _refuse_contradiction(one: Pressed, other: Pressed) -> None:
 
 def _fitted(pressed: Sequence[Pressed]) -> TileCalibration:
     recordings = [each.indentation for each in pressed]
-    tile = fit_tile(*recordings)
+    tile = fit_tile(*pressed_in(recordings))
     return tile.model_copy(
         update={
             "coefficient_words": pressed[0].chip,
@@ -148,6 +161,8 @@ def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
     frames = FrameBatch.concatenate([frames for frames, _ in pieces])
     pressed = np.concatenate([extra["pressed_tile"] for _, extra in pieces])
     phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
+    # A soak by itself is one of all tiles.
+    only_soak = bool((phase == "soak").any()) and not np.isin(pressed, session.info.serials).any()
     held, _ = hold_temperature(frames)
     readable_kpa = Compensation(session.info.tiles).readable_kpa(held)
     # A count that ran past its end reads as next to no pressure (model `unwrap`): here it says
@@ -165,7 +180,7 @@ def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
             tadc=np.where(held.tadc[:, i] == NOT_READ, np.nan, held.tadc[:, i].astype(np.float64)),
         )
         for i, serial in enumerate(session.info.serials)
-        if (pressed == serial).any()
+        if (pressed == serial).any() or only_soak
     ]
     if not tiles:
         raise CalibrationError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from service.estimation.bench_replay import Replay, replays
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.confidence import curve_n, mean_band_n, new_loading_band_n
-from service.estimation.indentation import Indentation, strokes
+from service.estimation.indentation import Indentation, pressed_in, strokes
 from service.plots import new_figure, png_of
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ COLUMNS = 4
 """Tiles side by side; more go on below."""
 FAST = {"release": "release of a held load", "tap": "tap"}
 _HEIGHTS = (3.0, 1.5, 1.5, 1.5)
+_LETTERS_PER_IN = 11.0
 
 
 def plot_calibration(
@@ -43,12 +45,13 @@ def plot_calibration(
     lines = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
     columns = min(COLUMNS, len(tiles))
     heights = _HEIGHTS[: 2 + len(kinds)]
-    figure = new_figure(1.2 + 3.7 * columns, 1.0 + len(lines) * 1.15 * sum(heights))
-    figure.suptitle(
+    width_in = max(6.4, 1.2 + 3.7 * columns)
+    figure = new_figure(width_in, 1.0 + len(lines) * 1.15 * sum(heights))
+    title = (
         f"Calibration {calibration.name} ({calibration.id}), {calibration.date[:10]}, "
-        f"reference: {calibration.reference}",
-        fontsize=11,
+        f"reference: {calibration.reference}"
     )
+    figure.suptitle(fill(title, round(_LETTERS_PER_IN * width_in)), fontsize=10)
     blocks = figure.subfigures(len(lines), 1, squeeze=False)[:, 0]
     for block, line in zip(blocks, lines, strict=True):
         axes = block.subplots(
@@ -68,7 +71,7 @@ def plot_calibration(
             axis.set_ylabel("gauge pressure, kPa")
         for row in axes:
             _same_scale(row[: len(line)])
-        axes[0, 0].legend(fontsize=7.5, loc="upper left", framealpha=0.9)
+        axes[0, 0].legend(markerscale=2.5, fontsize=7.5, loc="upper left", framealpha=0.9)
         for axis in axes[2:, 0]:
             if axis.get_legend_handles_labels()[0]:
                 axis.legend(fontsize=7.5, loc="upper right", framealpha=0.9)
@@ -78,7 +81,7 @@ def plot_calibration(
 def _curve(
     curve: Axes, residual: Axes, tile: TileCalibration, recordings: Sequence[Indentation]
 ) -> None:
-    blocks = strokes(*recordings)
+    blocks = strokes(*pressed_in(recordings))
     end_kpa = tile.range_kpa[1]
     grid_kpa = np.linspace(0.0, end_kpa, 200)
     force_n = curve_n(tile, grid_kpa)
@@ -99,7 +102,7 @@ def _curve(
             centre_n + mean_n,
             color="#AAAAAA",
             linewidth=0,
-            label=f"95 % of the mean of {tile.repeats}",
+            label="95 % of the mean curve",
         )
         for loading, name, colour, marker in BRANCHES:
             rows = blocks.loading == loading

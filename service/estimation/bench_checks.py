@@ -28,10 +28,12 @@ LOADED_N = 1.0
 LOADED_KPA = 3.0
 """A fifth of what the chip has above a seal at 100 kPa, and 24 counts: less bears no cubic."""
 REPEATS_MIN = 2
-R2_MIN = 0.95
-"""The paper has 0.9999 for the mean of four; single loadings with its scatter of 0.03 have 0.99."""
-GAIN_OFF_MAX = 0.15
-"""Five times the paper's scatter of 0.03 between loadings."""
+R2_MIN = 0.9
+"""The paper has 0.9999 for the mean of four; four loadings with its scatter of 0.03 have 0.97 to
+0.997 on the emulated bench."""
+GAIN_OFF_MAX = 0.3
+"""The paper's scatter between loadings is 0.03 of the output, some 0.05 of the force where the
+curve is steep: six times that."""
 DRIFT_MAX_KPA = 0.4
 """From the second repeat on, when the rubber is as crept as it will be: some 0.8 N."""
 SETTLING_MAX_KPA = 1.0
@@ -183,7 +185,7 @@ def refuse_contradictions(gains: Floats, where: str) -> None:
             f"repeats contradict one another: repeat {worst + 1} takes {100 * off[worst]:+.0f} % "
             "of the others' force for the same pressure",
             where=where,
-            expected=f"within {100 * GAIN_OFF_MAX:.0f} %, five times the paper's scatter",
+            expected=f"within {100 * GAIN_OFF_MAX:.0f} %, six times the paper's scatter",
             remedy="Look for a spindle off the dome's middle or a slipped tile, and press again",
         )
 

@@ -56,7 +56,8 @@ def presses(recording: Indentation, zero: Unloaded) -> Presses:
     rows &= recording.phase != "soak"
     t_s = (recording.t_ns[rows] - recording.t_ns[rows][0]) * 1e-9
     force_n = recording.reference_n[rows] - zero.reference_zero_n
-    kpa, phase = recording.kpa[rows], recording.phase[rows]
+    phase = recording.phase[rows]
+    kpa = np.where(np.isfinite(recording.kpa), recording.kpa, np.nan)[rows]
     # What the reference explains is no spike: the top of a tap is a single reading, too.
     unexplained_kpa = kpa - _kpa_per_n(kpa, force_n) * force_n
     kpa = np.where(spikes(unexplained_kpa[:, None], np.array([zero.noise_kpa]))[:, 0], np.nan, kpa)

@@ -12,7 +12,7 @@ from service.estimation.bench_press import Presses, joined, presses
 from service.estimation.calibration import TileCalibration, is_monotonic
 from service.estimation.effects import Effects, TemperatureEffect
 from service.estimation.identify import identify
-from service.estimation.indentation import Indentation, soak, unloaded
+from service.estimation.indentation import Indentation, pressed_in, soak, unloaded
 from service.estimation.soak import fit_soak
 
 Floats = npt.NDArray[np.float64]
@@ -29,7 +29,8 @@ def fit_effects(recordings: Sequence[Indentation], tile: TileCalibration) -> Eff
         tile: its static curve, from the same recordings.
     """
     points, baseline_kpa = loadings(recordings)
-    warm = _best([fit_soak(soak(recording, unloaded(recording))) for recording in recordings])
+    noise_kpa = float(np.mean([unloaded(each).noise_kpa for each in pressed_in(recordings)]))
+    warm = _best([fit_soak(soak(recording, noise_kpa)) for recording in recordings])
     effects = identify(
         points,
         scale_kpa=tile.range_kpa[1],
@@ -60,6 +61,7 @@ def fit_effects(recordings: Sequence[Indentation], tile: TileCalibration) -> Eff
 
 def loadings(recordings: Sequence[Indentation]) -> tuple[Presses, float]:
     """Every loading of a tile above one common baseline in kPa, and that baseline."""
+    recordings = pressed_in(recordings)
     zeros = [unloaded(recording) for recording in recordings]
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
     parts = []

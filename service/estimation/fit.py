@@ -6,6 +6,8 @@ beyond 1e12. The curve has no constant term, because the tare makes zero pressur
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import nnls
@@ -76,21 +78,14 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
     blocks, by_chip = before_saturation(recordings, blocks, noise_kpa)
     refuse_unloaded(blocks, where)
     drift_kpa = baseline_drift_kpa(recordings)
-    repeats = np.unique(blocks.repeat)
     # Every repeat reaches the end of the range on average: beyond it there is nothing to go by.
-    high_kpa = float(np.mean([blocks.gauge_kpa[blocks.repeat == r].max() for r in repeats]))
+    high_kpa = float(np.mean(_tops(blocks, blocks.gauge_kpa)))
     cubic = _Cubic(high_kpa)
     coefficients = cubic.solve(blocks)
     c1, c2, c3 = (float(c) for c in coefficients)
     polynomial = (0.0, c1, c2, c3)
-    fitted_n = blocks.force_n - cubic.residual_n(blocks, coefficients)
-    gains = np.array(
-        [
-            (blocks.force_n * fitted_n)[blocks.repeat == r].sum()
-            / (fitted_n**2)[blocks.repeat == r].sum()
-            for r in repeats
-        ]
-    )
+    residual_n = cubic.residual_n(blocks, coefficients)
+    gains = _gains(blocks, blocks.force_n - residual_n)
     refuse_contradictions(gains, where)
     if not is_monotonic(polynomial, (cubic.u0, 1.0)):
         raise CalibrationError(
@@ -98,21 +93,12 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
             where=where,
             remedy="Look at the recording for slips of the spindle or a leaking dome",
         )
-    residual_n = cubic.residual_n(blocks, coefficients)
     spread_n = blocks.force_n - blocks.force_n.mean()
     r2 = float(1 - (residual_n**2).sum() / (spread_n**2).sum())
     refuse_poor_fit(r2, where)
-    # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
-    without = np.stack([cubic.solve(blocks.rows(blocks.repeat != r)) for r in repeats])
-    left_out = [blocks.rows(blocks.repeat == r) for r in repeats]
-    left_out_n = np.concatenate(
-        [cubic.residual_n(part, c) for part, c in zip(left_out, without, strict=True)]
-    )
-    left_out_force_n = np.concatenate([part.force_n for part in left_out])
-    deviation = without - without.mean(axis=0)
-    covariance = (len(repeats) - 1) / len(repeats) * deviation.T @ deviation
+    left_out = _left_out(cubic, blocks)
     loop = cubic.solve(blocks.rows(blocks.loading)) - cubic.solve(blocks.rows(~blocks.loading))
-    relative_misfit, loop_misfit_n = _misfit(left_out_force_n, left_out_n)
+    relative_misfit, loop_misfit_n = _misfit(left_out.force_n, left_out.residual_n)
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
     tile = TileCalibration(
         serial=recordings[0].serial,
@@ -126,56 +112,96 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
         range_kpa=(0.0, high_kpa),
         monotonic=True,
         absolute_scale="measured",
-        covariance=tuple(tuple(float(c) for c in row) for row in covariance),
+        covariance=tuple(tuple(float(c) for c in row) for row in left_out.covariance),
         relative_misfit=relative_misfit,
         loop_misfit_n=loop_misfit_n,
         r2=r2,
         rmse_n=_rms(residual_n),
-        cv_rmse_n=_rms(left_out_n),
+        cv_rmse_n=_rms(left_out.residual_n),
         hysteresis_n=float(np.abs(cubic.design(np.linspace(0, high_kpa, 101)) @ loop).max()),
-        repeats=len(repeats),
+        repeats=len(gains),
         baseline_kpa=baseline_kpa,
         noise_kpa=noise_kpa,
     )
     tadc = [zero.tadc_counts for zero in zeros if zero.tadc_counts is not None]
     tadc_counts = float(np.mean(tadc)) if tadc else None
-    steps_kpa = np.linspace(0.0, high_kpa, BAND_STEPS + 1)
-    bands = (steps_kpa, curve_n(tile, steps_kpa), *_bands_n(tile, steps_kpa))
     facts = BenchFacts(
         recordings=sum(bool(stroke_rows(recording)) for recording in recordings),
-        end_n=float(np.mean([blocks.force_n[blocks.repeat == r].max() for r in repeats])),
+        end_n=float(np.mean(_tops(blocks, blocks.force_n))),
         end_absolute_kpa=baseline_kpa + high_kpa,
         spare_kpa=PRESSURE_MAX_KPA - baseline_kpa - high_kpa,
         ended_by="chip" if by_chip else "load",
         tadc_counts=tadc_counts,
         degc=None if tadc_counts is None else float(indicative_degc(tadc_counts)),
-        r2_of_mean=_r2_of_mean(cubic, coefficients, blocks),
-        repeat_gains=tuple(float(gain) for gain in gains),
+        r2_of_mean=_r2_of_mean(cubic, residual_n, blocks),
+        repeat_gains=tuple(gains.tolist()),
         baseline_drift_kpa=drift_kpa,
-        band_95=tuple(
-            BandPoint(gauge_kpa=p, force_n=f, mean_n=m, new_loading_n=n)
-            for p, f, m, n in zip(*(values.tolist() for values in bands), strict=True)
-        ),
+        band_95=_band(tile),
     )
     return tile.model_copy(update={"bench": facts})
 
 
-def _bands_n(tile: TileCalibration, gauge_kpa: Floats) -> tuple[Floats, Floats]:
-    return mean_band_n(tile, gauge_kpa), new_loading_band_n(tile, gauge_kpa)
+@dataclass(frozen=True)
+class _LeftOut:
+    """Every repeat against the curve of the others."""
+
+    force_n: Floats
+    residual_n: Floats
+    covariance: Floats
+    """Of the coefficients of all."""
 
 
-def _r2_of_mean(cubic: _Cubic, coefficients: Floats, blocks: Strokes) -> float:
-    """R2 of the cubic to the mean over repeats and branches, in equal steps of pressure."""
-    step = np.minimum(
-        (blocks.gauge_kpa / (2 * cubic.scale_kpa) * MEAN_STEPS).astype(np.int64), MEAN_STEPS - 1
+def _left_out(cubic: _Cubic, blocks: Strokes) -> _LeftOut:
+    # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
+    repeats = np.unique(blocks.repeat)
+    without = np.stack([cubic.solve(blocks.rows(blocks.repeat != r)) for r in repeats])
+    parts = [blocks.rows(blocks.repeat == r) for r in repeats]
+    deviation = without - without.mean(axis=0)
+    return _LeftOut(
+        force_n=np.concatenate([part.force_n for part in parts]),
+        residual_n=np.concatenate(
+            [cubic.residual_n(part, c) for part, c in zip(parts, without, strict=True)]
+        ),
+        covariance=(len(repeats) - 1) / len(repeats) * deviation.T @ deviation,
     )
-    step = np.maximum(step, 0)
+
+
+def _tops(blocks: Strokes, values: Floats) -> list[float]:
+    """The greatest value of each repeat."""
+    return [float(values[blocks.repeat == r].max()) for r in np.unique(blocks.repeat)]
+
+
+def _gains(blocks: Strokes, fitted_n: Floats) -> Floats:
+    """Force of each repeat over that of the curve."""
+    parts = [blocks.repeat == r for r in np.unique(blocks.repeat)]
+    return np.array(
+        [float((blocks.force_n * fitted_n)[r].sum() / (fitted_n**2)[r].sum()) for r in parts]
+    )
+
+
+def _band(tile: TileCalibration) -> tuple[BandPoint, ...]:
+    gauge_kpa = np.linspace(0.0, tile.range_kpa[1], BAND_STEPS + 1)
+    columns = (
+        gauge_kpa,
+        curve_n(tile, gauge_kpa),
+        mean_band_n(tile, gauge_kpa),
+        new_loading_band_n(tile, gauge_kpa),
+    )
+    return tuple(
+        BandPoint(gauge_kpa=p, force_n=f, mean_n=mean, new_loading_n=new)
+        for p, f, mean, new in zip(*(column.tolist() for column in columns), strict=True)
+    )
+
+
+def _r2_of_mean(cubic: _Cubic, residual_n: Floats, blocks: Strokes) -> float:
+    """R2 of the cubic to the mean over repeats and branches, in equal steps of pressure."""
+    place_of = blocks.gauge_kpa / (2 * cubic.scale_kpa) * MEAN_STEPS
+    step = np.clip(place_of.astype(np.int64), 0, MEAN_STEPS - 1)
     count = np.bincount(step, minlength=MEAN_STEPS)
     full = count > 0
     mean_n = np.bincount(step, blocks.force_n, MEAN_STEPS)[full] / count[full]
-    left_n = cubic.residual_n(blocks, coefficients)
-    mean_left_n = np.bincount(step, left_n, MEAN_STEPS)[full] / count[full]
-    return float(1 - (mean_left_n**2).sum() / ((mean_n - mean_n.mean()) ** 2).sum())
+    left_n = np.bincount(step, residual_n, MEAN_STEPS)[full] / count[full]
+    return float(1 - (left_n**2).sum() / ((mean_n - mean_n.mean()) ** 2).sum())
 
 
 def _misfit(force_n: Floats, residual_n: Floats) -> tuple[float, float]:

@@ -7,6 +7,7 @@ straight over into an `unload`; holds, releases and taps are left to the models 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -205,14 +206,19 @@ def _run_begin(rows: npt.NDArray[np.bool_]) -> int:
     return int(off[-1]) + 1 if len(off) else 0
 
 
-def soak(recording: Indentation, zero: Unloaded) -> Soak:
+def pressed_in(recordings: Sequence[Indentation]) -> list[Indentation]:
+    """Those in which the tile is pressed: others are a soak and nothing else."""
+    return [recording for recording in recordings if recording.under_spindle.any()]
+
+
+def soak(recording: Indentation, noise_kpa: float) -> Soak:
     """The part of the recording in which nothing presses and the surroundings warm up."""
     rows = recording.phase == "soak"
     return Soak(
         t_s=(recording.t_ns[rows] - recording.t_ns[0]) * 1e-9,
         kpa=recording.kpa[rows],
         tadc=recording.tadc[rows],
-        noise_kpa=zero.noise_kpa,
+        noise_kpa=noise_kpa,
     )
 
 

@@ -231,10 +231,16 @@ def test_calibrate_prints_the_contract_and_draws(run, tmp_path):
     assert outcome.code == 0, outcome.err
     printed = json.loads(outcome.out)
     assert [tile["serial"] for tile in printed["tiles"]] == ["T01", "T02"]
-    assert set(printed["tiles"][0]) == {
+    tile = printed["tiles"][0]
+    assert set(tile) >= {
         *("serial", "r2", "rmse_n", "cv_rmse_n", "hysteresis_n", "range_kpa"),
         *("monotonic", "coefficients"),
     }
+    assert tile["bench"]["ended_by"] == "load"
+    assert tile["absolute_scale"] == "measured"
+    low_ms, high_ms = tile["effects"]["gas_tau_ms"]["interval_95"]
+    assert low_ms < tile["effects"]["gas_tau_ms"]["value"] < high_ms
+    assert printed["refused"] == {}
     assert json.loads((tmp_path / "cal.json").read_text())["id"] == printed["id"]
     assert (tmp_path / "cal.png").read_bytes().startswith(b"\x89PNG")
 
