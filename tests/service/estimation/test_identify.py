@@ -113,7 +113,7 @@ def recorded(
 
 
 def found_in(recording: Indentation) -> Effects:
-    return fit_effects(recording, fit_tile(recording))
+    return fit_effects([recording], fit_tile(recording))
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ def test_the_same_recording_gives_the_same_calibration(
     recording = recorded(seed=0)
     tile = fit_tile(recording)
     one = tile.model_copy(update={"effects": known[0]})
-    two = tile.model_copy(update={"effects": fit_effects(recording, tile)})
+    two = tile.model_copy(update={"effects": fit_effects([recording], tile)})
     assert calibration_of(one).id == calibration_of(two).id
 
 
