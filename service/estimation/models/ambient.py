@@ -19,6 +19,8 @@ Floats = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 
 SMOOTHING_S = 0.03
+HELD_S = 0.2
+"""A foot sinks or is lifted in that time: what was read before says nothing of where it is."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Ambient:
 
         Args:
             reference_gauge_kpa: (n,), mean of the bare tiles above their tare; NaN where none
-                could be read, and then the last one holds.
+                could be read, and then the last one holds for `HELD_S`.
             t_ns: (n,) instants.
             state: from the frames before.
 
@@ -83,5 +85,5 @@ def _averaged(
                 passed_s = max(0.0, (t_ns[i] - last_ns) * 1e-9)
                 value -= math.expm1(-passed_s / SMOOTHING_S) * (kpa[i] - value)
             last_ns = t_ns[i]
-        out[i] = value
+        out[i] = value if t_ns[i] - last_ns <= HELD_S * 1e9 else math.nan
     return value, last_ns

@@ -36,8 +36,8 @@ def test_water_that_comes_at_once_is_known_after_thirty_milliseconds_to_two_thir
     assert head([0.0, 1.0, 1.0, 1.0, 1.0], t_s)[1:] == pytest.approx(expected, abs=1e-9)
 
 
-def test_the_first_reading_counts_at_once_and_the_last_holds() -> None:
-    out = head([math.nan, 0.7, math.nan, math.inf, math.nan], 10.0 * np.arange(5))
+def test_the_first_reading_counts_at_once_and_the_last_holds_for_a_while() -> None:
+    out = head([math.nan, 0.7, math.nan, math.inf, math.nan], 0.06 * np.arange(5))
     assert np.isnan(out[0])
     assert out[1:].tolist() == [0.7] * 4
 
@@ -74,3 +74,13 @@ def test_a_dome_passes_on_what_its_wall_gives_way_to(
     assert plan.ladder.ambient.relative_sigma == pytest.approx(0.0002 / 0.0013)
     with pytest.raises(UsageError, match="bare reference tile"):
         plan_of(info_of([(0.0, 0.0, 0.0)]), models=("static", "ambient"), tiles=tiles)
+
+
+def test_a_bare_tile_that_falls_silent_is_believed_for_a_fifth_of_a_second() -> None:
+    t_ns = np.arange(300, dtype=np.int64) * 2_000_000
+    kpa = np.where(np.arange(300) < 100, 1.0, np.nan)
+    felt_kpa, _, state = Ambient(np.array([0.1]), 0.1).felt(kpa, t_ns, AT_REST)
+    assert felt_kpa[:200, 0] == pytest.approx(0.1)
+    assert np.isnan(felt_kpa[200:, 0]).all()
+    later, _, _ = Ambient(np.array([0.1]), 0.1).felt(np.full(9, 2.0), t_ns[-1] + t_ns[1:10], state)
+    assert np.isfinite(later).all(), "and again as soon as it speaks"
