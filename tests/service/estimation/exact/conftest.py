@@ -165,7 +165,7 @@ def temperature(counts: list[Exact], t_ns: list[int], lag_s: Exact) -> list[Exac
 
 
 def around(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:
-    """A low-pass of 30 ms that holds where there is no reading."""
+    """A low-pass of 30 ms that holds for a while where there is no reading."""
     out: list[Exact] = []
     value, last_ns = None, 0
     for p, now_ns in zip(kpa, t_ns, strict=True):
@@ -176,7 +176,8 @@ def around(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:
                 passed = max(mpf(0), mpf(now_ns - last_ns) / 10**9)
                 value += (1 - mp.exp(-passed / mpf(ambient.SMOOTHING_S))) * (p - value)
             last_ns = now_ns
-        out.append(value)
+        held = now_ns - last_ns <= ambient.HELD_S * 1e9
+        out.append(value if held else None)
     return out
 
 
