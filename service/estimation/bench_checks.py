@@ -52,6 +52,14 @@ def refuse_unloaded(blocks: Strokes, where: str) -> None:
     Raises:
         CalibrationError: one of these.
     """
+    if not len(blocks.force_n):
+        raise CalibrationError(
+            "no reading of this tile while it was pressed",
+            where=where,
+            expected="pressures and reference forces in its strokes",
+            remedy="Check that the spindle stands over this tile, and that it is plugged in where "
+            "the scene says",
+        )
     most_n, least_n = float(blocks.force_n.max()), float(blocks.force_n.min())
     most_kpa = float(blocks.gauge_kpa.max())
     if most_n < LOADED_N and least_n < -LOADED_N:

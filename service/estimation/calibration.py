@@ -85,6 +85,13 @@ class TileCalibration(BaseModel):
             raise ValueError(f"covariance is {matrix.shape}, expected {(BASIS, BASIS)}")
         if self.monotonic != is_monotonic(self.coefficients, self.range_u):
             raise ValueError(f"monotonic = {self.monotonic} is not true of the coefficients")
+        rubber = self.effects.rubber
+        if rubber is not None:
+            shape = np.array(rubber.covariance, dtype=object).shape
+            if shape != (BASIS, BASIS):
+                raise ValueError(f"covariance of rubber is {shape}, expected {(BASIS, BASIS)}")
+            if not is_monotonic(rubber.coefficients, self.range_u):
+                raise ValueError("the curve beneath rubber does not rise all over its range")
         return self
 
     @property

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from devices.compensation import Compensation
 from devices.errors import TareError
-from devices.frames import FrameBatch
+from devices.frames import NOT_READ, FrameBatch
 from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration
 from service.estimation.tare import (
@@ -28,6 +28,8 @@ from service.estimation.tare import (
 
 LOOK_BACK_NS = 10_000_000_000
 WINDOW_NS = 250_000_000
+WARMING_COUNTS = 4.0
+"""0.75 K: the gas may be that far from its chip, a quarter of a kilopascal or half a newton."""
 WINDOW_MAX_NS = 1_000_000_000
 """A window is longer if an array is so slow that it would hold too few frames, up to this."""
 
@@ -111,7 +113,8 @@ def tare_in_flight(
     tare = tare_from_rows(frames, compensation, serials, rows, "unloaded")
     if present is not None:
         _refuse_above(tare, present, serials)
-    if np.isfinite(bench_kpa).all():
+    _refuse_warming(frames, tare, serials)
+    if np.isfinite(bench_kpa).any():
         refuse_loaded(tare, calibration, serials)
     refuse_stuck(frames, compensation, calibration, serials, rows)
     return tare
@@ -124,6 +127,24 @@ def _window_ns(since_ns: npt.NDArray[np.int64]) -> int:
 
 def _as_low(mean_kpa: np.ndarray, lowest_kpa: np.ndarray, sigma_kpa: np.ndarray) -> bool:
     return bool((mean_kpa < lowest_kpa + STILL_SIGMAS * np.sqrt(2.0) * sigma_kpa).all())
+
+
+def _refuse_warming(frames: FrameBatch, tare: Tare, serials: tuple[str, ...]) -> None:
+    """While a chip's temperature moves, its gas is seconds behind, and no baseline is one."""
+    tadc = np.where(frames.tadc == NOT_READ, np.nan, frames.tadc.astype(np.float64))
+    since_ns = frames.t_ns - frames.t_ns[0]
+    begin = tadc[since_ns <= WINDOW_NS]
+    known = np.isfinite(begin).any(axis=0)
+    moved = np.zeros(len(serials))
+    moved[known] = np.abs(np.nanmean(begin[:, known], axis=0) - tare.tadc_counts[known])
+    worst = int(np.argmax(np.nan_to_num(moved)))
+    if moved[worst] > WARMING_COUNTS:
+        raise TareError(
+            f"the temperature of tile {serials[worst]} has moved by {moved[worst]:.0f} counts in "
+            "the last seconds, and the gas in its dome is still behind",
+            expected=f"at most {WARMING_COUNTS:g} counts in {LOOK_BACK_NS / 1e9:g} s",
+            remedy="Wait for half a minute and tare again",
+        )
 
 
 def _refuse_above(tare: Tare, present: Tare, serials: tuple[str, ...]) -> None:

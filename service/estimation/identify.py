@@ -37,6 +37,8 @@ _CLEAR = 3.0
 """An effect is determined if it is so many standard uncertainties from none."""
 _LN_SIGMA_MAX = 0.7
 """A time constant is determined within a factor of two."""
+_GAMMA_MAX = 1.45
+"""Air has 1.40; a single time constant for a sphere makes it less, never more."""
 _FAST_MIN = 50
 """Readings of holds, releases and taps, without which nothing fast can be told."""
 
@@ -335,7 +337,12 @@ def _undetermined(found: _Found, free: _Free) -> dict[EffectName, str]:
     reasons: dict[EffectName, str] = {}
     if free.gas:
         sigma, ln_sigma = float(found.sigma["gamma"][0]), float(found.sigma["ln_tau"][0])
-        if found.gamma - 1.0 < _CLEAR * sigma or ln_sigma > _LN_SIGMA_MAX:
+        if found.gamma > _GAMMA_MAX:
+            reasons["gas"] = (
+                f"gamma {found.gamma:.2f} is more than a gas can have: tile and reference are not "
+                "of the same instants, or the spindle slipped"
+            )
+        elif found.gamma - 1.0 < _CLEAR * sigma or ln_sigma > _LN_SIGMA_MAX:
             reasons["gas"] = (
                 f"gamma {found.gamma:.3f} +- {sigma:.3f}, tau {found.tau_s * 1e3:.1f} ms within a "
                 f"factor of {np.exp(ln_sigma):.1f}: not determined"

@@ -20,7 +20,7 @@ from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import EffectName
 from service.estimation.models.ambient import Ambient
 from service.estimation.models.gas import Gas
-from service.estimation.models.hysteresis import Hysteresis
+from service.estimation.models.hysteresis import WIDTHS_N, Hysteresis
 from service.estimation.models.rubber import Rubber
 from service.estimation.models.static import StaticCurves
 from service.estimation.models.temperature import Temperature
@@ -99,6 +99,7 @@ def make_ladder(
             "model 'ambient' needs a bare reference tile, and the array has none",
             remedy="Leave it out, or plug in a bare chip and mark it `reference = true`",
         )
+    _refuse_mixed(tiles, models, calibration)
     ones = np.ones(len(tiles))
     gas = [tile.effects.gas for tile in tiles]
     rubber = [tile.effects.rubber for tile in tiles]
@@ -166,6 +167,23 @@ def _refuse_undetermined(
                 remedy="Leave the model out, or calibrate the tile from a recording with holds, "
                 "releases, taps and a soak at two temperatures",
             )
+
+
+def _refuse_mixed(
+    tiles: Sequence[TileCalibration], models: Sequence[str], calibration: Calibration
+) -> None:
+    """All tiles have as many creep terms, and the plays that are modelled."""
+    terms = {len(tile.effects.rubber.part) for tile in tiles if tile.effects.rubber is not None}
+    plays = {len(e.part) for tile in tiles if (e := tile.effects.hysteresis) is not None}
+    if ("rubber" in models and len(terms) > 1) or (
+        "hysteresis" in models and plays != {len(WIDTHS_N)}
+    ):
+        raise CalibrationError(
+            f"its tiles have {sorted(terms)} creep terms and {sorted(plays)} plays",
+            where=f"calibration {calibration.name} ({calibration.id})",
+            expected=f"the same number of terms in all tiles, and {len(WIDTHS_N)} plays",
+            remedy="Calibrate all of them with this version",
+        )
 
 
 def _temperature(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from devices.frames import NOT_READ, FrameBatch
+from devices.frames import NOT_READ, FrameBatch, TileStatus
 from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from service.estimation.drift import has_warmed
 from service.estimation.estimates import EstimateStatus
@@ -18,6 +18,8 @@ from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
+
+NEVER_NS = -(1 << 62)
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,8 @@ class LowerState:
     ambient: ambient.AmbientState = ambient.AT_REST
     gas: gas.GasState | None = None
     skew: skew.SkewState | None = None
+    bound_ns: npt.NDArray[np.int64] | None = None
+    """When each tile was last beyond its range."""
 
 
 def tile_kpa(plan: EstimationPlan, frames: FrameBatch) -> Floats:
@@ -116,8 +120,11 @@ def felt(
         baseline_variance = baseline_variance + sigma_kpa**2
         state = replace(state, temperature=after)
     if ladder.ambient is not None:
+        # A bare tile beyond the chip's range tells of itself, not of what is around the foot.
+        beyond_chip = (frames.status & np.uint8(TileStatus.OVER_RANGE)) != 0
+        outside_kpa = np.where(beyond_chip, np.nan, gauge_kpa)
         felt_kpa, sigma_kpa, outside = ladder.ambient.felt(
-            _mean_of(gauge_kpa, plan.references), frame_t_ns, state.ambient
+            _mean_of(outside_kpa, plan.references), frame_t_ns, state.ambient
         )
         bearing_kpa = bearing_kpa - felt_kpa
         baseline_variance = baseline_variance + sigma_kpa**2
@@ -125,16 +132,23 @@ def felt(
     if ladder.temperature is not None or ladder.ambient is not None:
         gauge_kpa = gauge_kpa.copy()
         gauge_kpa[:, columns] = bearing_kpa - plan.baseline_kpa
-    settled_kpa = bearing_kpa
+    settled_kpa, uncertain = bearing_kpa, np.zeros(bearing_kpa.shape, dtype=bool)
     if ladder.gas is not None:
+        # What is beyond the range is a bound, which the gas must not take for the truth.
+        bound = bearing_kpa - plan.baseline_kpa > ladder.curves.high_kpa
         settled_kpa, warm = ladder.gas.settled(
-            bearing_kpa, t_mono_ns, state.gas or gas.at_rest(len(columns))
+            np.where(bound, np.nan, bearing_kpa),
+            t_mono_ns,
+            state.gas or gas.at_rest(len(columns)),
         )
-        state = replace(state, gas=warm)
+        settled_kpa = np.where(bound, bearing_kpa, settled_kpa)
+        uncertain, last_ns = _since(bound, t_mono_ns, state.bound_ns, ladder.gas.memory_ns)
+        state = replace(state, gas=warm, bound_ns=last_ns)
     static_kpa = settled_kpa - plan.baseline_kpa
     static = ladder.curves.force(static_kpa)
     status[np.isnan(static.force_n).any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
-    beyond = static_kpa > ladder.curves.high_kpa
+    # After a bound the gas is as warm as nobody knows, until it has cooled.
+    beyond = (static_kpa > ladder.curves.high_kpa) | uncertain
     status[beyond.any(axis=1)] |= np.uint16(EstimateStatus.SATURATED)
     low_kpa = ladder.curves.low_kpa - SIGMAS * plan.still_kpa
     status[(static_kpa < low_kpa).any(axis=1)] |= np.uint16(EstimateStatus.EXTRAPOLATED)
@@ -157,6 +171,19 @@ def felt(
         status=status,
     )
     return now, state
+
+
+def _since(
+    happened: Bools,
+    t_ns: npt.NDArray[np.int64],
+    before_ns: npt.NDArray[np.int64] | None,
+    memory_ns: Floats,
+) -> tuple[Bools, npt.NDArray[np.int64]]:
+    """Where something has happened within so long before, and when last; arrays over tiles."""
+    first = np.full(happened.shape[1], NEVER_NS) if before_ns is None else before_ns
+    last_ns = np.maximum.accumulate(np.where(happened, t_ns, NEVER_NS), axis=0)
+    last_ns = np.maximum(last_ns, first)
+    return ~happened & (t_ns - last_ns < memory_ns), last_ns[-1]
 
 
 def _frame_status(

@@ -60,6 +60,11 @@ class Gas:
     wall_per_kpa: Floats
     baseline_kpa: Floats
 
+    @property
+    def memory_ns(self) -> Floats:
+        """How long each tile's gas remembers what was before."""
+        return np.asarray(RESTART * self.gamma * self.tau_s * 1e9)
+
     def settled(self, kpa: Floats, t_ns: Times, state: GasState) -> tuple[Floats, GasState]:
         """Pressures that measured ones would settle at.
 

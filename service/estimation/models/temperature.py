@@ -22,17 +22,20 @@ Times = npt.NDArray[np.int64]
 
 SETTLE_S = 0.5
 """So long is the mean of the chip's temperature taken for that of the gas."""
+NEAR_COUNTS = 2.0
+"""A chip that begins so near its temperature at the tare has a gas that is as near."""
 
 
 @dataclass(frozen=True)
 class TemperatureState:
-    """Of every tile: counts of the gas and of the chip, since when there are any, and the last.
+    """Of every tile: counts of its gas, its chip, the first ones and when, and when the last.
 
     NaN before the first reading.
     """
 
     gas_counts: Floats
     chip_counts: Floats
+    first_counts: Floats
     first_ns: Times
     t_ns: Times
 
@@ -40,7 +43,7 @@ class TemperatureState:
 def at_rest(tiles: int) -> TemperatureState:
     """Before the first reading."""
     unknown, never = np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64)
-    return TemperatureState(unknown, unknown, never, never)
+    return TemperatureState(unknown, unknown, unknown, never, never)
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,7 @@ class Temperature:
         after = TemperatureState(
             state.gas_counts.copy(),
             state.chip_counts.copy(),
+            state.first_counts.copy(),
             state.first_ns.copy(),
             state.t_ns.copy(),
         )
@@ -90,16 +94,23 @@ class Temperature:
             self.lag_s,
             after.gas_counts,
             after.chip_counts,
+            after.first_counts,
             after.first_ns,
             after.t_ns,
             gas,
             chip,
         )
+        # Where the chip began away from the tare's temperature, nobody knows how far the gas had
+        # followed: all of that is uncertain, and less so with every lag that passes.
+        since_s = np.maximum(t_ns - after.first_ns, 0) * 1e-9
+        away = after.first_counts - self.tare_counts
+        unknown = np.where(np.abs(away) > NEAR_COUNTS, away, 0.0) * np.exp(-since_s / self.lag_s)
         warmed_kpa = self.kpa_per_count * (gas - self.tare_counts)
         scale = 1.0 + warmed_kpa / self.baseline_kpa
-        sigma_kpa = np.hypot(
-            self.relative_sigma * warmed_kpa,
-            self.relative_lag_sigma * self.kpa_per_count * (chip - gas),
+        sigma_kpa = np.sqrt(
+            (self.relative_sigma * warmed_kpa) ** 2
+            + (self.relative_lag_sigma * self.kpa_per_count * (chip - gas)) ** 2
+            + (self.kpa_per_count * unknown) ** 2
         )
         # Counts that would be below absolute zero are none.
         return kpa / np.where(scale > 0.0, scale, np.nan), sigma_kpa, after
@@ -112,6 +123,7 @@ def _follow(
     lag_s: Floats,
     gas_counts: Floats,
     chip_counts: Floats,
+    first_counts: Floats,
     first_ns: Times,
     last_ns: Times,
     gas: Floats,
@@ -124,7 +136,7 @@ def _follow(
             counts = tadc[i, j]
             if math.isfinite(counts):
                 if math.isnan(now):  # as warm as its chip, as far as one can know
-                    now, first_ns[j] = counts, t_ns[i, j]
+                    now, first_counts[j], first_ns[j] = counts, counts, t_ns[i, j]
                 else:
                     dt = max(0.0, (t_ns[i, j] - last_ns[j]) * 1e-9)
                     known_s = (t_ns[i, j] - first_ns[j]) * 1e-9

@@ -322,3 +322,15 @@ def test_a_tile_that_hangs_is_refused_by_name(frames_of: FramesOf, flight_of: Fl
     forces_n[:, 1] = 0.0
     with pytest.raises(TareError, match=r"T02 gave 500 counts 126 times"):
         flight_of(frames_of(forces_n), present=present())
+
+
+def test_while_the_temperature_moves_there_is_no_tare_because_the_gas_is_behind(
+    frames_of: FramesOf, flight_of: FlightOf
+) -> None:
+    frames = frames_of(noise(1000))
+    fall = np.linspace(0.0, 10.0, 1000)[:, None].astype(np.uint16)
+    moving = replace(frames, tadc=frames.tadc + fall * np.array([0, 1], dtype=np.uint16))
+    with pytest.raises(TareError, match=r"temperature of tile T02 has moved by \d+ counts") as one:
+        flight_of(moving, present=present())
+    assert "Wait" in one.value.remedy
+    assert flight_of(frames, present=present()).frames > 0

@@ -111,3 +111,21 @@ def test_the_gas_is_never_outside_what_its_chip_has_been(
     counts, _ = followed(tadc, t_s, lag_s=lag_s, kpa_per_count=-0.05)
     assert (counts >= min(tadc) - 1e-9).all()
     assert (counts <= max(tadc) + 1e-9).all()
+
+
+def test_an_estimate_that_begins_away_from_the_tares_temperature_says_that_it_does_not_know() -> (
+    None
+):
+    # Twenty counts away: the gas may be anywhere between, 1.1 kPa, and is there after some lags.
+    t_s = np.arange(0.0, 20.0, 0.01)
+    _, sigma_kpa = followed(np.full(len(t_s), TARE + 20.0), t_s)
+    far_kpa = abs(KPA_PER_COUNT) * 20.0
+    assert sigma_kpa[0] > 0.99 * far_kpa
+    at_a_lag = int(LAG_S / 0.01)
+    assert sigma_kpa[at_a_lag] == pytest.approx(far_kpa * math.exp(-1), rel=0.01)
+    assert sigma_kpa[-1] < 0.03 * far_kpa
+
+
+def test_an_estimate_that_begins_at_the_tares_temperature_has_no_such_doubt() -> None:
+    _, sigma_kpa = followed([TARE + 1.0] * 9, 0.002 * np.arange(9))
+    assert (sigma_kpa < 0.01).all()

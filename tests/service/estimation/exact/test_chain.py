@@ -85,6 +85,9 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
         counts = [mpf(c) for c in tadc[i]]
         of_gas = eq.temperature(counts, t_ns[i], mpf(warm.lag_s.value))
         kpa_per_count = mpf(warm.kpa_per_k.value) / mpf(-5.35)
+        lag_ns = mpf(warm.lag_s.value) * 10**9
+        away = counts[0] - mpf(float(tare.tadc_counts[i]))
+        away = away if abs(away) > 2 else mpf(0)
         wall = mpf(walls[i].value)
         passed = wall * base[i] / (1 + wall * base[i])
         dry: list[Exact] = []
@@ -99,11 +102,17 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
                 + (mpf(warm.kpa_per_k.sigma) / mpf(warm.kpa_per_k.value) * warmed) ** 2
                 + (mpf(warm.lag_s.sigma) / mpf(warm.lag_s.value) * late) ** 2
                 + (doubt * head) ** 2
+                + (kpa_per_count * away * mp.exp(-mpf(t_ns[i][k] - t_ns[i][0]) / lag_ns)) ** 2
             )
         gauge[i] = [None if p is None else p - base[i] for p in dry]
         hot = effects[i].gas
-        settled = eq.gas(dry, t_ns[i], mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i])
         entry = plan.calibration.of(plan.info.tiles[i].serial)
+        # A reading beyond the range is a bound, which the gas is not told of.
+        bound = [p is not None and p - base[i] > mpf(entry.range_kpa[1]) for p in dry]
+        told = [None if b else p for p, b in zip(dry, bound, strict=True)]
+        settled = eq.gas(told, t_ns[i], mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i])
+        settled = [p if b else s for p, b, s in zip(dry, bound, settled, strict=True)]
+        memory_ns = 5 * mpf(hot.gamma.value) * mpf(hot.tau_s.value) * 10**9
         felt, single, beyond, own = [], [], [], []
         heat_n: list[Exact] = [None] * n
         for k in range(n):
@@ -117,7 +126,8 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
             force, slope, fit = _static(entry, p - base[i])
             felt.append(force)
             single.append(abs(slope) * noise[i])
-            beyond.append(p - base[i] > mpf(entry.range_kpa[1]))
+            lately = any(bound[m] and t_ns[i][k] - t_ns[i][m] < memory_ns for m in range(k))
+            beyond.append(p - base[i] > mpf(entry.range_kpa[1]) or lately)
             heat_n[k] = slope * mpf(hot.misfit) * (p - dry[k])
             own.append(slope**2 * variance[k] + fit)
         averaged = eq.denoise(
