@@ -35,6 +35,7 @@ Floats = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 
 HULL_SIGMAS = 3.0
+CONTACT_UNSEEN_NS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,11 @@ def _taken(
     frames, broken = frames.rows(0, n), broken[:n]
     now, lower = felt(plan, frames, kpa[:n], neighbours, broken, state.lower)
     loaded, since_ns, contact_run = seeming(
-        plan.contact, summed(now.felt_n), frames.t_mono_ns, broken, state.contact_run
+        plan.contact,
+        summed(now.felt_n),
+        frames.t_mono_ns,
+        _unseen(frames, state),
+        state.contact_run,
     )
     readings = None
     if plan.info.servo is not None:
@@ -290,6 +295,16 @@ def _cop_masked(plan: EstimationPlan, foot: Foot) -> npt.NDArray[np.bool_]:
             # Noise about the edge is let through, or the mean of what is left would lie inside.
             good &= beyond_m <= HULL_SIGMAS * sigma_m + 1e-9
     return ~good
+
+
+def _unseen(frames: FrameBatch, state: EstimationState) -> npt.NDArray[np.bool_]:
+    """Frames before which the foot was not seen for so long that it may have been anywhere.
+
+    A frame lost here and there is no reason to begin anew, or a link that loses every third would
+    never see a contact last.
+    """
+    last_t_ns = frames.t_mono_ns[0] if state.last_seq is None else state.last_t_ns
+    return np.asarray(np.diff(frames.t_mono_ns, prepend=last_t_ns) > CONTACT_UNSEEN_NS)
 
 
 def _after_gap(

@@ -882,3 +882,16 @@ def test_every_flag_has_a_bit_of_its_own(status: EstimateStatus) -> None:
         "over_rated": 256,
     }
     assert bits[status.name.lower()] == status
+
+
+def test_a_link_that_loses_every_third_frame_still_sees_the_contact(
+    info_of: InfoOf, plan_of: PlanOf, frames_of: FramesOf, estimate: Estimate
+) -> None:
+    frames = frames_of(held([9] * 4, rows=60))
+    kept = FrameBatch.concatenate([frames.rows(i, i + 2) for i in range(0, 60, 3)])
+    e = estimate(plan_of(info_of(SQUARE), lag_ms=10), kept)
+    assert (e.contact[1:] == 1).all()
+    assert (e.estimate_status & EstimateStatus.GAP).any(), "the gaps are flagged all the same"
+    # After a hundred milliseconds without a frame the foot may have been lifted and put down again.
+    long_ago = replace(frames, t_mono_ns=frames.t_mono_ns + 100_000_000 * (frames.seq >= 58))
+    assert estimate(plan_of(info_of(SQUARE)), long_ago).contact[57:59].tolist() == [1, 1]
