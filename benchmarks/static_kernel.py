@@ -154,7 +154,7 @@ class StaticKernel:
         np.copyto(divisor, grf)
         np.copyto(divisor, np.nan, where=grf == 0.0)
         for axis, (at, at_sigma) in enumerate(((x, sx), (y, sy), (z, sz))):
-            arm = self.plan.positions_m[:, axis, None]
+            arm = self.plan.bearing_m[:, axis, None]
             np.multiply(force, arm, out=u)
             np.add.reduce(u, axis=0, out=at)
             np.divide(at, divisor, out=at)

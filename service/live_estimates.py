@@ -13,6 +13,7 @@ from devices.errors import FootTileError, TareError
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
 from service.estimation.automatic import Look, first_in_flight, look_in_flight
 from service.estimation.calibration import Calibration
+from service.estimation.contact import UNSEEN_NS
 from service.estimation.flight import LOOK_BACK_NS, tare_in_flight
 from service.estimation.models.static import StaticCurves
 from service.estimation.plan import make_plan
@@ -21,7 +22,6 @@ from service.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStre
 
 LIVE_LAG_MS = 10.0
 _TADC_OVER_NS = 1_000_000_000
-_UNSEEN_NS = 50_000_000
 
 Floats = npt.NDArray[np.float64]
 
@@ -206,7 +206,7 @@ class LiveEstimates:
     def _note_contact(self, frames: FrameBatch, columns: Columns) -> None:
         before_t_ns = self._due_t_ns if self._due_t_ns is not None else int(frames.t_ns[0])
         # In a gap too short for a step, a slot missed here and there, nothing can have happened.
-        gap = np.diff(frames.t_ns, prepend=before_t_ns) > _UNSEEN_NS
+        gap = np.diff(frames.t_ns, prepend=before_t_ns) > UNSEEN_NS
         taken = np.flatnonzero((columns["contact"] != 0) | gap)  # or not known
         self._due_t_ns = int(frames.t_ns[-1])
         if len(taken):

@@ -23,7 +23,7 @@ def compiled(function: F) -> F:
     dispatcher: Any = numba.njit(nogil=True, error_model="numpy")(function)
     with contextlib.suppress(RuntimeError):  # nowhere to keep it: no home, read-only installation
         # As numba.njit(cache=True) does, which stops at a cache that it cannot read or write.
-        dispatcher._cache = _Kept(function)  # type: ignore[no-untyped-call]  # noqa: SLF001
+        dispatcher._cache = _Kept(function)  # type: ignore[no-untyped-call]  # noqa: SLF001  # numba's own seam
     return cast("F", dispatcher)
 
 
@@ -32,11 +32,11 @@ class _Kept(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError):
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]  # numba has no types
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
-            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # likewise
         except (OSError, EOFError, pickle.UnpicklingError):
             with contextlib.suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]  # it is written anew

@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 UNKNOWN = 255
+UNSEEN_NS = 50_000_000
+"""A foot that was not seen for so long may have been lifted and put down again; for less, not."""
 
 Floats = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from devices.mpl115a2 import TADC_PER_KELVIN
 from service.estimation.tare import Tare
 
 Floats = npt.NDArray[np.float64]
 
-TADC_COUNTS_PER_K = -5.35
-"""The chip's thermometer (MPL115A2 data sheet)."""
 SEALED_AT_K = 298.0
 """A sealed bubble's pressure is proportional to its absolute temperature; about 25 degC."""
 WARMED_COUNTS = 4.0
@@ -27,7 +26,7 @@ TREND_SPAN_MIN_NS = 600_000_000_000
 
 def warmer_k(tare: Tare, tadc_counts: Floats) -> Floats:
     """How much warmer each chip is than at the tare; NaN where that is not known."""
-    return np.asarray((tadc_counts - tare.tadc_counts) / TADC_COUNTS_PER_K)
+    return np.asarray((tadc_counts - tare.tadc_counts) / TADC_PER_KELVIN)
 
 
 def expected_shift_kpa(tare: Tare, warmer: Floats) -> Floats:
@@ -83,5 +82,5 @@ def trend(tares: Sequence[Tare], *, tiles: int) -> Trend:
     return Trend(
         kpa_per_hour=(lever[:, None] * by_tare["baseline_kpa"]).sum(axis=0),
         sigma_kpa_per_hour=np.sqrt(((lever[:, None] * by_tare["baseline_sigma_kpa"]) ** 2).sum(0)),
-        kelvin_per_hour=(lever[:, None] * by_tare["tadc_counts"]).sum(axis=0) / TADC_COUNTS_PER_K,
+        kelvin_per_hour=(lever[:, None] * by_tare["tadc_counts"]).sum(axis=0) / TADC_PER_KELVIN,
     )

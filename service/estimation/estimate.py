@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from devices.frames import FrameBatch
 from devices.temperature import HeldTemperature, hold_temperature
-from service.estimation.contact import UNKNOWN, UNLOADED, RunState, believed, seeming
+from service.estimation.contact import UNKNOWN, UNLOADED, UNSEEN_NS, RunState, believed, seeming
 from service.estimation.estimates import COP_COLUMNS, Estimates, EstimateStatus
 from service.estimation.geometry import angle_rad, to_ground_x_m
 from service.estimation.kinematics import Readings, counts_at, readings_of
@@ -35,7 +35,6 @@ Floats = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 
 HULL_SIGMAS = 3.0
-CONTACT_UNSEEN_NS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -304,7 +303,7 @@ def _unseen(frames: FrameBatch, state: EstimationState) -> npt.NDArray[np.bool_]
     never see a contact last.
     """
     last_t_ns = frames.t_mono_ns[0] if state.last_seq is None else state.last_t_ns
-    return np.asarray(np.diff(frames.t_mono_ns, prepend=last_t_ns) > CONTACT_UNSEEN_NS)
+    return np.asarray(np.diff(frames.t_mono_ns, prepend=last_t_ns) > UNSEEN_NS)
 
 
 def _after_gap(

@@ -100,7 +100,6 @@ def make_ladder(
             remedy="Leave it out, or plug in a bare chip and mark it `reference = true`",
         )
     _refuse_mixed(tiles, models, calibration)
-    ones = np.ones(len(tiles))
     gas = [tile.effects.gas for tile in tiles]
     rubber = [tile.effects.rubber for tile in tiles]
     return Ladder(
@@ -115,7 +114,7 @@ def make_ladder(
         )
         if "gas" in models
         else None,
-        gas_misfit=np.array([0.0 if g is None else max(g.misfit, MISFIT_MIN) for g in gas]) * ones,
+        gas_misfit=np.array([0.0 if g is None else max(g.misfit, MISFIT_MIN) for g in gas]),
         curves=StaticCurves(tiles, lasting="rubber" in models),
         skew="skew" in models,
         denoise="denoise" in models,
@@ -136,8 +135,7 @@ def make_ladder(
         )
         if "rubber" in models
         else None,
-        rubber_misfit=np.array([0.0 if r is None else max(r.misfit, MISFIT_MIN) for r in rubber])
-        * ones,
+        rubber_misfit=np.array([0.0 if r is None else max(r.misfit, MISFIT_MIN) for r in rubber]),
     )
 
 

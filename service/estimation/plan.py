@@ -56,8 +56,6 @@ class EstimationPlan:
     noise_kpa: Floats
     still_kpa: Floats
     """Standard deviation of a single unloaded reading about the true baseline."""
-    positions_m: Floats
-    """(all tiles, 3)."""
     bearing_m: Floats
     """(bearing tiles, 3)."""
     hull: tuple[Floats, Floats]
@@ -136,7 +134,6 @@ def make_plan(
         baseline_sigma_kpa=tare.baseline_sigma_kpa[bearing],
         noise_kpa=tare.noise_kpa[bearing],
         still_kpa=still_kpa,
-        positions_m=positions_m,
         bearing_m=positions_m[bearing],
         hull=hull(positions_m[bearing, :2]),
         grid=grid_indices(positions_m[bearing, :2]),

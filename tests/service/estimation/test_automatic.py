@@ -16,6 +16,7 @@ import pytest
 
 from devices.compensation import Compensation
 from devices.frames import ArrayInfo, FrameBatch
+from devices.mpl115a2 import TADC_PER_KELVIN
 from service.estimation.automatic import (
     APART_NS,
     CONFIRM_NS,
@@ -27,7 +28,6 @@ from service.estimation.automatic import (
     look_in_flight,
 )
 from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
-from service.estimation.drift import TADC_COUNTS_PER_K
 from service.estimation.flight import WINDOW_NS
 from service.estimation.tare import Tare
 
@@ -61,7 +61,7 @@ class Bench:
         n = round(seconds * SECOND_NS / PERIOD_NS)
         rng = np.random.default_rng(round(at_s))
         t_mono_ns = round(at_s * SECOND_NS) + PERIOD_NS * np.arange(1 - n, 1)
-        tadc = np.rint(480 + TADC_COUNTS_PER_K * warmer_k + rng.normal(0.0, 0.3, (n, TILES)))
+        tadc = np.rint(480 + TADC_PER_KELVIN * warmer_k + rng.normal(0.0, 0.3, (n, TILES)))
         forces_n = rng.normal(0.0, 0.9, (n, TILES)) + np.asarray(counts)
         return self._frames_of(forces_n, t_mono_ns=t_mono_ns, tadc=tadc)
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from devices.mpl115a2 import TADC_PER_KELVIN
 from service.estimation.drift import (
-    TADC_COUNTS_PER_K,
     TREND_OVER_NS,
     TREND_SPAN_MIN_NS,
     WARMED_COUNTS,
@@ -66,7 +66,7 @@ def test_a_trend_is_the_straight_line_through_the_baselines() -> None:
     tares = [tare(h, kpa=(100 + 0.3 * h, 96.0), tadc=(480 - 2 * h, 500.0)) for h in (0, 0.5, 2, 3)]
     found = trend(tares, tiles=2)
     assert found.kpa_per_hour == pytest.approx([0.3, 0.0], abs=1e-9)
-    assert found.kelvin_per_hour == pytest.approx([-2.0 / TADC_COUNTS_PER_K, 0.0], abs=1e-9)
+    assert found.kelvin_per_hour == pytest.approx([-2.0 / TADC_PER_KELVIN, 0.0], abs=1e-9)
     # least squares: sigma / sqrt(sum of squared distances from the mean of 1.375 h)
     hours = np.array([0.0, 0.5, 2.0, 3.0]) - 1.375
     assert found.sigma_kpa_per_hour == pytest.approx([0.01 / np.sqrt((hours**2).sum())] * 2)

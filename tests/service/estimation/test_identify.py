@@ -18,7 +18,7 @@ from devices.emulation.parts import DomePart, draw_dome
 from devices.emulation.surroundings import Surroundings
 from devices.scene import EmulationScene
 from service.estimation.bench_model import pressed
-from service.estimation.effects import WALL_PER_KPA, Effects
+from service.estimation.effects import WALL_PER_KPA, EffectName, Effects
 from service.estimation.effects_fit import fit_effects
 from service.estimation.fit import fit_tile
 from service.estimation.indentation import Indentation
@@ -241,12 +241,14 @@ def test_of_an_emulated_dome_all_effects_are_found_about_as_great_as_they_are() 
 
 
 @pytest.mark.parametrize("missing", ["gas", "rubber", "hysteresis"])
-def test_an_effect_that_an_emulated_dome_does_not_have_is_refused_in_words(missing: str) -> None:
+def test_an_effect_that_an_emulated_dome_does_not_have_is_refused_in_words(
+    missing: EffectName,
+) -> None:
     on = {name: name != missing for name in ("gas", "rubber", "hysteresis")}
     press = pressed_by_dome("T02", **on)
     effects = found_in(recorded(press, scatter=0.0, strokes=2, holds=2, taps=6))
     assert getattr(effects, missing) is None
-    assert effects.refused[missing].endswith("not determined")  # type: ignore[index]
+    assert effects.refused[missing].endswith("not determined")
     for name in on:
         assert (getattr(effects, name) is None) == (name == missing), name
 
