@@ -192,15 +192,18 @@ class HoppingLeg:
         """
         begin = self.motion
         self._damping = _PUSHING_DAMPING
+        stuck_m = height_m - self.centre_m(begin)
 
         def missing_m(stroke_m: float) -> float:
             self.motion = begin.copy()
             self._push(ground, angle, stroke_m, None)
+            if self._touches:  # it stands stretched in the ground, which has not let go
+                return stuck_m
             v = max(self.rising_m_s(self.motion), 0.0)
             return height_m - self.centre_m(self.motion) - v * v / (2 * GRAVITY_M_S2)
 
         low_m, high_m = 0.0, _STROKE_MAX_M
-        low, high = height_m - self.centre_m(begin), missing_m(high_m)
+        low, high = stuck_m, missing_m(high_m)
         if high > 0.0:
             raise SceneError(
                 f"the leg does not get out of this ground: with a stroke of {high_m:g} m it lacks "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -120,6 +122,16 @@ def test_a_leg_that_is_held_too_fast_says_so() -> None:
     hopping = dropped(glue, stand_s=0.5)
     with pytest.raises(SceneError, match="does not get out of this ground"):
         hopping.push_off(glue, upright, hopping.release_m)
+
+
+@pytest.mark.parametrize("suction_kpa", [8.0, 10.0, 20.0])
+def test_a_leg_that_stands_stretched_in_the_mud_has_not_hopped(suction_kpa: float) -> None:
+    # As high as a stretched leg reaches without leaving: that is not a hop.
+    glue = SoftGround.of(MudGround(kind="mud", suction_kpa=suction_kpa))
+    hopping = dropped(glue, stand_s=0.5)
+    with contextlib.suppress(SceneError):  # that it does not get out is an honest answer, too
+        hopping.push_off(glue, upright, hopping.centre_m(hopping.motion) + 0.06)
+        assert ground_n(hopping)[-1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_leg_that_is_too_soft_folds_up_and_says_so() -> None:
