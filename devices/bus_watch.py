@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from devices.bus_recovery import BusRecovery
 from devices.clock import Clock
-from devices.errors import BusFaultError, I2cError
+from devices.errors import BusFaultError, BusSetupError
 from devices.scan import Scan
 from devices.tca9548a import MuxRouter
 
@@ -37,10 +37,12 @@ def help_bus(recovery: BusRecovery, moves: Callable[[], bool]) -> Help:
     problems = []
     for help_ in (recovery.clock_out, recovery.reset_muxes):
         try:
-            if help_() and moves():
-                return Help(worked=True)
-        except I2cError as error:
+            helped = help_()
+        except BusSetupError as error:
             problems.append(str(error))
+            continue
+        if helped and moves():
+            return Help(worked=True)
     return Help(worked=False, problem="; ".join(problems))
 
 

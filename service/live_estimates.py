@@ -39,6 +39,7 @@ class LiveEstimates:
         self.calibration_problem: str | None = None
         self._info = info
         self._compensation = Compensation(info.tiles)
+        self._bears = np.array([not tile.reference for tile in info.tiles])
         self._calibration: Calibration | None = None
         self.range_kpa: Floats | None = None
         """End of each tile's calibrated range, NaN for bare ones; None without a calibration."""
@@ -62,7 +63,7 @@ class LiveEstimates:
         self.use(tare)
 
     def _know_ranges(self, calibration: Calibration) -> None:
-        bearing = np.flatnonzero([not tile.reference for tile in self._info.tiles])
+        bearing = np.flatnonzero(self._bears)
         curves = StaticCurves([calibration.of(self._info.serials[i]) for i in bearing])
 
         def by_tile(values: Floats) -> Floats:
@@ -176,6 +177,7 @@ class LiveEstimates:
             present=tare,
             anchor=anchor,
             free_since_t_ns=self.free_since_t_ns,
+            bears=self._bears,
         )
 
     def tare_from_flight(self) -> Tare:
@@ -193,6 +195,7 @@ class LiveEstimates:
             calibration,
             self._info.serials,
             present=self.tare,
+            bears=self._bears,
         )
 
     def _needed(self) -> Calibration:

@@ -135,7 +135,7 @@ class TareKeeper:
             return
         if not self._lead_is_over and journal is not None:
             self._look_at_lead(journal, node_first_seq)
-        if self.auto_tare == "on" and self._is_time():
+        if self._is_time() and self.auto_tare == "on":
             self._look_in_flight()
 
     def _look_at_lead(self, journal: Journal, node_first_seq: int) -> None:

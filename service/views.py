@@ -12,8 +12,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from devices.frames import ServoInfo
 from service.estimation.calibration import Calibration
 from service.estimation.drift import expected_shift_kpa, trend, warmer_k
+from service.estimation.tare import Source
 from service.nodes import Node
 from service.recorder import Recorder
+from service.tare_keeper import AutoTare
 from service.tares import RecordedTare
 from storage.session import Part, Session
 
@@ -64,7 +66,7 @@ class TareView(View):
 
     id: str
     t_ns: int = Field(description="End of the interval it was taken from, node's UTC.")
-    source: Literal["interval", "lead", "recognised", "unloaded", "flight"] = Field(
+    source: Source = Field(
         description="unloaded: by hand; flight: automatic; lead: of an emulation."
     )
     reason: str = Field(description="Why, in words.")
@@ -121,6 +123,8 @@ class DriftView(View):
         slope = live.slope_n_per_kpa if live.slope_n_per_kpa is not None else none
         warmer_by_k = none if live.tare is None else warmer_k(live.tare, live.recent_tadc())
         since_kpa = none if live.tare is None else expected_shift_kpa(live.tare, warmer_by_k)
+        # A bare tile has no sealed gas.
+        since_kpa = np.where([tile.reference for tile in node.info.tiles], np.nan, since_kpa)
         return cls(
             kpa_per_hour=_known(line.kpa_per_hour),
             sigma_kpa_per_hour=_known(line.sigma_kpa_per_hour),
@@ -168,7 +172,7 @@ class NodeView(View):
         description="Why the tare in force may no longer fit, in words: old, another temperature, "
         "a baseline that does not fit the foot in the air."
     )
-    auto_tare: Literal["on", "paused", "off"] = Field(
+    auto_tare: AutoTare = Field(
         description="Whether the baseline follows by itself in flight. paused: an automatic tare "
         "was undone, and nobody has tared since; off: the scene says `auto_tare = false`."
     )

@@ -131,6 +131,8 @@ def _budget(figures: SceneFigures) -> list[str]:
             ]
         rows.append(row)
     if not rows:
+        if len(figures.rungs) == 1 and len(figures.rungs[0].models) > 1:
+            return ["Not measured: only the whole ladder was estimated."]
         return ["No model of this ladder can be left out."]
     head = [f"{q}, {mode}" for mode in LAGS_MS for q in ("GRF mean abs N", "COP p95 mm")]
     text = (
@@ -183,6 +185,6 @@ def draws_text(n: int) -> str:
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """A table in Markdown: text to the left, figures to the right."""
-    words = {"rung", "mode", "without", "of the whole ladder", "met"}
+    words = {"rung", "mode", "ladder", "of the whole ladder", "met"}
     rule = ["---" if title in words else "--:" for title in head]
     return [f"| {' | '.join(cells)} |" for cells in (head, rule, *rows)]

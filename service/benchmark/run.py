@@ -189,7 +189,7 @@ def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
             for future in as_completed(futures):
                 try:
                     yield future.result()
-                except Exception as error:  # a process that was killed takes its draw with it
+                except Exception as error:  # one that was killed breaks the pool: all draws left
                     draw = futures[future].draw
                     yield Drawn(draw, 0, {}, (Failure(f"draw {draw}", reason(error)),))
         except BaseException:

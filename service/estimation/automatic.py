@@ -70,6 +70,7 @@ def look_in_flight(
     present: Tare,
     anchor: Tare | None,
     free_since_t_ns: int,
+    bears: npt.NDArray[np.bool_] | None = None,
 ) -> Look:
     """Whether the baseline should follow what a foot in the air reads.
 
@@ -81,20 +82,25 @@ def look_in_flight(
         present: the tare in force.
         anchor: the last one that was not automatic; None if there is none any more.
         free_since_t_ns: since when there has been no contact, nor any doubt about it.
+        bears: (tiles,), False for bare tiles, which follow the weather and no load; None: all do.
     """
+    if bears is None:
+        bears = np.ones(len(serials), dtype=bool)
     if not len(frames) or frames.t_ns[-1] - free_since_t_ns < SETTLE_NS + WINDOW_NS:
         return NOTHING
     try:
-        tare = tare_in_flight(frames, compensation, calibration, serials, present=present)
+        tare = tare_in_flight(
+            frames, compensation, calibration, serials, present=present, bears=bears
+        )
     except TareError:  # it moves, a tile is silent, or it bears a load: no flight
         return NOTHING
     begin_t_ns = int(frames.t_ns[0]) + round(tare.begin_s * 1e9)
     if begin_t_ns < free_since_t_ns + SETTLE_NS or tare.t_ns - present.t_ns < APART_NS:
         return NOTHING
-    shift_kpa = tare.baseline_kpa - present.baseline_kpa
-    doubt = _too_far(tare, present, NEAR_KPA, serials, "the last tare")
+    shift_kpa = np.where(bears, tare.baseline_kpa - present.baseline_kpa, 0.0)
+    doubt = _too_far(tare, present, NEAR_KPA, serials, bears, "the last tare")
     if doubt is None and anchor is not None:
-        doubt = _too_far(tare, anchor, FAR_KPA, serials, "the last tare by hand")
+        doubt = _too_far(tare, anchor, FAR_KPA, serials, bears, "the last tare by hand")
     if doubt is not None:
         return Look(doubt=doubt)
     since_s = (tare.t_ns - present.t_ns) * 1e-9
@@ -144,13 +150,19 @@ def first_in_flight(
 
 
 def _too_far(
-    tare: Tare, other: Tare, bound_kpa: float, serials: tuple[str, ...], which: str
+    tare: Tare,
+    other: Tare,
+    bound_kpa: float,
+    serials: tuple[str, ...],
+    bears: npt.NDArray[np.bool_],
+    which: str,
 ) -> str | None:
     """Why a baseline has moved too far from another one to be believed."""
     warmer = np.nan_to_num(warmer_k(other, tare.tadc_counts), nan=0.0)
     explained_kpa = expected_shift_kpa(other, warmer)
     shift_kpa = tare.baseline_kpa - other.baseline_kpa
     excess_kpa = np.abs(shift_kpa - explained_kpa) - EXPLAINED_PART * np.abs(explained_kpa)
+    excess_kpa = np.where(bears, excess_kpa, -np.inf)
     worst = int(np.argmax(excess_kpa))
     if excess_kpa[worst] <= bound_kpa:
         return None

@@ -112,12 +112,13 @@ def refuse_saturated_reference(recordings: Sequence[Indentation], blocks: Stroke
         zero = unloaded(recording)
         silent = recording.under_spindle & np.isin(recording.phase, ("load", "unload"))
         silent &= np.isnan(recording.reference_n) & np.isfinite(recording.kpa)
-        if silent.sum() < _RAIL_READINGS:
+        if silent.sum() < _RAIL_READINGS or not stroke_rows(recording):
             continue
         above_kpa = float(np.median(recording.kpa[silent])) - zero.baseline_kpa
-        if above_kpa > strokes(recording).gauge_kpa.max():
+        own = strokes(recording)
+        if above_kpa > own.gauge_kpa.max():
             raise CalibrationError(
-                f"the reference has no reading above {strokes(recording).force_n.max():.2f} N, "
+                f"the reference has no reading above {own.force_n.max():.2f} N, "
                 f"while the tile was pressed on to {above_kpa:.2f} kPa: it is saturated",
                 where=place(recording),
                 remedy=remedy,

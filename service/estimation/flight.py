@@ -41,6 +41,7 @@ def tare_in_flight(
     serials: tuple[str, ...],
     *,
     present: Tare | None,
+    bears: npt.NDArray[np.bool_] | None = None,
 ) -> Tare:
     """The tare from the newest unloaded window of `frames`.
 
@@ -54,6 +55,7 @@ def tare_in_flight(
         calibration: of its tiles, whose bench baselines tell an unloaded tile.
         serials: of the tiles, in order.
         present: the tare now in force.
+        bears: (tiles,), False for bare tiles, which follow the weather; None: all bear load.
 
     Raises:
         TareError: the foot was loaded or moved all the time, or a tile gave no readings.
@@ -112,7 +114,7 @@ def tare_in_flight(
     rows[slice(*low[0])] = True
     tare = tare_from_rows(frames, compensation, serials, rows, "unloaded")
     if present is not None:
-        _refuse_above(tare, present, serials)
+        _refuse_above(tare, present, serials, bears)
     _refuse_warming(frames, tare, serials)
     if np.isfinite(bench_kpa).any():
         refuse_loaded(tare, calibration, serials)
@@ -147,8 +149,15 @@ def _refuse_warming(frames: FrameBatch, tare: Tare, serials: tuple[str, ...]) ->
         )
 
 
-def _refuse_above(tare: Tare, present: Tare, serials: tuple[str, ...]) -> None:
+def _refuse_above(
+    tare: Tare,
+    present: Tare,
+    serials: tuple[str, ...],
+    bears: npt.NDArray[np.bool_] | None,
+) -> None:
     rise_kpa = tare.baseline_kpa - present.baseline_kpa
+    if bears is not None:
+        rise_kpa = np.where(bears, rise_kpa, -np.inf)
     worst = int(np.argmax(rise_kpa))
     if rise_kpa[worst] > NEAR_BASELINE_KPA:
         raise TareError(

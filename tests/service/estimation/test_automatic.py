@@ -72,6 +72,7 @@ class Bench:
         anchor: Tare | None = None,
         *,
         free_s: float = 1e9,
+        bears: tuple[bool, ...] = (True,) * TILES,
     ) -> Look:
         """A look at frames of a foot that has had no contact for `free_s`."""
         return look_in_flight(
@@ -82,6 +83,7 @@ class Bench:
             present=present,
             anchor=present if anchor is None else anchor,
             free_since_t_ns=int(frames.t_ns[-1]) - round(free_s * SECOND_NS),
+            bears=np.array(bears),
         )
 
     def first(self, frames: FrameBatch) -> Look:
@@ -294,3 +296,18 @@ def test_an_outlier_is_no_step(bench: Bench) -> None:
     counts = np.zeros((500, 1))
     counts[::100] = 60.0
     assert bench.first(bench.frames(20.0, counts)) == Look()
+
+
+@pytest.mark.parametrize("weather_counts", [0.0, 10.0, -4.0])
+def test_a_bare_tile_follows_the_weather_and_keeps_nobody_from_taring(
+    bench: Bench, weather_counts: float
+) -> None:
+    frames = bench.frames(600.0, [2.0 * COUNTS_PER_K, weather_counts], warmer_k=2.0)
+    found = bench.look(frames, by_hand(), bears=(True, False))
+    assert found.doubt is None
+    assert found.tare is not None
+    assert found.tare.baseline_kpa[1] == pytest.approx(
+        UNLOADED_KPA + weather_counts * COUNT_KPA, abs=0.05
+    )
+    assert "T01" in found.reason
+    assert bench.look(frames, by_hand()).doubt is not None, "a dome would be in doubt"
