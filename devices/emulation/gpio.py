@@ -48,17 +48,15 @@ class EmulatedScl(EmulatedWire):
 
 
 class EmulatedReset:
-    """RESET of all multiplexers; also frees a bus that a slave behind one of them holds."""
+    """RESET of all multiplexers. A slave that holds SDA needs clocks: it is not freed for good."""
 
-    def __init__(self, adapter: EmulatedI2cAdapter, clock: Clock) -> None:
+    def __init__(self, adapter: EmulatedI2cAdapter) -> None:
         self._adapter = adapter
-        self._clock = clock
 
     def drive(self, *, low: bool) -> None:
         """Low deselects all channels."""
         if low:
             self._adapter.reset_muxes()
-            self._adapter.line.sda_low.clear(self._clock.now_ns())
 
     def high(self) -> bool:
         """Nobody else pulls it."""
@@ -81,4 +79,4 @@ class EmulatedLines:
     @contextmanager
     def reset(self) -> Iterator[EmulatedReset]:
         """RESET while the block runs."""
-        yield EmulatedReset(self._adapter, self._clock)
+        yield EmulatedReset(self._adapter)
