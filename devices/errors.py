@@ -19,6 +19,7 @@
      |    +-- ServoPacketError  (ValueError)   bytes that are no valid packet
      |    +-- ServoStatusError                 the servo answered with an error number
      +-- FileFormatError       (ValueError)    a file is not what it should be
+     |    +-- DamagedFramesError               frames on disk are not those that were written
      +-- StorageError          (OSError)       a file cannot be written: disk full, read-only
      +-- CalibrationError      (ValueError)    a calibration is absent, unphysical or does not fit
      +-- TareError             (ValueError)    no interval to tare on
@@ -167,8 +168,46 @@ class FileFormatError(FootTileError, ValueError):
     """A file is absent, unreadable, or not of the kind the command needs."""
 
 
+class DamagedFramesError(FileFormatError):
+    """Frames `seq_first` to `seq_last` on disk do not agree with their checksum."""
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        expected: str = "",
+        remedy: str = "",
+        seq_first: int = 0,
+        seq_last: int = 0,
+    ) -> None:
+        super().__init__(what, where=where, expected=expected, remedy=remedy)
+        self.seq_first = seq_first
+        self.seq_last = seq_last
+
+    def facts(self) -> dict[str, object]:
+        """The facts of this error by name, the numbers among them."""
+        return super().facts() | {"seq_first": self.seq_first, "seq_last": self.seq_last}
+
+
 class StorageError(FootTileError, OSError):
-    """A file cannot be written: the disk is full, read-only, or gone."""
+    """A file cannot be written: the disk is full, read-only, or gone; `errno` is the system's."""
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        expected: str = "",
+        remedy: str = "",
+        errno: int | None = None,
+    ) -> None:
+        super().__init__(what, where=where, expected=expected, remedy=remedy)
+        self.errno = errno
+
+    def facts(self) -> dict[str, object]:
+        """The facts of this error by name, errno among them."""
+        return super().facts() | {"errno": self.errno}
 
 
 class CalibrationError(FootTileError, ValueError):

@@ -62,4 +62,5 @@ def storage_errors(path: Path, remedy: str = "") -> Iterator[None]:
             f"cannot be written: {error}",
             where=str(path),
             remedy=remedy or "Free space on the disk, or write elsewhere",
+            errno=error.errno,
         ) from error

@@ -1,34 +1,41 @@
-"""What a server holds of one stream: Arrow IPC stream segments on disk, and an index in memory.
+"""The frames of one stream on disk: Arrow IPC stream segments, each with an index beside it.
 
 `<folder>/<first_seq>.arrows` begins with the schema message; each batch is appended as the bytes in
-which it came. A file cut off anywhere keeps every whole message before the cut, so what was synced
-survives a killed process; opening a journal reads the segments again and cuts such a tail away.
-Nothing is held twice: a number that is there already is left as it is.
+which it came. Appending does not wait for the disk; `sync` does, and only what was synced may be
+promised to anybody. Opening a journal takes in the segments that are there and cuts off what is not
+whole. Nothing is held twice: a number that is there already is left as it is.
+
+Frames may come out of order, newest first and what was missed behind them: two segments are open,
+and each takes only what follows its last frame, so that within a file time never runs back.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import groupby
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import pyarrow as pa
 
-from devices.errors import FileFormatError, StorageError
+from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import storage_errors, sync_folder
 from storage.intervals import Intervals
+from storage.losses import CORRUPT, Losses
 from storage.schema import array_info, wire_schema
-from storage.segment import SUFFIX, Entry, Segment, recover, write_all
-from storage.wire import decode, encode
+from storage.segment import SUFFIX, Segment, SegmentWriter, numbers, payload_of, recover
+from storage.stream_notes import StreamNotes
+from storage.wire import FRAMES_MAX, decode, encode
 
 SEGMENT_NS = 60_000_000_000
 """A segment is closed after a minute of frames: what is not needed is deleted by segments."""
+_OPEN_MAX = 2
+_WINDOW_FRAMES = 1 << 16
+"""So many frames' index is in memory when a journal of any length is read."""
 
 
 class Journal:
@@ -44,34 +51,51 @@ class Journal:
         self.info = info
         self.held = Intervals()
         """Numbers that were appended, synced or not."""
+        self.lost = Losses()
+        """Numbers that were held, or should have been, and why they are not."""
         self._schema = wire_schema(info)
+        self._header = self._schema.serialize().to_pybytes()
         self._segments: list[Segment] = []
-        self._file: BinaryIO | None = None
-        self._end = 0
-        self._tidy = True
-        self._sync_failed: StorageError | None = None
+        self._open: list[SegmentWriter] = []
+        self._closing: list[SegmentWriter] = []
+        self._has_new_names = False
+        self._lock = threading.Lock()
+        """Guards the lists of writers: `sync` may run in another thread."""
         with storage_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+            if not folder.is_dir():
+                folder.mkdir(parents=True)
+                sync_folder(folder.parent)
             for path in sorted(folder.glob("*" + SUFFIX)):
-                segment = recover(path, self._schema)
+                segment, damaged = recover(path, self._schema)
+                self.lost.add(damaged, CORRUPT)
                 if segment is not None:
-                    self._index(segment)
+                    self._take_in(segment)
+        self.lost.found(self.held)
 
     @classmethod
     def open(cls, folder: Path) -> Journal:
-        """A journal that is there already; its description is in its segments.
+        """A journal that is there already; its description is in its notes or its segments.
 
         Raises:
             FileFormatError: no readable segment in it.
             StorageError: it cannot be read.
         """
         with storage_errors(folder):
+            with suppress(FileFormatError):
+                notes = StreamNotes.load(folder)
+                if notes is not None:
+                    return cls(folder, notes.array_info)
             for path in sorted(folder.glob("*" + SUFFIX)):
                 with suppress(pa.ArrowException, EOFError, FileFormatError):
                     with pa.OSFile(str(path), "r") as file:
                         schema = pa.ipc.open_stream(file).schema
                     return cls(folder, array_info(schema, where=str(path)))
         raise FileFormatError("no readable journal segment", where=str(folder))
+
+    @property
+    def size_bytes(self) -> int:
+        """What it takes on the disk, nearly."""
+        return sum(segment.size_bytes for segment in self._segments)
 
     def append(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
         """Hold the frames of `batch` that are not held yet; give back which ones these are.
@@ -96,82 +120,87 @@ class Journal:
         """Return when everything appended before is on the disk; may run in another thread.
 
         Raises:
-            StorageError: the disk refused, now or when a segment was closed since the last sync.
+            StorageError: the disk refused.
         """
-        failed, self._sync_failed = self._sync_failed, None
-        if failed is not None:
-            raise failed
-        file = self._file
-        if file is None:
-            return
+        with self._lock:
+            closing, self._closing = self._closing, []
+            writers = [writer for writer in self._open if writer.has_news]
+            has_new_names, self._has_new_names = self._has_new_names, False
+        failed: OSError | None = None
+        for writer in closing:
+            try:
+                writer.close()
+            except OSError as error:
+                failed = error
         with storage_errors(self.folder):
-            try:
-                descriptor = os.dup(file.fileno())
-            except ValueError:  # closed meanwhile, and synced before that
-                return
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            for writer in writers:
+                # A segment that is closed meanwhile was synced by whoever closed it.
+                with suppress(ValueError):
+                    writer.sync()
+            if has_new_names:
+                sync_folder(self.folder)
+            if failed is not None:
+                raise failed
 
-    def disown(self, numbers: Intervals) -> None:
-        """Hold batches within `numbers` no longer: they could not be synced, and may be lost."""
+    def disown(self, doubtful: Intervals) -> None:
+        """Hold batches within `doubtful` no longer: they could not be synced, or are damaged."""
         for segment in self._segments:
-            segment.entries = [
-                entry
-                for entry in segment.entries
-                if numbers.missing(entry.seq_first, entry.seq_last)
-            ]
-        left = (entry for segment in self._segments for entry in segment.entries)
-        self.held = Intervals((entry.seq_first, entry.seq_last) for entry in left)
-        self._tidy = False  # go on in a new segment
+            for record in segment.records():
+                if not Intervals([numbers(record)]).without(doubtful):
+                    segment.held = segment.held.without(Intervals([numbers(record)]))
+        self._segments = [segment for segment in self._segments if segment.held]
+        self._count_anew()
+        with self._lock:
+            self._closing += self._open
+            self._open = []
 
     def read(self, seq_first: int, seq_last: int) -> Iterator[FrameBatch]:
         """Frames from `seq_first` to `seq_last` that are held, in order, a batch at a time.
 
         Raises:
-            FileFormatError: a batch on disk is damaged.
+            DamagedFramesError: a batch on disk is damaged; which one, it says.
             StorageError: a segment cannot be read.
         """
-        index = sorted(
-            (entry.seq_first, segment.path, entry)
-            for segment in list(self._segments)
-            for entry in list(segment.entries)
-            if entry.seq_first <= seq_last and entry.seq_last >= seq_first
-        )
-        for path, found in groupby(index, key=lambda item: item[1]):
-            with storage_errors(path), path.open("rb") as file:
-                for _, _, entry in found:
-                    payload = os.pread(file.fileno(), entry.length, entry.offset)
-                    try:
-                        batch = decode(payload, self._schema)
-                    except FileFormatError as error:
-                        raise FileFormatError(
-                            f"the batch at byte {entry.offset} is damaged: {error.what}",
-                            where=str(path),
-                        ) from error
-                    if int(batch.seq[0]) != entry.seq_first or len(batch) != entry.frames:
-                        raise FileFormatError(
-                            f"the batch at byte {entry.offset} is not the one that was written",
-                            where=str(path),
-                        )
-                    yield batch.rows(
-                        max(0, seq_first - entry.seq_first),
-                        min(len(batch), seq_last - entry.seq_first + 1),
-                    )
+        for payload in self.payloads(seq_first, seq_last):
+            batch = decode(payload, self._schema)
+            first = int(batch.seq[0])
+            yield batch.rows(max(0, seq_first - first), min(len(batch), seq_last - first + 1))
+
+    def payloads(self, seq_first: int, seq_last: int) -> Iterator[bytes]:
+        """Batches with any of these frames, whole, in order, as the bytes in which they came.
+
+        Raises:
+            DamagedFramesError: a batch on disk is damaged; which one, it says.
+            StorageError: a segment cannot be read.
+        """
+        at = max(0, seq_first - FRAMES_MAX)
+        while (held := list(self.held.within(at, seq_last))) and held[0][0] <= seq_last:
+            at = held[0][0]
+            end = min(at + _WINDOW_FRAMES, seq_last + 1)
+            found = []
+            for segment in list(self._segments):
+                first, last = segment.span
+                if first < end and last >= at:
+                    with storage_errors(segment.path):
+                        records = segment.records()
+                    inside = (records["seq_first"] >= at) & (records["seq_first"] < end)
+                    found += [(numbers(r), segment.path, r) for r in records[inside]]
+            found.sort(key=lambda item: item[0])
+            yield from self._bytes_of([item for item in found if item[0][1] >= seq_first])
+            at = end
 
     def first_seq_since(self, t_ns: int) -> int | None:
         """The first number held that was taken at `t_ns` (node's UTC) or later, roughly.
 
         By whole batches, so up to one batch earlier; None if nothing so young is held.
         """
-        young = [
-            entry.seq_first
-            for segment in self._segments
-            if segment.t_ns_last >= t_ns
-            for entry in segment.entries
-            if entry.t_ns_last >= t_ns
-        ]
+        young = []
+        for segment in self._segments:
+            if segment.t_ns_first >= t_ns:
+                young.append(segment.span[0])
+            elif segment.t_ns_last >= t_ns:
+                records = segment.records()
+                young.append(int(records["seq_first"][records["t_ns_last"] >= t_ns].min()))
         return min(young, default=None)
 
     def t_ns_near(self, seq: int, *, newest: bool) -> int | None:
@@ -179,12 +208,21 @@ class Journal:
 
         By whole batches; None if there is no such frame.
         """
-        entries = [entry for segment in self._segments for entry in segment.entries]
-        if newest:
-            found = [entry for entry in entries if entry.seq_first <= seq]
-            return max(found, key=lambda e: e.seq_last).t_ns_last if found else None
-        found = [entry for entry in entries if entry.seq_last >= seq]
-        return min(found, key=lambda e: e.seq_first).t_ns_first if found else None
+        found: list[tuple[int, int]] = []
+        for segment in self._segments:
+            first, last = segment.span
+            if (first > seq) if newest else (last < seq):
+                continue
+            records = segment.records()
+            if newest:
+                records = records[records["seq_first"] <= seq][-1:]
+            else:
+                records = records[records["seq_first"] + records["count"] > seq][:1]
+            name = "t_ns_last" if newest else "t_ns_first"
+            found += [(int(r["seq_first"]), int(r[name])) for r in records]
+        if not found:
+            return None
+        return max(found)[1] if newest else min(found)[1]
 
     def last_seq_until(self, t_ns: int, *, at_least: int) -> int | None:
         """The last number taken at `t_ns` or before, if frames after `t_ns` are held too.
@@ -192,104 +230,152 @@ class Journal:
         None while the stream has not passed `t_ns`. Batches before `at_least` are not looked at;
         `at_least` - 1 if all of them were taken later.
         """
-        entries = [e for s in self._segments for e in s.entries if e.seq_last >= at_least]
-        if all(entry.t_ns_last <= t_ns for entry in entries):
+        segments = [segment for segment in self._segments if segment.span[1] >= at_least]
+        if all(segment.t_ns_last <= t_ns for segment in segments):
             return None
-        before = [entry for entry in entries if entry.t_ns_first <= t_ns]
-        if not before:
+        newest: tuple[int, int] | None = None
+        passed = False
+        for segment in segments:
+            records = segment.records()
+            records = records[records["seq_first"] + records["count"] > at_least]
+            passed = passed or bool((records["t_ns_last"] > t_ns).any())
+            before = records[records["t_ns_first"] <= t_ns]
+            if len(before) and (newest is None or numbers(before[-1]) > newest):
+                newest = numbers(before[-1])
+        if not passed:
+            return None
+        if newest is None:
             return at_least - 1
-        newest = max(before, key=lambda entry: entry.seq_last)
         rows = sum(
-            int(np.searchsorted(batch.t_ns, t_ns, side="right"))
-            for batch in self.read(newest.seq_first, newest.seq_last)
+            int(np.searchsorted(batch.t_ns, t_ns, side="right")) for batch in self.read(*newest)
         )
-        return max(at_least - 1, newest.seq_first + rows - 1)
+        return max(at_least - 1, newest[0] + rows - 1)
 
-    def prune(self, before_t_ns: int, keep: Intervals) -> int:
-        """Delete segments that end before `before_t_ns` and hold nothing of `keep`; how many.
+    def prune(self, before_t_ns: int, keep: Intervals) -> Intervals:
+        """Delete segments that end before `before_t_ns` and hold nothing of `keep`; their numbers.
 
         Raises:
             StorageError: a file cannot be deleted.
         """
-        gone = 0
-        for segment in self._segments[:-1]:  # never the one that is written
-            if segment.t_ns_last < before_t_ns and not segment.holds_any(keep):
-                with storage_errors(segment.path):
-                    segment.path.unlink(missing_ok=True)
-                self._segments.remove(segment)
-                gone += 1
+        writers = (*self._open, *self._closing)
+        written = {writer.segment.path for writer in writers}
+        gone = Intervals()
+        for segment in list(self._segments):
+            if segment.path in written or segment.t_ns_last >= before_t_ns:
+                continue
+            if any(keep.within(*interval) for interval in segment.held):
+                continue
+            with storage_errors(segment.path):
+                segment.delete()
+            self._segments.remove(segment)
+            for interval in segment.held:
+                gone.add(*interval)
         if gone:
-            self.held = Intervals(
-                (e.seq_first, e.seq_last) for s in self._segments for e in s.entries
-            )
+            self._count_anew()
         return gone
 
     def delete(self) -> None:
         """Close the journal and delete all of it."""
-        self.close()
+        with suppress(StorageError):
+            self.close()
         self._segments = []
         self.held = Intervals()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def close(self) -> None:
-        """Sync what is open and close it; a later append opens a new segment."""
-        if self._file is not None:
-            with storage_errors(self.folder):
-                try:
-                    os.fsync(self._file.fileno())
-                finally:
-                    self._file.close()
-                    self._file = None
+        """Sync what is open and close it; a later append opens a new segment.
 
-    def _index(self, segment: Segment) -> None:
+        Raises:
+            StorageError: the disk refused.
+        """
+        with self._lock:
+            self._closing += self._open
+            self._open = []
+        self.sync()
+
+    def _take_in(self, segment: Segment) -> None:
         """Take in a segment that was there; what was disowned once may be in two of them."""
-        new = []
-        for entry in segment.entries:
-            if self.held.missing(entry.seq_first, entry.seq_last).count == entry.frames:
-                self.held.add(entry.seq_first, entry.seq_last)
-                new.append(entry)
-        segment.entries = new
-        self._segments.append(segment)
+        twice = segment.held.without(segment.held.without(self.held))
+        if twice:
+            for record in segment.records():
+                if not Intervals([numbers(record)]).without(self.held):
+                    segment.held = segment.held.without(Intervals([numbers(record)]))
+        if segment.held:
+            self._segments.append(segment)
+            for interval in segment.held:
+                self.held.add(*interval)
+
+    def _count_anew(self) -> None:
+        self.held = Intervals(pair for segment in self._segments for pair in segment.held)
 
     def _write(self, rows: FrameBatch, payload: bytes | None) -> None:
         payload = encode(rows, self._schema) if payload is None else payload
-        first, t_ns = int(rows.seq[0]), int(rows.t_ns[0])
-        if self._file is not None and (
-            not self._tidy or t_ns - self._segments[-1].entries[0].t_ns_first >= SEGMENT_NS
-        ):
-            try:
-                self.close()
-            except StorageError as error:
-                self._sync_failed = error  # whoever waits for these frames to be safe is told
-        file = self._file if self._file is not None else self._begin(first)
-        segment = self._segments[-1]
-        self._tidy = False
-        with storage_errors(segment.path):
-            write_all(file, payload)
-        self._tidy = True
-        segment.entries.append(
-            Entry(first, int(rows.seq[-1]), t_ns, int(rows.t_ns[-1]), self._end, len(payload))
-        )
-        self._end += len(payload)
-        self.held.add(first, int(rows.seq[-1]))
+        first, last, t_ns = int(rows.seq[0]), int(rows.seq[-1]), int(rows.t_ns[0])
+        writer = self._writer_for(first, t_ns)
+        try:
+            with storage_errors(writer.segment.path):
+                writer.append(rows, payload)
+        except StorageError:
+            # Whatever stands at the end of the file now: the next batch begins another one.
+            self._retire(writer)
+            raise
+        if len(list(writer.segment.held)) == 1 and writer.segment.span == (first, last):
+            self._segments.append(writer.segment)
+        self.held.add(first, last)
+        self.lost.found(Intervals([(first, last)]))
 
-    def _begin(self, seq_first: int) -> BinaryIO:
-        header = self._schema.serialize().to_pybytes()
-        # After a failed write the name may be taken by a file without a whole batch.
+    def _writer_for(self, seq_first: int, t_ns: int) -> SegmentWriter:
+        """An open segment that these frames may follow in: the one that ends nearest before."""
+        fitting = [w for w in self._open if w.segment.span[1] < seq_first]
+        if fitting:
+            writer = max(fitting, key=lambda w: w.segment.span[1])
+            if t_ns - writer.segment.t_ns_first < SEGMENT_NS:
+                return writer
+            self._retire(writer)
+        if len(self._open) >= _OPEN_MAX:
+            self._retire(self._open[0])
+        # After a failed write the name may be taken.
         path = self.folder / f"{seq_first:020d}{SUFFIX}"
         taken = 1
         while path.exists():
             path = self.folder / f"{seq_first:020d}-{taken}{SUFFIX}"
             taken += 1
         with storage_errors(path):
-            file = path.open("xb", buffering=0)
-            try:
-                write_all(file, header)
-                sync_folder(self.folder)
-            except OSError:
-                file.close()
-                path.unlink(missing_ok=True)
-                raise
-        self._file, self._end = file, len(header)
-        self._segments.append(Segment(path))
-        return file
+            writer = SegmentWriter(path, self._header)
+        with self._lock:
+            self._open.append(writer)
+            self._has_new_names = True
+        return writer
+
+    def _retire(self, writer: SegmentWriter) -> None:
+        """Take nothing more into this segment; the next sync closes it."""
+        with self._lock:
+            self._open.remove(writer)
+            if writer.segment.held:
+                self._closing.append(writer)
+                return
+        writer.abandon()
+        with suppress(OSError):
+            writer.segment.delete()
+
+    def _bytes_of(self, found: list[tuple[tuple[int, int], Path, np.void]]) -> Iterator[bytes]:
+        opened: dict[Path, int] = {}
+        try:
+            for (first, last), path, record in found:
+                with storage_errors(path):
+                    if path not in opened:
+                        opened[path] = os.open(path, os.O_RDONLY)
+                    payload = payload_of(opened[path], record)
+                if payload is None:
+                    raise DamagedFramesError(
+                        f"the batch at byte {int(record['offset'])} (frames {first} to {last}) is "
+                        "damaged",
+                        where=str(path),
+                        expected="the bytes that were written, by their CRC-32",
+                        seq_first=first,
+                        seq_last=last,
+                    )
+                yield payload
+        finally:
+            for descriptor in opened.values():
+                os.close(descriptor)

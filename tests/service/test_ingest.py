@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed
 import service.ingest
 import service.nodes
 import service.server
-import storage.journal
+import storage.segment
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from service.link import INGEST_PATH, MESSAGE_BYTES_MAX
 from storage.intervals import Intervals
@@ -545,7 +545,7 @@ def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
     monkeypatch: pytest.MonkeyPatch,
     until: Until,
 ) -> None:
-    write_all = storage.journal.write_all
+    write_all = storage.segment.write_all
     check_storage = running.server.check_storage
     full = threading.Event()
 
@@ -561,7 +561,7 @@ def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
             raise StorageError("No space left on device")
         check_storage()
 
-    monkeypatch.setattr(storage.journal, "write_all", refusing)
+    monkeypatch.setattr(storage.segment, "write_all", refusing)
     monkeypatch.setattr(running.server, "check_storage", check)
     node.connect()
     node.tared()
@@ -600,7 +600,7 @@ def test_one_message_that_a_full_disk_did_not_take_is_asked_for_again(
     until: Until,
 ) -> None:
     # Space is there again before the server's next tick has seen that there was none.
-    write_all = storage.journal.write_all
+    write_all = storage.segment.write_all
     node.connect()
     node.send(10)
     node.acknowledged(9)
@@ -615,11 +615,11 @@ def test_one_message_that_a_full_disk_did_not_take_is_asked_for_again(
     monkeypatch.setattr(service.server, "TICK_S", 0.5)
     node.send(10)
     node.acknowledged(29, first=20)  # the next tick is half a second away
-    monkeypatch.setattr(storage.journal, "write_all", refusing)
+    monkeypatch.setattr(storage.segment, "write_all", refusing)
     node.send_again(lost)
     node.send(10)
     until(lambda: running.node()["last_seq"] == 39)
-    monkeypatch.setattr(storage.journal, "write_all", write_all)
+    monkeypatch.setattr(storage.segment, "write_all", write_all)
     code, _ = closing(node.socket)
     assert code == 1012
     assert node.connect() == [(10, 19), (40, None)]

@@ -1,0 +1,61 @@
+"""What is kept of a stream beside its frames: which array it is of, how it ended, what it lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from devices.errors import FileFormatError
+from devices.frames import ArrayInfo
+from storage.durable import write_whole
+from storage.losses import AsPairs
+
+NOTES_FILE = "stream.json"
+
+
+class StreamNotes(BaseModel):
+    """`stream.json` in the stream's folder, replaced whole at every change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    array_info: ArrayInfo
+    kernel_boot_id: str | None = None
+    """Which start of the machine it was taken in; None if that is not known here."""
+    next_seq: int | None = None
+    """The number after its last frame; None while it runs, or if nobody knows."""
+    unsynced_tail_max: int = 0
+    """How many more frames there may have been when it ended without a word."""
+    missed_slots: int = 0
+    """Slots in which no frame was taken; they never had a number."""
+    sync_max_s: float = 0.0
+    """The longest that frames waited for the disk."""
+    lost: AsPairs = Field(default_factory=dict)
+
+    @property
+    def has_ended(self) -> bool:
+        """Is it known where it ended?"""
+        return self.next_seq is not None
+
+    def save(self, folder: Path) -> None:
+        """Write it.
+
+        Raises:
+            StorageError: the disk is full or not writable.
+        """
+        write_whole(folder / NOTES_FILE, self.model_dump_json(indent=1).encode())
+
+    @classmethod
+    def load(cls, folder: Path) -> StreamNotes | None:
+        """Read it; None if there is none.
+
+        Raises:
+            FileFormatError: it is damaged.
+        """
+        path = folder / NOTES_FILE
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError) as error:
+            raise FileFormatError(f"not a stream's notes: {error}", where=str(path)) from error
