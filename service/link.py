@@ -1,15 +1,19 @@
 """The link between node and server, `foottile.v1`: what each side says, and why it hangs up.
 
     node                                  server
-    hello (ArrayInfo, what it has)   -->
-                                     <--  welcome (what the server lacks)
-    Arrow messages, oldest first     -->
+    hello (arrays, what it has)      -->
+                                     <--  welcome (what the server lacks, what sessions need)
+    stream, then Arrow messages      -->
                                      <--  ack (what is on the server's disk)
+                                     <--  wanted (what sessions need now)
     probe                            <->  probe        eight at a time, for the clocks' offset
-    clock, status                    -->
+    clock, status, lost              -->
 
-Text messages are JSON with a `type`; a binary message is a record batch (`storage.wire`). The node
-forgets nothing that is not acknowledged, and a new connection begins with hello again.
+Text messages are JSON with a `type`; a binary message is a record batch (`storage.wire`) of the
+stream that the node named last. Newest frames go first; what the server lacks of the past, of this
+stream and of earlier ones, follows behind them. The node forgets nothing that a session needs and
+that is not acknowledged; a new connection begins with hello again. Frames may come twice and in any
+order: a server takes each (stream, seq) once.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 
 SUBPROTOCOL = "foottile.v1"
-PROTOCOL = 1
+PROTOCOL = 2
 INGEST_PATH = "/api/v1/ingest"
 LIVE_PATH = "/api/v1/live"
 MESSAGE_BYTES_MAX = 1 << 20
@@ -66,11 +70,29 @@ class _Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class StreamEnd(_Message):
-    """Where a stream of this node ended in order: it was given to the server to its last frame."""
+Pairs = tuple[tuple[_Seq, _Seq], ...]
+"""Numbers as closed intervals."""
+OpenPairs = tuple[tuple[_Seq, _Seq | None], ...]
+"""The same; one without an end goes on with every frame to come."""
+PairsByReason = dict[Annotated[str, Field(pattern=r"^[a-z_]{1,40}$")], Pairs]
 
-    boot_id: str
+
+class EarlierStream(_Message):
+    """A stream of this node that has ended, and of which it still has frames or knows losses."""
+
+    array_info: ArrayInfo
+    held: Pairs
+    """What it has."""
     next_seq: _Seq
+    """The number after the last frame that it knows of."""
+    lost: PairsByReason = {}
+    """What it should have and has not, by reason."""
+    unsynced_tail_max: Annotated[int, Field(ge=0)] = 0
+    """How many more frames there may have been: its power failed. 0: it ended in order, or was
+    killed, which loses nothing."""
+    missed_slots: Annotated[int, Field(ge=0)] = 0
+    t_ns_first: _Ns = 0
+    """Instant of the oldest frame that it has, in the node's UTC."""
 
 
 class Hello(_Message):
@@ -79,34 +101,65 @@ class Hello(_Message):
     type: Literal["hello"] = "hello"
     protocol: int
     array_info: ArrayInfo
-    first_seq: _Seq
-    """The oldest frame it still has."""
+    held: Pairs
+    """What it has of its present stream."""
     next_seq: _Seq
     """The number of the next frame to be taken."""
+    lost: PairsByReason = {}
+    """What it should have of its present stream and has not, by reason."""
     scene: dict[str, Any]
     """The scene file's content."""
     emulated: bool
     calibration: Calibration | None
     calibration_problem: str | None
     """Why there is none."""
-    previous: StreamEnd | None = None
-    """The stream before, if the node is the same and its array has become another one."""
+    earlier: tuple[EarlierStream, ...] = ()
+    """Its streams before this one, oldest first."""
+
+
+class StreamNumbers(_Message):
+    """Numbers of one stream."""
+
+    boot_id: str
+    numbers: OpenPairs
+
+
+class Wanted(_Message):
+    """What sessions need: the node keeps it until it is acknowledged, whatever its age."""
+
+    type: Literal["wanted"] = "wanted"
+    streams: tuple[StreamNumbers, ...]
+    """Not yet sealed, by stream."""
+    recording: bool
+    """Is a session being recorded, so that a stream that begins now belongs to it from its first
+    frame on?"""
 
 
 class Welcome(_Message):
-    """What the server lacks of this stream, as closed intervals; the last one has no end."""
+    """What the server lacks, and what sessions need."""
 
     type: Literal["welcome"] = "welcome"
     protocol: int
-    lacks: tuple[tuple[_Seq, _Seq | None], ...]
+    lacks: tuple[StreamNumbers, ...]
+    """Of the present stream everything that the node has and the server has not, of earlier ones
+    what sessions need. The present stream's last interval has no end."""
+    wanted: Wanted
 
 
 class Ack(_Message):
     """These frames are on the server's disk: the node may forget them."""
 
     type: Literal["ack"] = "ack"
+    boot_id: str
     seq_first: _Seq
     seq_last: _Seq
+
+
+class Stream(_Message):
+    """The frames that follow are of this stream."""
+
+    type: Literal["stream"] = "stream"
+    boot_id: str
 
 
 class Probe(_Message):
@@ -129,24 +182,32 @@ class ClockRow(_Message):
     """Half the round trip: the server's reading lies somewhere in it."""
 
 
+class Lost(_Message):
+    """What the node has lost of its present stream by now: all of it, whenever that changes."""
+
+    type: Literal["lost"] = "lost"
+    boot_id: str
+    lost: PairsByReason
+
+
 class Status(_Message):
     """What the node counts beside its frames; each second."""
 
     type: Literal["status"] = "status"
     missed_slots: Annotated[int, Field(ge=0)]
-    first_seq: _Seq
-    """The oldest frame it still has; older ones that the server lacks are lost: evicted."""
+    backlog_frames: Annotated[int, Field(ge=0)] = 0
+    """How many the server lacks that the node has, and sends behind the newest ones."""
     troubles: tuple[str, ...] = ()
-    """What is wrong with the array now, in words."""
+    """What is wrong with the array or with the node's disk now, in words."""
     counts: dict[str, dict[str, Annotated[int, Field(ge=0)]]] = {}
     """How often what went wrong in this stream, by serial and reason."""
 
 
-FromNode: TypeAdapter[Hello | Probe | ClockRow | Status] = TypeAdapter(
-    Annotated[Hello | Probe | ClockRow | Status, Field(discriminator="type")]
+FromNode: TypeAdapter[Hello | Stream | Probe | ClockRow | Status | Lost] = TypeAdapter(
+    Annotated[Hello | Stream | Probe | ClockRow | Status | Lost, Field(discriminator="type")]
 )
-FromServer: TypeAdapter[Welcome | Ack | Probe] = TypeAdapter(
-    Annotated[Welcome | Ack | Probe, Field(discriminator="type")]
+FromServer: TypeAdapter[Welcome | Ack | Wanted | Probe] = TypeAdapter(
+    Annotated[Welcome | Ack | Wanted | Probe, Field(discriminator="type")]
 )
 
 
