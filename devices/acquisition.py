@@ -6,7 +6,7 @@ be waited for here: whoever iterates must be quick, and what was missed is count
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -49,6 +49,26 @@ class ServoSource(Protocol):
         """Age from which a position is older than it should be."""
 
 
+class FrameKeeper(Protocol):
+    """Is given every frame as it is taken, before its batch is whole."""
+
+    def put(
+        self,
+        seq: int,
+        t_mono_ns: int,
+        t_ns: int,
+        servo_counts: int,
+        servo_age_us: int,
+        reference_force_n: float,
+        frame_status: int,
+        padc: Sequence[int],
+        tadc: Sequence[int],
+        sample_offset_us: Sequence[int],
+        status: Sequence[int],
+    ) -> None:
+        """Keep one frame; quick, for the loop waits."""
+
+
 class Acquisition:
     """One stream of frames: `seq` counts from 0, `t_ns` is `t_mono_ns` plus one fixed anchor.
 
@@ -61,6 +81,8 @@ class Acquisition:
         expected_hz: what rate that is, to tell when the loop was stalled; 0: do not tell.
         servo: its position goes with the frames.
         is_new: the array was identified anew in a running node: the first frame says so.
+        keeper: keeps frames while their batch is being filled. Readings that are out of range are
+            flagged when a batch is whole, see `RangeFlag`.
     """
 
     def __init__(
@@ -74,6 +96,7 @@ class Acquisition:
         expected_hz: float = 0.0,
         servo: ServoSource | None = None,
         is_new: bool = False,
+        keeper: FrameKeeper | None = None,
     ) -> None:
         self.missed_slots = 0
         """Slots in which no frame was begun, because the loop was late."""
@@ -84,10 +107,10 @@ class Acquisition:
         self._expected_ns = round(1e9 / expected_hz) if expected_hz else 0
         self._servo = servo
         self._is_new = is_new
-        self._compensation = Compensation(tiles)
+        self._keeper = keeper
+        self._range = RangeFlag(tiles)
         self._next_seq = 0
         self._last_t_mono_ns = 0
-        self._temperature: HeldTemperature | None = None
         array.begin()
 
     def run(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
@@ -159,29 +182,46 @@ class Acquisition:
                 servo_age_us = min(age_ns // 1000, _AGE_MAX_US)
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_status |= FrameStatus.SERVO_STALE
+        offsets_us = [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns]
+        t_ns = t_mono_ns + self._anchor.offset_ns
         columns["seq"][row] = self._next_seq
         columns["t_mono_ns"][row] = t_mono_ns
-        columns["t_ns"][row] = t_mono_ns + self._anchor.offset_ns
+        columns["t_ns"][row] = t_ns
         columns["padc"][row] = scan.padc
         columns["tadc"][row] = scan.tadc
-        columns["sample_offset_us"][row] = [
-            (sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns
-        ]
+        columns["sample_offset_us"][row] = offsets_us
         columns["servo_counts"][row] = servo_counts
         columns["servo_age_us"][row] = servo_age_us
         columns["status"][row] = scan.status
         columns["frame_status"][row] = frame_status
         columns["reference_force_n"][row] = scan.reference_n
+        if self._keeper is not None:
+            self._keeper.put(
+                *(self._next_seq, t_mono_ns, t_ns, servo_counts, servo_age_us),
+                *(scan.reference_n, frame_status),
+                *(scan.padc, scan.tadc, offsets_us, scan.status),
+            )
         self._next_seq += 1
 
     def _batch(self, columns: dict[str, np.ndarray], rows: int) -> FrameBatch:
         batch = FrameBatch(**{name: column[:rows] for name, column in columns.items()})
-        self._flag_over_range(batch)
+        self._range.flag(batch)
         return batch
 
-    def _flag_over_range(self, batch: FrameBatch) -> None:
-        # Raw counts are kept as read. A part pressed past its range falls through zero and comes
-        # back near full count (hardware.md 1.3), so both ends are out of range.
+
+class RangeFlag:
+    """Flags readings that are out of the chips' range, in frames that come in order.
+
+    Raw counts are kept as read. A part pressed past its range falls through zero and comes back
+    near full count (hardware.md 1.3), so both ends are out of range.
+    """
+
+    def __init__(self, tiles: tuple[TileInfo, ...]) -> None:
+        self._compensation = Compensation(tiles)
+        self._temperature: HeldTemperature | None = None
+
+    def flag(self, batch: FrameBatch) -> None:
+        """Set `over_range` in the batch's own status."""
         held, self._temperature = hold_temperature(batch, self._temperature)
         kpa = self._compensation.readable_kpa(held)
         outside = (kpa > PRESSURE_MAX_KPA) | (kpa < PRESSURE_MIN_KPA) | (batch.padc <= 1)

@@ -189,6 +189,17 @@ class ArrayInfo(_Fact):
     scene: str
     models: tuple[str, ...]
 
+    def has_same_tiles_as(self, other: ArrayInfo) -> bool:
+        """Are these the same chips in the same places?
+
+        Conversion times are measured anew at each start and differ by some microseconds.
+        """
+
+        def places(info: ArrayInfo) -> list[TileInfo]:
+            return [tile.model_copy(update={"conversion_ms": 0.0}) for tile in info.tiles]
+
+        return places(self) == places(other)
+
     @property
     def serials(self) -> tuple[str, ...]:
         """Serials in the order of the tiles in a frame."""

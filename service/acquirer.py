@@ -19,9 +19,9 @@ from multiprocessing.connection import Connection
 
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
-from service.backlog import EncodedBatch
 from service.news import News
 from service.rig import Rig, RigOptions
+from storage.kept_stream import EncodedBatch
 from storage.schema import wire_schema
 from storage.wire import encode
 

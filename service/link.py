@@ -140,6 +140,8 @@ class Welcome(_Message):
 
     type: Literal["welcome"] = "welcome"
     protocol: int
+    server_id: str = ""
+    """Which data folder it is: what one server needs another does not give up."""
     lacks: tuple[StreamNumbers, ...]
     """Of the present stream everything that the node has and the server has not, of earlier ones
     what sessions need. The present stream's last interval has no end."""

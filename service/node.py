@@ -1,180 +1,309 @@
-"""A node: acquisition in its own process, a backlog, and the publisher that empties it."""
+"""A node: acquisition in its own process, a journal on disk, and the publisher that empties it."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
-from itertools import count
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
-from devices.frames import ArrayInfo
 from service.acquirer import AcquisitionProcess, Batch, Failed, Health, Message, Started
-from service.backlog import Backlog, make_room
 from service.estimation.calibration import Calibration
-from service.link import PROTOCOL, Hello, Status, StreamEnd
+from service.link import PROTOCOL, EarlierStream, Hello, Status, Wanted
+from service.node_recording import NodeRecording
 from service.publisher import Publisher
 from service.rig import RigOptions
+from storage.kept_stream import KeptStream
+from storage.node_journal import NodeJournal
+from storage.wanted import ServerWants
 
 _LOOK_S = 0.02
 _DRAIN_S = 3.0
 _AWAY_LOOKS = 50
+_TROUBLES_S = 0.5
+_EARLIER_MAX = 64
 
 
-async def run_node(
-    options: RigOptions,
-    server: str,
-    *,
-    calibration: Calibration | None,
-    calibration_problem: str | None,
-    token: str | None,
-    stop: asyncio.Event,
-    report: Callable[[str], None],
-) -> int:
-    """Take frames and publish them until `stop`; how many frames the server never took.
+@dataclass(frozen=True)
+class NodeOptions:
+    """What a node does.
 
-    Args:
-        options: the array to open.
-        server: address of the server.
+    Attributes:
+        rig: the array to open.
+        journal: the node's folder.
+        server: address of the server; None: none, it records for itself.
+        record: name of a session that is recorded on the node itself; None: none is.
         calibration: of its tiles, for the server to estimate with.
         calibration_problem: why there is none.
         token: for servers that want one.
+    """
+
+    rig: RigOptions
+    journal: Path
+    server: str | None
+    record: str | None = None
+    calibration: Calibration | None = None
+    calibration_problem: str | None = None
+    token: str | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of the frames of sessions when a node ended.
+
+    Attributes:
+        undelivered_frames: on the node's disk, for a server that has not got them yet.
+        lost_frames: neither on a disk of the node nor of a server, by reason; what was dropped
+            because no session wanted it is not among them.
+        recorded: id of the session that was recorded here; None: none was, or it is not sealed.
+        is_lossy: is that session not complete?
+    """
+
+    undelivered_frames: int = 0
+    lost_frames: int = 0
+    recorded: str | None = None
+    is_lossy: bool = False
+
+
+async def run_node(
+    options: NodeOptions, *, stop: asyncio.Event, report: Callable[[str], None]
+) -> Outcome:
+    """Take frames, keep them and publish them until `stop`.
+
+    Args:
+        options: what to do.
         stop: ends the node, gently.
-        report: told what happens to the link.
+        report: told what happens to link, disk and array.
 
     Raises:
-        FootTileError: the array cannot be opened, or failed for good.
+        FootTileError: the array cannot be opened or failed for good, or another node has the
+            folder.
     """
-    loop = asyncio.get_running_loop()
-    messages: asyncio.Queue[Message] = asyncio.Queue()
-    streams: list[_Stream] = []
-    stopping = asyncio.create_task(stop.wait())
-    acquisition = AcquisitionProcess(options, lambda message: _hand_over(loop, messages, message))
-    publishing: asyncio.Task[None] | None = None
+    rig = options.rig
+    journal = await asyncio.to_thread(NodeJournal, options.journal, rig.node)
+    journal.start()
+    try:
+        node = _Node(options, journal, report)
+        try:
+            return await node.run(stop)
+        finally:
+            await node.close()
+    finally:
+        await asyncio.to_thread(journal.close)
 
-    def publisher(stream: _Stream) -> Publisher:
-        def hello() -> Hello:
-            return Hello(
-                protocol=PROTOCOL,
-                array_info=stream.info,
-                first_seq=stream.backlog.first_seq,
-                next_seq=stream.backlog.next_seq,
-                scene=options.scene.model_dump(mode="json"),
-                emulated=options.emulated,
-                calibration=calibration,
-                calibration_problem=calibration_problem,
-                previous=stream.previous,
-            )
 
-        def status() -> Status:
-            return Status(
-                missed_slots=stream.missed_slots,
-                first_seq=stream.backlog.first_seq,
-                troubles=stream.health.troubles,
-                counts={serial: dict(counts) for serial, counts in stream.health.counts.items()},
-            )
+class _Node:
+    """The parts of a running node, and how they are joined."""
 
-        return Publisher(
-            server, hello=hello, backlog=stream.backlog, status=status, token=token, report=report
+    def __init__(
+        self, options: NodeOptions, journal: NodeJournal, report: Callable[[str], None]
+    ) -> None:
+        self._options = options
+        self._journal = journal
+        self._report = report
+        self._recording = NodeRecording(
+            options.journal,
+            options.rig.node,
+            journal,
+            name=options.record,
+            calibration=options.calibration,
+            notes={
+                "scene": options.rig.scene.model_dump(mode="json"),
+                "emulated": options.rig.emulated,
+            },
+            report=report,
+        )
+        self._health = Health()
+        self._present: KeptStream | None = None
+        self._messages: asyncio.Queue[Message] = asyncio.Queue()
+        self._publisher: Publisher | None = None
+        self._publishing: asyncio.Task[None] | None = None
+        self._told: tuple[str, ...] = ()
+        loop = asyncio.get_running_loop()
+        self._acquisition = AcquisitionProcess(
+            replace(options.rig, streams=journal.folder),
+            lambda message: _hand_over(loop, self._messages, message),
         )
 
-    try:
-        started = await _started(messages, stopping)
-        if started is None:
-            return 0
-        streams.append(_begin(started, None, report))
-        publishing = asyncio.create_task(_publish(streams, publisher))
-        publishing.add_done_callback(lambda task: _tell_failure(task, messages))
-        stopping.add_done_callback(lambda _: acquisition.stop())
-        while not isinstance(message := await messages.get(), Failed):
-            stream = streams[-1]
-            if isinstance(message, Batch):
-                make_room([each.backlog for each in streams], message.batch)
-                stream.backlog.append(message.batch)
-                stream.missed_slots = message.missed_slots
-                stream.health = message.health
-                if stream.publisher is not None:
-                    stream.publisher.notify()
-                for news in message.news:
-                    report(news)
-            elif isinstance(message, Started):
-                stream.has_ended = True
-                streams.append(_begin(message, stream, report))
-        if message.error is not None:
-            raise message.error
-        streams[-1].has_ended = True
-        await _drain(streams)
-    finally:
-        stopping.cancel()
-        if publishing is not None:
-            publishing.cancel()
-            await asyncio.gather(publishing, return_exceptions=True)
-        await asyncio.to_thread(acquisition.close)
-    return sum(s.backlog.next_seq - s.backlog.first_seq + s.backlog.evicted_frames for s in streams)
-
-
-async def _drain(streams: list[_Stream]) -> None:
-    """Give the server, if it is there, a moment to take all streams to their ends."""
-    with suppress(TimeoutError):
-        async with asyncio.timeout(_DRAIN_S):
-            away = 0
-            while any(not stream.is_delivered for stream in streams) and away < _AWAY_LOOKS:
-                # Between two streams there is no connection for a moment.
-                away = 0 if any(stream.is_connected for stream in streams) else away + 1
-                await asyncio.sleep(_LOOK_S)
-
-
-@dataclass
-class _Stream:
-    """One stream: it ends when the array becomes another one, and is given away to its end."""
-
-    info: ArrayInfo
-    previous: StreamEnd | None
-    backlog: Backlog = field(default_factory=Backlog)
-    missed_slots: int = 0
-    health: Health = Health()  # noqa: RUF009  # frozen, so one for all is safe
-    has_ended: bool = False
-    publisher: Publisher | None = None
-
-    @property
-    def is_delivered(self) -> bool:
-        """Has the server everything?"""
-        return self.has_ended and self.backlog.first_seq == self.backlog.next_seq
-
-    @property
-    def is_connected(self) -> bool:
-        """Is there a server that takes it now?"""
-        return self.publisher is not None and self.publisher.is_connected and not self.is_delivered
-
-
-def _begin(started: Started, before: _Stream | None, report: Callable[[str], None]) -> _Stream:
-    info = started.info
-    report(f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s")
-    for remark in started.remarks:
-        report(remark)
-    previous = None
-    if before is not None:
-        report("the tiles are described anew: a new stream begins")
-        previous = StreamEnd(boot_id=before.info.boot_id, next_seq=before.backlog.next_seq)
-    return _Stream(info, previous)
-
-
-async def _publish(streams: list[_Stream], publisher: Callable[[_Stream], Publisher]) -> None:
-    """Publish one stream after the other, each until the server has it to its end."""
-    for number in count():
-        while number >= len(streams):
-            await asyncio.sleep(_LOOK_S)
-        stream = streams[number]
-        stream.publisher = publisher(stream)
-        running = asyncio.create_task(stream.publisher.run())
+    async def run(self, stop: asyncio.Event) -> Outcome:
+        """Until it is stopped, or the array fails for good."""
+        stopping = asyncio.create_task(stop.wait())
+        beside: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._watch_disk())]
         try:
-            while not stream.is_delivered:
-                await asyncio.wait({running}, timeout=_LOOK_S)
-                if running.done():
-                    running.result()
+            started = await _started(self._messages, stopping)
+            if started is None:
+                return Outcome()
+            stopping.add_done_callback(lambda _: self._acquisition.stop())
+            self._begin(started)
+            sealing = asyncio.create_task(asyncio.to_thread(self._seal_what_was_left))
+            beside.append(sealing)
+            if self._options.server is not None:
+                self._publish(self._options.server)
+            while not isinstance(message := await self._messages.get(), Failed):
+                if isinstance(message, Started):
+                    self._report("the tiles are described anew: a new stream begins")
+                    self._begin(message)
+                elif self._present is not None:
+                    self._take(self._present, message)
+            if self._present is not None:
+                self._present.has_ended = True
+            await self._drain()
+            if message.error is not None:
+                await asyncio.to_thread(self._recording.stop)
+                raise message.error
+            await asyncio.to_thread(self._journal.settle)
+            return await asyncio.to_thread(self._outcome)
         finally:
-            running.cancel()
-            await asyncio.gather(running, return_exceptions=True)
+            for task in beside:
+                task.cancel()
+            await asyncio.gather(*beside, return_exceptions=True)
+
+    async def close(self) -> None:
+        """End what runs beside."""
+        if self._publishing is not None:
+            self._publishing.cancel()
+            await asyncio.gather(self._publishing, return_exceptions=True)
+        await asyncio.to_thread(self._acquisition.close)
+
+    def _begin(self, started: Started) -> None:
+        info = started.info
+        self._report(f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s")
+        for remark in started.remarks:
+            self._report(remark)
+        self._present = self._journal.begin(info)
+        self._recording.goes_on_in(self._present)
+        if self._publisher is not None:
+            self._publisher.renew()
+
+    def _take(self, stream: KeptStream, message: Batch) -> None:
+        self._journal.put(stream, message.batch, message.missed_slots)
+        self._health = message.health
+        if self._publisher is not None:
+            self._publisher.notify()
+        for news in message.news:
+            self._report(news)
+
+    def _publish(self, server: str) -> None:
+        self._publisher = Publisher(
+            server,
+            present=self._stream,
+            streams=lambda: {stream.boot_id: stream for stream in self._journal.streams},
+            hello=self._hello,
+            status=self._status,
+            wanted=self._want,
+            damaged=self._journal.damaged,
+            token=self._options.token,
+            report=self._report,
+        )
+        self._publishing = asyncio.create_task(self._publisher.run())
+        self._publishing.add_done_callback(lambda task: _tell_failure(task, self._messages))
+
+    def _stream(self) -> KeptStream:
+        if self._present is None:
+            raise RuntimeError("no stream has begun")
+        return self._present
+
+    def _hello(self) -> Hello:
+        options, present = self._options, self._stream()
+        return Hello(
+            protocol=PROTOCOL,
+            array_info=present.info,
+            held=tuple(present.held),
+            next_seq=present.next_seq,
+            lost=present.lost.as_pairs(),
+            scene=options.rig.scene.model_dump(mode="json"),
+            emulated=options.rig.emulated,
+            calibration=options.calibration,
+            calibration_problem=options.calibration_problem,
+            earlier=tuple(
+                _earlier(stream)
+                for stream in self._journal.streams[-_EARLIER_MAX:]
+                if stream is not present
+            ),
+        )
+
+    def _status(self, backlog_frames: int) -> Status:
+        return Status(
+            missed_slots=self._stream().missed_slots,
+            backlog_frames=backlog_frames,
+            troubles=(*self._health.troubles, *self._journal.troubles),
+            counts={serial: dict(counts) for serial, counts in self._health.counts.items()},
+        )
+
+    def _want(self, server_id: str, wanted: Wanted, known: tuple[str, ...]) -> None:
+        streams = {stream.boot_id: stream.numbers for stream in wanted.streams}
+        wants = ServerWants(streams=streams, recording=wanted.recording, known=known)
+        self._journal.want(server_id, wants)
+
+    async def _watch_disk(self) -> None:
+        """Say when the disk takes nothing any more, and when it does again."""
+        while True:
+            await asyncio.sleep(_TROUBLES_S)
+            kinds = tuple(trouble.partition(";")[0] for trouble in self._journal.troubles)
+            for kind in kinds:
+                if kind not in self._told:
+                    self._report(kind)
+            for kind in self._told:
+                if kind not in kinds:
+                    self._report(f"no longer: {kind}")
+            self._told = kinds
+
+    async def _drain(self) -> None:
+        """Give the server, if it is there, a moment to take what its sessions need."""
+        publisher = self._publisher
+        if publisher is None:
+            return
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_DRAIN_S):
+                away = 0
+                while self._undelivered(everything=True) and away < _AWAY_LOOKS:
+                    away = 0 if publisher.is_connected else away + 1
+                    await asyncio.sleep(_LOOK_S)
+
+    def _undelivered(self, *, everything: bool = False) -> int:
+        streams = self._journal.streams
+        if everything and self._present is not None:
+            present = self._present
+            behind = present.held.without(present.acked).count
+            return behind + sum(
+                self._journal.undelivered(stream).count for stream in streams if stream != present
+            )
+        return sum(self._journal.undelivered(stream).count for stream in streams)
+
+    def _seal_what_was_left(self) -> None:
+        self._journal.settle()
+        self._recording.seal_what_was_left()
+
+    def _outcome(self) -> Outcome:
+        recorded, is_lossy = self._recording.stop()
+        lost = 0
+        for stream in self._journal.streams:
+            wanted = self._journal.wanted.numbers(stream.boot_id)
+            lost += sum(numbers.count for numbers in stream.lost.within(wanted).values())
+        return Outcome(
+            undelivered_frames=self._undelivered() if self._options.server is not None else 0,
+            lost_frames=lost,
+            recorded=recorded,
+            is_lossy=is_lossy,
+        )
+
+
+def _earlier(stream: KeptStream) -> EarlierStream:
+    held = stream.held
+    first = next(iter(held))[0] if held else 0
+    journal = stream.journal
+    t_ns_first = journal.t_ns_near(first, newest=False) if journal is not None else None
+    return EarlierStream(
+        array_info=stream.info,
+        held=tuple(held),
+        next_seq=stream.next_seq,
+        lost=stream.lost.as_pairs(),
+        unsynced_tail_max=stream.notes.unsynced_tail_max,
+        missed_slots=stream.missed_slots,
+        t_ns_first=t_ns_first or 0,
+    )
 
 
 def _tell_failure(task: asyncio.Task[None], messages: asyncio.Queue[Message]) -> None:

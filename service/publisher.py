@@ -1,7 +1,8 @@
 """The node's end of the link: dials the server, gives it what it lacks, and never stops trying.
 
-Whatever breaks, the backlog keeps the frames and the next connection takes up where the server
-says it left off.
+Newest frames go first, and what the server lacks of the past follows behind them, never more of it
+under way than passes in part of a second (`service.flow`). Whatever breaks, the journal keeps the
+frames, and the next connection takes up where the server says it left off.
 """
 
 from __future__ import annotations
@@ -9,16 +10,20 @@ from __future__ import annotations
 import asyncio
 import random
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from itertools import count
 from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import ValidationError
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
-from devices.errors import LinkError, UsageError
+from devices.errors import DamagedFramesError, LinkError, StorageError, UsageError
 from service.backlog import Backlog
+from service.dial import dial
+from service.flow import Flow
 from service.link import (
     INGEST_PATH,
     MESSAGE_BYTES_MAX,
@@ -27,28 +32,47 @@ from service.link import (
     SUBPROTOCOL,
     Ack,
     ClockRow,
+    Close,
     FromServer,
     Hello,
+    Lost,
+    OpenPairs,
     Probe,
     Status,
+    Stream,
+    Wanted,
     Welcome,
 )
+from storage.intervals import Intervals
+from storage.kept_stream import EncodedBatch, KeptStream
+from storage.ledger import NO_END
 
-PING_S = 2.0
 PROBE_EVERY_S = 10.0
 STATUS_EVERY_S = 1.0
-_BACK_OFF_S = (0.2, 3.0)
+_MARK_EVERY_S = 0.1
+_NO_ANSWER_S = 4.0
+"""A link on which nothing comes back for so long is half open."""
+_BACK_OFF_S = (0.1, 0.5)
+"""Between attempts at a server that cannot be reached: the picture is back within a second."""
+_REFUSED_BACK_OFF_S = (0.2, 5.0)
+"""Between attempts at one that answered, and did not want us."""
+_LIVE_BEHIND_S = 0.5
+"""Frames that wait longer to be sent are no news: newer ones overtake them."""
+_CHUNK_FRAMES = 512
 _UNAUTHORISED = 401
 
 
 class Publisher:
-    """Sends a backlog to a server, over as many connections as it takes.
+    """Gives a node's streams to a server, over as many connections as it takes.
 
     Args:
         server: http(s) or ws(s) address of the server.
-        hello: describes the stream; asked for at every connection.
-        backlog: what is to be sent.
-        status: what the node counts.
+        present: the stream that is being taken.
+        streams: all streams that the node has, by boot_id.
+        hello: describes them; asked for at every connection.
+        status: what the node counts; is given how many frames are behind.
+        wanted: told what the server's sessions need, and of which streams it had heard.
+        damaged: told of frames that turned out to be damaged on disk.
         token: for servers that want one.
         report: told what happened, once for every change.
     """
@@ -57,111 +81,223 @@ class Publisher:
         self,
         server: str,
         *,
+        present: Callable[[], KeptStream],
+        streams: Callable[[], Mapping[str, KeptStream]],
         hello: Callable[[], Hello],
-        backlog: Backlog,
-        status: Callable[[], Status],
+        status: Callable[[int], Status],
+        wanted: Callable[[str, Wanted, tuple[str, ...]], None],
+        damaged: Callable[[KeptStream, Intervals], None],
         token: str | None,
         report: Callable[[str], None],
     ) -> None:
         self._url = ingest_url(server)
+        self._present = present
+        self._streams = streams
         self._hello = hello
-        self._backlog = backlog
         self._status = status
+        self._wanted = wanted
+        self._damaged = damaged
         self._headers = {"Authorization": f"Bearer {token}"} if token else {}
         self._report = report
         self._last_report = ""
         self._connected = False
         self._news = asyncio.Event()
+        self._renewed = asyncio.Event()
         self._probe_answers: asyncio.Queue[Probe] = asyncio.Queue(PROBES)
-        self._utc_offset_ns = 0
+        self._said_hello: Hello | None = None
+        self._server_id = ""
+        self._flow = Flow()
+        self._backlog = Backlog()
 
     def notify(self) -> None:
-        """There is something new in the backlog."""
+        """There are new frames."""
         self._news.set()
+
+    def renew(self) -> None:
+        """Another stream has begun: say hello again."""
+        self._renewed.set()
 
     async def run(self) -> None:
         """Publish until cancelled."""
-        wait_s = _BACK_OFF_S[0]
+        waits = _Waits()
         while True:
+            self._renewed.clear()
             try:
-                async with connect(
-                    self._url,
-                    subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
-                    compression=None,  # costs three times the CPU, saves little (performance.md)
-                    max_size=MESSAGE_BYTES_MAX,
-                    ping_interval=PING_S,
-                    ping_timeout=SILENCE_S,
-                    open_timeout=SILENCE_S,
-                    close_timeout=1.0,
-                    additional_headers=self._headers,
-                    proxy=None,
-                ) as socket:
-                    welcome = await self._greet(socket)
-                    self._say(f"connected to {self._url}")
-                    wait_s = _BACK_OFF_S[0]
-                    self._connected = True
-                    await self._serve(socket, welcome)
+                await self._connection(waits)
+            except* _Renewed:
+                waits = _Waits()
             except* (OSError, ValueError, WebSocketException) as group:
                 self._say(f"not connected to {self._url}: {_reason(group)}; trying again")
+                waits.failed(group)
             self._connected = False
-            await asyncio.sleep(wait_s * random.uniform(0.5, 1.0))  # noqa: S311  # no secret
-            wait_s = min(2.0 * wait_s, _BACK_OFF_S[1])
+            await asyncio.sleep(waits.next_s())
 
     @property
     def is_connected(self) -> bool:
         """Has a server welcomed it?"""
         return self._connected
 
+    async def _connection(self, waits: _Waits) -> None:
+        parts = urlsplit(self._url)
+        secure = parts.scheme == "wss"
+        tcp = await dial(parts.hostname or "", parts.port or (443 if secure else 80))
+        async with connect(
+            self._url,
+            sock=tcp,
+            subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
+            compression=None,  # costs three times the CPU, saves little (performance.md)
+            max_size=MESSAGE_BYTES_MAX,
+            ping_interval=None,  # we ask ourselves, and measure by the answers
+            open_timeout=SILENCE_S,
+            close_timeout=1.0,
+            additional_headers=self._headers,
+            proxy=None,
+        ) as socket:
+            welcome = await self._greet(socket)
+            self._say(f"connected to {self._url}")
+            waits.succeeded()
+            self._connected = True
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._receive(socket))
+                tasks.create_task(self._send_frames(socket, welcome))
+                tasks.create_task(self._measure_flow(socket))
+                tasks.create_task(self._measure_clock(socket))
+                tasks.create_task(self._send_status(socket))
+                tasks.create_task(self._await_renewal())
+
     async def _greet(self, socket: ClientConnection) -> Welcome:
         if socket.subprotocol != SUBPROTOCOL:
             raise LinkError(
                 f"the server does not speak {SUBPROTOCOL}", where=self._url, expected=SUBPROTOCOL
             )
-        hello = self._hello()
-        self._utc_offset_ns = hello.array_info.utc_offset_ns
+        hello = self._said_hello = self._hello()
         await socket.send(hello.model_dump_json())
         async with asyncio.timeout(SILENCE_S):
             answer = _parse(await socket.recv())
         if not isinstance(answer, Welcome):
             raise LinkError(f"the server answered hello with {answer.type!r}", expected="welcome")
+        self._server_id = answer.server_id
+        self._take_wanted(answer.wanted)
         return answer
-
-    async def _serve(self, socket: ClientConnection, welcome: Welcome) -> None:
-        """All that goes on over one connection; ends by an exception."""
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._receive(socket))
-            tasks.create_task(self._send_frames(socket, welcome))
-            tasks.create_task(self._measure_clock(socket))
-            tasks.create_task(self._send_status(socket))
 
     async def _receive(self, socket: ClientConnection) -> None:
         while True:
             message = _parse(await socket.recv())
-            if isinstance(message, Ack):
-                self._backlog.acknowledge(message.seq_first, message.seq_last)
-            elif isinstance(message, Probe):
-                with suppress(asyncio.QueueFull):
-                    self._probe_answers.put_nowait(message)
+            match message:
+                case Ack(boot_id=boot_id, seq_first=first, seq_last=last):
+                    stream = self._streams().get(boot_id)
+                    if stream is not None:
+                        stream.acknowledge(first, last)
+                case Wanted():
+                    self._take_wanted(message)
+                case Probe():
+                    with suppress(asyncio.QueueFull):
+                        self._probe_answers.put_nowait(message)
+                case Welcome():
+                    raise LinkError("welcome was said before")
+
+    def _take_wanted(self, wanted: Wanted) -> None:
+        hello = self._said_hello
+        if hello is not None:
+            earlier = tuple(stream.array_info.boot_id for stream in hello.earlier)
+            self._wanted(self._server_id, wanted, (*earlier, hello.array_info.boot_id))
 
     async def _send_frames(self, socket: ClientConnection, welcome: Welcome) -> None:
-        at = 0
-        for first, last in welcome.lacks:
-            at = max(at, first)
-            while True:
-                # News that come while sending are seen in the next round.
-                self._news.clear()
-                for batch in self._backlog.since(at):
-                    if last is not None and batch.seq_first > last:
-                        break
-                    await socket.send(batch.payload)
-                    at = batch.seq_last + 1
-                if last is not None:
-                    break
+        """The newest frames as they come, and behind them what the server lacks."""
+        hello = self._said_hello
+        if hello is None:
+            return
+        present, at = self._present(), hello.next_seq
+        self._flow = Flow()
+        self._backlog = Backlog(
+            (lacks.boot_id, _before(lacks.numbers, hello, lacks.boot_id)) for lacks in welcome.lacks
+        )
+        behind_frames = max(1, round(_LIVE_BEHIND_S * hello.array_info.nominal_rate_hz))
+        chunk: deque[tuple[str, EncodedBatch]] = deque()
+        named = hello.array_info.boot_id
+        reading: asyncio.Task[list[tuple[str, EncodedBatch]]] | None = None
+        while True:
+            self._news.clear()  # news that come while sending are seen in the next round
+            if not self._flow.is_open:
                 await self._news.wait()
+                continue
+            newest = present.recent(at)
+            if newest:
+                while newest[-1].seq_last - newest[0].seq_first >= behind_frames < len(newest):
+                    newest.pop(0)
+                batch = newest[0]
+                if batch.seq_first > at:
+                    self._backlog.add(present.boot_id, at, batch.seq_first - 1)
+                boot_id, at = present.boot_id, batch.seq_last + 1
+            elif chunk:
+                boot_id, batch = chunk.popleft()
+            else:
+                # Reading may take long, beside a card that is being written.
+                if reading is None and self._backlog.count:
+                    reading = asyncio.create_task(asyncio.to_thread(self._next_chunk))
+                    reading.add_done_callback(lambda _: self._news.set())
+                elif reading is not None and reading.done():
+                    chunk += reading.result()
+                    reading = None
+                else:
+                    await self._news.wait()
+                continue
+            if boot_id != named:
+                named = boot_id
+                await socket.send(Stream(boot_id=boot_id).model_dump_json())
+            await socket.send(batch.payload)
+            self._flow.sent(len(batch.payload))
+
+    def _next_chunk(self) -> list[tuple[str, EncodedBatch]]:
+        """Batches of the backlog, read from where they are."""
+        wanted = self._backlog.next(_CHUNK_FRAMES)
+        if wanted is None:
+            return []
+        boot_id, first, last = wanted
+        stream = self._streams().get(boot_id)
+        found: list[EncodedBatch] = []
+        if stream is not None:
+            try:
+                found.extend(stream.batches(first, last))
+            except DamagedFramesError as error:
+                self._damaged(stream, Intervals([(error.seq_first, error.seq_last)]))
+                self._backlog.done(boot_id, error.seq_first, error.seq_last)
+                last = max(first, error.seq_first) - 1
+            except StorageError:
+                found = []  # evicted meanwhile, and counted
+        if last >= first:
+            self._backlog.done(boot_id, first, last)
+        return [(boot_id, batch) for batch in found]
+
+    async def _measure_flow(self, socket: ClientConnection) -> None:
+        """Ask every so often whether the other side has read what was sent."""
+        waiting: dict[int, float] = {}
+        asked_s = -STATUS_EVERY_S
+        for number in count():
+            flow, now_s = self._flow, time.monotonic()
+            if waiting and now_s - next(iter(waiting.values())) > _NO_ANSWER_S:
+                raise LinkError(f"the server has not answered for {_NO_ANSWER_S:g} s")
+            if flow.under_way_bytes or now_s - asked_s >= STATUS_EVERY_S:
+                asked_s = waiting[number] = now_s
+                flow.mark(number)
+
+                def answered(
+                    answer: asyncio.Future[float], number: int = number, flow: Flow = flow
+                ) -> None:
+                    waiting.pop(number, None)
+                    if not answer.cancelled() and answer.exception() is None:
+                        flow.answered(number, time.monotonic())
+                        self._news.set()
+
+                pong = await socket.ping()
+                asyncio.ensure_future(pong).add_done_callback(answered)
+            await asyncio.sleep(_MARK_EVERY_S)
 
     async def _measure_clock(self, socket: ClientConnection) -> None:
         """The clocks' offset, by the probe with the shortest round trip; unmeasured is unsent."""
         number = 0
+        hello = self._said_hello
+        utc_offset_ns = hello.array_info.utc_offset_ns if hello is not None else 0
         while True:
             best: ClockRow | None = None
             for _ in range(PROBES):
@@ -177,7 +313,7 @@ class Publisher:
                 if best is None or half_ns < best.uncertainty_ns:
                     best = ClockRow(
                         t_mono_ns=middle_ns,
-                        server_minus_node_ns=answer.server_t_ns - middle_ns - self._utc_offset_ns,
+                        server_minus_node_ns=answer.server_t_ns - middle_ns - utc_offset_ns,
                         uncertainty_ns=half_ns,
                     )
             if best is not None:
@@ -194,14 +330,70 @@ class Publisher:
         return None
 
     async def _send_status(self, socket: ClientConnection) -> None:
+        present = self._present()
+        said = self._said_hello.lost if self._said_hello is not None else {}
         while True:
-            await socket.send(self._status().model_dump_json())
+            with present.lock:
+                lost = present.lost.as_pairs()
+            if lost != said:
+                said = lost
+                await socket.send(Lost(boot_id=present.boot_id, lost=lost).model_dump_json())
+            status = self._status(self._backlog.count)
+            await socket.send(status.model_dump_json())
             await asyncio.sleep(STATUS_EVERY_S)
+
+    async def _await_renewal(self) -> None:
+        await self._renewed.wait()
+        raise _Renewed
 
     def _say(self, message: str) -> None:
         if message != self._last_report:
             self._report(message)
         self._last_report = message
+
+
+class _Renewed(Exception):  # noqa: N818  # no error: a reason to say hello again
+    """The node has begun another stream."""
+
+
+class _Waits:
+    """How long to wait before the next attempt."""
+
+    def __init__(self) -> None:
+        self._bounds = _BACK_OFF_S
+        self._wait_s = 0.0
+
+    def succeeded(self) -> None:
+        self._bounds, self._wait_s = _BACK_OFF_S, 0.0
+
+    def failed(self, group: BaseExceptionGroup[Exception]) -> None:
+        refused = group.subgroup(_is_refusal) is not None
+        bounds = _REFUSED_BACK_OFF_S if refused else _BACK_OFF_S
+        if bounds != self._bounds:
+            self._bounds, self._wait_s = bounds, bounds[0]
+
+    def next_s(self) -> float:
+        least, most = self._bounds
+        self._wait_s = min(max(2.0 * self._wait_s, least), most)
+        return self._wait_s * random.uniform(0.5, 1.0)  # noqa: S311  # no secret
+
+
+def _is_refusal(error: BaseException) -> bool:
+    if isinstance(error, ConnectionClosed):
+        # A server that is going down says so, and will be back.
+        return error.rcvd is not None and error.rcvd.code != Close.RESTART
+    return isinstance(error, InvalidStatus)
+
+
+def _before(numbers: OpenPairs, hello: Hello, boot_id: str) -> Intervals:
+    """What is lacking and was taken before hello; of the present stream all newer frames follow."""
+    newest = hello.next_seq - 1 if boot_id == hello.array_info.boot_id else NO_END
+    found = Intervals()
+    for first, last in numbers:
+        end = newest if last is None else min(last, newest)
+        if end >= first:
+            found.add(first, end)
+    return found
 
 
 def ingest_url(server: str) -> str:
@@ -222,7 +414,7 @@ def ingest_url(server: str) -> str:
     return urlunsplit((scheme, parts.netloc, parts.path.rstrip("/") + INGEST_PATH, "", ""))
 
 
-def _parse(message: str | bytes) -> Welcome | Ack | Probe:
+def _parse(message: str | bytes) -> Welcome | Ack | Wanted | Probe:
     try:
         return FromServer.validate_json(message)
     except ValidationError as error:

@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +26,7 @@ from devices.servo import ServoReader
 from devices.startup import make_ready, renew
 from service.beside import recovery_of, reference_of
 from service.describe import describe
+from storage.in_flight import InFlight, open_in_flight
 
 if TYPE_CHECKING:
     from devices.array import TileArray
@@ -49,6 +51,8 @@ class RigOptions:
     lead_s: float = 1.0
     seed: int = 0
     parts_seed: int = 0
+    streams: Path | None = None
+    """Folder of the node's journals: frames in flight are kept there, each stream's in its own."""
 
     @property
     def emulated(self) -> bool:
@@ -93,6 +97,7 @@ class Rig:
             self._servo(scene.servo, world, stack) if scene.servo is not None else None
         )
         self._renew_at_ns = 0
+        self._in_flight: InFlight | None = None
         # Before the world begins: on a busy machine the trial would use up the lead.
         bus_hz = self._bus_hz(self._ready.array)
         if world is not None:
@@ -116,6 +121,13 @@ class Rig:
             schedule=ready.choice.schedule,
             rate_hz=min(scene.rate_hz or bus_hz, bus_hz),
         )
+        if self._in_flight is not None:
+            self._in_flight.close()
+        streams = self._options.streams
+        folder = None if streams is None else streams / self.info.boot_id
+        self._in_flight = open_in_flight(folder, self.info)
+        if folder is not None and self._in_flight is None:
+            self.remarks.append("no room for frames in flight: a crash may cost the last batches")
         self.acquisition = Acquisition(
             ready.array,
             ready.tiles,
@@ -125,6 +137,7 @@ class Rig:
             expected_hz=bus_hz,
             servo=self._servo_source,
             is_new=is_new,
+            keeper=self._in_flight,
         )
 
     def batches(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:

@@ -274,6 +274,18 @@ class Journal:
             self._count_anew()
         return gone
 
+    def evict(self, keep: Intervals) -> Intervals:
+        """Delete the oldest segment that holds nothing of `keep`; its numbers, if there is one.
+
+        Raises:
+            StorageError: it cannot be deleted.
+        """
+        ends = sorted(segment.t_ns_last for segment in self._segments)
+        for t_ns in ends:
+            if gone := self.prune(t_ns + 1, keep):
+                return gone
+        return Intervals()
+
     def delete(self) -> None:
         """Close the journal and delete all of it."""
         with suppress(StorageError):

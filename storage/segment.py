@@ -176,9 +176,10 @@ class SegmentWriter:
             OSError: the disk refused.
         """
         try:
-            os.fsync(self._data.fileno())
-            write_all(self._index, _sealed(np.zeros(1, RECORD)).tobytes())
-            os.fsync(self._index.fileno())
+            self.sync()
+            with suppress(OSError):  # without it the batches are checked when it is opened again
+                write_all(self._index, _sealed(np.zeros(1, RECORD)).tobytes())
+                os.fsync(self._index.fileno())
         finally:
             self.abandon()
 

@@ -20,6 +20,8 @@ class StreamNotes(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     array_info: ArrayInfo
+    number: int = 0
+    """Streams of a node are numbered as they begin; their clocks may have been set in between."""
     kernel_boot_id: str | None = None
     """Which start of the machine it was taken in; None if that is not known here."""
     next_seq: int | None = None

@@ -97,6 +97,7 @@ def demo_command(
     }
     arguments = [f"{name}={value}" for name, value in node_options.items() if value is not None]
     folder = data if data is not None else user_data_path("foottile") / "demo"
+    arguments.append(f"--journal={folder / 'node'}")
     uvloop.run(_demo(host, port, folder, seconds, arguments))
 
 

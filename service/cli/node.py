@@ -6,6 +6,7 @@ import asyncio
 import os
 import re
 import socket
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -23,16 +24,22 @@ from service.cli.emulation import (
     rig_options,
     scene_with,
 )
-from service.cli.options import remark
+from service.cli.options import remark, say
 
 if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
+    from service.node import NodeOptions, Outcome
     from service.rig import RigOptions
+
+SERVER = "http://127.0.0.1:8000"
 
 
 def node_command(
     scene: Annotated[str, typer.Option(help="Scene file, or a built-in scene.")],
-    server: Annotated[str, typer.Option(help="Address of the server.")] = "http://127.0.0.1:8000",
+    server: Annotated[
+        str | None,
+        typer.Option(help=f"Address of the server; default {SERVER}, with --record: none."),
+    ] = None,
     bus: Annotated[
         str | None, typer.Option(help="I2C bus, /dev/i2c-1 or emulated; default: the scene's.")
     ] = None,
@@ -42,6 +49,13 @@ def node_command(
     ] = None,
     name: Annotated[
         str | None, typer.Option(help="Name of this node; default: this machine's.")
+    ] = None,
+    journal: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the journal and for sessions recorded here."),
+    ] = None,
+    record: Annotated[
+        str | None, typer.Option(help="Record a session of this name here, without any server.")
     ] = None,
     load: LoadOption = None,
     load_scale: LoadScaleOption = 1.0,
@@ -55,19 +69,31 @@ def node_command(
         bool, typer.Option("--end-with-parent", hidden=True, help="End when its parent dies.")
     ] = False,
 ) -> None:
-    """Take frames from an array and publish them to a server.
+    """Take frames from an array, keep them on disk and publish them to a server.
 
-    It keeps trying: when the server is away, frames wait in memory (64 MiB) and follow when it is
-    back. A server that wants a token gets the one in FOOTTILE_TOKEN. Options from --load on are for
-    emulated tiles. Ctrl-C ends it.
+    Every frame is journaled: what sessions need stays until the server has it on its disk, the rest
+    for ten minutes. It keeps trying: when the server is away, or this node was switched off, frames
+    follow when both are back. With --record it needs no server: at Ctrl-C the session is sealed in
+    the folder of --journal. A server that wants a token gets the one in FOOTTILE_TOKEN. Options
+    from --load on are for emulated tiles.
+
+    Exit code 3: frames of a session are lost, or wait on this disk for their server.
     """
+    from platformdirs import user_state_path
+
+    from service.node import NodeOptions
     from service.publisher import ingest_url
 
     if end_with_parent:
         from devices import realtime
 
         realtime.end_with_parent()
-    ingest_url(server)  # refuse a wrong address before anything else
+    if server is None and record is None:
+        server = SERVER
+    if server is not None:
+        ingest_url(server)  # refuse a wrong address before anything else
+    if record is not None and not record.strip():
+        raise UsageError("--record without a name", expected="the name of the session")
     the_scene = scene_with(scene, bus=bus, servo=servo)
     options = rig_options(
         the_scene,
@@ -82,27 +108,37 @@ def node_command(
         parts_seed=parts_seed,
     )
     calibration, problem = calibration_of(options)
-    unsent = asyncio.run(_run(options, server, calibration, problem))
-    if unsent:
-        remark(f"{unsent} frames were never acknowledged by the server")
+    outcome = asyncio.run(
+        _run(
+            NodeOptions(
+                rig=options,
+                journal=journal if journal is not None else user_state_path("foottile"),
+                server=server,
+                record=record,
+                calibration=calibration,
+                calibration_problem=problem,
+                token=os.environ.get("FOOTTILE_TOKEN"),
+            )
+        )
+    )
+    if outcome.recorded is not None:
+        say(f"session {outcome.recorded}" + (" is lossy" if outcome.is_lossy else " is complete"))
+    if outcome.lost_frames:
+        remark(f"{outcome.lost_frames} frames of sessions are lost")
+    if outcome.undelivered_frames:
+        remark(
+            f"{outcome.undelivered_frames} frames wait on this disk: the server gets them when "
+            "this node runs again"
+        )
+    if outcome.lost_frames or outcome.undelivered_frames or outcome.is_lossy:
         raise typer.Exit(3)
 
 
-async def _run(
-    options: RigOptions, server: str, calibration: Calibration | None, problem: str | None
-) -> int:
+async def _run(options: NodeOptions) -> Outcome:
     from service.node import run_node
     from service.serve import stop_on_signals
 
-    return await run_node(
-        options,
-        server,
-        calibration=calibration,
-        calibration_problem=problem,
-        token=os.environ.get("FOOTTILE_TOKEN"),
-        stop=stop_on_signals(),
-        report=remark,
-    )
+    return await run_node(options, stop=stop_on_signals(), report=remark)
 
 
 def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]:

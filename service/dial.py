@@ -1,0 +1,73 @@
+"""A TCP connection as soon as there can be one.
+
+While a link is down an attempt waits for its time-out, and the kernel repeats its first packet
+after one second, three, seven: a link that returns would not be noticed for seconds. So a new
+attempt begins each half second beside those that wait, and the first that succeeds is taken. A slow
+link is given the time it needs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+
+EVERY_S = 0.5
+GIVE_UP_S = 5.0
+_UNSENT_BYTES = 16 << 10
+
+
+async def dial(host: str, port: int) -> socket.socket:
+    """Connect to a server.
+
+    Raises:
+        OSError: it refuses, or nobody answers.
+    """
+    loop = asyncio.get_running_loop()
+    end_s = loop.time() + GIVE_UP_S
+    attempts: set[asyncio.Task[socket.socket]] = set()
+    refused: OSError | None = None
+    try:
+        while loop.time() < end_s and refused is None:
+            attempts.add(asyncio.create_task(_attempt(host, port)))
+            done, attempts = await asyncio.wait(
+                attempts, timeout=EVERY_S, return_when=asyncio.FIRST_COMPLETED
+            )
+            for attempt in done:
+                error = attempt.exception()
+                if error is None:
+                    return attempt.result()
+                if not isinstance(error, OSError):
+                    raise error
+                refused = error
+    finally:
+        for attempt in attempts:
+            attempt.cancel()
+        for left in await asyncio.gather(*attempts, return_exceptions=True):
+            if isinstance(left, socket.socket):  # two came through at once
+                left.close()
+    raise refused or TimeoutError(f"nobody answered for {GIVE_UP_S:g} s")
+
+
+async def _attempt(host: str, port: int) -> socket.socket:
+    loop = asyncio.get_running_loop()
+    error: OSError | None = None
+    for family, kind, protocol, _, address in await loop.getaddrinfo(
+        host, port, type=socket.SOCK_STREAM
+    ):
+        connection = socket.socket(family, kind, protocol)
+        try:
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+                # What waits in the kernel cannot be overtaken by newer frames.
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
+            await loop.sock_connect(connection, address)
+        except OSError as refused:
+            connection.close()
+            error = refused
+        except BaseException:
+            connection.close()
+            raise
+        else:
+            return connection
+    raise error or OSError(f"{host} has no address")

@@ -1,0 +1,193 @@
+"""Frames in flight: taken, perhaps not yet in the journal, kept where SIGKILL cannot reach them.
+
+A file of fixed rows, mapped into memory, one row a frame, the oldest overwritten. It is never
+synced: the kernel keeps it when a process is killed, and a power cut loses it, which is why it
+names the start of the machine it belongs to. Each row carries its CRC-32, so a row that was being
+written, or is of another time, is seen.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import zlib
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from devices.errors import StorageError
+from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
+from storage.durable import storage_errors
+from storage.kernel import kernel_boot_id
+
+IN_FLIGHT_FILE = "in_flight"
+ROWS = 8192
+"""A quarter of a minute at full rate: as long as frames may wait for a slow card in this way."""
+_MAGIC = b"FootTile in flight 1\n"
+_HEAD = struct.Struct("<21sHII36sI")
+"""Magic, tiles, rows, length of the description, kernel's boot id, CRC-32 of all that follows."""
+_ORDER = ("seq", "t_mono_ns", "t_ns", "servo_counts", "servo_age_us", "reference_force_n",
+          "frame_status", "padc", "tadc", "sample_offset_us", "status")  # fmt: skip
+_CODES = {"uint64": "Q", "int64": "q", "int32": "i", "float32": "f", "uint16": "H", "uint8": "B"}
+
+
+class InFlight:
+    """Writes frames of one stream to its file. For the process that takes them.
+
+    Args:
+        folder: the stream's own; made if absent.
+        info: description of the stream's array.
+
+    Raises:
+        StorageError: there is no room for it; acquisition does without it then.
+    """
+
+    def __init__(self, folder: Path, info: ArrayInfo) -> None:
+        path = folder / IN_FLIGHT_FILE
+        tiles = len(info.tiles)
+        self._row = struct.Struct(_codes(tiles))
+        self._size = self._row.size + 4
+        description = info.model_dump_json().encode()
+        self._begin = _HEAD.size + len(description)
+        length = self._begin + ROWS * self._size
+        with storage_errors(path):
+            folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+            try:
+                # Room that is not reserved would end the process with SIGBUS on a full disk.
+                os.posix_fallocate(descriptor, 0, length)
+                self._map = mmap.mmap(descriptor, length)
+            except OSError:
+                path.unlink(missing_ok=True)
+                raise
+            finally:
+                os.close(descriptor)
+        boot_id = (kernel_boot_id() or "").encode()
+        check = zlib.crc32(description + boot_id)
+        head = _HEAD.pack(_MAGIC, tiles, ROWS, len(description), boot_id, check)
+        self._map[: self._begin] = head + description
+
+    def put(
+        self,
+        seq: int,
+        t_mono_ns: int,
+        t_ns: int,
+        servo_counts: int,
+        servo_age_us: int,
+        reference_force_n: float,
+        frame_status: int,
+        padc: Sequence[int],
+        tadc: Sequence[int],
+        sample_offset_us: Sequence[int],
+        status: Sequence[int],
+    ) -> None:
+        """Keep one frame, as it was taken."""
+        row = self._row.pack(
+            *(seq, t_mono_ns, t_ns, servo_counts, servo_age_us, reference_force_n, frame_status),
+            *padc,
+            *tadc,
+            *sample_offset_us,
+            *status,
+        )
+        at = self._begin + (seq % ROWS) * self._size
+        self._map[at : at + self._size] = row + zlib.crc32(row).to_bytes(4, "little")
+
+    def close(self) -> None:
+        """Let go of the file; it stays."""
+        self._map.close()
+
+
+def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
+    """What a killed process left, in order; None if there is nothing that can be trusted.
+
+    Nothing can be if the machine was started anew since: the file was never synced. The frames end
+    where the first one is missing, counted back from the newest.
+
+    Raises:
+        StorageError: it cannot be read.
+    """
+    path = folder / IN_FLIGHT_FILE
+    with storage_errors(path):
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+    info = _described(content)
+    if info is None:
+        return None
+    tiles = len(info.tiles)
+    row = struct.Struct(_codes(tiles))
+    begin = len(content) - ROWS * (row.size + 4)
+    types: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = []
+    for name in _ORDER:
+        dtype, per_tile = FRAME_COLUMNS[name]
+        code = np.dtype(dtype).newbyteorder("<").str
+        types.append((name, code, (tiles,)) if per_tile else (name, code))
+    rows = np.frombuffer(content, np.dtype([*types, ("crc32", "<u4")]), ROWS, begin)
+    body = memoryview(content)
+    good = [
+        number
+        for number in range(ROWS)
+        if zlib.crc32(body[(at := begin + number * (row.size + 4)) : at + row.size])
+        == rows["crc32"][number]
+        and int(rows["seq"][number]) % ROWS == number
+        and rows["t_mono_ns"][number] != 0
+    ]
+    if not good:
+        return info, None
+    found = rows[np.array(good)]
+    found = found[np.argsort(found["seq"])]
+    steps = np.flatnonzero(np.diff(found["seq"]) != 1)
+    found = found[steps[-1] + 1 :] if len(steps) else found
+    columns = {
+        name: np.ascontiguousarray(found[name], dtype=FRAME_COLUMNS[name][0]) for name in _ORDER
+    }
+    return info, FrameBatch(**columns)
+
+
+def delete_in_flight(folder: Path) -> None:
+    """What was in flight is in the journal."""
+    with suppress(OSError):
+        (folder / IN_FLIGHT_FILE).unlink(missing_ok=True)
+
+
+def open_in_flight(folder: Path | None, info: ArrayInfo) -> InFlight | None:
+    """A place for frames in flight; None if the disk has no room for it, or none is wanted."""
+    if folder is None:
+        return None
+    try:
+        return InFlight(folder, info)
+    except StorageError:
+        return None
+
+
+def _codes(tiles: int) -> str:
+    codes = []
+    for name in _ORDER:
+        dtype, per_tile = FRAME_COLUMNS[name]
+        codes.append((str(tiles) if per_tile else "") + _CODES[np.dtype(dtype).name])
+    return "<" + "".join(codes)
+
+
+def _described(content: bytes) -> ArrayInfo | None:
+    if len(content) < _HEAD.size:
+        return None
+    magic, tiles, rows, length, boot_id, check = _HEAD.unpack_from(content)
+    description = content[_HEAD.size : _HEAD.size + length]
+    boot_id = boot_id.rstrip(b"\0")
+    expected = _HEAD.size + length + rows * (struct.calcsize(_codes(tiles)) + 4)
+    if (
+        magic != _MAGIC
+        or rows != ROWS
+        or len(content) != expected
+        or zlib.crc32(description + boot_id) != check
+        or boot_id.decode(errors="replace") != (kernel_boot_id() or "")
+    ):
+        return None
+    try:
+        return ArrayInfo.model_validate_json(description)
+    except ValueError:
+        return None

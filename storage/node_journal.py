@@ -1,0 +1,419 @@
+"""What a node keeps on its disk: every frame, always, whether anybody listens or not.
+
+A thread writes, so that a slow card holds up nobody; what it could not write waits in memory as
+long as there is room, and what does not fit is counted under its reason. Frames that a session
+needs stay until a server has them on its disk; others are a ring of ten minutes.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import math
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+from devices.acquisition import RangeFlag
+from devices.errors import StorageError
+from devices.frames import ArrayInfo
+from storage.durable import storage_errors
+from storage.in_flight import delete_in_flight, read_in_flight
+from storage.intervals import Intervals
+from storage.journal import Journal
+from storage.kept_stream import EncodedBatch, KeptStream, opened
+from storage.kernel import kernel_boot_id
+from storage.losses import CORRUPT, DISK_FULL, DISK_SLOW, EVICTED, READ_ONLY
+from storage.schema import wire_schema
+from storage.stream_notes import StreamNotes
+from storage.wanted import ServerWants, Wanted
+from storage.wire import decode, encode
+
+RING_NS = 600_000_000_000
+"""Frames of no session are kept so long, for pre-roll."""
+BUDGET_BYTES = 4 << 30
+"""A day and a half of four tiles at full rate."""
+WAITING_BYTES = 32 << 20
+"""What may wait in memory for the disk: some minutes."""
+SYNC_S = 0.2
+PROMISE_S = 0.5
+"""No frame is longer unsynced, as long as the disk is not slower."""
+_BATCH_S = 0.03
+_TIDY_S = 2.0
+_AGAIN_S = 1.0
+_CLOSE_S = 10.0
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class NodeJournal:
+    """All streams of a node.
+
+    Args:
+        root: the node's folder.
+        node: its name.
+        budget_bytes: what its journals may take.
+
+    Raises:
+        StorageError: another process uses it.
+        FileFormatError: a file in it is damaged.
+    """
+
+    def __init__(self, root: Path, node: str, *, budget_bytes: int = BUDGET_BYTES) -> None:
+        self.folder = root / "journal" / node
+        self._budget_bytes = budget_bytes
+        self._locks = ExitStack()
+        self._trouble: tuple[str, str] | None = None
+        """Reason and words, while the disk takes nothing."""
+        self._tried_s = -math.inf
+        self._tidied_s = -math.inf
+        self._began_s = time.monotonic()
+        self._wants_changed = False
+        self._damaged: deque[tuple[KeptStream, Intervals]] = deque()
+        self._lost_before: dict[str, object] = {}
+        self._wake = threading.Event()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="journal")
+        try:
+            self._lock(root / ".lock", fcntl.LOCK_SH)
+            self._lock(self.folder / ".lock", fcntl.LOCK_EX)
+            self.wanted = Wanted(self.folder / "wanted.json")
+            self.streams: list[KeptStream] = self._found()
+        except BaseException:
+            self._locks.close()
+            raise
+
+    def start(self) -> None:
+        """Begin to write."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write what waits, as far as the disk takes it, and end."""
+        self._stopping.set()
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._locks.close()
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What is wrong with keeping frames, in words."""
+        trouble = self._trouble
+        if trouble is None:
+            return ()
+        waiting_s = sum(
+            sum(batch.seq_last - batch.seq_first + 1 for batch in list(stream.waiting))
+            / stream.info.nominal_rate_hz
+            for stream in self.streams
+        )
+        return (f"{trouble[1]}; {waiting_s:.0f} s of frames wait in memory",)
+
+    def begin(self, info: ArrayInfo) -> KeptStream:
+        """A new stream; those before have ended."""
+        for stream in self.streams:
+            stream.has_ended = True
+        number = max((stream.notes.number for stream in self.streams), default=0) + 1
+        notes = StreamNotes(array_info=info, number=number, kernel_boot_id=kernel_boot_id())
+        stream = KeptStream(self.folder / info.boot_id, notes, None)
+        self.streams = [*self.streams, stream]
+        self._wake.set()
+        return stream
+
+    def put(self, stream: KeptStream, batch: EncodedBatch, missed_slots: int = 0) -> None:
+        """Keep the newest frames; returns at once."""
+        stream.put(batch, missed_slots)
+        while stream.waiting_bytes > WAITING_BYTES:
+            with stream.lock:
+                if len(stream.waiting) < 2:  # the writer has taken them meanwhile
+                    break
+                oldest = stream.waiting.popleft()
+                stream.waiting_bytes -= len(oldest.payload)
+            trouble = self._trouble
+            stream.lose(oldest.numbers, trouble[0] if trouble is not None else DISK_SLOW)
+        self._wake.set()
+
+    def want(self, server_id: str, wants: ServerWants) -> None:
+        """A server has said what its sessions need."""
+        if self.wanted.say(server_id, wants):
+            self._wants_changed = True
+            self._wake.set()
+
+    def damaged(self, stream: KeptStream, numbers: Intervals) -> None:
+        """Frames on disk turned out not to be what was written."""
+        self._damaged.append((stream, numbers))
+        self._wake.set()
+
+    def undelivered(self, stream: KeptStream) -> Intervals:
+        """What sessions need of a stream and no server has yet, of what is held."""
+        held = stream.held
+        wanted = self.wanted.numbers(stream.boot_id)
+        found = Intervals(pair for first, last in wanted for pair in held.within(first, last))
+        return found.without(stream.acked)
+
+    def settle(self, timeout_s: float = _CLOSE_S) -> bool:
+        """Wait until every stream that has ended is on disk to its end; did it get there?"""
+        end_s = time.monotonic() + timeout_s
+        while not all(stream.is_settled for stream in self.streams if stream.has_ended):
+            if time.monotonic() > end_s or not self._thread.is_alive():
+                return False
+            self._wake.set()
+            time.sleep(0.01)
+        return True
+
+    # --- the writer's thread ----------------------------------------------------------------------
+
+    def _run(self) -> None:
+        stop_s = math.inf
+        synced_s = time.monotonic()
+        while True:
+            self._wake.wait(SYNC_S)
+            self._wake.clear()
+            if self._stopping.is_set() and stop_s == math.inf:
+                stop_s = time.monotonic() + _CLOSE_S
+                for stream in self.streams:
+                    stream.has_ended = True
+            with suppress(StorageError):
+                self._write_all()
+            now_s = time.monotonic()
+            if now_s - synced_s >= SYNC_S or stop_s < math.inf:
+                synced_s = now_s
+                for stream in list(self.streams):
+                    self._sync(stream)
+                    self._settle(stream)
+            if now_s - self._tidied_s >= _TIDY_S or self._wants_changed:
+                self._tidied_s = now_s
+                self._tidy()
+            settled = all(stream.is_settled for stream in self.streams)
+            if stop_s < math.inf and (settled or now_s > stop_s or self._trouble is not None):
+                return
+
+    def _write_all(self) -> None:
+        now_s = time.monotonic()
+        if self._trouble is not None and now_s - self._tried_s < _AGAIN_S:
+            return
+        self._tried_s = now_s
+        try:
+            for stream in list(self.streams):
+                self._write(stream)
+        except StorageError as error:
+            reason = DISK_FULL if error.errno in _FULL else READ_ONLY
+            what = "is full" if reason == DISK_FULL else f"does not take frames: {error.what}"
+            self._trouble = (reason, f"the journal's disk {what}")
+            return
+        self._trouble = None
+
+    def _write(self, stream: KeptStream) -> None:
+        if stream.journal is None and not stream.is_settled:
+            begun = Journal(stream.folder, stream.info)
+            stream.save_notes()
+            stream.journal = begun
+        journal, schema = stream.journal, wire_schema(stream.info)
+        while stream.waiting and journal is not None:
+            batch = stream.waiting[0]
+            try:
+                self._keep_to_budget()
+                journal.append(decode(batch.payload, schema), batch.payload)
+            except StorageError as error:
+                if error.errno in _FULL and self._evict():
+                    continue
+                raise
+            with stream.lock:
+                if stream.waiting and stream.waiting[0] is batch:
+                    stream.waiting.popleft()
+                    stream.waiting_bytes -= len(batch.payload)
+                stream.lost.found(batch.numbers)
+            stream.unsynced.append(batch)
+
+    def _sync(self, stream: KeptStream) -> None:
+        if stream.journal is None or not stream.unsynced:
+            return
+        begin_s = time.monotonic()
+        try:
+            stream.journal.sync()
+        except StorageError:
+            # The kernel may forget what it could not write: it has to be written once more.
+            numbers = Intervals((b.seq_first, b.seq_last) for b in stream.unsynced)
+            stream.journal.disown(numbers)
+            with stream.lock:
+                stream.waiting.extendleft(reversed(stream.unsynced))
+                stream.waiting_bytes += sum(len(batch.payload) for batch in stream.unsynced)
+            stream.unsynced = []
+            return
+        stream.unsynced = []
+        took_s = SYNC_S + time.monotonic() - begin_s
+        if took_s > max(PROMISE_S, stream.notes.sync_max_s):
+            with suppress(StorageError):
+                stream.save_notes(sync_max_s=took_s)
+
+    def _settle(self, stream: KeptStream) -> None:
+        """Note where a stream has ended, once all of it is on disk."""
+        if stream.is_settled or not stream.has_ended or stream.waiting or stream.unsynced:
+            return
+        try:
+            if stream.journal is not None:
+                stream.journal.close()
+            if stream.next_seq:
+                stream.save_notes(next_seq=stream.next_seq)
+            elif stream.folder.is_dir():  # it ended before its first frame
+                shutil.rmtree(stream.folder, ignore_errors=True)
+        except StorageError:
+            return
+        delete_in_flight(stream.folder)
+        stream.is_settled = True
+
+    def _tidy(self) -> None:
+        while self._damaged:
+            stream, numbers = self._damaged.popleft()
+            if stream.journal is not None:
+                stream.journal.disown(numbers)
+                stream.lose(numbers, CORRUPT)
+        if self._wants_changed:
+            self._wants_changed = False
+            try:
+                self.wanted.save()
+            except StorageError:
+                self._wants_changed = True
+        past_ring = time.monotonic() - self._began_s > RING_NS * 1e-9
+        for stream in list(self.streams):
+            journal, is_present = stream.journal, not stream.has_ended
+            if journal is None:
+                continue
+            keep = self._keep(stream)
+            newest = stream.recent(max(0, stream.next_seq - 1))
+            before_ns: int | None = None
+            if is_present and newest:
+                schema = wire_schema(stream.info)
+                before_ns = int(decode(newest[-1].payload, schema).t_ns[-1]) - RING_NS
+            elif not is_present and past_ring:
+                before_ns = 2**62
+            if before_ns is not None:
+                with suppress(StorageError):
+                    stream.lose(journal.prune(before_ns, keep), EVICTED)
+            unheld = not journal.held and stream.is_settled
+            if unheld and past_ring and not self.wanted.numbers(stream.boot_id):
+                journal.delete()
+                self.streams = [each for each in self.streams if each is not stream]
+                continue
+            lost = stream.lost.as_pairs()
+            if lost != self._lost_before.get(stream.boot_id, stream.notes.lost):
+                with suppress(StorageError):
+                    stream.save_notes()
+                    self._lost_before[stream.boot_id] = lost
+
+    def _keep(self, stream: KeptStream) -> Intervals:
+        """What must not be deleted."""
+        with stream.lock:
+            return self.wanted.numbers(stream.boot_id).without(stream.acked)
+
+    def _keep_to_budget(self) -> None:
+        while self._size_bytes() > self._budget_bytes:
+            if not self._evict():
+                raise StorageError(
+                    f"the journal has its {self._budget_bytes} bytes, all of frames that sessions "
+                    "need",
+                    where=str(self.folder),
+                    errno=errno.ENOSPC,
+                )
+
+    def _size_bytes(self) -> int:
+        return sum(s.journal.size_bytes for s in self.streams if s.journal is not None)
+
+    def _evict(self) -> bool:
+        """Make room: delete the oldest frames that no session needs; was there anything?"""
+        for stream in list(self.streams):
+            if stream.journal is not None:
+                gone = stream.journal.evict(self._keep(stream))
+                if gone:
+                    stream.lose(gone, EVICTED)
+                    return True
+        return False
+
+    # --- what was there ---------------------------------------------------------------------------
+
+    def _found(self) -> list[KeptStream]:
+        streams = []
+        if self.folder.is_dir():
+            with storage_errors(self.folder):
+                folders = [path for path in self.folder.iterdir() if path.is_dir()]
+            for folder in folders:
+                stream = taken_up(folder)
+                if stream is not None:
+                    streams.append(stream)
+        # One that was killed before its notes were written has no number yet: it is the newest.
+        streams.sort(key=lambda stream: stream.notes.number or math.inf)
+        for number, stream in enumerate(streams):
+            if not stream.notes.number:
+                before = streams[number - 1].notes.number if number else 0
+                stream.notes = stream.notes.model_copy(update={"number": before + 1})
+        return streams
+
+    def _lock(self, path: Path, how: int) -> None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = self._locks.enter_context(path.open("a"))
+        except OSError:  # a disk that takes nothing has no second user either
+            return
+        try:
+            fcntl.flock(file, how | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise StorageError(
+                "another foottile process uses this folder",
+                where=str(path.parent),
+                remedy="Stop it, or choose another folder with --journal or another --name",
+            ) from error
+
+
+def taken_up(folder: Path, progress: Callable[[str], None] | None = None) -> KeptStream | None:
+    """A stream that an earlier process left, with what it had in flight when it was killed.
+
+    If the machine itself went down, what was in flight is lost; how much that can have been is
+    noted: what was taken since the last sync, by the disk's slowest one.
+
+    Raises:
+        StorageError: it cannot be read.
+    """
+    left = read_in_flight(folder)
+    stream = opened(folder)
+    if stream is None:
+        if left is None:
+            return None
+        stream = KeptStream(folder, StreamNotes(array_info=left[0]), None)
+        stream.notes = stream.notes.model_copy(update={"kernel_boot_id": kernel_boot_id()})
+    if stream.notes.has_ended:
+        return stream
+    held = stream.held
+    end = (held.last + 1) if held.last is not None else 0
+    lost_last = stream.lost.all.last
+    end = max(end, (lost_last + 1) if lost_last is not None else 0)
+    rescued = left[1] if left is not None else None
+    tail = 0
+    if rescued is not None:
+        RangeFlag(stream.info.tiles).flag(rescued)
+        first, last = int(rescued.seq[0]), int(rescued.seq[-1])
+        if first > end:  # more waited for the disk than was in flight
+            stream.lost.add(Intervals([(end, first - 1)]), DISK_SLOW)
+        schema = wire_schema(stream.info)
+        for a, b in held.missing(max(first, _oldest(held)), last):
+            for begin in range(a, b + 1, 64):
+                rows = rescued.rows(begin - first, min(begin + 64, b + 1) - first)
+                batch = EncodedBatch(int(rows.seq[0]), int(rows.seq[-1]), encode(rows, schema))
+                stream.waiting.append(batch)
+                stream.waiting_bytes += len(batch.payload)
+        end = max(end, last + 1)
+    elif left is None:
+        waited_s = max(PROMISE_S, stream.notes.sync_max_s) + _BATCH_S
+        tail = math.ceil(waited_s * stream.info.nominal_rate_hz) + 1
+    stream.next_seq = end
+    stream.has_ended = True
+    stream.notes = stream.notes.model_copy(update={"unsynced_tail_max": tail})
+    if progress is not None:
+        progress(f"stream {stream.boot_id}: taken up to frame {end - 1}")
+    return stream
+
+
+def _oldest(held: Intervals) -> int:
+    """What is older than everything that is held was evicted, not lost in flight."""
+    return next(iter(held))[0] if held else 0
