@@ -15,6 +15,7 @@ QUEUE_S = 0.4
 LEAST_BYTES = 32 << 10
 MOST_BYTES = 8 << 20
 _PACE_OVER_S = 1.0
+_PIECES = 8
 
 
 class Flow:
@@ -37,6 +38,12 @@ class Flow:
     def is_open(self) -> bool:
         """May more be sent?"""
         return self.under_way_bytes < self.window_bytes
+
+    @property
+    def wants_mark(self) -> bool:
+        """Is it time to ask? Often enough that room comes back piece by piece, not all at once."""
+        marked = self._marks[-1][1] if self._marks else self._passed
+        return self._sent - marked >= self.window_bytes / _PIECES
 
     def sent(self, length: int) -> None:
         """A message of so many bytes went out."""

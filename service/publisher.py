@@ -49,7 +49,7 @@ from storage.ledger import NO_END
 
 PROBE_EVERY_S = 10.0
 STATUS_EVERY_S = 1.0
-_MARK_EVERY_S = 0.1
+_ASK_EVERY_S = 0.5
 _NO_ANSWER_S = 4.0
 """A link on which nothing comes back for so long is half open."""
 _BACK_OFF_S = (0.1, 0.5)
@@ -107,6 +107,9 @@ class Publisher:
         self._said_hello: Hello | None = None
         self._server_id = ""
         self._flow = Flow()
+        self._asked: dict[int, float] = {}
+        """Questions that were not answered yet, and when they were asked."""
+        self._numbers = count()
         self._backlog = Backlog()
 
     def notify(self) -> None:
@@ -154,13 +157,14 @@ class Publisher:
             proxy=None,
         ) as socket:
             welcome = await self._greet(socket)
+            self._flow, self._asked = Flow(), {}
             self._say(f"connected to {self._url}")
             waits.succeeded()
             self._connected = True
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(self._receive(socket))
                 tasks.create_task(self._send_frames(socket, welcome))
-                tasks.create_task(self._measure_flow(socket))
+                tasks.create_task(self._watch(socket))
                 tasks.create_task(self._measure_clock(socket))
                 tasks.create_task(self._send_status(socket))
                 tasks.create_task(self._await_renewal())
@@ -208,7 +212,6 @@ class Publisher:
         if hello is None:
             return
         present, at = self._present(), hello.next_seq
-        self._flow = Flow()
         self._backlog = Backlog(
             (lacks.boot_id, _before(lacks.numbers, hello, lacks.boot_id)) for lacks in welcome.lacks
         )
@@ -247,6 +250,8 @@ class Publisher:
                 await socket.send(Stream(boot_id=boot_id).model_dump_json())
             await socket.send(batch.payload)
             self._flow.sent(len(batch.payload))
+            if self._flow.wants_mark:
+                await self._ask(socket)
 
     def _next_chunk(self) -> list[tuple[str, EncodedBatch]]:
         """Batches of the backlog, read from where they are."""
@@ -269,29 +274,29 @@ class Publisher:
             self._backlog.done(boot_id, first, last)
         return [(boot_id, batch) for batch in found]
 
-    async def _measure_flow(self, socket: ClientConnection) -> None:
-        """Ask every so often whether the other side has read what was sent."""
-        waiting: dict[int, float] = {}
-        asked_s = -STATUS_EVERY_S
-        for number in count():
-            flow, now_s = self._flow, time.monotonic()
-            if waiting and now_s - next(iter(waiting.values())) > _NO_ANSWER_S:
+    async def _watch(self, socket: ClientConnection) -> None:
+        """Ask now and then whether anybody is there: a link that is half open is noticed."""
+        while True:
+            oldest_s = next(iter(self._asked.values()), None)
+            if oldest_s is not None and time.monotonic() - oldest_s > _NO_ANSWER_S:
                 raise LinkError(f"the server has not answered for {_NO_ANSWER_S:g} s")
-            if flow.under_way_bytes or now_s - asked_s >= STATUS_EVERY_S:
-                asked_s = waiting[number] = now_s
-                flow.mark(number)
+            await self._ask(socket)
+            await asyncio.sleep(_ASK_EVERY_S)
 
-                def answered(
-                    answer: asyncio.Future[float], number: int = number, flow: Flow = flow
-                ) -> None:
-                    waiting.pop(number, None)
-                    if not answer.cancelled() and answer.exception() is None:
-                        flow.answered(number, time.monotonic())
-                        self._news.set()
+    async def _ask(self, socket: ClientConnection) -> None:
+        """Mark what was sent so far; the answer says that it was read."""
+        number, flow = next(self._numbers), self._flow
+        asked = self._asked
+        asked[number] = time.monotonic()
+        flow.mark(number)
 
-                pong = await socket.ping()
-                asyncio.ensure_future(pong).add_done_callback(answered)
-            await asyncio.sleep(_MARK_EVERY_S)
+        def answered(answer: asyncio.Future[float]) -> None:
+            asked.pop(number, None)
+            if not answer.cancelled() and answer.exception() is None:
+                flow.answered(number, time.monotonic())
+                self._news.set()
+
+        asyncio.ensure_future(await socket.ping()).add_done_callback(answered)
 
     async def _measure_clock(self, socket: ClientConnection) -> None:
         """The clocks' offset, by the probe with the shortest round trip; unmeasured is unsent."""
