@@ -19,6 +19,7 @@ from urllib.parse import urlsplit, urlunsplit
 from pydantic import ValidationError
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.frames import CloseCode
 
 from devices.errors import DamagedFramesError, LinkError, StorageError, UsageError
 from service.backlog import Backlog
@@ -127,8 +128,6 @@ class Publisher:
             self._renewed.clear()
             try:
                 await self._connection(waits)
-            except* _Renewed:
-                waits = _Waits()
             except* (OSError, ValueError, WebSocketException) as group:
                 self._say(f"not connected to {self._url}: {_reason(group)}; trying again")
                 waits.failed(group)
@@ -161,13 +160,16 @@ class Publisher:
             self._say(f"connected to {self._url}")
             waits.succeeded()
             self._connected = True
-            async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(self._receive(socket))
-                tasks.create_task(self._send_frames(socket, welcome))
-                tasks.create_task(self._watch(socket))
-                tasks.create_task(self._measure_clock(socket))
-                tasks.create_task(self._send_status(socket))
-                tasks.create_task(self._await_renewal())
+            try:
+                async with asyncio.TaskGroup() as tasks:
+                    tasks.create_task(self._receive(socket))
+                    tasks.create_task(self._send_frames(socket, welcome))
+                    tasks.create_task(self._watch(socket))
+                    tasks.create_task(self._measure_clock(socket))
+                    tasks.create_task(self._send_status(socket))
+                    tasks.create_task(self._await_renewal())
+            except* _Renewed:
+                await socket.close(CloseCode.GOING_AWAY, "another stream has begun")
 
     async def _greet(self, socket: ClientConnection) -> Welcome:
         if socket.subprotocol != SUBPROTOCOL:
@@ -226,9 +228,9 @@ class Publisher:
                 continue
             newest = present.recent(at)
             if newest:
-                while newest[-1].seq_last - newest[0].seq_first >= behind_frames < len(newest):
-                    newest.pop(0)
-                batch = newest[0]
+                # What has waited too long is overtaken; a long batch is no reason to skip it.
+                late = newest[-1].seq_last - behind_frames
+                batch = next((b for b in newest if b.seq_first > late), newest[-1])
                 if batch.seq_first > at:
                     self._backlog.add(present.boot_id, at, batch.seq_first - 1)
                 boot_id, at = present.boot_id, batch.seq_last + 1
@@ -271,7 +273,8 @@ class Publisher:
             except StorageError:
                 found = []  # evicted meanwhile, and counted
         if last >= first:
-            self._backlog.done(boot_id, first, last)
+            # Batches are sent whole, and may reach further than what was asked for.
+            self._backlog.done(boot_id, first, max([last, *(b.seq_last for b in found[-1:])]))
         return [(boot_id, batch) for batch in found]
 
     async def _watch(self, socket: ClientConnection) -> None:

@@ -308,7 +308,7 @@ class FakeNode:
         content: dict[str, Any] = {
             "protocol": PROTOCOL,
             "array_info": self.info,
-            "first_seq": 0,
+            "held": ((0, self.seq - 1),) if self.seq else (),
             "next_seq": self.seq,
             "scene": {"name": "test"},
             "emulated": False,
