@@ -22,7 +22,8 @@ RUN pip install --no-index --find-links /wheels hatchling \
 FROM python:3.12-slim-bookworm
 COPY --from=build /opt/foottile /opt/foottile
 COPY scripts/container-node /usr/local/bin/foottile-node
-RUN useradd --create-home --uid 1000 foottile && install -d -o foottile -g foottile /data /home/foottile/.cache
+RUN useradd --create-home --uid 1000 foottile && install -d -o foottile -g foottile /data /home/foottile/.cache \
+    /home/foottile/.local /home/foottile/.local/state
 ENV PATH=/opt/foottile/bin:$PATH PYTHONUNBUFFERED=1
 USER foottile
 VOLUME /data

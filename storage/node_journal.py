@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import logging
 import math
 import shutil
 import threading
@@ -32,6 +33,8 @@ from storage.schema import wire_schema
 from storage.stream_notes import StreamNotes
 from storage.wanted import ServerWants, Wanted
 from storage.wire import decode, encode
+
+log = logging.getLogger("foottile.journal")
 
 RING_NS = 600_000_000_000
 """Frames of no session are kept so long, for pre-roll."""
@@ -69,7 +72,7 @@ class NodeJournal:
         self._trouble: tuple[str, str] | None = None
         """Reason and words, while the disk takes nothing."""
         self._tried_s = -math.inf
-        self._tidied_s = -math.inf
+        self._tidied_s = self._synced_s = -math.inf
         self._began_s = time.monotonic()
         self._wants_changed = False
         self._damaged: deque[tuple[KeptStream, Intervals]] = deque()
@@ -167,7 +170,6 @@ class NodeJournal:
 
     def _run(self) -> None:
         stop_s = math.inf
-        synced_s = time.monotonic()
         while True:
             self._wake.wait(SYNC_S)
             self._wake.clear()
@@ -175,20 +177,26 @@ class NodeJournal:
                 stop_s = time.monotonic() + _CLOSE_S
                 for stream in self.streams:
                     stream.has_ended = True
-            with suppress(StorageError):
-                self._write_all()
-            now_s = time.monotonic()
-            if now_s - synced_s >= SYNC_S or stop_s < math.inf:
-                synced_s = now_s
-                for stream in list(self.streams):
-                    self._sync(stream)
-                    self._settle(stream)
-            if now_s - self._tidied_s >= _TIDY_S or self._wants_changed:
-                self._tidied_s = now_s
-                self._tidy()
+            try:
+                self._work(at_once=stop_s < math.inf)
+            except Exception:
+                log.exception("this is a bug; the journal goes on")
             settled = all(stream.is_settled for stream in self.streams)
-            if stop_s < math.inf and (settled or now_s > stop_s or self._trouble is not None):
+            is_late = time.monotonic() > stop_s
+            if stop_s < math.inf and (settled or is_late or self._trouble is not None):
                 return
+
+    def _work(self, *, at_once: bool) -> None:
+        self._write_all()
+        now_s = time.monotonic()
+        if now_s - self._synced_s >= SYNC_S or at_once:
+            self._synced_s = now_s
+            for stream in list(self.streams):
+                self._sync(stream)
+                self._settle(stream)
+        if now_s - self._tidied_s >= _TIDY_S or self._wants_changed:
+            self._tidied_s = now_s
+            self._tidy()
 
     def _write_all(self) -> None:
         now_s = time.monotonic()
