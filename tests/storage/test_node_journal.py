@@ -217,7 +217,7 @@ def test_a_disk_that_was_slower_than_the_promise_widens_the_bound(
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", slow)
         fill(journal, stream, 0, 9)
-        until(lambda: stream.notes.sync_max_s > 0.6)
+        until(lambda: (n := StreamNotes.load(stream.folder)) and n.sync_max_s > 0.6)
     folder = killed(journal, tmp_path)
     again = NodeJournal(folder, "leg")
     assert again.streams[0].notes.unsynced_tail_max > 0.6 * 500
