@@ -12,12 +12,14 @@ import httpx
 
 from devices.errors import LinkError, StateError, UsageError
 from service.sealing import sha256_of
+from storage.clock_file import CLOCK_NAME
 from storage.durable import storage_errors, sync_folder, write_whole
 from storage.session import FRAMES_NAME
 
 API = "/api/v1"
 _CHUNK = 1 << 20
 _PARTIAL = 206
+_NOT_FOUND = 404
 
 
 class Client:
@@ -100,6 +102,7 @@ class Client:
         ledger = self._get(f"/sessions/{session_id}/ledger")
         for name, content in (("session", session), ("events", events), ("ledger", ledger)):
             write_whole(folder / f"{name}.json", _json(content))
+        self._pull_clock(session_id, folder / CLOCK_NAME)
         return {**session, "path": str(path), "resumed_bytes": resumed}
 
     def _download(self, session: dict[str, Any], path: Path) -> int:
@@ -142,15 +145,16 @@ class Client:
             sync_folder(path.parent)
         return resumed
 
+    def _pull_clock(self, session_id: str, path: Path) -> None:
+        answer = self._answer(f"/sessions/{session_id}/clock", {"format": "parquet"})
+        if answer.status_code == _NOT_FOUND:  # taken away, or a server that knows no clocks yet
+            return
+        if answer.is_error:
+            raise self._refused(answer)
+        write_whole(path, answer.content)
+
     def _get(self, path: str, query: dict[str, str] | None = None) -> dict[str, Any]:
-        try:
-            answer = self._http.get(path, params=query)
-        except httpx.HTTPError as error:
-            raise LinkError(
-                f"no answer: {error}",
-                where=self.server,
-                remedy="Is `foottile serve` running there? Name it with --server",
-            ) from error
+        answer = self._answer(path, query)
         if answer.is_error:
             raise self._refused(answer)
         try:
@@ -160,6 +164,16 @@ class Client:
         if not isinstance(content, dict):
             raise LinkError("the answer is not a foottile server's", where=self.server)
         return content
+
+    def _answer(self, path: str, query: dict[str, str] | None) -> httpx.Response:
+        try:
+            return self._http.get(path, params=query)
+        except httpx.HTTPError as error:
+            raise LinkError(
+                f"no answer: {error}",
+                where=self.server,
+                remedy="Is `foottile serve` running there? Name it with --server",
+            ) from error
 
     def _refused(self, answer: httpx.Response) -> LinkError:
         try:

@@ -21,6 +21,8 @@ from service.estimation.calibration import Calibration
 from service.estimation.plan import EstimationPlan
 from service.estimation.tare import Tare
 from service.pipeline import Columns, EstimateOptions, EstimateStream, notes_of
+from storage.clock_file import CLOCK_NAME, write_clock
+from storage.clock_table import ClockTable, StreamFacts, rows_by_stream
 from storage.durable import write_whole
 from storage.intervals import Intervals
 from storage.journal import Journal
@@ -52,6 +54,19 @@ class Sources:
     problem: str | None
     tares: tuple[Tare, ...]
     notes: Mapping[str, object]
+
+    @property
+    def streams(self) -> tuple[StreamFacts, ...]:
+        """What is known of the clocks of the session's streams."""
+        boot_ids = dict.fromkeys(part.boot_id for part in self.session.parts)
+        known = {boot_id: journal.info for boot_id, journal in self.journals.items()}
+        known[self.info.boot_id] = self.info
+        return tuple(
+            StreamFacts(boot_id, info.utc_offset_ns, info.clock_set)
+            if (info := known.get(boot_id)) is not None
+            else StreamFacts(boot_id)
+            for boot_id in boot_ids
+        )
 
 
 class SessionFrames:
@@ -144,7 +159,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
             f"{count} frames were sealed, the ledger has {recorded}", where=str(path)
         )
     write_events(session, folder)
-    _write_clock(session, folder)
+    write_clock(folder / CLOCK_NAME, session.clock, sources.streams)
     plan = frames.plan
     return session.model_copy(
         update={
@@ -239,20 +254,18 @@ def write_events(session: Session, folder: Path) -> None:
     )
 
 
-def _write_clock(session: Session, folder: Path) -> None:
-    rows = session.clock
-    numbers = {
-        name: pa.array([getattr(row, name) for row in rows], pa.int64())
-        for name in ("t_mono_ns", "server_minus_node_ns", "uncertainty_ns")
-    }
-    boot_ids = pa.array([row.boot_id for row in rows], pa.string())
-    _write_table(pa.table({"boot_id": boot_ids, **numbers}), folder / "clock.parquet")
-
-
 def _write_table(table: pa.Table, path: Path) -> None:
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd")
     write_whole(path, sink.getvalue().to_pybytes())
+
+
+def table_of_rows(sources: Sources) -> ClockTable:
+    """The clock table of a session that is not sealed yet."""
+    parts = [part.boot_id for part in sources.session.parts]
+    where = f"session {sources.session.id}"
+    rows = rows_by_stream(sources.session.clock, where=where)
+    return ClockTable(rows, sources.streams, parts, where=where)
 
 
 def sha256_of(path: Path) -> str:

@@ -19,17 +19,24 @@ import pyarrow.parquet as pq
 
 from devices.errors import UsageError
 from devices.frames import ArrayInfo, FrameBatch
-from storage.schema import ARRAY_INFO_KEY, FRAMES, KNOWN, Array, flat_columns
+from storage.clock_table import ClockTable
+from storage.schema import ARRAY_INFO_KEY, FRAMES, KNOWN, SERVER_TIME, Array, flat_columns
 from storage.session_file import NOTES_KEY, parquet_options
 
 Format = Literal["parquet", "arrow", "csv"]
 FORMATS: tuple[Format, ...] = get_args(Format)
+
+ClockName = Literal["node", "server"]
+CLOCKS: tuple[ClockName, ...] = get_args(ClockName)
+"""Whose time goes with the frames: the node's own only, or the server's beside it."""
 
 MEDIA_TYPES: Mapping[Format, str] = {
     "parquet": "application/vnd.apache.parquet",
     "arrow": "application/vnd.apache.arrow.stream",
     "csv": "text/csv; charset=utf-8; header=present",
 }
+
+_SERVER_TIME = {column.name for column in SERVER_TIME}
 
 Pieces = Iterable[tuple[FrameBatch, Mapping[str, Array]]]
 
@@ -56,7 +63,12 @@ class Slice:
 
 
 def export(
-    pieces: Pieces, info: ArrayInfo, notes: Mapping[str, object], to: Format, part: Slice
+    pieces: Pieces,
+    info: ArrayInfo,
+    notes: Mapping[str, object],
+    to: Format,
+    part: Slice,
+    clock: ClockTable | None = None,
 ) -> Iterator[bytes]:
     """A session's frames as bytes of a file.
 
@@ -66,6 +78,7 @@ def export(
         notes: for the file's metadata; CSV has no place for them.
         to: format.
         part: rows and columns.
+        clock: adds `t_server_ns` and its bound, and how they were found to the notes; None: not.
 
     Yields:
         Chunks of the file. There is a header even if no frame is in the slice.
@@ -73,6 +86,9 @@ def export(
     Raises:
         UsageError: a column is not there; raised before the first chunk.
     """
+    if clock is not None:
+        pieces = _with_server_time(pieces, clock)
+        notes = {**notes, "clock": clock.summary().model_dump(mode="json")}
     tables = _tables(pieces, info, notes, part)
     first = next(tables, None)
     if first is None:
@@ -123,6 +139,13 @@ def _tables(
         )
 
 
+def _with_server_time(
+    pieces: Pieces, clock: ClockTable
+) -> Iterator[tuple[FrameBatch, Mapping[str, Array]]]:
+    for frames, extra in pieces:
+        yield frames, {**extra, **clock.columns(frames.t_mono_ns, frames.t_ns, extra.get("part"))}
+
+
 def _chosen(present: Sequence[str], tiles: int, asked: Sequence[str]) -> list[tuple[str, str]]:
     """Logical and flat name of every column asked for, in that order, each once."""
     flat = {f: name for name in present for f in KNOWN[name].flat_names(tiles)}
@@ -136,7 +159,9 @@ def _chosen(present: Sequence[str], tiles: int, asked: Sequence[str]) -> list[tu
             chosen[name] = flat[name]
         else:
             raise UsageError(
-                f"no column {name[:80]!r} in this session", expected=f"some of {', '.join(present)}"
+                f"no column {name[:80]!r} in this session",
+                expected=f"some of {', '.join(present)}",
+                remedy="Ask for the clock `server` as well" if name in _SERVER_TIME else "",
             )
     return [(name, f) for f, name in chosen.items()]
 

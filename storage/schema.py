@@ -129,7 +129,23 @@ MILL = (
 PARTS = (Column("part", pa.uint16(), "1", "which part of the session, one for each start"),)
 """A recorded session goes on when its node is switched on anew; `seq` then begins again."""
 
-KNOWN = {column.name: column for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL)}
+NO_INSTANT = -(2**63)
+
+SERVER_TIME = (
+    Column("t_server_ns", pa.int64(), "ns", "t_ns in the server's UTC", missing=NO_INSTANT),
+    Column(
+        "t_server_uncertainty_ns",
+        pa.int64(),
+        "ns",
+        "bound of t_server_ns: the truth is within plus or minus this",
+        missing=NO_INSTANT,
+    ),
+)
+"""What a clock table makes of `t_ns` when a session is read; never in a sealed file."""
+
+KNOWN = {
+    column.name: column for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL, *SERVER_TIME)
+}
 
 
 # --- wire -----------------------------------------------------------------------------------------

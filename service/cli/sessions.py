@@ -109,15 +109,21 @@ def export_command(
     columns: Annotated[
         str | None, typer.Option(help="Names with commas between: t_ns,grf_n,force_n_0.")
     ] = None,
+    clock: Annotated[
+        str, typer.Option(help="node, or server: adds t_server_ns and t_server_uncertainty_ns.")
+    ] = "node",
 ) -> None:
     """Write a sealed session, or a slice of it, in another format."""
+    from storage.clock_file import clock_beside
     from storage.durable import storage_errors
-    from storage.export import FORMATS, Slice, export
+    from storage.export import CLOCKS, FORMATS, Slice, export
     from storage.schema import FRAMES, KNOWN
     from storage.session_file import SessionReader
 
     if to not in FORMATS:
         raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))
+    if clock not in CLOCKS:
+        raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
     chosen: Format = to
     source = _sealed_file(session, data)
     path = output_path(out, source)
@@ -132,6 +138,7 @@ def export_command(
             reader.notes,
             chosen,
             Slice(start_s, end_s, names),
+            clock_beside(reader) if clock == "server" else None,
         )
         try:
             with storage_errors(path), progress(f"writing {path.name}"):

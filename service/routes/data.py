@@ -21,10 +21,11 @@ from devices.errors import StateError, UnknownError, UsageError
 from devices.frames import FRAME_COLUMNS
 from service.problems import problem
 from service.routes.access import ServerState, problems
-from service.sealing import SessionFrames
+from service.sealing import SessionFrames, sha256_of, table_of_rows
 from service.server import Server
 from service.version import SOFTWARE
-from storage.export import MEDIA_TYPES, Format, Slice, export
+from storage.clock_file import CLOCK_NAME, clock_beside
+from storage.export import MEDIA_TYPES, ClockName, Format, Slice, export
 from storage.schema import KNOWN
 from storage.session import FRAMES_NAME, Session
 from storage.session_file import SessionReader
@@ -53,6 +54,11 @@ class DataQuery(BaseModel):
         description="Names with commas between: of all tiles (`force_n`) or one (`force_n_0`).",
         examples=["t_ns,grf_n,force_n_0"],
     )
+    clock: ClockName = Field(
+        default="node",
+        description="`server` adds `t_server_ns`, the frame's instant in the server's UTC, and its "
+        "bound `t_server_uncertainty_ns`; null where the clocks were not compared.",
+    )
 
     @property
     def slice(self) -> Slice:
@@ -64,7 +70,13 @@ class DataQuery(BaseModel):
     def canonical(self) -> str:
         """The same for queries that ask for the same."""
         part = self.slice
-        return f"{self.format}|{part.start_s}|{part.end_s}|{','.join(part.columns)}"
+        columns = ",".join(part.columns)
+        return f"{self.format}|{part.start_s}|{part.end_s}|{columns}|{self.clock}"
+
+    @property
+    def is_stored(self) -> bool:
+        """Is it the sealed file as it is?"""
+        return self.format == "parquet" and self.slice.is_all and self.clock == "node"
 
 
 @router.head("/{session_id}/data", include_in_schema=False)
@@ -96,9 +108,10 @@ async def data(
 ) -> Response:
     """A session as Parquet, Arrow or CSV.
 
-    Parquet without slice or columns is the stored file: with ranges, a strong ETag that is its
-    SHA-256, and a digest. Everything else is made on request and streamed; while a session is
-    recorded it is what there is so far. `Foottile-Complete` says whether frames are missing.
+    Parquet without slice, columns or server's clock is the stored file: with ranges, a strong ETag
+    that is its SHA-256, and a digest. Everything else is made on request and streamed; while a
+    session is recorded it is what there is so far. `Foottile-Complete` says whether frames are
+    missing.
     """
     session = server.recorder.get(session_id)
     ledger = server.recorder.ledger(session_id)
@@ -111,7 +124,7 @@ async def data(
             f"session {session_id} is {session.state}, and Parquet is made when it is sealed",
             remedy="Stop it, or ask for format=arrow or csv",
         )
-    if session.sha256 is not None and query.format == "parquet" and query.slice.is_all:
+    if session.sha256 is not None and query.is_stored:
         return _stored(session, session.sha256, request, server, headers)
     return await _made(session, query, request, server, headers)
 
@@ -157,13 +170,16 @@ def _stored(
 async def _made(
     session: Session, query: DataQuery, request: Request, server: Server, headers: dict[str, str]
 ) -> Response:
+    clocks = ""
+    if query.clock == "server":
+        clocks = await run_in_threadpool(_clocks_hash, session, server)
     if session.sha256 is not None:
-        about = f"{session.sha256}|{query.canonical}|{SOFTWARE}|{pa.__version__}"
+        about = f"{session.sha256}|{query.canonical}|{clocks}|{SOFTWARE}|{pa.__version__}"
         tag = hashlib.sha256(about.encode()).hexdigest()
         headers |= {"ETag": f'"{tag}"'}
     else:
         frames = sum(part.recorded for part in server.recorder.ledger(session.id).parts)
-        about = f"{session.id}|{session.state}|{frames}|{query.canonical}|{SOFTWARE}"
+        about = f"{session.id}|{session.state}|{frames}|{query.canonical}|{clocks}|{SOFTWARE}"
         tag = hashlib.sha256(about.encode()).hexdigest()
         headers |= {"ETag": f'W/"{tag}"'}
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
@@ -188,18 +204,27 @@ async def _made(
     return StreamingResponse(body(), headers=headers, media_type=MEDIA_TYPES[query.format])
 
 
+def _clocks_hash(session: Session, server: Server) -> str:
+    path = server.recorder.folder.path(session.id) / CLOCK_NAME
+    if session.sha256 is not None and path.is_file():
+        return sha256_of(path)
+    return hashlib.sha256(repr(session.clock).encode()).hexdigest()
+
+
 def _chunks(session: Session, query: DataQuery, server: Server) -> Iterator[bytes]:
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
-        return export(SessionFrames(sources), sources.info, {}, query.format, query.slice)
+        clock = table_of_rows(sources) if query.clock == "server" else None
+        return export(SessionFrames(sources), sources.info, {}, query.format, query.slice, clock)
     return _chunks_of_file(server.recorder.folder.path(session.id) / FRAMES_NAME, query)
 
 
 def _chunks_of_file(path: Path, query: DataQuery) -> Iterator[bytes]:
     with SessionReader(path) as reader:
         extra = [name for name in KNOWN if name not in FRAME_COLUMNS and reader.has(name)]
+        clock = clock_beside(reader) if query.clock == "server" else None
         pieces = reader.batches(*extra)
-        yield from export(pieces, reader.info, reader.notes, query.format, query.slice)
+        yield from export(pieces, reader.info, reader.notes, query.format, query.slice, clock)
 
 
 def _matches(request: Request, tag: str) -> bool:

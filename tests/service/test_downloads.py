@@ -333,6 +333,7 @@ def test_the_client_pulls_a_session_whole(sealed: Sealed, tmp_path: Path) -> Non
             "session.json",
             "events.json",
             "ledger.json",
+            "clock.parquet",
         }
         again = client.pull(sealed.id, tmp_path / "out")
         assert again["path"] == pulled["path"]

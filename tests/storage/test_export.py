@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 
 from devices.errors import UsageError
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, ArrayInfo, FrameBatch, TileInfo
+from storage.clock_bounds import Rows
+from storage.clock_table import ClockTable, StreamFacts
 from storage.export import FORMATS, MEDIA_TYPES, Format, Slice, export
 from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, FRAMES, Array
 from storage.session_file import NOTES_KEY
@@ -215,6 +217,67 @@ def test_csv_is_lines_with_a_header() -> None:
 
 def test_every_format_has_a_media_type() -> None:
     assert set(MEDIA_TYPES) == set(FORMATS) == {"parquet", "arrow", "csv"}
+
+
+# --- the server's time ----------------------------------------------------------------------------
+
+
+def clock() -> ClockTable:
+    """The server's clock was set by an hour between the rows at 20 and at 60 ms."""
+    hour_ns = 3_600_000_000_000
+    rows = Rows(
+        np.array([0, 20_000_000, 60_000_000]), np.array([5, 5, 5 + hour_ns]), np.array([100] * 3)
+    )
+    return ClockTable({"0" * 32: rows}, [StreamFacts("0" * 32, 10**18, True)], ["0" * 32, "other"])
+
+
+def on_servers_axis(to: Format, part: Slice | None = None, *, every: int = 20) -> bytes:
+    columns = extra()
+    columns["part"][30:] = 1
+    pieces = cut(frames(), columns, every)
+    return b"".join(export(pieces, array(), NOTES, to, part or Slice(), clock()))
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_the_servers_time_is_added_and_raw_time_stays(to: Format) -> None:
+    table = read(on_servers_axis(to), to)
+    assert table.column_names[-2:] == ["t_server_ns", "t_server_uncertainty_ns"]
+    assert table.column("t_ns").to_pylist() == frames().t_ns.tolist()
+    t_server_ns = table.column("t_server_ns").to_pylist()
+    bound_ns = table.column("t_server_uncertainty_ns").to_pylist()
+    assert t_server_ns[:10] == [t_ns + 5 for t_ns in frames().t_ns[:10].tolist()]
+    assert all(100 < bound < 2000 for bound in bound_ns[:10])
+    assert all(bound > 1_800_000_000_000 for bound in bound_ns[10:30])
+    assert t_server_ns[30:] == bound_ns[30:] == [None] * (ROWS - 30)  # the stream was not measured
+
+
+@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("every", [1, 7])
+def test_any_pieces_give_the_same_servers_time(to: Format, every: int) -> None:
+    part = Slice(columns=("t_server_ns", "t_server_uncertainty_ns"))
+    found = read(on_servers_axis(to, part, every=every), to)
+    assert found.column_names == list(part.columns)
+    assert values(found) == values(read(on_servers_axis(to, part, every=ROWS), to))
+
+
+@pytest.mark.parametrize("to", ["parquet", "arrow"])
+def test_notes_say_how_the_servers_time_was_found(to: Format) -> None:
+    schema = read(on_servers_axis(to, Slice(columns=("t_server_ns",))), to).schema
+    assert schema.field("t_server_ns").type == pa.int64()
+    assert schema.field("t_server_ns").nullable
+    assert schema.metadata is not None
+    notes = json.loads(schema.metadata[NOTES_KEY])
+    (stream,) = notes.pop("clock")["streams"]
+    assert stream["state"] == "measured"
+    assert [stretch["rows"] for stretch in stream["stretches"]] == [2, 1]
+    assert abs(stream["steps"][0]["jump_ns"] - 3_600_000_000_000) < 10_000
+    assert notes == NOTES
+
+
+def test_the_servers_time_is_not_there_unless_it_is_asked_for() -> None:
+    assert "t_server_ns" not in names(Slice())
+    with pytest.raises(UsageError, match="clock `server`"):
+        exported("csv", Slice(columns=("t_server_ns",)))
 
 
 # --- rows -----------------------------------------------------------------------------------------

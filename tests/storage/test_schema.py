@@ -23,6 +23,7 @@ from storage.schema import (
     FRAMES,
     KNOWN,
     MILL,
+    SERVER_TIME,
     TRUTH,
     array_info,
     flat_columns,
@@ -227,6 +228,8 @@ def test_every_column_on_disk_says_its_unit() -> None:
     for column in MILL:
         values[column.name] = np.array(["a", "b", "c"])
     values["part"] = np.zeros(3, dtype=np.uint16)
+    for column in SERVER_TIME:
+        values[column.name] = np.zeros(3, dtype=np.int64)
     fields_made = [field for field, _ in flat_columns(tuple(KNOWN.values()), values)]
     assert len(fields_made) == len(KNOWN) + sum(c.per_tile for c in KNOWN.values())
     for field in fields_made:

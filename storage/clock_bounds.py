@@ -1,0 +1,281 @@
+"""One stream's clock against the server's: rows that bound the offset, and what follows between.
+
+Each row says that the offset lay within +-`uncertainty_ns` at its instant: half the shortest round
+trip bounds it however lopsided the way there and back were, so rows are intersected, never
+averaged; a mean of lopsided ways would have a small sigma around a wrong value. What connects two
+instants is how fast one clock can gain on the other:
+
+- never more than `CRYSTAL`, two uncompensated crystals of 50 ppm each, and
+- within `WANDER` of its mean over the stretch, the frequency tolerance of RFC 5905 (PHI).
+
+From every row the offset can thus only lie in a cone that opens with time; where all cones of a
+stretch overlap is the bound. Nothing is assumed of the network's delays. Rows that no such clock
+connects are a step, and begin another stretch. A step, or a clock being slewed, that hides within
+the rows' own uncertainties cannot be seen, and makes the bound wrong by as much between two rows.
+
+Rates are ns of offset per ns of the node's time: 1 ppm is 1e-6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Int64 = npt.NDArray[np.int64]
+Float64 = npt.NDArray[np.float64]
+
+CRYSTAL = 100e-6
+"""Two uncompensated crystals, each 50 ppm off at most over temperature and age."""
+WANDER = 15e-6
+"""RFC 5905, PHI: how far a clock's frequency may be from what was measured."""
+FAST = 500e-6
+"""How far Linux lets a clock be disciplined (the `tolerance` of adjtimex); drift only if steady."""
+
+_READING_NS = 1.0
+"""Both clocks are read in whole ns."""
+_FIRST_LOOK_ROWS = 64
+_STEADY_ROWS_MIN = 4
+"""A step between two rows or three looks like a steady rate."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Measurements in order of time: int64[n] each; what they may be is checked by whoever reads.
+
+    Attributes:
+        t_mono_ns: when, by the node's clock that never steps.
+        offset_ns: the server's UTC minus the `t_ns` of a frame taken then.
+        uncertainty_ns: the offset lies within plus or minus this.
+    """
+
+    t_mono_ns: Int64
+    offset_ns: Int64
+    uncertainty_ns: Int64
+
+    def __len__(self) -> int:
+        return len(self.t_mono_ns)
+
+    def part(self, begin: int, end: int) -> Rows:
+        """Rows `begin` to `end`, the latter not included."""
+        s = slice(begin, end)
+        return Rows(self.t_mono_ns[s], self.offset_ns[s], self.uncertainty_ns[s])
+
+
+class _Cones:
+    """Where the cones of all rows overlap, for rates from `slowest` to `fastest`.
+
+    Entry k of an "ahead" array is about the first k rows, whose cones open towards later; entry k
+    of a "behind" one about the others, whose cones open towards earlier.
+    """
+
+    def __init__(
+        self, x: Float64, low: Float64, high: Float64, slowest: float, fastest: float
+    ) -> None:
+        self.slowest = slowest
+        self.fastest = fastest
+        none = np.array([np.inf])
+        least, most = np.minimum.accumulate, np.maximum.accumulate
+        self._ahead_high = np.concatenate((none, least(high - fastest * x)))
+        self._ahead_low = np.concatenate((-none, most(low - slowest * x)))
+        self._behind_high = np.concatenate((least((high - slowest * x)[::-1])[::-1], none))
+        self._behind_low = np.concatenate((most((low - fastest * x)[::-1])[::-1], -none))
+
+    def at(self, x: Float64, rows_before: npt.NDArray[np.intp]) -> tuple[Float64, Float64]:
+        """Lowest and highest offset at `x`, with so many rows at or before it."""
+        high = np.minimum(
+            self.fastest * x + self._ahead_high[rows_before],
+            self.slowest * x + self._behind_high[rows_before],
+        )
+        low = np.maximum(
+            self.slowest * x + self._ahead_low[rows_before],
+            self.fastest * x + self._behind_low[rows_before],
+        )
+        return low, high
+
+
+class Stretch:
+    """Rows that one clock without a step can have given.
+
+    Args:
+        rows: one at least, in order of time.
+        limit: bound of its rate.
+    """
+
+    def __init__(self, rows: Rows, limit: float = CRYSTAL) -> None:
+        self.rows = rows
+        self.steady = True
+        """Does a rate within `WANDER` of its mean explain all rows?"""
+        self.mean_rate: tuple[float, float] = (-limit, limit)
+        """Bounds of the mean rate from the first row to the last."""
+        self._limit = limit
+        self._begin_ns = rows.t_mono_ns[0]
+        self._reference_ns = rows.offset_ns[0]
+        x = self._x(rows.t_mono_ns)
+        low, high = _intervals(rows)
+        wander = WANDER
+        while not self._fit(x, low, high, limit, wander) and wander < 2 * limit:
+            # Its rate moves more than is assumed: by as much as the rows require, and up to twice.
+            self.steady = False
+            wander *= 2
+
+    @property
+    def begin_ns(self) -> int:
+        """Instant of its first row, `t_mono_ns`."""
+        return int(self._begin_ns)
+
+    @property
+    def end_ns(self) -> int:
+        """Instant of its last row."""
+        return int(self.rows.t_mono_ns[-1])
+
+    @property
+    def drift_bounds(self) -> tuple[float, float] | None:
+        """Bounds of the mean rate; None if the rows say no more than that it is a crystal's."""
+        return None if self.mean_rate == (-self._limit, self._limit) else self.mean_rate
+
+    def bounds(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
+        """Lowest and highest offset in ns at any instants, also before and after the rows."""
+        low, high = self._cones.at(
+            self._x(t_mono_ns), np.searchsorted(self.rows.t_mono_ns, t_mono_ns, side="right")
+        )
+        return (
+            self._reference_ns + np.floor(low).astype(np.int64),
+            self._reference_ns + np.ceil(high).astype(np.int64),
+        )
+
+    def _x(self, t_mono_ns: Int64) -> Float64:
+        # Exact up to 104 days; beyond, a rate's 1e-4 of the rounding is still below 1 ns.
+        x: Float64 = (t_mono_ns - self._begin_ns).astype(np.float64)
+        return x
+
+    def _fit(self, x: Float64, low: Float64, high: Float64, limit: float, wander: float) -> bool:
+        """Bounds of rate and offset; False if no clock has rates within `wander` of their mean."""
+        before = np.searchsorted(x, x, side="right")
+        self.mean_rate = (-limit, limit)
+        self._cones = _Cones(x, low, high, -limit, limit)
+        if not x[-1]:
+            return True
+        for _ in range(3):  # a narrower rate narrows the ends, and these the rate
+            lowest, highest = self._cones.at(x, before)
+            if np.any(lowest > highest):
+                return False
+            self.mean_rate = (
+                max(-limit, float((lowest[-1] - highest[0]) / x[-1])),
+                min(limit, float((highest[-1] - lowest[0]) / x[-1])),
+            )
+            slowest = max(-limit, self.mean_rate[0] - wander)
+            fastest = min(limit, self.mean_rate[1] + wander)
+            self._cones = _Cones(x, low, high, slowest, fastest)
+        lowest, highest = self._cones.at(x, before)
+        return not np.any(lowest > highest)
+
+
+class ClockMap:
+    """The offset of one stream's clock to the server's, with its bound, at every instant.
+
+    Args:
+        rows: one at least, in any order.
+    """
+
+    def __init__(self, rows: Rows) -> None:
+        order = np.argsort(rows.t_mono_ns, kind="stable")
+        self.rows = Rows(rows.t_mono_ns[order], rows.offset_ns[order], rows.uncertainty_ns[order])
+        self.stretches = _stretches(self.rows)
+        self._begins_ns = np.array([s.begin_ns for s in self.stretches], dtype=np.int64)
+        self._ends_ns = np.array([s.end_ns for s in self.stretches], dtype=np.int64)
+
+    def at(self, t_mono_ns: Int64) -> tuple[Int64, Int64]:
+        """Offset and its bound at each instant, both in ns; every instant by itself.
+
+        Between two stretches it is not known where the step was, and the bound reaches over both.
+        The truth is within plus or minus the bound, which is no standard deviation.
+
+        Args:
+            t_mono_ns: int64[n], in any order, absolute value below 2^62.
+        """
+        begun = np.searchsorted(self._begins_ns, t_mono_ns, side="right")
+        ended = np.searchsorted(self._ends_ns, t_mono_ns, side="left")
+        number = np.maximum(begun - 1, 0)
+        between = (begun == ended) & (begun > 0) & (begun < len(self.stretches))
+        low = np.empty(len(t_mono_ns), dtype=np.int64)
+        high = np.empty(len(t_mono_ns), dtype=np.int64)
+        for i in np.unique(number):
+            here = number == i
+            low[here], high[here] = self.stretches[i].bounds(t_mono_ns[here])
+            torn = here & between
+            if torn.any():
+                later_low, later_high = self.stretches[i + 1].bounds(t_mono_ns[torn])
+                low[torn] = np.minimum(low[torn], later_low)
+                high[torn] = np.maximum(high[torn], later_high)
+        offset = (low >> 1) + (high >> 1) + (low & high & 1)  # the sum might not fit
+        return offset, np.maximum(high - offset, offset - low)
+
+
+def _intervals(rows: Rows) -> tuple[Float64, Float64]:
+    """Lowest and highest offset at each row, relative to the first row's."""
+    offset = (rows.offset_ns - rows.offset_ns[0]).astype(np.float64)
+    # The server was read somewhere in the round trip, the row is about its middle.
+    half = rows.uncertainty_ns.astype(np.float64) * (1 + FAST) + _READING_NS
+    return offset - half, offset + half
+
+
+def _reach(rows: Rows, limit: float) -> int:
+    """How many of the first rows one clock can have given whose rate is within the limit."""
+    look = _FIRST_LOOK_ROWS
+    while True:
+        part = rows.part(0, look)
+        low, high = _intervals(part)
+        x = (part.t_mono_ns - part.t_mono_ns[0]).astype(np.float64)
+        highest = limit * x + np.minimum.accumulate(high - limit * x)
+        lowest = np.maximum.accumulate(low + limit * x) - limit * x
+        apart = np.flatnonzero(lowest > highest)
+        if len(apart):
+            return int(apart[0])
+        if look >= len(rows):
+            return len(rows)
+        look *= 2
+
+
+def _steady_reach(rows: Rows, at_least: int) -> int:
+    """As `_reach`, for a clock that is off by more than crystals are, but steadily; or 0."""
+    shortest, longest = at_least, _reach(rows, FAST)
+    if longest <= at_least or not Stretch(rows.part(0, at_least + 1), FAST).steady:
+        return 0
+    while longest - shortest > 1:
+        middle = (shortest + longest) // 2
+        if Stretch(rows.part(0, middle), FAST).steady:
+            shortest = middle
+        else:
+            longest = middle
+    return longest if Stretch(rows.part(0, longest), FAST).steady else shortest
+
+
+def _stretches(rows: Rows) -> tuple[Stretch, ...]:
+    pieces: list[tuple[int, int, float]] = []
+    begin = 0
+    while begin < len(rows):
+        rest = rows.part(begin, len(rows))
+        reach, limit = _reach(rest, CRYSTAL), CRYSTAL
+        if reach < len(rest):
+            further = _steady_reach(rest, reach)
+            if further >= max(reach + 1, _STEADY_ROWS_MIN):
+                reach, limit = further, FAST
+        pieces.append((begin, begin + reach, limit))
+        begin += reach
+    stretches: list[Stretch] = []
+    for begin, end, limit in reversed(pieces):
+        certain = _certain_end(rows, begin, end, stretches[-1]) if stretches else end
+        stretches.append(Stretch(rows.part(begin, certain), limit))
+    return tuple(reversed(stretches))
+
+
+def _certain_end(rows: Rows, begin: int, end: int, later: Stretch) -> int:
+    """Where the rows end that cannot belong to the later stretch: the step was after those."""
+    part = rows.part(begin, end)
+    low, high = later.bounds(part.t_mono_ns)
+    half = part.uncertainty_ns + part.uncertainty_ns // 2000 + 2  # as in _intervals, rounded up
+    foreign = (part.offset_ns - half > high) | (part.offset_ns + half < low)
+    last = np.flatnonzero(foreign)
+    return begin + (int(last[-1]) + 1 if len(last) else 1)
