@@ -14,15 +14,23 @@ stream that the node named last. Newest frames go first; what the server lacks o
 stream and of earlier ones, follows behind them. The node forgets nothing that a session needs and
 that is not acknowledged; a new connection begins with hello again. Frames may come twice and in any
 order: a server takes each (stream, seq) once.
+
+Every message carries a CRC-32 (zlib), because neither websockets nor Arrow notice a flipped bit:
+the last four bytes of a binary message, little endian, of all before; the last field of a text
+message, `"crc32"` with eight hex digits, of the text before its comma. A message that does not agree with it
+ends the connection, and what was in it is sent once more.
 """
 
 from __future__ import annotations
 
+import re
+import zlib
 from enum import IntEnum
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
+from devices.errors import FileFormatError, LinkError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 
@@ -36,6 +44,8 @@ SILENCE_S = 5.0
 """A side that has heard nothing for so long takes the link for dead."""
 PROBES = 8
 _REASON_BYTES_MAX = 123
+_CHECK_BYTES = 4
+_CHECKED = re.compile(r'(\{.*),"crc32":"([0-9a-f]{8})"\}', re.DOTALL)
 
 _Seq = Annotated[int, Field(ge=0, lt=2**62)]
 _Ns = Annotated[int, Field(ge=-(2**63), lt=2**63)]
@@ -211,6 +221,44 @@ FromNode: TypeAdapter[Hello | Stream | Probe | ClockRow | Status | Lost] = TypeA
 FromServer: TypeAdapter[Welcome | Ack | Wanted | Probe] = TypeAdapter(
     Annotated[Welcome | Ack | Wanted | Probe, Field(discriminator="type")]
 )
+
+
+def say(message: BaseModel) -> str:
+    """A message as text, with its checksum."""
+    body = message.model_dump_json()[:-1]
+    return f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}'
+
+
+def heard(text: str | bytes) -> str:
+    """A text message without its checksum.
+
+    Raises:
+        LinkError: they do not agree, or there is none.
+    """
+    text = text.decode(errors="replace") if isinstance(text, bytes) else text
+    found = _CHECKED.fullmatch(text)
+    if found is None or int(found[2], 16) != zlib.crc32(found[1].encode()):
+        raise LinkError("a message was damaged on its way", expected="the CRC-32 of its text")
+    return found[1] + "}"
+
+
+def with_check(payload: bytes) -> bytes:
+    """A binary message: frames with their checksum."""
+    return payload + zlib.crc32(payload).to_bytes(_CHECK_BYTES, "little")
+
+
+def checked(message: bytes) -> bytes:
+    """The frames of a binary message.
+
+    Raises:
+        FileFormatError: they do not agree with their checksum.
+    """
+    payload, check = message[:-_CHECK_BYTES], message[-_CHECK_BYTES:]
+    if len(check) < _CHECK_BYTES or zlib.crc32(payload) != int.from_bytes(check, "little"):
+        raise FileFormatError(
+            "a message of frames was damaged on its way", expected="the CRC-32 of its bytes"
+        )
+    return payload
 
 
 def close_reason(text: str) -> str:

@@ -43,6 +43,9 @@ from service.link import (
     Stream,
     Wanted,
     Welcome,
+    heard,
+    say,
+    with_check,
 )
 from storage.intervals import Intervals
 from storage.kept_stream import EncodedBatch, KeptStream
@@ -177,7 +180,7 @@ class Publisher:
                 f"the server does not speak {SUBPROTOCOL}", where=self._url, expected=SUBPROTOCOL
             )
         hello = self._said_hello = self._hello()
-        await socket.send(hello.model_dump_json())
+        await socket.send(say(hello))
         async with asyncio.timeout(SILENCE_S):
             answer = _parse(await socket.recv())
         if not isinstance(answer, Welcome):
@@ -249,8 +252,8 @@ class Publisher:
                 continue
             if boot_id != named:
                 named = boot_id
-                await socket.send(Stream(boot_id=boot_id).model_dump_json())
-            await socket.send(batch.payload)
+                await socket.send(say(Stream(boot_id=boot_id)))
+            await socket.send(with_check(batch.payload))
             self._flow.sent(len(batch.payload))
             if self._flow.wants_mark:
                 await self._ask(socket)
@@ -311,7 +314,7 @@ class Publisher:
             for _ in range(PROBES):
                 number += 1
                 sent_ns = time.monotonic_ns()
-                await socket.send(Probe(id=number).model_dump_json())
+                await socket.send(say(Probe(id=number)))
                 answer = await self._probe_answer(number)
                 came_ns = time.monotonic_ns()
                 if answer is None or answer.server_t_ns is None:
@@ -325,7 +328,7 @@ class Publisher:
                         uncertainty_ns=half_ns,
                     )
             if best is not None:
-                await socket.send(best.model_dump_json())
+                await socket.send(say(best))
             await asyncio.sleep(PROBE_EVERY_S)
 
     async def _probe_answer(self, number: int) -> Probe | None:
@@ -345,9 +348,8 @@ class Publisher:
                 lost = present.lost.as_pairs()
             if lost != said:
                 said = lost
-                await socket.send(Lost(boot_id=present.boot_id, lost=lost).model_dump_json())
-            status = self._status(self._backlog.count)
-            await socket.send(status.model_dump_json())
+                await socket.send(say(Lost(boot_id=present.boot_id, lost=lost)))
+            await socket.send(say(self._status(self._backlog.count)))
             await asyncio.sleep(STATUS_EVERY_S)
 
     async def _await_renewal(self) -> None:
@@ -388,8 +390,9 @@ class _Waits:
 
 def _is_refusal(error: BaseException) -> bool:
     if isinstance(error, ConnectionClosed):
-        # A server that is going down says so, and will be back.
-        return error.rcvd is not None and error.rcvd.code != Close.RESTART
+        # One that is going down will be back, and what was damaged on its way is sent once more.
+        soon = (Close.RESTART, Close.MALFORMED)
+        return error.rcvd is not None and error.rcvd.code not in soon
     return isinstance(error, InvalidStatus)
 
 
@@ -424,7 +427,7 @@ def ingest_url(server: str) -> str:
 
 def _parse(message: str | bytes) -> Welcome | Ack | Wanted | Probe:
     try:
-        return FromServer.validate_json(message)
+        return FromServer.validate_json(heard(message))
     except ValidationError as error:
         raise LinkError(
             "the server said something that is no message",

@@ -15,7 +15,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from devices.errors import StorageError
-from storage.durable import storage_errors, sync_folder
+from storage.durable import make_folder, storage_errors, sync_folder
 from storage.session import ClockOffset
 
 NAME = "clock.jsonl"
@@ -40,7 +40,7 @@ class ClockLog:
             StorageError: the disk is full or not writable. Earlier rows are untouched.
         """
         with storage_errors(self.path):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path.parent)
             descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
             try:
                 end = os.fstat(descriptor).st_size

@@ -92,6 +92,23 @@ def _started(process: int) -> int | None:
         return None
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, and have their names on the disk when this returns.
+
+    The name of a folder that another process has made is not known to be there: the last one's is
+    synced in any case.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    missing = [folder]
+    while not missing[-1].parent.is_dir():
+        missing.append(missing[-1].parent)
+    for each in reversed(missing):
+        each.mkdir(exist_ok=True)
+        sync_folder(each.parent)
+
+
 def sync_folder(folder: Path) -> None:
     """Have the names in a folder on the disk: a rename is not, until its folder is synced."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -20,7 +20,7 @@ import numpy as np
 
 from devices.errors import StorageError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
-from storage.durable import storage_errors
+from storage.durable import make_folder, storage_errors
 from storage.kernel import kernel_boot_id
 
 IN_FLIGHT_FILE = "in_flight"
@@ -54,7 +54,7 @@ class InFlight:
         self._begin = _HEAD.size + len(description)
         length = self._begin + ROWS * self._size
         with storage_errors(path):
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
             try:
                 # Room that is not reserved would end the process with SIGBUS on a full disk.

@@ -23,7 +23,7 @@ import pyarrow as pa
 
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
-from storage.durable import storage_errors, sync_folder
+from storage.durable import make_folder, storage_errors, sync_folder
 from storage.intervals import Intervals
 from storage.losses import CORRUPT, Losses
 from storage.schema import array_info, wire_schema
@@ -62,9 +62,7 @@ class Journal:
         self._lock = threading.Lock()
         """Guards the lists of writers: `sync` may run in another thread."""
         with storage_errors(folder):
-            if not folder.is_dir():
-                folder.mkdir(parents=True)
-                sync_folder(folder.parent)
+            make_folder(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
                 segment, damaged = recover(path, self._schema)
                 self.lost.add(damaged, CORRUPT)

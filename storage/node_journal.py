@@ -22,7 +22,7 @@ from pathlib import Path
 from devices.acquisition import RangeFlag
 from devices.errors import StorageError
 from devices.frames import ArrayInfo
-from storage.durable import storage_errors
+from storage.durable import make_folder, storage_errors
 from storage.in_flight import delete_in_flight, read_in_flight
 from storage.intervals import Intervals
 from storage.journal import Journal
@@ -360,7 +360,7 @@ class NodeJournal:
 
     def _lock(self, path: Path, how: int) -> None:
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             file = self._locks.enter_context(path.open("a"))
         except OSError:  # a disk that takes nothing has no second user either
             return

@@ -31,6 +31,9 @@ from service.link import (
     StreamNumbers,
     Wanted,
     Welcome,
+    checked,
+    heard,
+    say,
 )
 from service.publisher import Publisher, ingest_url
 from storage.intervals import Intervals
@@ -298,27 +301,27 @@ class Script:
 
     async def serve(self, connection: ServerConnection) -> None:
         self.connection = connection
-        hello = FromNode.validate_json(await connection.recv())
+        hello = FromNode.validate_json(heard(await connection.recv()))
         assert isinstance(hello, Hello)
         self.hellos.append(hello)
         lacks = self.lacks or (
             StreamNumbers(boot_id=hello.array_info.boot_id, numbers=((0, None),)),
         )
         welcome = Welcome(protocol=PROTOCOL, server_id="played", lacks=lacks, wanted=self.wanted)
-        await connection.send(welcome.model_dump_json())
+        await connection.send(say(welcome))
         boot_id = hello.array_info.boot_id
         schema = wire_schema(hello.array_info)
         async for message in connection:
             await self.reads.wait()
             if isinstance(message, bytes):
-                seq = decode(message, schema).seq
+                seq = decode(checked(message), schema).seq
                 first, last = int(seq[0]), int(seq[-1])
                 self.came.append((boot_id, first, last))
                 if self.acknowledges:
                     ack = Ack(boot_id=boot_id, seq_first=first, seq_last=last)
-                    await connection.send(ack.model_dump_json())
+                    await connection.send(say(ack))
                 continue
-            said = FromNode.validate_json(message)
+            said = FromNode.validate_json(heard(message))
             self.said.append(said)
             if isinstance(said, Stream):
                 boot_id = said.boot_id
@@ -409,7 +412,7 @@ def test_what_a_server_wants_is_told_with_the_streams_it_had_heard_of(node: Fake
                 await publishing.until(lambda: publishing.wanted)
                 assert script.connection is not None
                 nothing = Wanted(streams=(), recording=False)
-                await script.connection.send(nothing.model_dump_json())
+                await script.connection.send(say(nothing))
                 await publishing.until(lambda: len(publishing.wanted) == 2)
             assert publishing.wanted[0] == ("played", wanted, (node.boot_id,))
             assert publishing.wanted[1] == ("played", nothing, (node.boot_id,))

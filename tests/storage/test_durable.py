@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, StorageError
-from storage.durable import storage_errors, sync_folder, write_whole
+from storage import durable
+from storage.durable import make_folder, storage_errors, sync_folder, write_whole
 
 
 @contextmanager
@@ -166,3 +167,16 @@ def test_errors_that_say_enough_pass_as_they_are(error: Exception) -> None:
     with pytest.raises(type(error)) as caught, storage_errors(Path("outer")):
         raise error
     assert caught.value is error
+
+
+def test_the_names_of_new_folders_are_on_the_disk_all_the_way_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
+    monkeypatch.setattr(durable, "sync_folder", lambda folder: synced.append(folder.name))
+    make_folder(tmp_path / "sessions" / "one" / "two")
+    assert synced == [tmp_path.name, "sessions", "one"]
+    assert (tmp_path / "sessions" / "one" / "two").is_dir()
+    synced.clear()
+    make_folder(tmp_path / "sessions" / "one")
+    assert synced == ["sessions"]
