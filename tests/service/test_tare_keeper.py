@@ -36,7 +36,7 @@ class Foot:
         self.hello = Hello(
             protocol=PROTOCOL,
             array_info=info,
-            first_seq=0,
+            held=(),
             next_seq=0,
             scene={"name": "test", **scene},
             emulated=True,
@@ -51,7 +51,7 @@ class Foot:
         if hasattr(self, "node"):
             self.close()
         self.node = Node(self._folder / "node", self._folder / "journal", self.hello)
-        self.node.attach(self.hello)
+        self.node.attach(self.hello, UTC_NS)
         self.node.connected = True
 
     def close(self) -> None:
@@ -96,7 +96,7 @@ class Foot:
         schema = wire_schema(self.hello.array_info)
         for begin in range(0, len(frames), BATCH):
             payload = encode(frames.rows(begin, begin + BATCH), schema)
-            _, _, due = self.node.take(payload, 0)
+            _, _, due = self.node.take(self.node.present, payload, 0)
             self.due += [int(seq) for piece, _ in due for seq in piece.seq]
 
     def live(self, seconds: float, counts: Any = 0.0, **how: Any) -> None:
