@@ -207,7 +207,7 @@ def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_
     again = {"boot_id": "1" * 32}
     info = foot.hello.array_info.model_copy(update=again)
     foot.hello = foot.hello.model_copy(update={"array_info": info})
-    foot.node.attach(foot.hello)
+    foot.node.attach(foot.hello, UTC_NS)
     foot.seq = 0
     foot.live(1.0, lead=True, silent=0)
     foot.live(1.0)
