@@ -16,7 +16,7 @@ from service.guard import Guard
 from service.ingest import ingest
 from service.link import INGEST_PATH, LIVE_PATH
 from service.page import page_folder
-from service.routes import access, clock, data, health, nodes, sessions
+from service.routes import access, clock, data, health, nodes, sessions, trash
 from service.routes.live import live
 from service.server import Server
 from service.version import SOFTWARE
@@ -71,7 +71,7 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
             _422="A parameter or the body is not as described.",
         ),
     )
-    for module in (health, nodes, sessions, data, clock):
+    for module in (health, nodes, sessions, trash, data, clock):
         api.include_router(module.router)
     app.include_router(api)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 from contextlib import suppress
 
@@ -15,15 +16,21 @@ from service.link import (
     PROTOCOL,
     SILENCE_S,
     SUBPROTOCOL,
+    Ack,
     ClockRow,
     Close,
     FromNode,
     HangUp,
     Hello,
+    Lost,
     Probe,
     Status,
+    Stream,
     Welcome,
+    checked,
     close_reason,
+    heard,
+    say,
 )
 from service.server import Link, Server
 from service.steady import utc_ns
@@ -54,17 +61,23 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
             Close.WRONG_VERSION,
             f"subprotocol {', '.join(offered) or 'none'} offered; this server speaks {SUBPROTOCOL}",
         )
-    hello = _parse(await _receive(socket), Close.BAD_HELLO)
+    first = await _receive(socket)
+    if (protocol := _protocol_of(first)) is not None and protocol != PROTOCOL:
+        # Before it is read: another version's hello has other fields.
+        raise HangUp(
+            Close.WRONG_VERSION,
+            f"protocol {protocol}; this server speaks {PROTOCOL}: update the "
+            + ("node" if protocol < PROTOCOL else "server"),
+        )
+    hello = _parse(first, Close.BAD_HELLO)
     if not isinstance(hello, Hello):
         raise HangUp(Close.BAD_HELLO, "the first message has to be hello")
-    if hello.protocol != PROTOCOL:
-        raise HangUp(
-            Close.WRONG_VERSION, f"protocol {hello.protocol}; this server speaks {PROTOCOL}"
-        )
     name, boot_id = hello.array_info.node, hello.array_info.boot_id
     other = server.links.get(name)
     if other is not None:
-        if other.node.boot_id != boot_id:
+        # A node that was switched off and on again knows the stream it had before.
+        known = {boot_id, *(stream.array_info.boot_id for stream in hello.earlier)}
+        if other.node.boot_id not in known:
             raise HangUp(
                 Close.NAME_TAKEN,
                 f"a node {name!r} is connected already; give this one another name (--name)",
@@ -72,25 +85,18 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
         other.end(Close.SUPERSEDED, "the same node has connected again")
     try:
         node = server.nodes.greet(hello)
-        if node.boot_id == boot_id and node.info != hello.array_info:
-            raise HangUp(Close.BAD_HELLO, f"stream {boot_id} was announced with another array")
-        if node.boot_id != boot_id:
-            server.recorder.node_restarts(node, hello)
-        held = node.attach(hello)
+        node.attach(hello, utc_ns())
+        server.recorder.follow(node)
     except (LinkError, StorageError) as error:
         code = Close.TRY_LATER if isinstance(error, StorageError) else Close.BAD_HELLO
         raise HangUp(code, str(error)) from error
     node.connected = True
     link = server.links[name] = Link(node)
-    # What is here but was never acknowledged, because the link broke before: acknowledge it now.
-    for first, last in held:
-        link.unsynced.add(first, last)
-    lacks = [*held.missing(hello.first_seq, max(hello.first_seq, held.last or 0))]
-    beyond = max(hello.first_seq, (held.last + 1) if held.last is not None else 0)
-    closed = [(a, b) for a, b in lacks if b < beyond]
-    welcome = Welcome(protocol=PROTOCOL, lacks=(*closed, (beyond, None)))
+    link.wanted = server.recorder.wanted(name)
+    lacks = node.lacks(server.recorder.needed(name))
+    welcome = Welcome(protocol=PROTOCOL, server_id=server.id, lacks=lacks, wanted=link.wanted)
     try:
-        await socket.send_text(welcome.model_dump_json())
+        await socket.send_text(say(welcome))
     except BaseException:  # it went away before it was welcomed
         _leave(server, link)
         raise
@@ -102,7 +108,7 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
 async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
     tasks = [
         asyncio.create_task(_take(socket, server, link)),
-        asyncio.create_task(_acknowledge(socket, link)),
+        asyncio.create_task(_tell(socket, server, link)),
         asyncio.create_task(link.ended.wait()),
     ]
     try:
@@ -124,11 +130,9 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
         if isinstance(message, bytes):
             tare_before = node.live.tare
             try:
-                seq_first, seq_last, due = node.take(message, utc_ns())
+                *_, due = node.take(link.stream, checked(message), utc_ns())
             except FileFormatError as error:
                 raise HangUp(Close.MALFORMED, f"node {node.name!r}: {error}") from error
-            if node.storage_problem is None:
-                link.unsynced.add(seq_first, seq_last)
             server.hub.publish(node, due)
             if node.live.tare is not tare_before:
                 server.tell_node(node)
@@ -137,24 +141,44 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
         match said:
             case Probe(id=number):
                 answer = Probe(id=number, server_t_ns=utc_ns())
-                await socket.send_text(answer.model_dump_json())
+                await socket.send_text(say(answer))
+            case Stream(boot_id=boot_id):
+                if boot_id not in node.order:
+                    raise HangUp(Close.MALFORMED, f"stream {boot_id[:80]!r} was not announced")
+                link.stream = node.streams[boot_id]
             case ClockRow():
-                node.clock = said
+                node.present.clock = said
                 with suppress(FootTileError):
                     server.recorder.note_clock(node)
             case Status():
-                node.missed_slots = said.missed_slots
+                node.present.missed_slots = said.missed_slots
                 node.troubles, node.fault_counts = said.troubles, said.counts
-                node.node_first_seq = max(node.node_first_seq, said.first_seq)
                 server.tell_node(node)
+            case Lost():
+                if said.boot_id != node.boot_id:
+                    raise HangUp(Close.MALFORMED, f"stream {said.boot_id[:80]!r} is not its own")
+                try:
+                    node.present.note_losses(said.lost)
+                except ValueError as error:
+                    raise HangUp(Close.MALFORMED, f"lost: {error}") from error
             case Hello():
                 raise HangUp(Close.MALFORMED, "hello was said before")
 
 
-async def _acknowledge(socket: WebSocket, link: Link) -> None:
+async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
+    """Tell the node what is on the disk, and what sessions need whenever that changes."""
     while True:
-        ack = await link.outbox.get()
-        await socket.send_text(ack.model_dump_json())
+        await link.news.wait()
+        link.news.clear()
+        # First what is to be kept: what is acknowledged before may be forgotten.
+        wanted = server.recorder.wanted(link.node.name)
+        if wanted != link.wanted:
+            link.wanted = wanted
+            await socket.send_text(say(wanted))
+        for boot_id, numbers in link.acks().items():
+            for first, last in numbers:
+                ack = Ack(boot_id=boot_id, seq_first=first, seq_last=last)
+                await socket.send_text(say(ack))
 
 
 async def _receive(socket: WebSocket) -> str | bytes:
@@ -173,15 +197,29 @@ async def _receive(socket: WebSocket) -> str | bytes:
     return data
 
 
-def _parse(message: str | bytes, code: Close) -> Hello | Probe | ClockRow | Status:
+def _parse(message: str | bytes, code: Close) -> Hello | Stream | Probe | ClockRow | Status | Lost:
     try:
         if isinstance(message, bytes):
             raise HangUp(code, "a text message was expected, and a binary one came")
-        return FromNode.validate_json(message)
+        return FromNode.validate_json(heard(message))
+    except LinkError as error:
+        raise HangUp(code, str(error)) from error
     except ValidationError as error:
         complaint = error.errors()[0]
         where = ".".join(str(part) for part in complaint["loc"])
         raise HangUp(code, f"message not understood: {where}: {complaint['msg']}") from error
+
+
+def _protocol_of(message: str | bytes) -> int | None:
+    """The protocol that a hello names, whatever else is in it; None if it names none."""
+    try:
+        said = json.loads(message) if isinstance(message, str) else None
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(said, dict) or said.get("type") != "hello":
+        return None
+    protocol = said.get("protocol")
+    return protocol if isinstance(protocol, int) else None
 
 
 async def _close(socket: WebSocket, end: HangUp) -> None:

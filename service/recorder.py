@@ -13,15 +13,19 @@ import time
 import uuid
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 
-from devices.errors import FootTileError, StateError, UnknownError
+from devices.errors import DamagedFramesError, FootTileError, StateError, UnknownError
 from service import parts
 from service.estimation.calibration import Calibration
-from service.link import Hello
+from service.link import StreamNumbers, Wanted
 from service.nodes import Node, Nodes
-from service.sealing import Sources, ledger_of, seal, write_events
+from service.sealing import Sources, seal, write_events
 from service.steady import utc_ns
+from service.streams import common
+from service.trash import Trash
 from storage.intervals import Intervals
+from storage.ledger import NO_END, ledger_of
 from storage.session import Event, Ledger, Session, SessionFolder, new_session_id
 
 log = logging.getLogger("foottile.recorder")
@@ -35,19 +39,29 @@ class Recorder:
 
     Args:
         folder: where they are kept.
+        trash: where those are that were deleted.
         nodes: whose frames are recorded.
         changed: told of every session that changed.
+        ask_again: told of a node that may still have frames that are damaged here.
 
     Raises:
         FileFormatError: a session's file is damaged.
     """
 
     def __init__(
-        self, folder: SessionFolder, nodes: Nodes, changed: Callable[[Session], None]
+        self,
+        folder: SessionFolder,
+        trash: Trash,
+        nodes: Nodes,
+        *,
+        changed: Callable[[Session], None],
+        ask_again: Callable[[Node], None],
     ) -> None:
         self.folder = folder
+        self.trash = trash
         self._nodes = nodes
         self._changed = changed
+        self._ask_again = ask_again
         self._sessions: dict[str, Session] = {}
         self._sealing: dict[str, asyncio.Task[None]] = {}
         self._again_after: dict[str, float] = {}
@@ -70,7 +84,8 @@ class Recorder:
         """
         self.folder.path(session_id)
         if session_id not in self._sessions:
-            raise UnknownError(f"no session {session_id!r}")
+            remedy = "It is in the trash: restore it first" if session_id in self.trash else ""
+            raise UnknownError(f"no session {session_id!r}", remedy=remedy)
         return self._sessions[session_id]
 
     def recording_on(self, node: str) -> list[Session]:
@@ -89,9 +104,11 @@ class Recorder:
     ) -> Session:
         """Begin a session with the next frame, or `pre_roll_s` earlier if the ring reaches so far.
 
+        Others may be recorded on the same node at the same time.
+
         Raises:
             UnknownError: no such node.
-            StateError: it is away, has sent nothing yet, or is being recorded already.
+            StateError: it is away, or has sent nothing yet.
             StorageError: the session cannot be written down; nothing was started then.
         """
         node = self._nodes.get(node_name)
@@ -102,15 +119,8 @@ class Recorder:
         behind_s = (node.node_t_ns(utc_ns()) - node.last_t_ns) * 1e-9
         if node.clock is not None and behind_s > BEHIND_S:
             raise StateError(
-                f"node {node_name!r} is {behind_s:.1f} s behind: it is sending what it took while "
-                "the link was down",
-                remedy="Record when it has caught up, in a few seconds",
-            )
-        if recording := self.recording_on(node_name):
-            raise StateError(
-                f"node {node_name!r} is being recorded already: session {recording[0].id} "
-                f"({recording[0].name})",
-                remedy="Stop it first",
+                f"node {node_name!r} is {behind_s:.1f} s behind: its link is too slow",
+                remedy="Record when it has caught up",
             )
         calibration = node.live.calibration
         now = datetime.now(UTC)
@@ -127,7 +137,7 @@ class Recorder:
             scene=node.info.scene,
             scene_content=node.hello.scene,
             calibration=calibration.model_dump(mode="json") if calibration is not None else None,
-            missed_slots_at_start=node.missed_slots,
+            missed_slots_at_start=node.present.missed_slots,
             clock=parts.clock_rows(node),
         )
         self._keep(session)
@@ -179,23 +189,74 @@ class Recorder:
             write_events(session, self.folder.path(session_id))
         return event
 
-    def node_restarts(self, node: Node, hello: Hello) -> None:
-        """The node is about to begin a new stream: its recording goes on in a new part.
+    def give_up(self, session_id: str) -> Session:
+        """Seal a pending session without what has not come: its node never will.
 
-        Frames of the old stream that were not sent are gone; how many there may have been is noted.
-        If its tiles are others now, a session of its own takes up the recording: a file describes
+        Raises:
+            UnknownError: no such session.
+            StateError: it is not pending.
+            StorageError: that cannot be written down.
+        """
+        session = self.get(session_id)
+        if session.state != "pending":
+            raise StateError(
+                f"session {session_id} is {session.state}",
+                expected="a session that is pending",
+                remedy="Stop it first" if session.state == "recording" else "",
+            )
+        self._keep(parts.given_up(session, self._nodes.find(session.node)))
+        self._again_after.pop(session_id, None)
+        self.settle()
+        return self._sessions[session_id]
+
+    def discard(self, session_id: str) -> None:
+        """Move a session to the trash.
+
+        Raises:
+            UnknownError: no such session.
+            StateError: it is being recorded, or sealed.
+            StorageError: it cannot be moved.
+        """
+        session = self.get(session_id)
+        if session.state == "recording":
+            raise StateError(f"session {session_id} is being recorded", remedy="Stop it first")
+        if session_id in self._sealing:
+            raise StateError(
+                f"session {session_id} is being sealed", remedy="Delete it in some seconds"
+            )
+        self.trash.take(session, self.folder)
+        del self._sessions[session_id]
+        self._again_after.pop(session_id, None)
+        self._not_sealed.pop(session_id, None)
+
+    def restore(self, session_id: str) -> Session:
+        """Have a session back from the trash; if it was pending, it goes on to be so.
+
+        Raises:
+            UnknownError: it is not in the trash.
+            StorageError: it cannot be moved.
+        """
+        session = self.trash.give_back(session_id, self.folder)
+        self._sessions[session_id] = session
+        self.settle()
+        self._changed(self._sessions[session_id])
+        return self._sessions[session_id]
+
+    def follow(self, node: Node) -> None:
+        """The node has said which streams it took: its sessions go on in them.
+
+        If its tiles are others now, a session of its own takes up a recording: a file describes
         one array.
 
         Raises:
             StorageError: that cannot be written down.
         """
-        for session in list(self._sessions.values()):
-            open_here = session.parts[-1].boot_id == node.boot_id and session.node == node.name
-            if open_here and session.state in ("recording", "pending"):
-                after = parts.after_restart(session, node, hello)
-                self._keep(after)
-                if session.state == "recording" and after.state != "recording":
-                    self._keep(parts.continued(after, hello))
+        for session in [s for s in self._sessions.values() if s.node == node.name]:
+            if session.state in ("recording", "pending"):
+                try:
+                    self._follow(session)
+                except DamagedFramesError as error:
+                    self._disown(session, error)
 
     def note_clock(self, node: Node) -> None:
         """Keep a new measurement of a node's clock with its recordings."""
@@ -231,19 +292,14 @@ class Recorder:
         Raises:
             UnknownError: no such session.
         """
-        session = self.get(session_id)
+        return self.ledger_of(self.get(session_id))
+
+    def ledger_of(self, session: Session) -> Ledger:
+        """The same of a session that may be in the trash."""
         if session.state == "sealed" and session.ledger is not None:
             return session.ledger
-        node = self._nodes.find(session.node)
-        missed = node.missed_slots - session.missed_slots_at_start if node is not None else 0
-        return ledger_of(
-            session,
-            {boot_id: journal.held for boot_id, journal in node.journals.items()} if node else {},
-            open_boot_id=node.boot_id if node is not None else None,
-            node_first_seq=node.node_first_seq if node is not None else 0,
-            missed_slots=max(0, missed),
-            finished=session.stopped_t_ns is not None,
-        )
+        states = parts.states(session, self._nodes.find(session.node))
+        return ledger_of(session.parts, states, finished=session.stopped_t_ns is not None)
 
     def problem_of(self, session: Session) -> str | None:
         """What a person should know of a session as it is now."""
@@ -282,23 +338,64 @@ class Recorder:
             notes={"scene": session.scene_content, "emulated": node.hello.emulated},
         )
 
-    def needed(self, node: str) -> dict[str, Intervals]:
-        """Numbers by boot_id that unsealed sessions of a node still need in its journals."""
-        return parts.needed(
-            s for s in self._sessions.values() if s.node == node and s.state != "sealed"
+    def needed(self, node_name: str) -> dict[str, Intervals]:
+        """Numbers by boot_id that sessions of a node, not sealed yet, need in its journals.
+
+        What is in the trash can be had back, so it needs its frames as well.
+        """
+        node = self._nodes.find(node_name)
+        return parts.by_stream(
+            parts.needed(session, node)
+            for session in (*self._sessions.values(), *self.trash.all())
+            if session.node == node_name and session.state != "sealed"
         )
+
+    def wanted(self, node_name: str) -> Wanted:
+        """The same as the node is told it."""
+        streams = []
+        for boot_id, numbers in sorted(self.needed(node_name).items()):
+            ends = tuple((a, None if b >= NO_END else b) for a, b in numbers)
+            streams.append(StreamNumbers(boot_id=boot_id, numbers=ends))
+        recording = bool(self.recording_on(node_name))
+        return Wanted(streams=tuple(streams), recording=recording)
 
     def _settle(self, session_id: str) -> None:
         session = self._sessions[session_id]
+        try:
+            if session.state == "pending":
+                session = self._follow(session)
+        except DamagedFramesError as error:
+            self._disown(session, error)
+            return
         if session.state == "pending":
-            session = parts.with_end(session, self._nodes.get(session.node))
-            if session is not self._sessions[session_id]:
-                self._keep(session)
             unknown = session.parts[-1].seq_last is None
             if not unknown and not any(p.pending for p in self.ledger(session_id).parts):
                 session = self._keep(session.model_copy(update={"state": "sealing"}))
         if session.state == "sealing" and session_id not in self._sealing:
             self._sealing[session_id] = asyncio.create_task(self._seal(session_id))
+
+    def _follow(self, session: Session) -> Session:
+        """The session as far as its node's streams go by now."""
+        node = self._nodes.find(session.node)
+        if node is None:
+            return session
+        followed = parts.followed(session, node)
+        # Those that take it up first: if the server is killed between, none is forgotten.
+        if not any(known.continues == session.id for known in self._sessions.values()):
+            for further in reversed(followed[1:]):
+                self._keep(further)
+        return session if followed[0] is session else self._keep(followed[0])
+
+    def _disown(self, session: Session, error: DamagedFramesError) -> None:
+        """Frames on the disk are not what was written: have them again, or count them as lost."""
+        node, folder = self._nodes.get(session.node), Path(error.where).parent
+        for stream in node.streams.values():
+            if stream.folder == folder:
+                damaged = Intervals([(error.seq_first, error.seq_last)])
+                stream.disown(damaged, corrupt=True)
+                log.warning("session %s: %s", session.id, error)
+                if common(stream.may_come, damaged):
+                    self._ask_again(node)
 
     async def _seal(self, session_id: str) -> None:
         try:
@@ -312,6 +409,10 @@ class Recorder:
                 write_events(now, self.folder.path(session_id))
             self._not_sealed.pop(session_id, None)
             self._keep(sealed.model_copy(update=people))
+        except DamagedFramesError as error:
+            session = self._sessions[session_id]
+            self._disown(session, error)
+            self._keep(session.model_copy(update={"state": "pending"}))
         except Exception as error:
             if not isinstance(error, FootTileError):
                 log.exception("session %s: this is a bug", session_id)

@@ -24,9 +24,8 @@ from service.pipeline import Columns, EstimateOptions, EstimateStream, notes_of
 from storage.clock_file import CLOCK_NAME, write_clock
 from storage.clock_table import ClockTable, StreamFacts, rows_by_stream
 from storage.durable import write_whole
-from storage.intervals import Intervals
 from storage.journal import Journal
-from storage.session import FRAMES_NAME, Ledger, PartLedger, Session
+from storage.session import FRAMES_NAME, Ledger, Session
 from storage.session_file import SessionWriter
 
 OFFLINE_LAG_MS = 100.0
@@ -180,60 +179,6 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
 
 _IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts", "scene"}
 """What the sealed file says of its session; names and notes may change later and are not in it."""
-
-
-def ledger_of(
-    session: Session,
-    held: Mapping[str, Intervals],
-    *,
-    open_boot_id: str | None,
-    node_first_seq: int,
-    missed_slots: int,
-    finished: bool,
-) -> Ledger:
-    """Count every frame of a session once.
-
-    Args:
-        session: what it consists of; a part without end reaches to what is held.
-        held: numbers on the server, by boot_id.
-        open_boot_id: the stream that its node can still give frames of.
-        node_first_seq: the oldest frame of that stream that the node still has.
-        missed_slots: slots without a frame.
-        finished: no more parts will be added to it.
-    """
-    parts = []
-    for part in session.parts:
-        here = held.get(part.boot_id, Intervals())
-        newest = -1 if here.last is None else here.last
-        last = part.seq_last if part.seq_last is not None else max(newest, part.seq_first - 1)
-        gaps = here.missing(part.seq_first, last) if last >= part.seq_first else Intervals()
-        lost: dict[str, int] = {}
-        if part.boot_id == open_boot_id:
-            evicted = gaps.within(0, node_first_seq - 1).count
-            if evicted:
-                lost["evicted"] = evicted
-        elif gaps:
-            lost["node_restarted"] = gaps.count
-        length = max(0, last - part.seq_first + 1)
-        parts.append(
-            PartLedger(
-                boot_id=part.boot_id,
-                seq_first=part.seq_first,
-                seq_last=last,
-                recorded=length - gaps.count,
-                lost=lost,
-                pending=gaps.count - sum(lost.values()),
-                unsynced_tail_max=session.unsynced_tail_max.get(part.boot_id, 0),
-            )
-        )
-    finished = finished and all(part.seq_last is not None for part in session.parts)
-    lossy = any(part.lost or part.unsynced_tail_max for part in parts)
-    return Ledger(
-        complete=finished and not lossy and not any(part.pending for part in parts),
-        lossy=lossy,
-        parts=tuple(parts),
-        missed_slots=missed_slots,
-    )
 
 
 def write_events(session: Session, folder: Path) -> None:

@@ -5,20 +5,25 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import logging
+import re
 import time
+import uuid
 from pathlib import Path
 from typing import TextIO
 
 from devices.errors import FootTileError, StorageError
-from service.link import Ack, Close
+from service.link import Close, Wanted
 from service.live import Hub
 from service.nodes import Node, Nodes
 from service.recorder import Recorder
 from service.steady import utc_ns
+from service.streams import KeptStream
+from service.trash import Trash, destroy
 from service.views import NodeView, SessionView
-from storage.durable import storage_errors, write_whole
+from storage.durable import make_folder, storage_errors, write_whole
 from storage.intervals import Intervals
 from storage.session import Session, SessionFolder
+from storage.stale_files import remove_stale
 
 log = logging.getLogger("foottile.server")
 
@@ -27,6 +32,7 @@ TICK_S = 0.2
 _SLOW_TICK_S = 1.0
 _PRUNE_EVERY_S = 30.0
 _PROBE_BYTES = 64 << 10
+_SERVER_ID = re.compile(r"[0-9a-f]{32}")
 
 
 class Link:
@@ -34,11 +40,27 @@ class Link:
 
     def __init__(self, node: Node) -> None:
         self.node = node
-        self.outbox: asyncio.Queue[Ack] = asyncio.Queue(64)
-        self.unsynced = Intervals()
-        """Frames in the journal that are not yet acknowledged."""
+        self.stream: KeptStream = node.present
+        """Whose frames come."""
+        self.wanted: Wanted | None = None
+        """What sessions need, as the node was told last."""
+        self.news = asyncio.Event()
+        """There is something to tell the node."""
+        self._acks: dict[str, Intervals] = {}
         self.closing: tuple[Close, str] | None = None
         self.ended = asyncio.Event()
+
+    def acknowledge(self, boot_id: str, numbers: Intervals) -> None:
+        """Tell the node that these frames are on the disk."""
+        waiting = self._acks.setdefault(boot_id, Intervals())
+        for interval in numbers:
+            waiting.add(*interval)
+        self.news.set()
+
+    def acks(self) -> dict[str, Intervals]:
+        """What it is to be told of that, once."""
+        acks, self._acks = self._acks, {}
+        return acks
 
     def end(self, code: Close, reason: str) -> None:
         """Have the connection closed."""
@@ -60,14 +82,22 @@ class Server:
     def __init__(self, data: Path) -> None:
         self.data = data
         with storage_errors(data, "Choose another folder with --data"):
-            data.mkdir(parents=True, exist_ok=True)
+            make_folder(data)
         self._lock = _locked(data)
         try:
+            remove_stale(data)
             self.check_storage()
+            self.id = _id_of(data)
+            """Name of this data folder: a node keeps what this server needs, whoever else asks."""
             self.hub = Hub()
             self.nodes = Nodes(data)
-            folder = SessionFolder(data / "sessions")
-            self.recorder = Recorder(folder, self.nodes, self._tell_session)
+            self.recorder = Recorder(
+                SessionFolder(data / "sessions"),
+                Trash(data / "trash"),
+                self.nodes,
+                changed=self._tell_session,
+                ask_again=self._ask_again,
+            )
         except FootTileError:
             self._lock.close()
             raise
@@ -80,8 +110,9 @@ class Server:
             await asyncio.sleep(TICK_S)
             now_s = time.monotonic()
             try:
-                await asyncio.gather(*(self._sync(link) for link in list(self.links.values())))
+                await asyncio.gather(*(self._sync(node) for node in self.nodes))
                 self.recorder.settle()
+                self._tell_wanted()
                 if now_s >= slow_s:
                     slow_s = now_s + _SLOW_TICK_S
                     self._heartbeat()
@@ -116,10 +147,34 @@ class Server:
         # As much as some seconds of frames: on a full disk an empty file can still be written.
         write_whole(self.data / ".writable", bytes(_PROBE_BYTES))
 
+    async def empty_trash(self) -> tuple[int, int]:
+        """Delete what is in the trash for good; how many sessions, and bytes, they were.
+
+        Raises:
+            StorageError: one of them cannot be deleted.
+        """
+        doomed = self.recorder.trash.doom()
+        return len(doomed), await asyncio.to_thread(destroy, doomed)
+
+    def tell_deleted(self, session_id: str) -> None:
+        """Tell every screen that a session is in the trash."""
+        self.hub.notice({"type": "deleted", "session_id": session_id})
+
     def tell_node(self, node: Node) -> None:
         """Tell every screen how a node is."""
         view = NodeView.of(node, self.recorder).model_dump(mode="json")
         self.hub.notice({"type": "node", "node": view})
+
+    def _tell_wanted(self) -> None:
+        """Tell nodes what sessions need, where that has changed."""
+        for link in self.links.values():
+            if link.wanted is not None and self.recorder.wanted(link.node.name) != link.wanted:
+                link.news.set()
+
+    def _ask_again(self, node: Node) -> None:
+        link = self.links.get(node.name)
+        if link is not None:
+            link.end(Close.RESTART, "frames are damaged here; send what the server lacks")
 
     def _tell_session(self, session: Session) -> None:
         view = SessionView.of(session, self.recorder).model_dump(mode="json")
@@ -136,8 +191,9 @@ class Server:
                     node.name: {
                         "last_seq": node.last_seq,
                         "rate_hz": node.rate_hz,
-                        "lost_frames": node.lost_frames,
-                        "missed_slots": node.missed_slots,
+                        "lost_frames": sum(node.lost.values()),
+                        "backlog_frames": node.backlog_frames,
+                        "missed_slots": node.present.missed_slots,
                         "connected": node.connected,
                     }
                     for node in self.nodes
@@ -148,41 +204,52 @@ class Server:
             if session.state in ("recording", "pending", "sealing"):
                 self._tell_session(session)
 
-    async def _sync(self, link: Link) -> None:
-        """Have the journal on disk, then acknowledge what was in it before."""
-        if link.node.storage_problem is not None:  # perhaps not even a journal could be begun
-            await self._try_again(link)
+    async def _sync(self, node: Node) -> None:
+        """Have a node's journals on disk, then acknowledge what was in them before."""
+        if node.storage_problem is not None:  # perhaps not even a journal could be begun
+            await self._try_again(node)
             return
-        journal = link.node.journal
-        if journal is None:
-            return
-        waiting, link.unsynced = link.unsynced, Intervals()
-        if not waiting:
-            return
-        try:
-            await asyncio.to_thread(journal.sync)
-        except StorageError as error:
-            link.node.storage_problem = str(error)
-            for first, last in waiting:
-                link.unsynced.add(first, last)
-            # The kernel may forget what it could not write: the node has to send it again.
-            journal.disown(link.unsynced)
-            link.unsynced = Intervals()
-            return
-        for first, last in waiting:
-            try:
-                link.outbox.put_nowait(Ack(seq_first=first, seq_last=last))
-            except asyncio.QueueFull:
-                link.end(Close.TOO_SLOW, "the node does not read its acknowledgements")
+        streams = [stream for stream in node.streams.values() if stream.has_news]
+        await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
 
-    async def _try_again(self, link: Link) -> None:
+    async def _sync_stream(self, node: Node, stream: KeptStream) -> None:
+        unsynced, stream.unsynced = stream.unsynced, Intervals()
+        owed, stream.owed = stream.owed, Intervals()
+        try:
+            await asyncio.to_thread(stream.sync)
+        except StorageError as error:
+            node.storage_problem = str(error)
+            # The kernel may forget what it could not write: the node has to send it again.
+            for interval in unsynced:
+                stream.unsynced.add(*interval)
+            stream.disown(stream.unsynced)
+            stream.unsynced, stream.owed = Intervals(), Intervals()
+            return
+        link = self.links.get(node.name)
+        if link is not None and owed:
+            link.acknowledge(stream.boot_id, owed)
+
+    async def _try_again(self, node: Node) -> None:
         """After a full disk: once it can be written again, have the node send what is missing."""
         try:
             await asyncio.to_thread(self.check_storage)
         except StorageError:
             return
-        link.node.storage_problem = None
-        link.end(Close.RESTART, "the server can write again; send what it lacks")
+        node.storage_problem = None
+        if node.name in self.links:
+            self.links[node.name].end(
+                Close.RESTART, "the server can write again; send what it lacks"
+            )
+
+
+def _id_of(data: Path) -> str:
+    path = data / "server_id"
+    with storage_errors(path):
+        kept = path.read_text("utf-8", "replace").strip() if path.exists() else ""
+    if not _SERVER_ID.fullmatch(kept):
+        kept = uuid.uuid4().hex
+        write_whole(path, kept.encode() + b"\n")
+    return kept
 
 
 def _locked(data: Path) -> TextIO:

@@ -16,7 +16,7 @@ from typing import Any
 from devices.errors import FileFormatError, TareError, UnknownError
 from devices.frames import ArrayInfo
 from service.estimation.tare import Tare
-from storage.durable import storage_errors, write_whole
+from storage.durable import make_folder, storage_errors, write_whole
 
 KEPT_MAX = 1000
 AUTOMATIC_KEPT_MAX = 200
@@ -152,7 +152,7 @@ class TareHistory:
             for t in tares
         ]
         with storage_errors(self._path):
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self._path.parent)
         write_whole(self._path, json.dumps(content).encode())
         self._tares = tares
 

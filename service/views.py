@@ -181,9 +181,15 @@ class NodeView(View):
     clock: ClockView | None = Field(description="Null: not measured yet.")
     clock_set: bool = Field(description="Whether anything had set the node's date.")
     rate_hz: float | None = Field(description="Frames a second over the last second.")
-    lost_frames: int = Field(description="Frames of this stream that never came.")
+    lost_frames: int = Field(description="Frames of this stream that are missing for good.")
+    lost: dict[str, int] = Field(description="The same by reason.", examples=[{"evicted": 12}])
+    backlog_frames: int = Field(
+        description="Frames of this stream that the node still has, and sends behind the newest."
+    )
     missed_slots: int = Field(description="Slots in which no frame was taken.")
-    troubles: list[str] = Field(description="What is wrong with its array now, in words.")
+    troubles: list[str] = Field(
+        description="What is wrong with its array, or its disk, now, in words."
+    )
     fault_counts: dict[str, dict[str, int]] = Field(
         description="How often what went wrong in this stream, by serial and reason."
     )
@@ -197,7 +203,7 @@ class NodeView(View):
         """Of a node as it is now."""
         info, live = node.info, node.live
         calibration = live.calibration
-        tare = node.tares.in_force(info)
+        tare, lost = node.tares.in_force(info), node.lost
         return cls(
             node=node.name,
             connected=node.connected,
@@ -230,8 +236,10 @@ class NodeView(View):
             ),
             clock_set=info.clock_set,
             rate_hz=node.rate_hz if node.connected else None,
-            lost_frames=node.lost_frames,
-            missed_slots=node.missed_slots,
+            lost_frames=sum(lost.values()),
+            lost=lost,
+            backlog_frames=node.backlog_frames,
+            missed_slots=node.present.missed_slots,
             troubles=list(node.troubles),
             fault_counts=node.fault_counts,
             last_seq=node.last_seq,
@@ -248,7 +256,7 @@ class SessionView(View):
     name: str
     node: str
     state: Literal["recording", "pending", "sealing", "sealed"] = Field(
-        description="pending: stopped while the node was away, completes when it returns."
+        description="pending: frames are still with the node, it completes when they have come."
     )
     complete: bool | Literal["lossy"] = Field(
         description="true: every frame is in it; 'lossy': some never will be."
@@ -257,6 +265,13 @@ class SessionView(View):
     stopped_t_ns: int | None
     duration_s: float
     frames: int
+    pending_frames: int = Field(description="Still with the node.")
+    lost: dict[str, int] = Field(
+        description="Frames that will never be in it, by reason.", examples=[{"evicted": 12}]
+    )
+    tail_frames_max: int = Field(
+        description="How many more there may have been where a node's power failed."
+    )
     bytes: int | None = Field(description="Size of the sealed file.")
     sha256: str | None = Field(description="Hash of the sealed file.")
     parts: list[Part] = Field(description="Intervals of streams, ends included.")
@@ -271,15 +286,20 @@ class SessionView(View):
     @classmethod
     def of(cls, session: Session, recorder: Recorder) -> SessionView:
         """Of a session as it is now."""
-        ledger = recorder.ledger(session.id)
+        ledger = recorder.ledger_of(session)
         frames = sum(part.recorded for part in ledger.parts)
-        content = session.model_dump(
-            include=set(cls.model_fields) - {"frames", "duration_s", "problem"}
-        )
+        lost: dict[str, int] = {}
+        for part in ledger.parts:
+            for reason, count in part.lost.items():
+                lost[reason] = lost.get(reason, 0) + count
+        made = {"frames", "pending_frames", "lost", "tail_frames_max", "duration_s", "problem"}
+        content = session.model_dump(include=set(cls.model_fields) - made)
         return cls(
-            **content,
-            complete="lossy" if ledger.lossy else ledger.complete,
+            **content | {"complete": "lossy" if ledger.lossy else ledger.complete},
             frames=frames,
+            pending_frames=sum(part.pending for part in ledger.parts),
+            lost=lost,
+            tail_frames_max=sum(part.unsynced_tail_max for part in ledger.parts),
             problem=recorder.problem_of(session),
             duration_s=recorder.duration_s(session, frames),
         )

@@ -16,9 +16,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import FileFormatError, UnknownError
-from storage.durable import storage_errors, write_whole
+from storage.durable import make_folder, storage_errors, sync_folder, write_whole
 
 FRAMES_NAME = "frames.parquet"
+DOOMED_PREFIX = ".deleted-"
 _ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
 
 State = Literal["recording", "pending", "sealing", "sealed"]
@@ -99,8 +100,14 @@ class Session(_Record):
     events: tuple[Event, ...] = ()
     clock: tuple[ClockOffset, ...] = ()
     missed_slots_at_start: int = 0
+    missed_slots_at_stop: dict[str, int] = Field(default_factory=dict)
+    """By boot_id, of the stream in which it was stopped, if the node was there."""
     unsynced_tail_max: dict[str, int] = Field(default_factory=dict)
     """By boot_id, of parts that ended because the node went away."""
+    given_up: bool = False
+    """A person has said that what is still to come will not."""
+    continues: str | None = None
+    """Id of the session whose recording this one takes up, with other tiles."""
     problem: str | None = None
     """What a person should know: why it could not be sealed yet, why it has no estimates."""
     ledger: Ledger | None = None
@@ -142,7 +149,7 @@ class SessionFolder:
         """
         folder = self.path(session.id)
         with storage_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
         write_whole(folder / "session.json", session.model_dump_json(indent=1).encode())
 
     def load(self, session_id: str) -> Session:
@@ -159,6 +166,39 @@ class SessionFolder:
             raise UnknownError(f"no session {session_id!r}") from error
         except (OSError, ValidationError) as error:
             raise FileFormatError(f"not a session: {error}", where=str(path)) from error
+
+    def move(self, session_id: str, to: SessionFolder) -> None:
+        """Have a session's folder among those of `to`: it is in one place or the other, never both.
+
+        Raises:
+            UnknownError: there is no such session.
+            StorageError: it cannot be moved; it is where it was then.
+        """
+        source, target = self.path(session_id), to.path(session_id)
+        if not source.is_dir():
+            raise UnknownError(f"no session {session_id!r}")
+        with storage_errors(target):
+            make_folder(target.parent)
+            source.rename(target)
+            sync_folder(target.parent)
+            sync_folder(source.parent)
+
+    def doom(self, session_id: str) -> Path:
+        """Have a session be none any more; what is left of it is to be deleted.
+
+        Raises:
+            UnknownError: there is no such session.
+            StorageError: it cannot be; it is as it was then.
+        """
+        folder = self.path(session_id)
+        if not folder.is_dir():
+            raise UnknownError(f"no session {session_id!r}")
+        # What is half deleted must not be taken for a session.
+        doomed = folder.with_name(DOOMED_PREFIX + session_id)
+        with storage_errors(folder):
+            folder.rename(doomed)
+            sync_folder(self._folder)
+        return doomed
 
     def ids(self) -> Iterator[str]:
         """Ids of all sessions, newest first."""

@@ -8,13 +8,15 @@ from contextlib import suppress
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from service.link import PROTOCOL, SUBPROTOCOL, Close, HangUp, close_reason
+from service.link import SUBPROTOCOL, Close, HangUp, close_reason
 from service.live import Subscriber, dumps
 from service.server import Server
 from service.steady import utc_ns
 from service.version import SOFTWARE
 from service.views import NodeView, SessionView
 
+PROTOCOL = 1
+"""Of this socket; the nodes' link counts its own."""
 RATES_HZ = (1.0, 60.0)
 RATE_HZ = 30.0
 SEND_TIMEOUT_S = 10.0

@@ -68,12 +68,15 @@ class MarkEvent(_Body):
     summary="Start recording",
     status_code=HTTPStatus.CREATED,
     responses={
-        **problems(_404="No such node.", _409="It is away, or is being recorded already."),
+        **problems(_404="No such node.", _409="It is away, or far behind."),
         **_FULL,
     },
 )
 async def start(body: StartSession, server: ServerState, response: Response) -> SessionView:
-    """Record a node from its next frame on, or from `pre_roll_s` earlier."""
+    """Record a node from its next frame on, or from `pre_roll_s` earlier.
+
+    Several sessions may be recorded on one node at a time; each is stopped by its own id.
+    """
     session = server.recorder.start(
         body.node,
         body.name,
@@ -102,6 +105,22 @@ async def stop(session_id: str, server: ServerState) -> SessionView:
     server.tell_node(server.nodes.get(session.node))
     if server.nodes.get(session.node).connected:
         session = await server.recorder.settled(session_id, SETTLE_S)
+    return SessionView.of(session, server.recorder)
+
+
+@router.post(
+    "/{session_id}/seal",
+    operation_id="sealSession",
+    summary="Seal without what is missing",
+    responses={**_UNKNOWN, **problems(_409="It is not pending."), **_FULL},
+)
+async def seal(session_id: str, server: ServerState) -> SessionView:
+    """Give up what a pending session waits for, because its node never comes back.
+
+    It is sealed as lossy: frames that were still to come are lost, reason `given_up`.
+    """
+    server.recorder.give_up(session_id)
+    session = await server.recorder.settled(session_id, SETTLE_S)
     return SessionView.of(session, server.recorder)
 
 
@@ -143,6 +162,19 @@ async def change(session_id: str, body: ChangeSession, server: ServerState) -> S
     """Change name, subject, notes or tags; the sealed data does not change."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
     return SessionView.of(server.recorder.change(session_id, **changes), server.recorder)
+
+
+@router.delete(
+    "/{session_id}",
+    operation_id="deleteSession",
+    summary="Move to the trash",
+    status_code=HTTPStatus.NO_CONTENT,
+    responses={**_UNKNOWN, **problems(_409="It is being recorded, or sealed."), **_FULL},
+)
+async def delete(session_id: str, server: ServerState) -> None:
+    """It can be had back until the trash is emptied; its space is free only then."""
+    server.recorder.discard(session_id)
+    server.tell_deleted(session_id)
 
 
 @router.post(

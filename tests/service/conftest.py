@@ -15,7 +15,9 @@ import sys
 import threading
 import time
 import uuid
+import zlib
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -37,7 +39,19 @@ from devices.frames import (
 )
 from service.app import make_app
 from service.estimation.calibration import Calibration, TileCalibration
-from service.link import INGEST_PATH, PROTOCOL, SUBPROTOCOL, ClockRow, FromServer, Hello
+from service.link import (
+    INGEST_PATH,
+    PROTOCOL,
+    SUBPROTOCOL,
+    ClockRow,
+    EarlierStream,
+    FromServer,
+    Hello,
+    Stream,
+    Wanted,
+    heard,
+    with_check,
+)
 from service.serve import listen, serving, urls_of
 from service.server import Server
 from storage.intervals import Intervals
@@ -266,6 +280,57 @@ async def _left_over() -> list[str]:
         await asyncio.sleep(0.01)
 
 
+@dataclass
+class Earlier:
+    """A stream that a node took before it was switched on anew."""
+
+    info: ArrayInfo
+    next_seq: int
+    sent: list[FrameBatch]
+
+    @property
+    def boot_id(self) -> str:
+        return self.info.boot_id
+
+    def said(self, **changes: Any) -> EarlierStream:
+        """As a hello mentions it: the node has all of it."""
+        content: dict[str, Any] = {
+            "array_info": self.info,
+            "held": ((0, self.next_seq - 1),) if self.next_seq else (),
+            "next_seq": self.next_seq,
+            "t_ns_first": int(self.sent[0].t_ns[0]) if self.sent else 0,
+        }
+        return EarlierStream(**content | changes)
+
+
+class Spoken:
+    """A node's end of the link: what it sends has its checksum, whatever it is."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._socket, name)
+
+    def send(self, message: str | bytes) -> None:
+        """Send something, with the checksum that fits it."""
+        if isinstance(message, bytes):
+            self.send_raw(with_check(message))
+        elif message.endswith("}"):
+            body = message[:-1]
+            self.send_raw(f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}')
+        else:
+            self.send_raw(message)
+
+    def send_raw(self, message: str | bytes) -> None:
+        """Send these bytes."""
+        self._socket.send(message)
+
+    def recv(self, timeout: float | None = None) -> str:
+        """The next message, without its checksum, which has to be right."""
+        return heard(self._socket.recv(timeout=timeout))
+
+
 class FakeNode:
     """A node that says what a test has it say."""
 
@@ -284,12 +349,22 @@ class FakeNode:
         self.calibration = calibration
         self.tiles = tiles
         self.acked = Intervals()
-        self.socket: ClientConnection
+        """Of the present stream."""
+        self.acked_of: dict[str, Intervals] = {}
+        self.lacks: dict[str, list[tuple[int, int | None]]] = {}
+        """What the server asked for at the last connection, by stream."""
+        self.wanted: Wanted | None = None
+        self.boot_id = ""
+        self.before: list[Earlier] = []
+        """Its streams before the present one."""
+        self.socket: Spoken
         self._sockets = contextlib.ExitStack()
         self.reboot()
 
     def reboot(self) -> None:
         """Begin a new stream, with the clock where it was before or long ago."""
+        if self.boot_id:
+            self.before.append(Earlier(self.info, self.seq, self.sent))
         self.boot_id = uuid.uuid4().hex
         self.utc_offset_ns = time.time_ns() - time.monotonic_ns()
         self.next_t_mono_ns = time.monotonic_ns() - LONG_AGO_NS
@@ -321,16 +396,20 @@ class FakeNode:
         """Connect and say hello, then how the clocks differ; gives what the server lacks."""
         self.open()
         self.socket.send(self.hello(**changes).model_dump_json())
-        lacks = [tuple(interval) for interval in self.receive("welcome").lacks]
+        welcome = self.receive("welcome")
+        self.wanted = welcome.wanted
+        self.lacks = {each.boot_id: [*each.numbers] for each in welcome.lacks}
         clock = ClockRow(t_mono_ns=time.monotonic_ns(), server_minus_node_ns=0, uncertainty_ns=9)
         self.socket.send(clock.model_dump_json())
-        return lacks
+        return self.lacks[self.boot_id]
 
-    def open(self) -> ClientConnection:
+    def open(self) -> Spoken:
         """Connect and say nothing."""
         headers = {"Authorization": f"Bearer {self.token}"} if self.token else None
-        self.socket = self._sockets.enter_context(
-            self.running.socket(INGEST_PATH, additional_headers=headers)
+        self.socket = Spoken(
+            self._sockets.enter_context(
+                self.running.socket(INGEST_PATH, additional_headers=headers)
+            )
         )
         return self.socket
 
@@ -342,7 +421,12 @@ class FakeNode:
                 self.socket.recv(timeout=max(0.0, end_s - time.monotonic()))
             )
             if message.type == "ack":
-                self.acked.add(message.seq_first, message.seq_last)
+                acked = self.acked_of.setdefault(message.boot_id, Intervals())
+                acked.add(message.seq_first, message.seq_last)
+                if message.boot_id == self.boot_id:
+                    self.acked.add(message.seq_first, message.seq_last)
+            if message.type == "wanted":
+                self.wanted = message
             if message.type == kind:
                 return message
 
@@ -403,6 +487,15 @@ class FakeNode:
         """Send frames, perhaps for the second time."""
         for begin in range(0, len(batch), 10):
             self.socket.send(self.payload(batch.rows(begin, begin + 10)))
+
+    def send_earlier(self, stream: Earlier, seq_first: int, seq_last: int) -> None:
+        """Send frames of a stream before this one, then go on with this one."""
+        self.socket.send(Stream(boot_id=stream.info.boot_id).model_dump_json())
+        rows = FrameBatch.concatenate(stream.sent).rows(seq_first, seq_last + 1)
+        for begin in range(0, len(rows), 10):
+            batch = rows.rows(begin, begin + 10)
+            self.socket.send(encode(batch, wire_schema(stream.info)))
+        self.socket.send(Stream(boot_id=self.boot_id).model_dump_json())
 
     def payload(self, batch: FrameBatch) -> bytes:
         return encode(batch, wire_schema(self.info))

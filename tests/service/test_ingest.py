@@ -22,6 +22,7 @@ from websockets.exceptions import ConnectionClosed
 import service.ingest
 import service.nodes
 import service.server
+import service.streams
 import storage.segment
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from service.link import INGEST_PATH, MESSAGE_BYTES_MAX
@@ -65,7 +66,7 @@ def test_a_new_node_is_asked_for_everything(node: FakeNode) -> None:
 
 
 def test_a_new_node_is_not_asked_for_what_it_has_forgotten(node: FakeNode) -> None:
-    assert node.connect(first_seq=500, next_seq=900) == [(500, None)]
+    assert node.connect(held=((500, 899),), next_seq=900) == [(500, None)]
 
 
 def test_what_is_acknowledged_is_readable_from_disk(running: Running, node: FakeNode) -> None:
@@ -254,7 +255,7 @@ def test_a_clock_row_and_counts_of_a_node_are_shown(
     node.send(10)
     row = {"t_mono_ns": 5, "server_minus_node_ns": -77, "uncertainty_ns": 12}
     node.socket.send(json.dumps({"type": "clock", **row}))
-    node.socket.send('{"type":"status","missed_slots":4,"first_seq":0}')
+    node.socket.send('{"type":"status","missed_slots":4}')
     until(lambda: running.node()["missed_slots"] == 4)
     assert running.node()["clock"] == {"server_minus_node_ns": -77, "uncertainty_ns": 12}
 
@@ -274,9 +275,9 @@ def test_another_subprotocol_is_refused(
 def test_another_protocol_number_is_refused(
     running: Running, healthy: FakeNode, node: FakeNode, closing: Closing
 ) -> None:
-    node.open().send(node.hello(protocol=2).model_dump_json())
+    node.open().send('{"type":"hello","protocol":1,"first_seq":0}')  # with fields of its own
     code, reason = closing(node.socket)
-    assert (code, reason) == (4002, "protocol 2; this server speaks 1")
+    assert (code, reason) == (4002, "protocol 1; this server speaks 2: update the node")
     assert running.http.get("/nodes/bench").status_code == 404
     assert_goes_on(running, healthy)
 
@@ -293,7 +294,7 @@ def test_another_protocol_number_is_refused(
         '{"type":"hello"}',
         '{"type":"goodbye"}',
         '{"type":"probe","id":1}',
-        '{"type":"hello","protocol":1,"array_info":null}',
+        '{"type":"hello","protocol":2,"array_info":null}',
         '{"type":"hello","😀":1}',
     ],
     ids=lambda first: repr(first[:30]),
@@ -311,8 +312,11 @@ def test_whoever_does_not_say_hello_first_is_let_go(
 @pytest.mark.parametrize(
     "change",
     [
-        {"first_seq": -1},
-        {"first_seq": 2**62},
+        {"held": [[-1, 5]]},
+        {"held": [[0, 2**62]]},
+        {"held": [[0]]},
+        {"lost": {"Evicted!": [[0, 1]]}},
+        {"earlier": [{}]},
         {"next_seq": 1.5},
         {"protocol": "one"},
         {"surprise": 1},
@@ -788,12 +792,12 @@ def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
     def refuse(*_: object) -> None:
         raise StorageError("No space left on device")
 
-    monkeypatch.setattr(service.nodes, "Journal", refuse)  # not even its folder can be made
+    monkeypatch.setattr(service.streams, "Journal", refuse)  # not even its folder can be made
     monkeypatch.setattr(running.server, "check_storage", refuse)
     node.connect()
     node.send(10)
     until(lambda: running.node()["storage_problem"] is not None)
-    monkeypatch.setattr(service.nodes, "Journal", Journal)
+    monkeypatch.setattr(service.streams, "Journal", Journal)
     monkeypatch.setattr(running.server, "check_storage", lambda: None)
     assert closing(node.socket)[0] == 1012
     assert node.connect() == [(0, None)]

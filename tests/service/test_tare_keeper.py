@@ -36,7 +36,7 @@ class Foot:
         self.hello = Hello(
             protocol=PROTOCOL,
             array_info=info,
-            first_seq=0,
+            held=(),
             next_seq=0,
             scene={"name": "test", **scene},
             emulated=True,
@@ -51,7 +51,7 @@ class Foot:
         if hasattr(self, "node"):
             self.close()
         self.node = Node(self._folder / "node", self._folder / "journal", self.hello)
-        self.node.attach(self.hello)
+        self.node.attach(self.hello, UTC_NS)
         self.node.connected = True
 
     def close(self) -> None:
@@ -96,7 +96,7 @@ class Foot:
         schema = wire_schema(self.hello.array_info)
         for begin in range(0, len(frames), BATCH):
             payload = encode(frames.rows(begin, begin + BATCH), schema)
-            _, _, due = self.node.take(payload, 0)
+            _, _, due = self.node.take(self.node.present, payload, 0)
             self.due += [int(seq) for piece, _ in due for seq in piece.seq]
 
     def live(self, seconds: float, counts: Any = 0.0, **how: Any) -> None:
@@ -207,7 +207,7 @@ def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_
     again = {"boot_id": "1" * 32}
     info = foot.hello.array_info.model_copy(update=again)
     foot.hello = foot.hello.model_copy(update={"array_info": info})
-    foot.node.attach(foot.hello)
+    foot.node.attach(foot.hello, UTC_NS)
     foot.seq = 0
     foot.live(1.0, lead=True, silent=0)
     foot.live(1.0)
