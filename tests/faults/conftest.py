@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -32,10 +33,10 @@ def disk(tmp_path: Path) -> Disk:
 
 
 @pytest.fixture
-def run(disk: Disk) -> Iterator[Run]:
-    """Run Python code on the watched folder, in which it is; it ends by itself or is killed."""
+def run_on() -> Run:
+    """Run Python code in a watched folder; it ends by itself or is killed."""
 
-    def run_code(code: str, **environment: str) -> Ended:
+    def run_code(disk: Disk, code: str, **environment: str) -> Ended:
         ended = subprocess.run(
             [sys.executable, "-c", code],
             cwd=disk.root,
@@ -48,3 +49,9 @@ def run(disk: Disk) -> Iterator[Run]:
         return Ended(ended.returncode, ended.stdout)
 
     return run_code
+
+
+@pytest.fixture
+def run(disk: Disk, run_on: Run) -> Run:
+    """The same in a folder that is made for the test."""
+    return partial(run_on, disk)
