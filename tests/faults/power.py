@@ -81,7 +81,7 @@ class Disk:
         """Make the folder what the disk holds; all its processes must have been killed before.
 
         Returns:
-            What became of it, in a line.
+            What became of names and lengths, in a line.
 
         Raises:
             HarnessError: see `possible`.
@@ -94,13 +94,11 @@ class Disk:
         write_tree(tree, self.root)
         after = _sizes(self.root)
         self.begin()
-        gone = sorted(before.keys() - after.keys())
-        back = sorted(after.keys() - before.keys())
-        shorter = [f"{n} -{before[n] - after[n]}" for n in before if after.get(n, 0) < before[n]]
-        return (
-            f"{draws.mood}: {len(gone)} names gone, {len(back)} back, "
-            f"cut: {', '.join(n for n in shorter if n.split(' ')[0] not in gone) or 'none'}"
-        )
+        gone = [f"-{name}" for name in sorted(before.keys() - after.keys())]
+        back = [f"+{name}" for name in sorted(after.keys() - before.keys())]
+        common = sorted(before.keys() & after.keys())
+        cut = [f"{n} {after[n] - before[n]:+d} bytes" for n in common if after[n] != before[n]]
+        return f"{draws.mood}: " + (", ".join(gone + back + cut) or "nothing was gone")
 
     def begin(self) -> None:
         """All that is there is durable, and another boot of the kernel begins."""
