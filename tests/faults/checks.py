@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from tests.faults.draws import Remains, Tree
 from tests.faults.facts import Facts
 from tests.faults.link_witness import Columns
 from tests.faults.product import Product
@@ -58,6 +59,41 @@ def bound_frames(facts: Facts, boot_id: str) -> int:
     return math.ceil(info.nominal_rate_hz * (unsynced_s + batch_s))
 
 
+def sessions_are_whole(tree: Tree, expected: str) -> list[str]:
+    """What is wrong with the session folders of a data folder, wherever its server was stopped.
+
+    Args:
+        tree: the data folder.
+        expected: id of a session that has to be there.
+    """
+    sessions = tree.get("sessions", {})
+    assert isinstance(sessions, dict)
+    found = []
+    if "session.json" not in sessions.get(expected, {}):
+        found.append(f"session {expected} is gone")
+    for session_id, folder in sessions.items():
+        assert isinstance(folder, dict)
+        files = {name: node.content for name, node in folder.items() if isinstance(node, Remains)}
+        state = ""
+        if "session.json" in files:
+            try:
+                session = json.loads(files["session.json"])
+                state = session["state"]
+            except ValueError:
+                found.append(f"session.json of {session_id} is damaged")
+        sealed = files.get("frames.parquet")
+        if sealed is not None:
+            try:
+                _read(sealed)
+            except (pa.ArrowException, OSError) as error:
+                found.append(f"frames.parquet of {session_id} is damaged: {error}")
+        if state == "sealed" and (
+            sealed is None or hashlib.sha256(sealed).hexdigest() != session["sha256"]
+        ):
+            found.append(f"the sealed file of {session_id} is not the one in session.json")
+    return found
+
+
 # --- the ledger and the file ----------------------------------------------------------------------
 
 
@@ -85,9 +121,11 @@ def _ledger_sums(facts: Facts) -> Iterator[str]:
 
 
 def _table(facts: Facts) -> pa.Table | None:
-    if facts.file is None:
-        return None
-    with pq.ParquetFile(io.BytesIO(facts.file), page_checksum_verification=True) as file:
+    return None if facts.file is None else _read(facts.file)
+
+
+def _read(content: bytes) -> pa.Table:
+    with pq.ParquetFile(io.BytesIO(content), page_checksum_verification=True) as file:
         return file.read()
 
 

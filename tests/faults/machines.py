@@ -72,8 +72,13 @@ class Machine:
         """Does its first process run?"""
         return self._process is not None and self._process.poll() is None
 
-    def run(self, *arguments: object) -> None:
-        """Start a command of the product; what was running has to be dead."""
+    def run(self, *arguments: object, kill_at: str = "") -> None:
+        """Start a command of the product; what was running has to be dead.
+
+        Args:
+            arguments: of `foottile`.
+            kill_at: a call at which it is killed (`bootstrap/fault_recorder.py`).
+        """
         self.arm.unlink(missing_ok=True)
         environment = {
             **clean_environment(),
@@ -81,6 +86,7 @@ class Machine:
             **self.clock.environment(),
             **self.slow.environment(),
             "FAULTS_KILL_FILE": str(self.arm),
+            "FAULTS_KILL": kill_at,
         }
         with self.said.open("ab") as said:
             self._process = subprocess.Popen(
@@ -156,9 +162,9 @@ class ServerMachine(Machine):
             base_url=f"http://127.0.0.1:{self.port}/api/v1", timeout=15.0, trust_env=False
         )
 
-    def start(self) -> None:
-        """Start it."""
-        self.run("serve", "--port", self.port, "--data", self.root)
+    def start(self, kill_at: str = "") -> None:
+        """Start it, to be killed at a call if one is given."""
+        self.run("serve", "--port", self.port, "--data", self.root, kill_at=kill_at)
 
     def wait_ready(self, timeout_s: float = 40.0) -> None:
         """Until it answers.
@@ -223,11 +229,21 @@ class NodeMachine(Machine):
         self._scene = scene
         self._port = port
 
-    def start(self) -> None:
-        """Start it."""
+    def start(self, kill_at: str = "") -> None:
+        """Start it, to be killed at a call if one is given."""
         journal = ("--journal", self.root) if product().node_journal else ()
         server = f"http://127.0.0.1:{self._port}"
-        self.run("node", "--scene", self._scene, "--server", server, "--name", NODE, *journal)
+        self.run(
+            "node",
+            "--scene",
+            self._scene,
+            "--server",
+            server,
+            "--name",
+            NODE,
+            *journal,
+            kill_at=kill_at,
+        )
 
 
 def free_port() -> int:

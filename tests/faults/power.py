@@ -115,6 +115,15 @@ class Disk:
         self._boot_id.write_text(f"{uuid.uuid4()}\n")
 
 
+def read_tree(folder: Path) -> Tree:
+    """What is in a folder."""
+    tree: Tree = {}
+    for path in folder.iterdir():
+        mode = path.stat().st_mode & 0o777
+        tree[path.name] = read_tree(path) if path.is_dir() else Remains(path.read_bytes(), mode)
+    return tree
+
+
 def write_tree(tree: Tree, folder: Path) -> None:
     """Write what is left into a folder."""
     for name, node in tree.items():

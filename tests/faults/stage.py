@@ -36,8 +36,8 @@ from tests.faults.stories import SMALL_DISK_BYTES, Fault, Story
 RATE_HZ = 200
 _BACK_S = 30.0
 _SEALED_S = 25.0
-_POINTS_OF_SEALING = 16
-"""Calls that sealing makes, about: one of them is drawn to be killed at."""
+_POINTS_OF_SEALING = 20
+"""So many files and folders are synced or renamed, about, from stop to sealed."""
 
 
 def scene_file(folder: Path, tiles: int) -> Path:
@@ -76,7 +76,7 @@ class Stage:
         self._folder = folder
         self._stack = ExitStack()
         self._begin_s = time.monotonic()
-        self._session_id = ""
+        self.session_id = ""
         self._stopped = False
 
     def __enter__(self) -> Stage:
@@ -106,6 +106,22 @@ class Stage:
         Raises:
             RoundError: something that has to happen does not.
         """
+        self.begin()
+        for fault in self.story.faults:
+            time.sleep(fault.after_s)
+            self.note(f"{fault}")
+            with self._timed(fault.kind):
+                getattr(self, f"_{fault.kind}")(fault)
+        if not self._stopped:
+            time.sleep(self.story.in_the_end_s)
+        return self.end()
+
+    def begin(self) -> None:
+        """Start everything and record.
+
+        Raises:
+            RoundError: it cannot be.
+        """
         with self._timed("start"):
             self.server.start()
             self.node.start()
@@ -113,15 +129,16 @@ class Stage:
             self.wait_back()
         with self._timed("record"):
             self._start_session()
-        for fault in self.story.faults:
-            time.sleep(fault.after_s)
-            self._note(f"{fault}")
-            with self._timed(fault.kind):
-                getattr(self, f"_{fault.kind}")(fault)
+
+    def end(self) -> Facts:
+        """Stop if that has not been done, wait for the sealed session, and fetch it.
+
+        Raises:
+            RoundError: it cannot be.
+        """
         if not self._stopped:
-            time.sleep(self.story.in_the_end_s)
             with self._timed("stop"):
-                self._stop_session()
+                self.stop()
         with self._timed("seal"):
             self._wait_sealed()
         with self._timed("fetch"):
@@ -148,6 +165,27 @@ class Stage:
 
         wait_for("the node sends", back, _BACK_S)
 
+    def end_node_when_it_dies(self, how: str, rng: random.Random) -> None:
+        """The node will be killed at a call that was chosen; then it is started again.
+
+        Args:
+            how: `killed`, or `power`: then its disk is left as a power cut leaves it.
+            rng: for that.
+
+        Raises:
+            RoundError: it is not killed, or does not come back.
+        """
+
+        def dies() -> None:
+            wait_for("the node is killed", lambda: not self.node.is_alive, 20.0)
+            self.node.kill()
+
+        boot_id = self._end_node(how, dies)
+        if how == "power":
+            self.note(f"power of the node: {self.node.cut_power(rng)}")
+        self.node.start()
+        self.wait_back(boot_id)
+
     # --- the session ------------------------------------------------------------------------------
 
     def _start_session(self) -> None:
@@ -161,13 +199,19 @@ class Stage:
 
         session = wait_for("the session begins", begun, 10.0)
         assert session is not None
-        self._session_id = session["id"]
+        self.session_id = session["id"]
         self.facts.started_s = time.monotonic()
-        self._note(f"session {self._session_id} from {session['parts']}")
+        self.note(f"session {self.session_id} from {session['parts']}")
 
-    def _stop_session(self) -> None:
+    def stop(self) -> None:
+        """Stop the session, now.
+
+        Raises:
+            RoundError: it is refused.
+            httpx.HTTPError: the server dies of it.
+        """
         self._before_stop()
-        self.server.post(f"/sessions/{self._session_id}/stop")
+        self.server.post(f"/sessions/{self.session_id}/stop")
 
     def _before_stop(self) -> None:
         node = self.server.node() or {}
@@ -178,7 +222,7 @@ class Stage:
 
     def _wait_sealed(self) -> None:
         def sealed() -> bool:
-            session = self.facts.session = self.server.get(f"/sessions/{self._session_id}")
+            session = self.facts.session = self.server.get(f"/sessions/{self.session_id}")
             return bool(session["state"] == "sealed")
 
         with suppress(RoundError):  # what it is instead is for the checks
@@ -186,9 +230,9 @@ class Stage:
 
     def _fetch(self) -> None:
         facts = self.facts
-        facts.session = self.server.get(f"/sessions/{self._session_id}")
-        facts.ledger = self.server.get(f"/sessions/{self._session_id}/ledger")
-        answer = self.server.download(f"/sessions/{self._session_id}/data")
+        facts.session = self.server.get(f"/sessions/{self.session_id}")
+        facts.ledger = self.server.get(f"/sessions/{self.session_id}/ledger")
+        answer = self.server.download(f"/sessions/{self.session_id}/data")
         facts.file = answer.content if answer.status_code == httpx.codes.OK else None
         facts.look_into_journal()
         self.node.kill()
@@ -307,7 +351,7 @@ class Stage:
         self.proxy.quality = quality
         time.sleep(length_s)
         self.proxy.quality = Quality()
-        self._note(f"{self.proxy.flips} bits flipped so far")
+        self.note(f"{self.proxy.flips} bits flipped so far")
         self.wait_back()
 
     # --- disks and clocks -------------------------------------------------------------------------
@@ -363,7 +407,7 @@ class Stage:
     def _stop_while_away(self, fault: Fault) -> None:
         self.proxy.cut()
         time.sleep(fault.length_s)
-        self._stop_session()
+        self.stop()
         time.sleep(0.2)
         self.proxy.mend()
         self.wait_back()
@@ -371,7 +415,7 @@ class Stage:
     def _stop_while_away_and_kill_node(self, fault: Fault) -> None:
         self.proxy.cut()
         time.sleep(fault.length_s)
-        self._stop_session()
+        self.stop()
         time.sleep(0.2)
         boot_id = self._end_node("killed", self.node.kill)
         self.proxy.mend()
@@ -387,17 +431,16 @@ class Stage:
     def _die_while_sealing(self, fault: Fault, die: Callable[[], None]) -> None:
         number = 1 + int(fault.amount * _POINTS_OF_SEALING)
         when = self._rng.choice(("before", "after"))
-        self.server.kill_at(f"any@sessions/:{number}:{when}")
-        self._before_stop()
+        self.server.kill_at(f"fsync+replace@sessions/:{number}:{when}")
         with suppress(httpx.HTTPError):
-            self.server.post(f"/sessions/{self._session_id}/stop")
+            self.stop()
         with suppress(RoundError):  # sealing may make fewer calls than that
             wait_for("the server kills itself", lambda: not self.server.is_alive, 2.0)
         die()
         self._server_again()
-        if self.server.get(f"/sessions/{self._session_id}")["state"] == "recording":
-            self._note("the stop was not kept: stopped again")
-            self._stop_session()
+        if self.server.get(f"/sessions/{self.session_id}")["state"] == "recording":
+            self.note("the stop was not kept: stopped again")
+            self.stop()
 
     # --- helpers ----------------------------------------------------------------------------------
 
@@ -427,7 +470,7 @@ class Stage:
         return newest
 
     def _cut(self, machine: Machine) -> None:
-        self._note(f"power of the {machine.name}: {machine.cut_power(self._rng)}")
+        self.note(f"power of the {machine.name}: {machine.cut_power(self._rng)}")
 
     def _server_again(self) -> None:
         self.server.start()
@@ -448,7 +491,8 @@ class Stage:
         finally:
             self.times[step] = self.times.get(step, 0.0) + time.monotonic() - begin_s
 
-    def _note(self, text: str) -> None:
+    def note(self, text: str) -> None:
+        """For the log."""
         self.log.append(f"{time.monotonic() - self._begin_s:7.3f} {text}")
 
     def write_down(self) -> None:

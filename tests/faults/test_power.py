@@ -234,7 +234,11 @@ def test_a_process_kills_itself_at_the_chosen_call(disk: Disk, run: Run) -> None
     assert sorted(path.name for path in disk.root.iterdir()) == ["0", "1"]
     assert run(BEGIN + "os.rename('0', '7')", FAULTS_KILL="rename@/7:1:after").code < 0
     assert sorted(path.name for path in disk.root.iterdir()) == ["1", "7"]
-    assert run(BEGIN + "os.rename('1', '8')", FAULTS_KILL="rename@/7:1:after").code == 0
+    code = BEGIN + "os.rename('1', '8'); os.rmdir('8')"
+    assert run(code, FAULTS_KILL="rename@/7:1:after").code == 0
+    code = BEGIN + "[(os.mkdir(n), os.rmdir(n)) for n in 'ab']"
+    assert run(code, FAULTS_KILL="mkdir+rmdir:3").code == -signal.SIGKILL
+    assert sorted(path.name for path in disk.root.iterdir()) == ["7"]
 
 
 def test_a_kill_can_be_armed_while_the_process_runs(disk: Disk, run: Run, tmp_path: Path) -> None:

@@ -11,19 +11,21 @@ class KillPoint:
     """SIGKILL to this process at the Nth call that fits.
 
     Args:
-        spec: KIND[@PART_OF_PATH]:N[:before|after].
+        spec: KIND[+KIND...][@PART_OF_PATH]:N[:before|after].
     """
 
     def __init__(self, spec: str) -> None:
         what, number, *when = spec.strip().split(":")
-        self._kind, _, self._part = what.partition("@")
+        kinds, _, self._part = what.partition("@")
+        self._kinds = kinds.split("+")
         self._left = int(number)
         self._when = when[0] if when else "before"
         self._lock = threading.Lock()
 
     def reached(self, kind: str, path: str, when: str) -> None:
         """A call begins ("before") or has returned ("after"); this may not return."""
-        if when != self._when or self._kind not in ("any", kind) or self._part not in path:
+        fits = kind in self._kinds or "any" in self._kinds
+        if when != self._when or not fits or self._part not in path:
             return
         with self._lock:
             self._left -= 1

@@ -5,7 +5,7 @@ Standard library only, and nothing of the product. Everything is off unless the 
     FAULTS_ROOT       the folder that is watched
     FAULTS_LOG        where calls are noted, a line of JSON each, outside of that folder
     FAULTS_GRAVEYARD  what loses its name is kept here until that is durable; same file system
-    FAULTS_KILL       KIND[@PART_OF_PATH]:N[:before|after]: SIGKILL at the Nth such call
+    FAULTS_KILL       KIND[+KIND...][@PART_OF_PATH]:N[:before|after]: SIGKILL at the Nth such call
     FAULTS_KILL_FILE  a file that may appear later, with the same in it; counting begins then
     FAULTS_SLOW       a file with the seconds that every fsync takes longer
 
