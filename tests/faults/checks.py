@@ -19,7 +19,7 @@ from tests.faults.facts import Facts
 from tests.faults.link_witness import Columns
 from tests.faults.product import Product
 
-_SYNC_S = 0.5
+_SYNC_S, _BATCH_S = 0.5, 0.05
 _STOP_S = 0.03
 """Frames that were on the link so long before the stop were surely taken before it."""
 _GOOD, _DAMAGED, _LOSSY = 0, 1, 3
@@ -51,12 +51,10 @@ def findings(facts: Facts, product: Product) -> list[str]:
 
 def bound_frames(facts: Facts, boot_id: str) -> int:
     """What a power cut may cost of a stream: half a second and a batch."""
-    info = facts.witness.infos.get(boot_id) or next(iter(facts.witness.infos.values()))
     end = facts.ends.get(boot_id)
     # An fsync that takes a second leaves that second unsynced, and one more may be waiting.
     unsynced_s = _SYNC_S + (2 * end.slow_s if end is not None else 0.0)
-    batch_s = 0.05
-    return math.ceil(info.nominal_rate_hz * (unsynced_s + batch_s))
+    return math.ceil(facts.rate_hz * (unsynced_s + _BATCH_S))
 
 
 def sessions_are_whole(tree: Tree, expected: str) -> list[str]:
@@ -154,7 +152,7 @@ def _file_is_the_one_it_says(facts: Facts) -> Iterator[str]:
         if recorded:
             yield "there is no sealed file to download"
         return
-    folder = facts.server_root / "sessions" / facts.session["id"]
+    folder = facts.sealed_root / "sessions" / facts.session["id"]
     sha256 = hashlib.sha256(facts.file).hexdigest()
     written = json.loads((folder / "session.json").read_text())
     if not sha256 == written["sha256"] == facts.session["sha256"]:
@@ -271,7 +269,7 @@ def _streams_are_all_there(facts: Facts, product: Product) -> Iterator[str]:
     """Each stream of which frames were taken while it was recorded is a part."""
     if not product.node_journal:
         return
-    named = {part["boot_id"] for part in facts.ledger["parts"]}
+    named = {part["boot_id"] for part in facts.ledger["parts"]} | facts.elsewhere
     first = facts.ledger["parts"][0]["boot_id"] if facts.ledger["parts"] else None
     order = [*facts.witness.infos]
     before = set(order[: order.index(first)]) if first in order else set()
@@ -285,7 +283,7 @@ def _streams_are_all_there(facts: Facts, product: Product) -> Iterator[str]:
             end is not None
             and end.how == "power"
             and boot_id not in promised
-            and max(known) < bound_frames(facts, boot_id)
+            and max(known) < facts.rate_hz * (_SYNC_S + _BATCH_S)
         ):
             continue
         yield f"stream {boot_id} was taken while it was recorded, and is no part of it: {end}"
@@ -299,6 +297,8 @@ def _begins_with_the_start(facts: Facts) -> Iterator[str]:
     before = facts.witness.last_seq(parts[0]["boot_id"], facts.started_s)
     if before is not None and parts[0]["seq_first"] > before + 1:
         yield f"it begins with {parts[0]['seq_first']}; when it was started {before} was there"
+    if facts.story.alone and parts[0]["seq_first"] != 0:
+        yield f"the node records from its start on, and the session begins with {parts[0]}"
 
 
 def _verified(facts: Facts, product: Product) -> Iterator[str]:

@@ -37,8 +37,11 @@ class Facts:
 
     story: Story
     witness: Witness
-    server_root: Path
+    sealed_root: Path
+    """The data folder in which the session is sealed."""
     node_root: Path
+    rate_hz: float
+    """Of the node's frames."""
     started_s: float = 0.0
     """When the start of the session had been answered, by `time.monotonic`."""
     stopped_s: float = 0.0
@@ -49,6 +52,8 @@ class Facts:
     """Streams that were ended by a fault, by boot_id."""
     kept_by_node: dict[str, Columns] = field(default_factory=dict)
     """What was in the node's journal whenever it was looked at, by boot_id."""
+    elsewhere: frozenset[str] = frozenset()
+    """Streams that are parts of another session."""
     session: dict[str, Any] = field(default_factory=dict)
     """As the API gives it in the end."""
     ledger: dict[str, Any] = field(default_factory=dict)
@@ -69,10 +74,10 @@ class Facts:
         return found
 
 
-def journal_of(root: Path) -> dict[str, Columns]:
+def journal_of(root: Path, boot_id: str = "*") -> dict[str, Columns]:
     """All whole batches of a data folder's journal, by boot_id, read with plain Arrow."""
     found: dict[str, list[Columns]] = {}
-    for path in sorted((root / "journal" / NODE).glob("*/*.arrows")):
+    for path in sorted((root / "journal" / NODE).glob(f"{boot_id}/*.arrows")):
         pieces = found.setdefault(path.parent.name, [])
         try:
             with pa.OSFile(str(path)) as file, pa.ipc.open_stream(file) as stream:
@@ -81,7 +86,7 @@ def journal_of(root: Path) -> dict[str, Columns]:
         except (pa.ArrowException, EOFError, OSError):
             continue  # its tail is not whole
     return {
-        boot_id: columns
-        for boot_id, pieces in found.items()
+        stream: columns
+        for stream, pieces in found.items()
         if (columns := joined(pieces)) is not None
     }

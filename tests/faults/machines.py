@@ -222,28 +222,26 @@ class ServerMachine(Machine):
 
 
 class NodeMachine(Machine):
-    """The node."""
+    """The node.
 
-    def __init__(self, folder: Path, scene: Path, port: int, small: Path | None = None) -> None:
+    Args:
+        folder: where everything of it is.
+        scene: its scene file.
+        port: where it finds its server; None: it has none, and records by itself.
+        small: a mounted small disk, if its journal is to be there.
+    """
+
+    def __init__(
+        self, folder: Path, scene: Path, port: int | None, small: Path | None = None
+    ) -> None:
         super().__init__("node", folder, small)
-        self._scene = scene
-        self._port = port
+        link = ("--record", "round") if port is None else ("--server", f"http://127.0.0.1:{port}")
+        journal = ("--journal", self.root) if product().node_journal else ()
+        self._arguments = ("--scene", scene, "--name", NODE, *link, *journal)
 
     def start(self, kill_at: str = "") -> None:
         """Start it, to be killed at a call if one is given."""
-        journal = ("--journal", self.root) if product().node_journal else ()
-        server = f"http://127.0.0.1:{self._port}"
-        self.run(
-            "node",
-            "--scene",
-            self._scene,
-            "--server",
-            server,
-            "--name",
-            NODE,
-            *journal,
-            kill_at=kill_at,
-        )
+        self.run("node", *self._arguments, kill_at=kill_at)
 
 
 def free_port() -> int:

@@ -37,6 +37,7 @@ ROOT = Path(__file__).resolve().parents[2]
 if str(ROOT) not in sys.path:  # run as a script
     sys.path.insert(0, str(ROOT))
 
+from tests.faults.alone import Alone  # noqa: E402
 from tests.faults.checks import findings, summary_of  # noqa: E402
 from tests.faults.machines import RoundError  # noqa: E402
 from tests.faults.product import Product, product  # noqa: E402
@@ -55,10 +56,18 @@ class Result:
     faults: str
     findings: list[str]
     ledger: dict[str, Any] = field(default_factory=dict)
+    """Of its session; of all of them, if it became several."""
     times: dict[str, float] = field(default_factory=dict)
     acknowledged: int = 0
     folder: str = ""
     """Where its files are, if it failed."""
+
+    def add(self, ledger: dict[str, Any]) -> None:
+        """Count another session."""
+        self.ledger = {
+            "lossy": self.ledger.get("lossy", False) or ledger.get("lossy", False),
+            "parts": [*self.ledger.get("parts", ()), *ledger.get("parts", ())],
+        }
 
     @property
     def verdict(self) -> str:
@@ -85,13 +94,14 @@ def play(story: Story, folder: Path) -> Result:
     """
     folder.mkdir(parents=True)
     result = Result(story.seed, story.title, [])
-    with Stage(story, folder) as stage:
+    with (Alone if story.alone else Stage)(story, folder) as stage:
         try:
-            facts = stage.play()
-            result.findings = findings(facts, product())
+            for facts in stage.play():
+                result.findings += findings(facts, product())
+                result.add(facts.ledger)
         except (RoundError, httpx.HTTPError) as error:
             result.findings = [f"{type(error).__name__}: {error}"]
-        result.ledger, result.times = stage.facts.ledger, stage.times
+        result.times = stage.times
         acknowledged = stage.witness.acknowledged().values()
         result.acknowledged = sum(len(numbers) for numbers in acknowledged)
         stage.write_down()
@@ -197,7 +207,9 @@ def _summary(results: list[Result], what: Product, seconds: float) -> Iterator[s
     bad = [result for result in results if result.findings]
     parts = [part for result in results for part in result.ledger.get("parts", ())]
     lossy = sum(bool(result.ledger.get("lossy")) for result in results)
-    kinds = Counter(kind for result in results for kind in result.faults.split(", "))
+    kinds = Counter(
+        kind for result in results for kind in result.faults.removeprefix("alone: ").split(", ")
+    )
     yield f"{len(results)} rounds in {seconds / 60:.1f} min: {len(results) - len(bad)} good"
     if bad:
         yield "failed: " + ", ".join(str(result.seed) for result in bad)

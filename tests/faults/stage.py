@@ -10,10 +10,10 @@ import random
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import httpx
 
@@ -78,30 +78,39 @@ class Stage:
         self._begin_s = time.monotonic()
         self.session_id = ""
         self._stopped = False
+        self.witness = Witness()
 
-    def __enter__(self) -> Stage:
+    def __enter__(self) -> Self:
         small: SmallDisk | None = None
         if self.story.small_disk_of:
             small = self._stack.enter_context(small_disk(self._folder / "small", SMALL_DISK_BYTES))
         self._small = small
-        of = {self.story.small_disk_of: small.folder if small is not None else None}
-        self.server = ServerMachine(self._folder / "server", of.get("server"))
+        folder = None if small is None else small.folder
+        self._set_up({self.story.small_disk_of: folder})
+        return self
+
+    def _set_up(self, small: Mapping[str, Path | None]) -> None:
+        """Make the machines; which of them has a small disk is given."""
+        self.server = ServerMachine(self._folder / "server", small.get("server"))
         self._stack.callback(self.server.close)
-        self.witness = Witness()
         self.proxy = self._stack.enter_context(
             Proxy(self.server.port, seed=self.story.seed, tap=self.witness.tap)
         )
+        self._set_up_node(self.proxy.port, self.server.root, small.get("node"))
+
+    def _set_up_node(self, port: int | None, sealed_root: Path | None, small: Path | None) -> None:
         scene = scene_file(self._folder, self.story.tiles)
-        self.node = NodeMachine(self._folder / "node", scene, self.proxy.port, of.get("node"))
+        self.node = NodeMachine(self._folder / "node", scene, port, small)
         self._stack.callback(self.node.kill)
-        self.facts = Facts(self.story, self.witness, self.server.root, self.node.root)
-        return self
+        self.facts = Facts(
+            self.story, self.witness, sealed_root or self.node.root, self.node.root, RATE_HZ
+        )
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def play(self) -> Facts:
-        """All of the story, to the sealed session.
+    def play(self) -> list[Facts]:
+        """All of the story, to the sealed session; nearly always one.
 
         Raises:
             RoundError: something that has to happen does not.
@@ -130,7 +139,7 @@ class Stage:
         with self._timed("record"):
             self._start_session()
 
-    def end(self) -> Facts:
+    def end(self) -> list[Facts]:
         """Stop if that has not been done, wait for the sealed session, and fetch it.
 
         Raises:
@@ -143,7 +152,7 @@ class Stage:
             self._wait_sealed()
         with self._timed("fetch"):
             self._fetch()
-        return self.facts
+        return [self.facts]
 
     def wait_back(self, boot_before: str | None = None) -> None:
         """Until the node sends to the server, and, if asked for, another stream than before.
@@ -237,17 +246,20 @@ class Stage:
         facts.look_into_journal()
         self.node.kill()
         self.server.terminate()
+        self._verify(self.server.root)
+
+    def _verify(self, root: Path) -> None:
         if product().verify:
             verified = subprocess.run(
-                command("verify", self.server.root, "--json"),
+                command("verify", root, "--json"),
                 cwd=REPOSITORY,
                 env=clean_environment(),
                 capture_output=True,
                 text=True,
                 timeout=60.0,
             )
-            facts.verify_code = verified.returncode
-            facts.verify_said = verified.stdout + verified.stderr
+            self.facts.verify_code = verified.returncode
+            self.facts.verify_said = verified.stdout + verified.stderr
 
     # --- kills ------------------------------------------------------------------------------------
 
@@ -358,7 +370,7 @@ class Stage:
 
     def _slow_fsync(self, fault: Fault) -> None:
         """A slow card; half of the time its machine then loses power."""
-        machine: Machine = self._rng.choice((self.node, self.server))
+        machine = self._rng.choice(self._machines())
         slow_s = 0.1 + fault.amount
         machine.slow.set_s(slow_s)
         time.sleep(1.0 + fault.length_s)
@@ -443,6 +455,9 @@ class Stage:
             self.stop()
 
     # --- helpers ----------------------------------------------------------------------------------
+
+    def _machines(self) -> tuple[Machine, ...]:
+        return self.node, self.server
 
     def _boot_id(self) -> str | None:
         """The newest stream that was announced."""

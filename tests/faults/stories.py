@@ -41,10 +41,25 @@ AT_THE_END = {
 }
 """Faults at the end of a recording."""
 
+ALONE = {
+    "kill_node": 3,
+    "kill_node_parent": 2,
+    "kill_acquisition": 2,
+    "power_node": 4,
+    "restart_node_twice": 2,
+    "slow_fsync": 1,
+    "clock_of_node": 1,
+}
+"""Faults of a node that has no server."""
+
+AT_THE_END_ALONE = {"kill_and_recover": 1, "power_and_recover": 1}
+"""What `foottile recover` is for."""
+
 FULL = {"full_disk_of_server": 1, "full_disk_of_node": 1}
 """They need a small disk to be mounted, so somebody who may."""
 
 _END_SHARE = 0.35
+_ALONE_SHARE = 0.15
 _NEEDS_NODE_JOURNAL = {"full_disk_of_node", "stop_while_away_and_kill_node"}
 
 
@@ -75,11 +90,13 @@ class Story:
     pre_roll_s: float = 0.0
     in_the_end_s: float = 0.4
     """How long all is well before the recording is stopped."""
+    alone: bool = False
+    """Without a server: the node records by itself."""
 
     @property
     def title(self) -> str:
         """Its faults."""
-        return ", ".join(fault.kind for fault in self.faults)
+        return ("alone: " if self.alone else "") + ", ".join(fault.kind for fault in self.faults)
 
     @property
     def small_disk_of(self) -> str:
@@ -98,18 +115,20 @@ def draw_story(seed: int, product: Product, *, may_mount: bool) -> Story:
     """
     rng = random.Random(seed)
     number = rng.choices((1, 2, 3), (5, 4, 1))[0]
-    kinds = dict(ANYTIME)
+    alone = product.node_record and rng.random() < _ALONE_SHARE
+    kinds = dict(ALONE if alone else ANYTIME)
     if may_mount:
-        kinds |= FULL
+        kinds |= {"full_disk_of_node": 1} if alone else FULL
     chosen: list[str] = []
     for _ in range(number):
         chosen.append(_drawn(rng, kinds, product))
         if chosen[-1] in FULL:
             kinds = {kind: weight for kind, weight in kinds.items() if kind not in FULL}
-    if rng.random() < _END_SHARE:
-        chosen[-1] = _drawn(rng, AT_THE_END, product)
+    if rng.random() < _END_SHARE and (product.recover or not alone):
+        chosen[-1] = _drawn(rng, AT_THE_END_ALONE if alone else AT_THE_END, product)
     return Story(
         seed=seed,
+        alone=alone,
         tiles=rng.choice((4, 4, 8)),
         pre_roll_s=rng.choice((0.0, 0.0, 0.5)),
         in_the_end_s=rng.uniform(0.0, 0.8),
