@@ -10,7 +10,7 @@ from contextlib import suppress
 from pydantic import ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from devices.errors import FileFormatError, FootTileError, LinkError, StorageError
+from devices.errors import FileFormatError, LinkError, StorageError
 from service.link import (
     MESSAGE_BYTES_MAX,
     PROTOCOL,
@@ -147,9 +147,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
                     raise HangUp(Close.MALFORMED, f"stream {boot_id[:80]!r} was not announced")
                 link.stream = node.streams[boot_id]
             case ClockRow():
-                node.present.clock = said
-                with suppress(FootTileError):
-                    server.recorder.note_clock(node)
+                server.recorder.note_clock(node, said)
             case Status():
                 node.present.missed_slots = said.missed_slots
                 node.troubles, node.fault_counts = said.troubles, said.counts

@@ -23,7 +23,7 @@ from devices.errors import (
     UnknownError,
 )
 from devices.frames import ArrayInfo, FrameBatch
-from service.link import PROTOCOL, ClockRow, Hello, Pairs, StreamNumbers
+from service.link import PROTOCOL, Hello, Pairs, StreamNumbers
 from service.live_estimates import LiveEstimates
 from service.pipeline import Columns
 from service.streams import KeptStream, common
@@ -34,6 +34,7 @@ from storage.intervals import Intervals
 from storage.journal import Journal
 from storage.ledger import NO_END
 from storage.losses import NODE_RESTARTED
+from storage.session import ClockOffset
 from storage.wire import decode
 
 log = logging.getLogger("foottile.nodes")
@@ -116,7 +117,7 @@ class Node:
         return self.present.journal
 
     @property
-    def clock(self) -> ClockRow | None:
+    def clock(self) -> ClockOffset | None:
         """How its clock differs in the present stream; None before it was measured."""
         return self.present.clock
 

@@ -164,12 +164,27 @@ def _instant(node: Node, boot_id: str, seq: int | None, *, newest: bool) -> int 
     return journal.t_ns_near(seq if seq is not None else NO_END, newest=newest)
 
 
-def clock_rows(node: Node) -> tuple[ClockOffset, ...]:
-    """The newest measurement of a node's clock, if there is one."""
-    if node.clock is None:
-        return ()
-    content = node.clock.model_dump(exclude={"type"})
-    return (ClockOffset(boot_id=node.boot_id, **content),)
+def clock_at_start(node: Node, part: Part) -> tuple[ClockOffset, ...]:
+    """Measurements of a node's clock from the beginning of a part on, and the last before it."""
+    begin_t_ns = _instant(node, part.boot_id, part.seq_first, newest=False)
+    rows = list(node.present.clock_rows)
+    if begin_t_ns is None:
+        return tuple(rows[-1:])
+    begin_ns = begin_t_ns - node.info.utc_offset_ns
+    before = [number for number, row in enumerate(rows) if row.t_mono_ns <= begin_ns]
+    return tuple(rows[before[-1] if before else 0 :])
+
+
+def with_clock_logs(session: Session, node: Node | None) -> Session:
+    """A session with what its streams' clock logs have beyond what was written down with it."""
+    rows = list(session.clock)
+    for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
+        stream = node.streams.get(boot_id) if node is not None else None
+        known = [row.t_mono_ns for row in session.clock if row.boot_id == boot_id]
+        if stream is not None:
+            after_ns = max(known, default=-1)
+            rows += [row for row in stream.all_clock_rows() if row.t_mono_ns > after_ns]
+    return session.model_copy(update={"clock": tuple(rows)})
 
 
 def _step(session: Session, node: Node) -> list[Session]:

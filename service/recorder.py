@@ -15,10 +15,16 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from devices.errors import DamagedFramesError, FootTileError, StateError, UnknownError
+from devices.errors import (
+    DamagedFramesError,
+    FootTileError,
+    StateError,
+    StorageError,
+    UnknownError,
+)
 from service import parts
 from service.estimation.calibration import Calibration
-from service.link import StreamNumbers, Wanted
+from service.link import ClockRow, StreamNumbers, Wanted
 from service.nodes import Node, Nodes
 from service.sealing import Sources, seal, write_events
 from service.steady import utc_ns
@@ -68,7 +74,7 @@ class Recorder:
         self._not_sealed: dict[str, str] = {}
         for session_id in folder.ids():
             try:
-                self._sessions[session_id] = folder.load(session_id)
+                self._sessions[session_id] = self._with_clock(folder.load(session_id))
             except FootTileError as error:
                 log.warning("session %s is left out: %s", session_id, error)
 
@@ -123,6 +129,7 @@ class Recorder:
                 remedy="Record when it has caught up",
             )
         calibration = node.live.calibration
+        part = parts.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
         now = datetime.now(UTC)
         session = Session(
             id=new_session_id(now),
@@ -130,7 +137,7 @@ class Recorder:
             node=node_name,
             state="recording",
             started_t_ns=utc_ns(),
-            parts=(parts.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s),),
+            parts=(part,),
             subject=subject,
             notes=notes,
             tags=tags,
@@ -138,7 +145,7 @@ class Recorder:
             scene_content=node.hello.scene,
             calibration=calibration.model_dump(mode="json") if calibration is not None else None,
             missed_slots_at_start=node.present.missed_slots,
-            clock=parts.clock_rows(node),
+            clock=parts.clock_at_start(node, part),
         )
         self._keep(session)
         return session
@@ -236,7 +243,7 @@ class Recorder:
             UnknownError: it is not in the trash.
             StorageError: it cannot be moved.
         """
-        session = self.trash.give_back(session_id, self.folder)
+        session = self._with_clock(self.trash.give_back(session_id, self.folder))
         self._sessions[session_id] = session
         self.settle()
         self._changed(self._sessions[session_id])
@@ -258,11 +265,21 @@ class Recorder:
                 except DamagedFramesError as error:
                     self._disown(session, error)
 
-    def note_clock(self, node: Node) -> None:
-        """Keep a new measurement of a node's clock with its recordings."""
-        for session in self.recording_on(node.name):
-            clock = session.clock + parts.clock_rows(node)
-            self._keep(session.model_copy(update={"clock": clock}))
+    def note_clock(self, node: Node, row: ClockRow) -> None:
+        """Keep a new measurement of a node's clock, with its sessions too.
+
+        It is in the stream's log; theirs are written down with the next change.
+        """
+        try:
+            node.present.note_clock(row)
+        except StorageError as error:  # it counts all the same
+            log.warning("node %s: %s", node.name, error)
+        offset = node.present.clock_rows[-1]
+        for session in self._sessions.values():
+            unsealed = session.node == node.name and session.state in ("recording", "pending")
+            if unsealed and any(part.boot_id == node.boot_id for part in session.parts):
+                clock = (*session.clock, offset)
+                self._sessions[session.id] = session.model_copy(update={"clock": clock})
 
     def settle(self) -> None:
         """Find the end of stopped sessions, and seal those whose frames are all there."""
@@ -422,6 +439,15 @@ class Recorder:
             self._changed(self._sessions[session_id])
         finally:
             del self._sealing[session_id]
+
+    def _with_clock(self, session: Session) -> Session:
+        if session.state == "sealed":
+            return session
+        try:
+            return parts.with_clock_logs(session, self._nodes.find(session.node))
+        except StorageError as error:  # its frames are worth more than its clock
+            log.warning("session %s: %s", session.id, error)
+            return session
 
     def _keep(self, session: Session) -> Session:
         self.folder.save(session)

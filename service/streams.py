@@ -6,18 +6,24 @@ knows why frames are missing and where a stream ended. It is written by whoever 
 
 from __future__ import annotations
 
+from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.link import ClockRow, EarlierStream, Hello, PairsByReason
+from storage.clock_log import ClockLog
 from storage.intervals import Intervals
 from storage.journal import Journal
 from storage.ledger import NO_END
 from storage.losses import CORRUPT, Losses
 from storage.schema import wire_schema
+from storage.session import ClockOffset
 from storage.stream_notes import StreamNotes
+
+CLOCK_ROWS = 128
+"""So many measurements of a clock are at hand for a pre-roll; all of them are in the log."""
 
 
 class KeptStream:
@@ -38,7 +44,8 @@ class KeptStream:
         """What the node may still give; None: it has not said so since the server was started."""
         self.t_ns_first: int | None = None
         """Instant of the oldest frame that the node has of an earlier stream, in its UTC."""
-        self.clock: ClockRow | None = None
+        self.clock_rows: deque[ClockOffset] = deque(maxlen=CLOCK_ROWS)
+        """How the node's clock differs, as measured, oldest first."""
         self.last_seen_t_ns: int | None = None
         """When its last frame came, server's UTC."""
         self.missed_slots = 0
@@ -50,6 +57,8 @@ class KeptStream:
         self._forgotten = Intervals()
         self._guessed = False
         self._notes_on_disk: StreamNotes | None = None
+        self._clock_log = ClockLog(folder)
+        self._clock_unsynced = False
 
     @classmethod
     def open(cls, folder: Path) -> KeptStream:
@@ -67,6 +76,8 @@ class KeptStream:
             if notes is not None:
                 stream.notes = stream._notes_on_disk = notes
                 stream.missed_slots = notes.missed_slots
+        with suppress(StorageError):
+            stream.clock_rows.extend(stream.all_clock_rows())
         newest = journal.held.last
         if newest is not None:
             stream._first_seq = next(iter(journal.held))[0]
@@ -79,6 +90,30 @@ class KeptStream:
     def boot_id(self) -> str:
         """Its name."""
         return self.info.boot_id
+
+    @property
+    def clock(self) -> ClockOffset | None:
+        """How the node's clock differs; None before it was measured."""
+        return self.clock_rows[-1] if self.clock_rows else None
+
+    def all_clock_rows(self) -> tuple[ClockOffset, ...]:
+        """Every measurement since the stream began, oldest first.
+
+        Raises:
+            StorageError: the log cannot be read.
+        """
+        return self._clock_log.rows()
+
+    def note_clock(self, row: ClockRow) -> None:
+        """Keep a measurement of the node's clock.
+
+        Raises:
+            StorageError: the log cannot be written; it is known all the same.
+        """
+        offset = ClockOffset(boot_id=self.boot_id, **row.model_dump(exclude={"type"}))
+        self.clock_rows.append(offset)
+        if self.journal is not None:
+            self._log_clock(offset)
 
     @property
     def held(self) -> Intervals:
@@ -149,6 +184,8 @@ class KeptStream:
         """
         if self.journal is None:
             self.journal = Journal(self.folder, self.info)
+            for row in self.clock_rows:
+                self._log_clock(row)
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         self.last_seen_t_ns = now_t_ns
         self._see_from(first)
@@ -168,12 +205,15 @@ class KeptStream:
         if notes != self._notes_on_disk and self.folder.is_dir():
             notes.save(self.folder)
             self._notes_on_disk = notes
+        if self._clock_unsynced:
+            self._clock_unsynced = False
+            self._clock_log.sync()
 
     @property
     def has_news(self) -> bool:
         """Is there anything to be synced or acknowledged?"""
         unsaved = self.notes != self._notes_on_disk and self.journal is not None
-        return bool(self.unsynced or self.owed or unsaved)
+        return bool(self.unsynced or self.owed or unsaved or self._clock_unsynced)
 
     def disown(self, doubtful: Intervals, *, corrupt: bool = False) -> None:
         """Hold these frames no longer: what is on the disk may not be what was written."""
@@ -213,6 +253,10 @@ class KeptStream:
         if self._guessed:
             self._guessed = False
             self._forgotten = self._forgotten.without(self.may_come)
+
+    def _log_clock(self, row: ClockOffset) -> None:
+        self._clock_log.append(row)
+        self._clock_unsynced = True
 
     def _see_from(self, seq: int) -> None:
         self._first_seq = seq if self._first_seq is None else min(self._first_seq, seq)

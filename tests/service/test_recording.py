@@ -549,6 +549,45 @@ def test_clock_measurements_are_kept_beside_the_session(
     ]
 
 
+def test_clock_measurements_outlive_the_server_without_rewriting_the_session_each_time(
+    running: Running, tared: FakeNode, until: Until
+) -> None:
+    session = start(running)
+    written = (running.data / "sessions" / session["id"] / "session.json").read_bytes()
+    for number in range(3):
+        row = {"t_mono_ns": 10**15 + number, "server_minus_node_ns": number, "uncertainty_ns": 7}
+        tared.socket.send(json.dumps({"type": "clock", **row}))
+    tared.send(20)
+    taken_in(running, tared, until)
+    assert (running.data / "sessions" / session["id"] / "session.json").read_bytes() == written
+    running.restart()
+    tared.connect()
+    stop(running, session)
+    tared.send(10, now=True)
+    running.sealed(session["id"])
+    path = running.data / "sessions" / session["id"] / "clock.parquet"
+    offsets = pq.read_table(path)["server_minus_node_ns"].to_pylist()
+    assert offsets == [0, 0, 1, 2, 0]  # at connecting, three later, and after the restart
+
+
+def test_a_pre_roll_has_the_clock_measurements_of_its_time(
+    running: Running, tared: FakeNode, until: Until
+) -> None:
+    begin_ns = int(tared.sent[0].t_mono_ns[0])
+    for number, t_mono_ns in enumerate((-2000, -1000, 10_000_000, 20_000_000)):
+        row = {
+            "t_mono_ns": begin_ns + t_mono_ns,
+            "server_minus_node_ns": number,
+            "uncertainty_ns": 7,
+        }
+        tared.socket.send(json.dumps({"type": "clock", **row}))
+    tared.send(20)
+    taken_in(running, tared, until)
+    session = start(running, pre_roll_s=600)
+    found = json.loads((running.data / "sessions" / session["id"] / "session.json").read_bytes())
+    assert [row["server_minus_node_ns"] for row in found["clock"]] == [1, 2, 3]
+
+
 def test_a_session_ends_by_the_servers_clock(
     running: Running, tared: FakeNode, until: Until
 ) -> None:
