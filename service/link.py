@@ -17,8 +17,8 @@ order: a server takes each (stream, seq) once.
 
 Every message carries a CRC-32 (zlib), because neither websockets nor Arrow notice a flipped bit:
 the last four bytes of a binary message, little endian, of all before; the last field of a text
-message, `"crc32"` with eight hex digits, of the text before its comma. A message that does not agree
-with it ends the connection, and what was in it is sent once more.
+message, `"crc32"` with eight hex digits, of the text before its comma. A message that does not
+agree with it ends the connection, and what was in it is sent once more.
 """
 
 from __future__ import annotations
