@@ -98,6 +98,15 @@ def given_up(session: Session, node: Node | None) -> Session:
     return session.model_copy(update={"given_up": True})
 
 
+def provisional(session: Session, node: Node | None) -> Session:
+    """A stopped session whose end is not known yet, with the one that it will have nearly."""
+    part = session.parts[-1]
+    if session.stopped_t_ns is None or part.seq_last is not None or node is None:
+        return session
+    last = _seq_at_stop(session, node, node.streams.get(part.boot_id), waiting=False)
+    return session if last is None else ended(session, last)
+
+
 def states(session: Session, node: Node | None) -> dict[str, StreamState]:
     """What is known of the streams of a session, for its ledger."""
     found = {}

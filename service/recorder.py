@@ -12,6 +12,7 @@ import logging
 import time
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -179,16 +180,23 @@ class Recorder:
         self._keep(session)
         return session
 
-    def mark(self, session_id: str, label: str, t_ns: int | None) -> Event:
-        """Note an event, now or at `t_ns` of the server's UTC.
+    def mark(
+        self, session_id: str, label: str, t_ns: int | None, event_id: str | None = None
+    ) -> Event:
+        """Note an event, now or at `t_ns` of the server's UTC; once, if it comes with an id.
 
         Raises:
             UnknownError: no such session.
             StorageError: it cannot be written down.
         """
         session = self.get(session_id)
+        for known in session.events:
+            if known.id == event_id:
+                return known
         event = Event(
-            id=uuid.uuid4().hex[:12], label=label, t_ns=utc_ns() if t_ns is None else t_ns
+            id=event_id or uuid.uuid4().hex[:12],
+            label=label,
+            t_ns=utc_ns() if t_ns is None else t_ns,
         )
         session = session.model_copy(update={"events": (*session.events, event)})
         self._keep(session)
@@ -315,8 +323,12 @@ class Recorder:
         """The same of a session that may be in the trash."""
         if session.state == "sealed" and session.ledger is not None:
             return session.ledger
-        states = parts.states(session, self._nodes.find(session.node))
-        return ledger_of(session.parts, states, finished=session.stopped_t_ns is not None)
+        node = self._nodes.find(session.node)
+        about, finished = session, session.parts[-1].seq_last is not None
+        with suppress(FootTileError):  # the frames that tell are damaged
+            about = parts.provisional(session, node)
+        finished = finished and session.stopped_t_ns is not None
+        return ledger_of(about.parts, parts.states(session, node), finished=finished)
 
     def problem_of(self, session: Session) -> str | None:
         """What a person should know of a session as it is now."""
@@ -337,6 +349,8 @@ class Recorder:
         """
         session = self.get(session_id)
         node = self._nodes.get(session.node)
+        with suppress(FootTileError):
+            session = parts.provisional(session, node)
         first = node.journals.get(session.parts[0].boot_id)
         info = first.info if first is not None else node.info
         tares, problem = parts.tares_of(session, node, info)

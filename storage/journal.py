@@ -207,9 +207,15 @@ class Journal:
         By whole batches; None if there is no such frame.
         """
         found: list[tuple[int, int]] = []
-        for segment in self._segments:
-            first, last = segment.span
-            if (first > seq) if newest else (last < seq):
+        reach = [segment.span for segment in self._segments]
+        # Of segments that lie beside `seq` altogether only the nearest one counts.
+        nearest = (
+            max((last for _, last in reach if last <= seq), default=None)
+            if newest
+            else min((first for first, _ in reach if first >= seq), default=None)
+        )
+        for segment, (first, last) in zip(self._segments, reach, strict=True):
+            if not first <= seq <= last and nearest not in (first, last):
                 continue
             records = segment.records()
             if newest:
@@ -232,14 +238,20 @@ class Journal:
         if all(segment.t_ns_last <= t_ns for segment in segments):
             return None
         newest: tuple[int, int] | None = None
-        passed = False
+        passed = any(segment.t_ns_first > t_ns for segment in segments)
+        # Of segments that were taken before `t_ns` altogether only the last one counts.
+        before = max((s.span[1] for s in segments if s.t_ns_last <= t_ns), default=None)
         for segment in segments:
+            if segment.t_ns_first > t_ns:
+                continue
+            if segment.t_ns_last <= t_ns and segment.span[1] != before:
+                continue
             records = segment.records()
             records = records[records["seq_first"] + records["count"] > at_least]
             passed = passed or bool((records["t_ns_last"] > t_ns).any())
-            before = records[records["t_ns_first"] <= t_ns]
-            if len(before) and (newest is None or numbers(before[-1]) > newest):
-                newest = numbers(before[-1])
+            early = records[records["t_ns_first"] <= t_ns]
+            if len(early) and (newest is None or numbers(early[-1]) > newest):
+                newest = numbers(early[-1])
         if not passed:
             return None
         if newest is None:

@@ -2,16 +2,21 @@
 
 import * as api from "./api.js";
 import { notice } from "./notices.js";
-import { byId, duration, localTime, setText } from "./text.js";
+import { byId, duration, el, localTime, setText } from "./text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
 
 export class Actions {
-  /** `state` is the page's state; `onSession(session)` takes every session an answer brings. */
-  constructor(state, onSession) {
+  /**
+   * `state` is the page's state; `marks` keeps marks until the server has them;
+   * `onSession(session)` takes every session an answer brings.
+   */
+  constructor(state, marks, onSession) {
     this.state = state;
+    this.marks = marks;
     this.onSession = onSession;
     this.busy = new Set();
+    this.rows = new Map(); // id of a recording -> its line
     for (const name of ["tare", "undo", "record", "stop", "mark"]) {
       byId(name).addEventListener("click", () => this.run(name));
     }
@@ -37,7 +42,7 @@ export class Actions {
   async run(name) {
     const button = byId(name);
     if (button.disabled || button.hidden || this.busy.has(name)) {
-      if (name === "mark" && !this.session()) notice("Marks belong to a recording: press Record first.", { bad: true });
+      if (name === "mark" && !this.running().length) notice("Marks belong to a recording: press Record first.", { bad: true });
       return;
     }
     this.busy.add(name);
@@ -82,22 +87,24 @@ export class Actions {
     if (document.activeElement === document.body || document.activeElement === byId("record")) byId("stop").focus();
   }
 
-  async stop() {
-    const session = await api.stopSession(this.session().id);
+  /** Stop a recording; without one named, the newest that runs on the chosen node. */
+  async stop(_node, id = this.running()[0].id) {
+    const session = await api.stopSession(id);
     this.onSession(session);
     notice(session.state === "pending"
-      ? `Stopped “${session.name}”. The node is away: the recording completes when it returns.`
+      ? `Stopped “${session.name}”. It completes by itself when its last frames have come.`
       : `Stopped “${session.name}”.`);
     this.draw();
     if (document.activeElement === document.body) byId("record").focus();
   }
 
   async mark() {
+    const pressedMs = this.state.serverNowMs();
     const field = byId("mark-label");
     const label = field.value.trim() || "mark";
-    await api.markEvent(this.session().id, label);
     field.value = "";
-    notice(`Marked “${label}”.`);
+    const made = await this.marks.add(this.running(), label, pressedMs);
+    if (made.length) notice(`Marked “${label}”.`);
   }
 
   undoable(id) {
@@ -108,28 +115,57 @@ export class Actions {
     this.undoId = id;
   }
 
-  /** The recording that runs on the chosen node, if any. */
-  session() {
-    for (const session of this.state.recordings.values()) if (session.node === this.state.node?.node) return session;
-    return null;
+  /** The recordings that run on the chosen node, newest first. */
+  running() {
+    const all = [...this.state.recordings.values()].filter((session) => session.node === this.state.node?.node);
+    return all.sort((a, b) => b.started_t_ns - a.started_t_ns);
   }
 
   draw() {
     const { node } = this.state;
-    const session = this.session();
+    const running = this.running();
     byId("tare").disabled = byId("record").disabled = !node;
-    byId("record").disabled ||= Boolean(session);
-    byId("stop").disabled = byId("mark").disabled = !session;
+    byId("stop").disabled = byId("mark").disabled = !running.length;
+    setText(byId("record-text"), running.length ? "Record another" : "Record");
     if (this.undoId === undefined) {
       try { this.undoId = sessionStorage.getItem(UNDO_KEY); } catch { this.undoId = null; }
     }
     const tare = node?.tare;
     const mine = this.undoId && tare?.id === this.undoId;
     byId("undo").hidden = !(tare && !tare.undone && (mine || tare.source === "flight"));
-    byId("recording").hidden = !session;
-    if (session) {
+    this.drawRecordings(running);
+  }
+
+  drawRecordings(running) {
+    const box = byId("recordings");
+    box.hidden = !running.length;
+    box.dataset.several = String(running.length > 1);
+    const rows = new Map(running.map((session) => [session.id, this.rows.get(session.id) ?? this.row(session)]));
+    this.rows = rows;
+    const wanted = [...rows.values()];
+    if (wanted.length !== box.children.length || wanted.some((row, i) => row !== box.children[i])) box.replaceChildren(...wanted);
+    for (const session of running) {
       const elapsedS = Math.max(0, (this.state.serverNowMs() - session.started_t_ns / 1e6) / 1000);
-      setText(byId("recording-text"), `${duration(elapsedS)}, ${session.frames + (session.since ?? 0)} frames, “${session.name}”`);
+      const frames = (session.frames + (session.since ?? 0)).toLocaleString("en-GB");
+      setText(rows.get(session.id).querySelector(".recording-text"), `“${session.name}” ${duration(elapsedS)}, ${frames} frames`);
     }
+  }
+
+  /** One line; each of several has its own button to stop it. */
+  row(session) {
+    const stop = el("button", { type: "button", cls: "small", text: "Stop", "aria-label": `Stop ${session.name}` });
+    stop.addEventListener("click", async () => {
+      stop.disabled = true;
+      try {
+        await this.stop(null, session.id);
+      } catch (error) {
+        if (!(error instanceof api.Refusal)) throw error;
+        notice(error.message, { bad: true });
+        stop.disabled = false;
+      }
+    });
+    return el("li", { "data-session-id": session.id },
+      el("span", { cls: "rec-dot", "aria-hidden": "true" }), el("span", { cls: "unseen", text: "Recording: " }),
+      el("span", { cls: "recording-text" }), stop);
   }
 }

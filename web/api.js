@@ -85,8 +85,13 @@ export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
 export const startSession = (node, name) => call("POST", "/sessions", { node, name });
 export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
-export const markEvent = (session, label) => call("POST", `/sessions/${id(session)}/events`, { label });
-export const renameSession = (session, name) => call("PATCH", `/sessions/${id(session)}`, { name });
+export const markEvent = (session, event) => call("POST", `/sessions/${id(session)}/events`, event);
+export const changeSession = (session, changes) => call("PATCH", `/sessions/${id(session)}`, changes);
+export const sealSession = (session) => call("POST", `/sessions/${id(session)}/seal`);
+export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);
+export const listTrash = () => call("GET", "/trash");
+export const restoreSession = (session) => call("POST", `/trash/${id(session)}/restore`);
+export const emptyTrash = () => call("DELETE", "/trash");
 export const listSessions = (cursor) =>
   call("GET", `/sessions?limit=20${cursor ? `&cursor=${id(cursor)}` : ""}`);
 export const dataAddress = (session, format) => `${PREFIX}/sessions/${id(session)}/data?format=${format}`;

@@ -6,12 +6,14 @@ import { Bars } from "./bars.js";
 import { Foot } from "./foot.js";
 import { drawGrf } from "./grf.js";
 import { Link } from "./link.js";
+import { Marks } from "./marks.js";
 import { Notes } from "./notes.js";
 import { Sessions } from "./sessions.js";
 import { Status } from "./status.js";
 import { Tares } from "./tares.js";
 import { byId, el, setText } from "./text.js";
 import { Trace } from "./trace.js";
+import { Trash } from "./trash.js";
 
 const NODE_KEY = "foottile.node";
 const RESYNC_MS = 5000; // frame counts of a running recording are counted here between two looks
@@ -34,9 +36,11 @@ const foot = new Foot();
 foot.resized = () => { state.fresh = true; };
 const trace = new Trace();
 const notes = new Notes();
-const sessions = new Sessions();
+const trash = new Trash(takeSession);
+const sessions = new Sessions({ onSession: takeSession, onDeleted: forgetSession });
 const tares = new Tares();
-const actions = new Actions(state, takeSession);
+const marks = new Marks();
+const actions = new Actions(state, marks, takeSession);
 
 const handlers = {
   hello(message) {
@@ -45,6 +49,8 @@ const handlers = {
     (message.recording ?? []).forEach(takeSession);
     chooseNode();
     sessions.reload().then((items) => items.forEach(takeSession));
+    marks.send(); // the server is back
+    trash.changed();
   },
   node({ node }) {
     const isNew = !state.nodes.has(node.node);
@@ -58,6 +64,7 @@ const handlers = {
     if (isNew || !state.node) chooseNode();
   },
   session: ({ session }) => takeSession(session),
+  deleted: ({ session_id: id }) => forgetSession(id),
   heartbeat(message) {
     state.heard.beat = message.nodes?.[state.node?.node] ?? null;
   },
@@ -75,7 +82,8 @@ const handlers = {
 const link = new Link({
   onMessage(message) {
     if (Number.isFinite(message.t_ns) && ["hello", "heartbeat", "pong"].includes(message.type)) {
-      state.serverAheadMs = message.t_ns / 1e6 - Date.now();
+      // What has come was sent half a round trip ago.
+      state.serverAheadMs = message.t_ns / 1e6 + (link.roundTripMs ?? 0) / 2 - Date.now();
     }
     // Unknown types are a newer server's business.
     if (Object.hasOwn(handlers, message.type)) handlers[message.type](message);
@@ -112,6 +120,13 @@ function takeSession(session) {
     state.recordings.set(session.id, { ...session, since: since < 1000 ? since : 0 });
   } else state.recordings.delete(session.id);
   sessions.take(session);
+  actions.draw();
+}
+
+function forgetSession(id) {
+  state.recordings.delete(id);
+  sessions.drop(id);
+  trash.changed();
   actions.draw();
 }
 

@@ -1,5 +1,6 @@
 // Plain notes about what to trust. They change seldom: an estimate's flag is held so it can be read.
 
+import { lossesInWords } from "./losses.js";
 import { byId, el, number, roughly, setText } from "./text.js";
 import { ESTIMATE, FRAME, TILE } from "./tile.js";
 
@@ -74,6 +75,9 @@ function standing(node, frame, serverNowMs) {
     for (const doubt of doubts) notes.push(`Tare in doubt: ${doubt}.`);
     if (!doubts.length && bits & ESTIMATE.TARE_OLD) notes.push(`Tare in doubt (${tareAge(tare, serverNowMs)} old): lift the foot, press Tare.`);
   }
+  for (const trouble of node.troubles ?? []) notes.push(sentence(trouble));
+  for (const loss of lossesInWords(node.lost)) notes.push(`Lost ${loss}.`);
+  if (node.storage_problem) notes.push(`Nothing is being kept by the server: ${node.storage_problem}`);
   // An emulated node runs on this machine, and its date is nobody's concern.
   if (node.clock_set === false && !node.emulated) notes.push("Clock of the node not set: dates may be wrong.");
   return notes;
@@ -81,6 +85,8 @@ function standing(node, frame, serverNowMs) {
 
 /** The reason, without saying twice what it begins with. */
 const said = (what, why) => (why.toLowerCase().startsWith(what.toLowerCase()) ? why[0].toUpperCase() + why.slice(1) : `${what}: ${why}`);
+
+const sentence = (text) => `${text[0]?.toUpperCase() ?? ""}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 
 const tareAge = (tare, serverNowMs) => roughly((serverNowMs - tare.t_ns / 1e6) / 1000);
 

@@ -1,18 +1,37 @@
 // Results and refusals of what the user did: short, announced politely, few at a time.
 
+import { Refusal } from "./api.js";
 import { byId, el } from "./text.js";
 
 const GOOD_FOR_MS = 4000;
+const UNDO_FOR_MS = 10_000;
 const MOST = 2;
 
-export function notice(text, { bad = false } = {}) {
+/** `undo`: a way back, offered for as long as the notice stands. */
+export function notice(text, { bad = false, undo = null } = {}) {
   const box = byId("notices");
   const close = el("button", { type: "button", cls: "close", text: "×", "aria-label": "Dismiss" });
-  const item = el("p", { cls: bad ? "notice bad" : "notice" }, el("span", { text: bad ? `Not done: ${text}` : text }), close);
+  const item = el("p", { cls: bad ? "notice bad" : "notice" }, el("span", { text: bad ? `Not done: ${text}` : text }));
+  if (undo) {
+    const back = el("button", { type: "button", cls: "small", text: "Undo" });
+    back.addEventListener("click", () => { item.remove(); undo(); });
+    item.append(back);
+  }
+  item.append(close);
   close.addEventListener("click", () => item.remove());
   // A refusal says what to do: it stays until it is dismissed or something newer is said.
   for (const old of box.querySelectorAll(".bad")) old.remove();
   box.append(item);
   while (box.children.length > MOST) box.firstElementChild.remove();
-  if (!bad) setTimeout(() => item.remove(), GOOD_FOR_MS);
+  if (!bad) setTimeout(() => item.remove(), undo ? UNDO_FOR_MS : GOOD_FOR_MS);
+}
+
+/** Do something; a refusal is told, not thrown. */
+export async function quietly(doing) {
+  try {
+    await doing();
+  } catch (error) {
+    if (!(error instanceof Refusal)) throw error;
+    notice(error.message, { bad: true });
+  }
 }

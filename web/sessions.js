@@ -1,7 +1,9 @@
 // The list of sessions: newest first, kept up to date by the link, more on request.
 
 import * as api from "./api.js";
-import { notice } from "./notices.js";
+import { ask, edit } from "./dialogs.js";
+import { frames, lossesInWords } from "./losses.js";
+import { notice, quietly } from "./notices.js";
 import { byId, bytes, duration, el, localTime } from "./text.js";
 
 const MOST = 500; // a page left open for weeks must not grow without end
@@ -9,26 +11,33 @@ const MOST = 500; // a page left open for weeks must not grow without end
 /** State and completeness in plain words: [short, long, how serious]. */
 export function plainState(session) {
   const why = session.problem ? ` ${session.problem}` : "";
+  const losses = lossesInWords(session.lost).map((loss) => `${loss}.`);
+  if (session.tail_frames_max) losses.push(`At most ${frames(session.tail_frames_max)} more may be missing where the node's power failed.`);
+  const missing = losses.length ? ` Missing: ${losses.join(" ")}` : "";
   switch (session.state) {
-    case "recording": return ["recording", "", "run"];
-    case "pending": return ["pending", `Waits for the node to return, then completes by itself.${why}`, "warn"];
-    case "sealing": return ["sealing", "Being written; Parquet follows.", "run"];
-    case "failed": return ["failed", why.trim() || "The server gave no reason.", "bad"];
+    case "recording": return ["recording", missing.trim(), "run"];
+    case "pending": {
+      const waits = session.pending_frames ? `${frames(session.pending_frames)} are still with the node` : "Its end is still with the node";
+      return ["pending", `${waits}; it completes by itself when they have come.${missing}${why}`, "warn"];
+    }
+    case "sealing": return ["sealing", `Being written; Parquet follows.${missing}${why}`, "run"];
     case "sealed":
       if (session.complete === true) return ["complete", why.trim(), "good"];
-      if (session.complete === "lossy") return ["lossy", `Frames are missing for good.${why}`, "warn"];
+      if (session.complete === "lossy") return ["lossy", `${missing.trim() || "Frames are missing for good."}${why}`, "warn"];
       return ["incomplete", why.trim() || "Not all frames have arrived.", "warn"];
     default: return [String(session.state), why.trim(), "warn"];
   }
 }
 
 export class Sessions {
-  constructor() {
+  /** `onSession(session)` takes what an answer brings, `onDeleted(id)` what was moved to the trash. */
+  constructor({ onSession, onDeleted }) {
+    this.onSession = onSession;
+    this.onDeleted = onDeleted;
     this.box = byId("sessions");
     this.sessions = new Map();
     this.rows = new Map();
     this.cursor = null;
-    this.editing = null;
     byId("sessions-more").addEventListener("click", () => this.load(this.cursor));
   }
 
@@ -60,6 +69,11 @@ export class Sessions {
     this.draw();
   }
 
+  drop(id) {
+    this.sessions.delete(id);
+    this.draw();
+  }
+
   draw() {
     const sorted = [...this.sessions.values()].sort((a, b) => b.started_t_ns - a.started_t_ns).slice(0, MOST);
     this.sessions = new Map(sorted.map((session) => [session.id, session]));
@@ -73,9 +87,7 @@ export class Sessions {
     for (const session of sorted) {
       const key = JSON.stringify(session);
       const old = this.rows.get(session.id);
-      // A row in which a name is being typed, or whose link has the focus, is not torn away.
-      const keep = old && (old.key === key || this.editing === session.id);
-      rows.set(session.id, keep ? old : { key, row: this.row(session) });
+      rows.set(session.id, old?.key === key ? old : { key, row: this.row(session) });
     }
     this.rows = rows;
     const wanted = [head(), ...[...rows.values()].map(({ row }) => row)];
@@ -91,9 +103,9 @@ export class Sessions {
   row(session) {
     const [short, long, weight] = plainState(session);
     const name = el("span", { cls: "session-name", text: session.name || session.id });
-    const rename = el("button", { type: "button", cls: "small", text: "Rename", "data-part": "rename", "aria-label": `Rename ${session.name}` });
-    const nameCell = el("div", { cls: "c-name", role: "cell" }, name, rename);
-    rename.addEventListener("click", () => this.rename(session, nameCell));
+    const about = [session.subject, ...(session.tags ?? []).map((tag) => `#${tag}`), session.notes].filter(Boolean).join(" · ");
+    const nameCell = el("div", { cls: "c-name", role: "cell" }, name);
+    if (about) nameCell.append(el("span", { cls: "why about", text: about }));
     const state = el("div", { cls: "c-state", role: "cell" }, el("span", { cls: `state ${weight}`, text: short }));
     if (long) state.append(" ", el("span", { cls: "why", text: long }));
     if (session.absolute_scale === "assumed") state.append(" ", el("span", { cls: "why", text: "Scale assumed." }));
@@ -105,45 +117,51 @@ export class Sessions {
       cell("c-frames", "Frames", Number.isFinite(session.frames) ? session.frames.toLocaleString("en-GB") : "–"),
       cell("c-size", "Size", bytes(session.bytes)),
       state,
-      downloads(session));
+      downloads(session),
+      this.buttons(session));
   }
 
-  rename(session, cell) {
-    this.editing = session.id;
-    const field = el("input", { type: "text", maxlength: "200", "aria-label": "New name; Enter saves, Escape cancels" });
-    field.value = session.name;
-    const old = [...cell.childNodes];
-    cell.replaceChildren(field);
-    field.focus();
-    field.select();
-    let done = false;
-    const finish = async (save, byKey) => {
-      if (done) return;
-      done = true;
-      const name = field.value.trim();
-      if (save && name && name !== session.name) {
-        try {
-          this.sessions.set(session.id, await api.renameSession(session.id, name) ?? { ...session, name });
-        } catch (error) {
-          notice(error.message, { bad: true });
-        }
-      }
-      cell.replaceChildren(...old);
-      this.editing = null;
-      this.draw();
-      if (byKey) this.rows.get(session.id)?.row.querySelector('[data-part="rename"]')?.focus();
+  /** What can be done with a session in its present state. */
+  buttons(session) {
+    const box = el("div", { cls: "c-do", role: "cell" });
+    const add = (part, text, long, action) => {
+      const button = el("button", { type: "button", cls: "small", text, "data-part": part, "aria-label": `${long} ${session.name}` });
+      button.addEventListener("click", () => quietly(() => action(this.sessions.get(session.id) ?? session)));
+      box.append(button);
     };
-    field.addEventListener("keydown", (event) => {
-      if (event.key === "Enter" && !event.isComposing) finish(true, true);
-      if (event.key === "Escape") finish(false, true);
+    add("edit", "Edit", "Edit", (now) => this.edit(now));
+    if (session.state === "pending") add("seal", "Seal without them", "Seal without what is missing:", (now) => this.seal(now));
+    if (session.state === "sealed" || session.state === "pending") add("delete", "Delete", "Delete", (now) => this.delete(now));
+    return box;
+  }
+
+  async edit(session) {
+    const changes = await edit(session);
+    if (changes) this.onSession(await api.changeSession(session.id, changes));
+  }
+
+  async seal(session) {
+    const what = session.pending_frames ? frames(session.pending_frames) : "what is still with the node";
+    const sure = await ask(`Seal “${session.name}” without them?`,
+      `${what[0].toUpperCase()}${what.slice(1)} will be missing for good, and the session is marked lossy. Do this only if the node never comes back: while you wait, it completes by itself as soon as the node does.`,
+      "Seal as lossy");
+    if (!sure) return;
+    this.onSession(await api.sealSession(session.id));
+    notice(`Sealed “${session.name}” without what was missing.`);
+  }
+
+  async delete(session) {
+    await api.deleteSession(session.id);
+    this.onDeleted(session.id);
+    notice(`“${session.name}” is in the trash.`, {
+      undo: () => quietly(async () => this.onSession(await api.restoreSession(session.id))),
     });
-    field.addEventListener("blur", () => finish(true));
   }
 }
 
 function head() {
   const row = el("div", { cls: "head", role: "row" });
-  for (const text of ["Name", "Started", "Duration", "Frames", "Size", "State", "Download"]) row.append(el("span", { role: "columnheader", text }));
+  for (const text of ["Name", "Started", "Duration", "Frames", "Size", "State", "Download", ""]) row.append(el("span", { role: "columnheader", text }));
   return row;
 }
 

@@ -4,6 +4,7 @@ import { byId, number, roughly, setData, setText } from "./text.js";
 
 const FROZEN_AFTER_MS = 600; // with a tick of 100 ms well within the promised second
 const LATE_MS = 1000; // frames that old when they arrive show the past
+const SHOWN_BEHIND_S = 0.5; // what is on its way in good order is not behind
 const EVERY_MS = 250; // numbers that change faster cannot be read
 
 export class Status {
@@ -38,7 +39,7 @@ export class Status {
       const frozen = sinceMs === null || sinceMs > FROZEN_AFTER_MS;
       setText(byId("frozen-text"), !frozen ? `Picture is ${number(this.delayMs / 1000)} s late`
         : `No data for ${howLong(sinceMs, node, nowMs, serverNowMs, heard)}`);
-      setText(byId("frozen-reason"), frozen ? this.reason(node) : "The node or the network is catching up.");
+      setText(byId("frozen-reason"), frozen ? this.reason(node) : "The network is slower than the frames come.");
     }
     if (live !== this.live) {
       this.live = live;
@@ -68,8 +69,11 @@ export class Status {
     const slow = rateHz !== null && nominalHz && rateHz < 0.97 * nominalHz;
     write("rate", `${number(rateHz ?? NaN)} of ${number(nominalHz ?? NaN)} `, slow);
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
+    const behind = beat.backlog_frames ?? node.backlog_frames ?? 0;
     const missed = beat.missed_slots ?? node.missed_slots ?? 0;
     write("lost", `${lost} frames, ${missed} slots`, lost > 0 || missed > 0);
+    byId("behind-box").hidden = behind < SHOWN_BEHIND_S * (nominalHz || 400);
+    write("behind", `${behind.toLocaleString("en-GB")} frames, catching up`, false);
     write("latency", this.delayMs === null ? "unknown" : `${number(this.delayMs, 0)} ms`, this.delayMs > 250);
     const ageS = sinceMs === null ? null : (sinceMs + (this.delayMs ?? 0)) / 1000;
     const ago = ageS !== null && ageS < 10 ? `${number(ageS, 2)} s ago` : `${roughly(ageS ?? 0)} ago`;

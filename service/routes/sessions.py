@@ -60,6 +60,9 @@ class MarkEvent(_Body):
     t_ns: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
         default=None, description="Server's UTC; left out: now."
     )
+    id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")] | None = Field(
+        default=None, description="Your own, so that what is sent twice is marked once."
+    )
 
 
 @router.post(
@@ -186,7 +189,7 @@ async def delete(session_id: str, server: ServerState) -> None:
 )
 async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventView:
     """Note that something happened, now or at an instant."""
-    event = server.recorder.mark(session_id, body.label, body.t_ns)
+    event = server.recorder.mark(session_id, body.label, body.t_ns, body.id)
     return EventView(**event.model_dump())
 
 

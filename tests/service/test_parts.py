@@ -472,3 +472,14 @@ def test_events_are_kept_by_their_instant_also_while_the_node_is_away_and_after_
         ("pending", 7),
     ]
     assert running.session(session["id"])["sha256"] == before["sha256"]
+
+
+def test_a_mark_that_is_sent_twice_with_its_id_is_marked_once(
+    running: Running, tared: FakeNode
+) -> None:
+    url = f"/sessions/{start(running)['id']}/events"
+    for label in ("stone", "again"):
+        answer = running.http.post(url, json={"label": label, "t_ns": 5, "id": "0123456789ab"})
+        assert (answer.status_code, answer.json()["label"]) == (201, "stone")
+    assert len(running.http.get(url).json()["items"]) == 1
+    assert running.http.post(url, json={"label": "x", "id": "no"}).status_code == 422

@@ -1,0 +1,237 @@
+"""Sessions on the page: several at once, losses in words, marks that wait, the trash."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+import service.recorder
+import service.routes.sessions
+import service.server
+from tests.service.conftest import FakeNode, Play, Running
+from tests.web.conftest import wait_until
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+
+
+class Scripted:
+    """A server, and a node that streams whenever the test does not have it do otherwise."""
+
+    def __init__(self, folder: Path) -> None:
+        self.running = Running(folder / "data")
+        self.running.start()
+        self.node = FakeNode(self.running)
+        self.node.connect()
+        self.node.tared()
+
+    @property
+    def url(self) -> str:
+        return self.running.url
+
+    def start(self, name: str) -> dict[str, Any]:
+        answer = self.running.http.post("/sessions", json={"node": "bench", "name": name})
+        assert answer.status_code == 201, answer.text
+        content: dict[str, Any] = answer.json()
+        return content
+
+    def stop(self, session: dict[str, Any]) -> None:
+        answer = self.running.http.post(f"/sessions/{session['id']}/stop")
+        assert answer.status_code == 200, answer.text
+
+    def recorded(self, name: str) -> dict[str, Any]:
+        """A sealed session."""
+        with Play(self.node):
+            session = self.start(name)
+            time.sleep(0.2)
+            self.stop(session)
+            return self.running.sealed(session["id"])
+
+    def pending(self, name: str) -> dict[str, Any]:
+        """A session with a hundred frames that are still with the node."""
+        session = self.start(name)
+        self.node.next_t_mono_ns = time.monotonic_ns()
+        self.node.frames(100)
+        self.node.send(50)
+        time.sleep(0.4)
+        self.stop(session)
+        self.node.send(10, now=True)
+        return session
+
+    def sessions(self) -> list[dict[str, Any]]:
+        items: list[dict[str, Any]] = self.running.http.get("/sessions").json()["items"]
+        return items
+
+    def close(self) -> None:
+        self.node.close()
+        self.running.stop()
+
+
+@pytest.fixture
+def scripted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scripted]:
+    monkeypatch.setattr(service.routes.sessions, "SETTLE_S", 0.1)
+    monkeypatch.setattr(service.server, "TICK_S", 0.05)
+    monkeypatch.setattr(service.recorder, "BEHIND_S", 1e9)  # its lead is long ago
+    one = Scripted(tmp_path)
+    yield one
+    one.close()
+
+
+def row_of(page: Page, session: dict[str, Any]) -> Any:
+    return page.locator(f'#sessions [data-session-id="{session["id"]}"]')
+
+
+def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node):
+        page = open_page(scripted.url)
+        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        for name in ("first", "second"):
+            page.fill("#session-name", name)
+            page.click("#record")
+            expect(page.locator("#recordings")).to_contain_text(name)
+        expect(page.locator("#recordings li")).to_have_count(2)
+        page.fill("#mark-label", "a stone")
+        page.click("#mark")
+        expect(page.locator("#notices")).to_contain_text("Marked")
+        page.get_by_role("button", name="Stop first").click()
+        expect(page.locator("#recordings li")).to_have_count(1)
+        expect(page.locator("#recordings")).to_contain_text("second")
+        page.click("#stop")
+        expect(page.locator("#recordings")).to_be_hidden()
+        found = scripted.sessions()
+        wait_until(lambda: {s["state"] for s in scripted.sessions()} == {"sealed"}, "both sealed")
+    for session in found:
+        events = scripted.running.http.get(f"/sessions/{session['id']}/events").json()["items"]
+        assert [event["label"] for event in events] == ["a stone"]
+
+
+def test_a_mark_that_is_set_while_the_server_is_away_has_the_instant_of_the_press(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    session = scripted.start("walk")
+    with Play(scripted.node):
+        page = open_page(scripted.url)
+        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        expect(page.locator("#mark")).to_be_enabled()
+        time.sleep(1.5)  # a heartbeat says what time it is
+    scripted.running.stop()
+    expect(page.locator("body")).to_have_attribute("data-live", "false", timeout=3000)
+    page.fill("#mark-label", "a stone")
+    pressed_ns = time.time_ns()
+    page.click("#mark")
+    expect(page.locator("#waiting-marks")).to_contain_text("1 mark waits")
+    expect(page.locator("#waiting-marks")).to_contain_text("a stone")
+    expect(page.locator("#waiting-marks")).to_contain_text("closing it loses it")
+    time.sleep(1.5)
+    scripted.running.start()
+    expect(page.locator("#waiting-marks")).to_be_hidden(timeout=15_000)
+    url = f"/sessions/{session['id']}/events"
+    [event] = scripted.running.http.get(url).json()["items"]
+    assert event["label"] == "a stone"
+    assert abs(event["t_ns"] - pressed_ns) < 1_000_000_000
+
+
+def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is_emptied(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    session = scripted.recorded("walk")
+    page = open_page(scripted.url)
+    row = row_of(page, session)
+    row.get_by_role("button", name="Delete").click()
+    expect(row).to_have_count(0)
+    page.locator("#notices").get_by_role("button", name="Undo").click()
+    expect(row).to_have_count(1)
+    row.get_by_role("button", name="Delete").click()
+    expect(row).to_have_count(0)
+    page.locator("#trash-card summary").click()
+    trashed = page.locator(f'#trash [data-session-id="{session["id"]}"]')
+    expect(trashed).to_contain_text("walk")
+    trashed.get_by_role("button", name="Restore").click()
+    expect(trashed).to_have_count(0)
+    expect(row).to_have_count(1)
+    row.get_by_role("button", name="Delete").click()
+    expect(trashed).to_have_count(1)
+    page.click("#trash-empty")
+    page.get_by_role("button", name="Cancel").click()
+    expect(trashed).to_have_count(1)
+    page.click("#trash-empty")
+    page.get_by_role("button", name="Delete 1 session").click()
+    expect(trashed).to_have_count(0)
+    assert scripted.running.http.get("/trash").json()["items"] == []
+
+
+def test_a_pending_session_says_what_it_waits_for_and_can_be_sealed_without_it(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    session = scripted.pending("walk")
+    page = open_page(scripted.url)
+    row = row_of(page, session)
+    expect(row).to_contain_text("100 frames are still with the node")
+    row.get_by_role("button", name="Seal without").click()
+    expect(page.locator("#ask-dialog")).to_contain_text("100 frames will be missing for good")
+    page.get_by_role("button", name="Seal as lossy").click()
+    expect(row.locator(".state")).to_have_text("lossy")
+    expect(row).to_contain_text("100 frames: sealed without them")
+    expect(row.get_by_role("button", name="Seal without")).to_have_count(0)
+
+
+def test_losses_troubles_and_what_is_behind_are_said_in_words(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    node = scripted.node
+    first = node.seq
+    node.frames(1000)
+    lost = {"disk_full": [[first, first + 1]], "evicted": [[first + 2, first + 101]]}
+    with Play(node):
+        node.socket.send(json.dumps({"type": "lost", "boot_id": node.boot_id, "lost": lost}))
+        status = {"type": "status", "missed_slots": 3, "troubles": ["the node's disk is full"]}
+        node.socket.send(json.dumps(status))
+        page = open_page(scripted.url)
+        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        expect(page.locator("#lost")).to_have_text("102 frames, 3 slots")
+        expect(page.locator("#behind")).to_have_text("898 frames, catching up")
+        notes = page.locator("#notes")
+        expect(notes).to_contain_text("Lost 2 frames: the node's disk was full.")
+        expect(notes).to_contain_text("Lost 100 frames: the link was down for longer than")
+        expect(notes).to_contain_text("The node's disk is full.")
+
+
+def test_what_is_said_of_a_session_can_be_changed(scripted: Scripted, open_page: OpenPage) -> None:
+    session = scripted.recorded("walk")
+    page = open_page(scripted.url)
+    row = row_of(page, session)
+    row.get_by_role("button", name="Edit").click()
+    page.fill("#edit-name", "mud & <b>stones</b>")
+    page.fill("#edit-subject", "leg 2")
+    page.fill("#edit-tags", "wet,  slow ,")
+    page.fill("#edit-notes", "first line\nsecond")
+    page.get_by_role("button", name="Save").click()
+    expect(row).to_contain_text("mud & <b>stones</b>")
+    expect(row).to_contain_text("leg 2 · #wet · #slow")
+    found = scripted.running.session(session["id"])
+    assert (found["subject"], found["tags"]) == ("leg 2", ["wet", "slow"])
+    assert found["notes"] == "first line\nsecond"
+
+
+def test_a_phone_has_room_for_several_recordings_and_all_buttons(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    scripted.recorded("before")
+    with Play(scripted.node):
+        for name in ("first", "second", "third"):
+            scripted.start(name)
+        page = open_page(scripted.url, 390, 844)
+        expect(page.locator("body")).to_have_attribute("data-live", "true")
+        expect(page.locator("#recordings li")).to_have_count(3)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        for button in ("#tare", "#record", "#stop", "#mark"):
+            expect(page.locator(button)).to_be_in_viewport()

@@ -1,0 +1,59 @@
+// The trash: what was deleted, to be had back or deleted for good. Loaded when it is opened.
+
+import * as api from "./api.js";
+import { ask } from "./dialogs.js";
+import { notice, quietly } from "./notices.js";
+import { byId, bytes, el, localTime, setText } from "./text.js";
+
+export class Trash {
+  /** `onRestored(session)` takes a session that is back. */
+  constructor(onRestored) {
+    this.onRestored = onRestored;
+    this.card = byId("trash-card");
+    this.card.addEventListener("toggle", () => this.card.open && this.load());
+    byId("trash-empty").addEventListener("click", () => this.empty());
+  }
+
+  /** Something was moved there, or back; it costs nothing while it is closed. */
+  changed() {
+    if (this.card.open) this.load();
+  }
+
+  async load() {
+    await quietly(async () => {
+      const { items } = await api.listTrash();
+      this.items = items;
+      byId("trash").replaceChildren(...items.map((session) => this.row(session)));
+      byId("trash-empty").hidden = !items.length;
+      setText(byId("trash-legend"), items.length ? "deleted sessions, which can be had back" : "empty");
+    });
+  }
+
+  row(session) {
+    const back = el("button", { type: "button", cls: "small", text: "Restore", "aria-label": `Restore ${session.name}` });
+    back.addEventListener("click", () => this.restore(session));
+    const about = [localTime(new Date(session.started_t_ns / 1e6)), `${session.frames.toLocaleString("en-GB")} frames`];
+    if (session.state === "pending") about.push("still pending: its frames are kept");
+    return el("li", { "data-session-id": session.id }, back, el("strong", { text: session.name }), el("span", { text: about.join(", ") }));
+  }
+
+  restore(session) {
+    return quietly(async () => {
+      const restored = await api.restoreSession(session.id);
+      this.onRestored(restored);
+      notice(`Restored “${restored.name}”.`);
+      await this.load();
+    });
+  }
+
+  async empty() {
+    const count = this.items?.length ?? 0;
+    const what = count === 1 ? "1 session" : `${count} sessions`;
+    if (!await ask("Empty the trash?", `${what} will be deleted for good. Nothing brings them back.`, `Delete ${what}`)) return;
+    await quietly(async () => {
+      const emptied = await api.emptyTrash();
+      notice(`Deleted ${emptied.sessions} session${emptied.sessions === 1 ? "" : "s"}, ${bytes(emptied.bytes)} are free.`);
+      await this.load();
+    });
+  }
+}
