@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -10,6 +11,12 @@ from functools import partial
 from pathlib import Path
 
 from devices.errors import StorageError
+
+_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp")
+_OLDER_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
+_NO_LONGER = {"Z", "X"}
+_STARTED_FIELD = 19
+"""Of /proc/PID/stat, behind the name: when the process started."""
 
 
 def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
@@ -23,7 +30,7 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
     Raises:
         StorageError: the disk is full or not writable; nothing is left behind then.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    temporary = temporary_of(path)
     try:
         with storage_errors(path):
             with open(temporary, "wb", opener=partial(os.open, mode=mode)) as file:
@@ -35,6 +42,54 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def temporary_of(path: Path) -> Path:
+    """A name of its own beside `path`, to write under until it is whole; it says whose it is."""
+    process = os.getpid()
+    name = f".{path.name}.{process}.{_started(process) or 0}.{secrets.token_hex(4)}.tmp"
+    return path.with_name(name)
+
+
+def remove_stale_temporaries(folder: Path) -> list[Path]:
+    """Delete what dead processes have left half-written in a folder; give back what it was.
+
+    What a living process may still be writing stays. A number that was given to another process
+    since is told by when that one started.
+
+    Raises:
+        StorageError: the folder cannot be read, or a file not deleted.
+    """
+    removed = []
+    with storage_errors(folder):
+        for path in sorted(folder.iterdir()):
+            if _is_stale(path.name) and path.is_file():
+                path.unlink(missing_ok=True)
+                removed.append(path)
+        if removed:
+            sync_folder(folder)
+    return removed
+
+
+def _is_stale(name: str) -> bool:
+    if match := _TEMPORARY.fullmatch(name):
+        return _started(int(match["process"])) != int(match["started"])
+    if match := _OLDER_TEMPORARY.fullmatch(name):
+        return _started(int(match["process"])) is None
+    return False
+
+
+def _started(process: int) -> int | None:
+    """When a process started, in ticks since the machine did; None if there is none of this number.
+
+    One that has ended and that nobody has asked for its end is none.
+    """
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text("utf-8", "replace").rsplit(") ", 1)[1]
+        state, *rest = fields.split()
+        return None if state in _NO_LONGER else int(rest[_STARTED_FIELD - 1])
+    except (FileNotFoundError, ProcessLookupError):
+        return None
 
 
 def sync_folder(folder: Path) -> None:
