@@ -12,6 +12,7 @@ from devices.frames import ArrayInfo
 from storage.intervals import Intervals
 from storage.losses import CORRUPT, Losses
 from storage.segment import INDEX_SUFFIX, RECORD, SUFFIX, UNREAD_SUFFIX
+from storage.session_claims import bytes_of
 from storage.stream_notes import NOTES_FILE, StreamNotes
 from storage.verify_segment import SegmentReport, verify_segment
 
@@ -77,9 +78,9 @@ def verify_stream(folder: Path) -> StreamReport:
         report.info, report.lost = report.notes.array_info, Losses(report.notes.lost)
     else:
         report.remarks.append(f"no {NOTES_FILE}: nothing says where the stream ended")
-    segments = [found for path in _names(folder, SUFFIX) if (found := _if_there(path)) is not None]
+    segments = _segments(folder)
     for path in _names(folder, INDEX_SUFFIX):
-        if not path.with_suffix(SUFFIX).exists() and path.exists() and path.stat().st_size:
+        if not path.with_suffix(SUFFIX).exists() and bytes_of(path):
             report.problems.append(f"{path.name}: the segment of this index is missing")
     for path in _names(folder, UNREAD_SUFFIX):
         report.remarks.append(f"{path.name}: bytes that were no whole batch after a crash")
@@ -132,14 +133,25 @@ def _check_stream(report: StreamReport, segments: list[SegmentReport], *, is_ser
         ]
 
 
+def _segments(folder: Path) -> list[SegmentReport]:
+    """Every segment's report; what looks damaged is looked at again, as it may just be deleted."""
+    first_look = [_if_there(path) for path in _names(folder, SUFFIX)]
+    looked = [
+        _if_there(report.path) if report is not None and report.problems else report
+        for report in first_look
+    ]
+    return [report for report in looked if report is not None]
+
+
 def _if_there(path: Path) -> SegmentReport | None:
     """The segment's report; None if it was deleted meanwhile, as those are that nobody needs."""
     try:
-        return verify_segment(path)
+        report = verify_segment(path)
     except FileFormatError:
         if path.exists():
             raise
         return None
+    return report if not report.problems or path.exists() else None
 
 
 def _names(folder: Path, suffix: str) -> list[Path]:

@@ -66,30 +66,36 @@ def verify_segment(path: Path) -> SegmentReport:
     """
     report = SegmentReport(path)
     try:
+        _verify(path, report)
+    except OSError as error:  # not there, or deleted meanwhile
+        raise FileFormatError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    return report
+
+
+def _verify(path: Path, report: SegmentReport) -> None:
+    try:
         # In this order, for whoever writes appends to the segment first: what was there before the
         # index was read, and is not in the index, is one batch at most.
         size = path.stat().st_size
         index: Records | None = read_index(path)
-    except FileNotFoundError as error:
+    except FileNotFoundError:
         if not path.exists():
-            raise FileFormatError("no such segment", where=str(path)) from error
+            raise
         index = None
-    except OSError as error:
-        raise FileFormatError(f"cannot be read: {error.strerror}", where=str(path)) from error
     report.is_closed = index is not None and _is_closed(index)
     schema, header_bytes = _schema_of(path, report)
     if schema is None:
         # One that was just begun when the power failed may be empty; one with frames may not.
         if report.is_closed or (index is not None and _holds_any(path, index)):
             report.problems.append("it does not begin with the description of an array")
-        return report
+        return
     if index is None:
         if size > header_bytes:
             report.problems.append(
                 f"its index {path.with_suffix(INDEX_SUFFIX).name} is missing: nothing proves its "
                 "frames; it is made anew when the journal is next opened"
             )
-        return report
+        return
     _check_batches(report, index, schema, header_bytes)
     end = _end_of(index, header_bytes)
     behind = _whole_messages(path, end, size, schema)
@@ -99,7 +105,6 @@ def verify_segment(path: Path) -> SegmentReport:
         report.problems.append(f"{behind} batches behind its last one are in no index: it was cut")
     elif behind:
         report.remarks.append("a batch behind its last one is in no index")
-    return report
 
 
 def _check_batches(
