@@ -20,6 +20,7 @@ from service.estimation.stances import Stance, Stances
 from service.estimation.tare import Tare
 from service.pipeline import EstimateOptions, EstimateStream, notes_of
 from service.simulate import judged_of
+from storage.frame_order import in_order
 from storage.schema import MILL, PARTS, TRUTH
 from storage.session_file import SessionReader, SessionWriter
 
@@ -67,7 +68,8 @@ def estimate_session(
         stances = Stances()
         frames = 0
         with SessionWriter(out, info, session.notes) as writer:
-            for batch, extra in stream.run(session.batches(*kept)):
+            ordered = in_order(session.batches(*kept), where=str(source))
+            for batch, extra in stream.run(ordered):
                 if not frames and stream.plan is not None:
                     writer.add_notes(notes_of(stream.plan, options.tares))
                 writer.append(batch, extra)

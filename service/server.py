@@ -20,10 +20,9 @@ from service.steady import utc_ns
 from service.streams import KeptStream
 from service.trash import Trash, destroy
 from service.views import NodeView, SessionView
-from storage.durable import make_folder, storage_errors, write_whole
+from storage.durable import make_folder, remove_stale_temporaries, storage_errors, write_whole
 from storage.intervals import Intervals
 from storage.session import Session, SessionFolder
-from storage.stale_files import remove_stale
 
 log = logging.getLogger("foottile.server")
 
@@ -85,7 +84,7 @@ class Server:
             make_folder(data)
         self._lock = _locked(data)
         try:
-            remove_stale(data)
+            remove_stale_temporaries(data)
             self.check_storage()
             self.id = _id_of(data)
             """Name of this data folder: a node keeps what this server needs, whoever else asks."""

@@ -52,7 +52,7 @@ def temporary_of(path: Path) -> Path:
 
 
 def remove_stale_temporaries(folder: Path) -> list[Path]:
-    """Delete what dead processes have left half-written in a folder; give back what it was.
+    """Delete what dead processes have left half-written in a folder and below; which files.
 
     What a living process may still be writing stays. A number that was given to another process
     since is told by when that one started.
@@ -62,12 +62,12 @@ def remove_stale_temporaries(folder: Path) -> list[Path]:
     """
     removed = []
     with storage_errors(folder):
-        for path in sorted(folder.iterdir()):
+        for path in sorted(folder.rglob(".*.tmp")):
             if _is_stale(path.name) and path.is_file():
                 path.unlink(missing_ok=True)
                 removed.append(path)
-        if removed:
-            sync_folder(folder)
+        for parent in {path.parent for path in removed}:
+            sync_folder(parent)
     return removed
 
 

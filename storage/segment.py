@@ -103,8 +103,9 @@ class Segment:
         Raises:
             OSError: they cannot be deleted.
         """
-        self.path.unlink(missing_ok=True)
+        # Who is killed in between leaves a segment, whose index is made anew, and no orphan.
         self.path.with_suffix(INDEX_SUFFIX).unlink(missing_ok=True)
+        self.path.unlink(missing_ok=True)
 
 
 class SegmentWriter:

@@ -2,13 +2,13 @@
 
 Integers are delta-encoded, floats byte-stream-split, all of it zstd (6 bytes a frame of four tiles
 where CSV takes 54, performance.md). A row group is about a minute. The file appears whole or not at
-all: it is written beside its place under a name of its own, synced, and renamed.
+all: it is written beside its place under a name of its own, synced, and renamed. Its footer states
+hashes of its content and of its bytes (`storage.content_hash`), so that it proves itself.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
@@ -21,7 +21,14 @@ import pyarrow.parquet as pq
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
-from storage.durable import storage_errors, sync_folder
+from storage.content_hash import (
+    CONTENT_HASH_KEY,
+    CONTENT_KEY,
+    ContentDigest,
+    content_hash,
+    write_file_hash,
+)
+from storage.durable import storage_errors, sync_folder, temporary_of
 from storage.schema import (
     ARRAY_INFO_KEY,
     FRAMES,
@@ -33,7 +40,9 @@ from storage.schema import (
 )
 
 FORMAT_KEY = b"foottile.format"
-FORMAT = b"1"
+FORMAT = b"2"
+FORMAT_WITHOUT_HASH = b"1"
+"""Files of older versions: the same, without any hash of their own. They are read, not written."""
 NOTES_KEY = b"foottile.notes"
 
 ROW_GROUP_NS = 60_000_000_000
@@ -52,12 +61,14 @@ class SessionWriter:
 
     def __init__(self, path: Path, info: ArrayInfo, notes: Mapping[str, object]) -> None:
         self.path = path
-        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        self._temporary = temporary_of(path)
         self._info = info
         self._notes = dict(notes)
         self._waiting: list[dict[str, Array]] = []
         self._group_end_ns: int | None = None
         self._writer: pq.ParquetWriter | None = None
+        self._digest = ContentDigest()
+        self._head = b"", b""
 
     def add_notes(self, notes: Mapping[str, object]) -> None:
         """Add what became known later; must precede the first row group's end."""
@@ -98,10 +109,10 @@ class SessionWriter:
         if self._writer is None:
             raise FileFormatError("no frames to write", where=str(self.path))
         with self._errors():
+            self._writer.add_key_value_metadata(self._digest.metadata(*self._head))
             self._writer.close()
             self._writer = None
-            with self._temporary.open("rb") as file:
-                os.fsync(file.fileno())
+            write_file_hash(self._temporary)
             self._temporary.replace(self.path)
             sync_folder(self.path.parent)
 
@@ -128,13 +139,13 @@ class SessionWriter:
         self._waiting = []
         self._group_end_ns = None
         fields, arrays = zip(*flat_columns([KNOWN[name] for name in names], values), strict=True)
+        if self._writer is None:
+            info, notes = self._info.model_dump_json(), json.dumps(self._notes, sort_keys=True)
+            self._head = info.encode(), notes.encode()
+        info_text, notes_text = self._head
         schema = pa.schema(
             list(fields),
-            metadata={
-                FORMAT_KEY: FORMAT,
-                ARRAY_INFO_KEY: self._info.model_dump_json().encode(),
-                NOTES_KEY: json.dumps(self._notes, sort_keys=True).encode(),
-            },
+            metadata={FORMAT_KEY: FORMAT, ARRAY_INFO_KEY: info_text, NOTES_KEY: notes_text},
         )
         table = pa.Table.from_arrays(list(arrays), schema=schema)
         with self._errors():
@@ -143,6 +154,7 @@ class SessionWriter:
                     self._temporary, table.schema, **parquet_options(table.schema)
                 )
             self._writer.write_table(table, row_group_size=len(table))
+        self._digest.feed(table)
 
     def _errors(self) -> AbstractContextManager[None]:
         return storage_errors(
@@ -197,7 +209,7 @@ class SessionReader:
         schema = self._file.schema_arrow
         metadata = schema.metadata or {}
         version = metadata.get(FORMAT_KEY)
-        if version != FORMAT:
+        if version not in (FORMAT, FORMAT_WITHOUT_HASH):
             raise FileFormatError(
                 f"its format is {version!r}" if version else "it states no format",
                 where=str(path),
@@ -206,6 +218,8 @@ class SessionReader:
             )
         self.info = array_info(schema, where=str(path))
         self.notes = _notes(metadata.get(NOTES_KEY), where=str(path))
+        self.format = version
+        self.content_sha256, self.content = self._content(metadata)
         self.column_names = frozenset(schema.names)
         tiles = len(self.info.tiles)
         if f"padc_{tiles}" in schema.names:
@@ -215,6 +229,35 @@ class SessionReader:
         self.frame_count = self._file.metadata.num_rows
         if not self.frame_count:
             raise FileFormatError("the session has no frames", where=str(path))
+
+    def _content(self, metadata: Mapping[bytes, bytes]) -> tuple[str | None, dict[str, Any] | None]:
+        """What the file says of its content; None of a file that was not written by us last."""
+        said = self._file.metadata.metadata or {}
+        content, stated = said.get(CONTENT_KEY), said.get(CONTENT_HASH_KEY)
+        if content is None or stated is None:
+            return None, None
+        found = content_hash(metadata[ARRAY_INFO_KEY], metadata[NOTES_KEY], content)
+        if found.encode() != stated:
+            raise FileFormatError(
+                "its description of array and session is not the one that was sealed",
+                where=str(self.path),
+                expected=f"content with the hash {stated[:64]!r}, found {found}",
+            )
+        return found, json.loads(content)
+
+    def tables(self) -> Iterator[pa.Table]:
+        """All columns as they are in the file, a row group at a time.
+
+        Raises:
+            FileFormatError: a row group is damaged.
+        """
+        for group in range(self._file.num_row_groups):
+            try:
+                yield self._file.read_row_group(group)
+            except (OSError, ValueError, pa.ArrowException) as error:
+                raise FileFormatError(
+                    f"row group {group} cannot be read: {error}", where=str(self.path)
+                ) from error
 
     def close(self) -> None:
         """Close the file."""

@@ -16,9 +16,11 @@ from service.cli.doctor import doctor_command
 from service.cli.domes import domes_command
 from service.cli.estimate import estimate_command
 from service.cli.node import node_command
+from service.cli.recover import recover_command
 from service.cli.serve import serve_command
 from service.cli.sessions import export_command, pull_command, sessions_command
 from service.cli.simulate import simulate_command
+from service.cli.verify import verify_command
 from service.version import SOFTWARE
 
 _TYPER_INTERRUPTED = 130
@@ -41,6 +43,8 @@ app.command("simulate")(simulate_command)
 app.command("estimate")(estimate_command)
 app.command("calibrate")(calibrate_command)
 app.command("domes")(domes_command)
+app.command("verify")(verify_command)
+app.command("recover")(recover_command)
 app.command("doctor")(doctor_command)
 app.command("bench")(bench_command)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import resource
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +16,14 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, StorageError
 from storage import durable
-from storage.durable import make_folder, storage_errors, sync_folder, write_whole
+from storage.durable import (
+    make_folder,
+    remove_stale_temporaries,
+    storage_errors,
+    sync_folder,
+    temporary_of,
+    write_whole,
+)
 
 
 @contextmanager
@@ -180,3 +189,64 @@ def test_the_names_of_new_folders_are_on_the_disk_all_the_way_up(
     synced.clear()
     make_folder(tmp_path / "sessions" / "one")
     assert synced == ["sessions"]
+
+
+# --- what dead processes leave --------------------------------------------------------------------
+
+_NAME = (
+    "from pathlib import Path; from storage.durable import temporary_of; "
+    "print(temporary_of(Path({!r})))"
+)
+
+
+def temporary_of_another(path: Path, then: str = "") -> subprocess.Popen[str]:
+    """A process that prints the name it would write under."""
+    code = _NAME.format(str(path)) + then
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+
+
+def first_line(process: subprocess.Popen[str]) -> Path:
+    assert process.stdout is not None
+    return Path(process.stdout.readline().strip())
+
+
+def test_what_a_dead_process_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    with temporary_of_another(tmp_path / "frames.parquet") as process:
+        stale = first_line(process)
+    older = tmp_path / f".frames.parquet.{process.pid}.tmp"
+    even_older = tmp_path / f".session.json.{process.pid}-0123abcd.tmp"
+    mine = temporary_of(tmp_path / "session.json")
+    others = [".lock", "session.json", ".tmp", "a.1.2.0123abcd.tmp", ".frames.parquet.part"]
+    for path in (stale, older, even_older, mine, *(tmp_path / name for name in others)):
+        path.write_bytes(b"x")
+    (tmp_path / f".folder.{process.pid}.tmp").mkdir()
+    assert sorted(remove_stale_temporaries(tmp_path)) == sorted([stale, older, even_older])
+    assert {p.name for p in tmp_path.iterdir() if p.is_file()} == {mine.name, *others}
+    assert remove_stale_temporaries(tmp_path) == []
+
+
+def test_what_a_living_process_is_writing_stays(tmp_path: Path) -> None:
+    with temporary_of_another(
+        tmp_path / "frames.parquet", "; import sys, time; sys.stdout.flush(); time.sleep(60)"
+    ) as process:
+        writing = first_line(process)
+        writing.write_bytes(b"x")
+        assert remove_stale_temporaries(tmp_path) == []
+        process.kill()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        # It is dead, although nobody has asked for its end.
+        assert remove_stale_temporaries(tmp_path) == [writing]
+
+
+def test_a_number_that_was_given_to_another_process_is_no_sign_of_life(tmp_path: Path) -> None:
+    mine = temporary_of(tmp_path / "x")
+    parts = mine.name.split(".")
+    stale = mine.with_name(".".join([*parts[:3], str(int(parts[3]) - 1), *parts[4:]]))
+    stale.write_bytes(b"")
+    assert remove_stale_temporaries(tmp_path) == [stale]
+
+
+def test_a_folder_that_is_not_there_is_an_error_that_names_it(tmp_path: Path) -> None:
+    with pytest.raises(StorageError) as caught:
+        remove_stale_temporaries(tmp_path / "none")
+    assert caught.value.where == str(tmp_path / "none")

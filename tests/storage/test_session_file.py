@@ -28,6 +28,7 @@ from devices.frames import (
     FrameBatch,
     TileInfo,
 )
+from storage.durable import remove_stale_temporaries
 from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN
 from storage.session_file import FORMAT_KEY, NOTES_KEY, SessionReader, SessionWriter
 
@@ -449,6 +450,15 @@ def test_it_is_synced_before_it_gets_its_name_and_the_folder_after(
     assert events == [("file", False), ("folder", True)]
 
 
+def test_while_it_is_written_its_name_says_whose_it_is(tmp_path: Path) -> None:
+    with SessionWriter(tmp_path / "s.parquet", array(), {}) as writer:
+        writer.append(frames(3000, period_ns=50_000_000), {})
+        (name,) = names_in(tmp_path)
+        assert name.startswith(f".s.parquet.{os.getpid()}.")
+        assert remove_stale_temporaries(tmp_path) == []
+    assert names_in(tmp_path) == ["s.parquet"]
+
+
 @contextmanager
 def disk_with_room_for(size: int) -> Iterator[None]:
     """No file may grow beyond `size` bytes: a write fails as it does on a full disk."""
@@ -551,7 +561,7 @@ def test_no_flipped_bit_of_the_data_changes_a_value_unnoticed(tmp_path: Path) ->
 
 def test_a_later_format_says_so_and_what_to_do(tmp_path: Path) -> None:
     table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
-    refused(rewritten(tmp_path / "later.parquet", table, format=b"2"), "format.*2.*Update foottile")
+    refused(rewritten(tmp_path / "later.parquet", table, format=b"3"), "format.*3.*Update foottile")
     refused(rewritten(tmp_path / "none.parquet", table, format=None), "format")
 
 
@@ -561,7 +571,7 @@ def test_a_later_format_says_so_even_if_it_describes_its_array_in_a_new_way(
     table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
     info = json.loads(array().model_dump_json()) | {"hall_sensors": 4}
     path = tmp_path / "later.parquet"
-    rewritten(path, table, format=b"2", array_info=json.dumps(info).encode())
+    rewritten(path, table, format=b"3", array_info=json.dumps(info).encode())
     refused(path, "Update foottile")
 
 
@@ -588,7 +598,7 @@ def test_the_keys_of_the_metadata_are_those_of_the_format(tmp_path: Path) -> Non
         b"foottile.array_info",
         b"foottile.notes",
     )
-    assert metadata[FORMAT_KEY] == b"1"
+    assert metadata[FORMAT_KEY] == b"2"
     assert json.loads(metadata[ARRAY_INFO_KEY])["tiles"][1]["serial"] == "T02"
 
 

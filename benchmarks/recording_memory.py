@@ -1,0 +1,235 @@
+"""Memory and time of sealing, reading and verifying a long session.
+
+    python benchmarks/recording_memory.py [--hours 10] [--tiles 8] [--rate 544] [--folder DIR]
+
+A journal of that length is generated and sealed as a server would (static model, calibration
+`paper-eq2-shape`), then read through, one column of a slice is read, and all of it is verified.
+Each step runs in a process of its own, whose peak resident memory is printed beside that of a
+process that has only imported what it needs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+BATCH_FRAMES = 14
+LEAD_FRAMES = 1000
+BOOT_ID = "b" * 32
+SESSION_ID = "20200101T000000Z-000000"
+UTC_NS = 1_577_836_800_000_000_000
+
+
+def peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def array(tiles: int, rate_hz: float) -> Any:
+    from devices.frames import ArrayInfo, TileInfo
+
+    return ArrayInfo(
+        node="bench",
+        boot_id=BOOT_ID,
+        tiles=tuple(
+            TileInfo(
+                serial=f"T{i + 1:02}",
+                mux=0x70 + i // 8,
+                channel=i % 8,
+                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
+                x_m=0.01 * i,
+                y_m=0.0,
+                z_m=-0.15,
+                reference=False,
+                conversion_ms=1.6,
+            )
+            for i in range(tiles)
+        ),
+        servo=None,
+        schedule="pipelined",
+        nominal_rate_hz=rate_hz,
+        utc_offset_ns=UTC_NS,
+        clock_set=True,
+        software="benchmark",
+        scene="benchmark",
+        models=("static",),
+    )
+
+
+def minute(number: int, tiles: int, rate_hz: float) -> Any:
+    from devices.frames import FrameBatch, FrameStatus
+
+    rng = np.random.default_rng(number % 7)
+    rows = round(60 * rate_hz)
+    seq = np.arange(number * rows, (number + 1) * rows, dtype=np.uint64)
+    t_mono_ns = (seq.astype(np.float64) * 1e9 / rate_hz).astype(np.int64)
+    t_mono_ns += rng.integers(0, 20_000, rows)
+    steps = 20 + 20 * np.sin(np.arange(rows) * 2 * np.pi / rate_hz)
+    padc = 400 - steps[:, None] + rng.normal(0, 1.3, (rows, tiles))
+    lead = seq < LEAD_FRAMES
+    padc[lead] = 400 + rng.normal(0, 1.3, (int(lead.sum()), tiles))
+    return FrameBatch(
+        seq=seq,
+        t_mono_ns=t_mono_ns,
+        t_ns=t_mono_ns + UTC_NS,
+        padc=padc.round().astype(np.uint16),
+        tadc=rng.integers(478, 480, (rows, tiles)).astype(np.uint16),
+        sample_offset_us=(210 * np.arange(tiles) + rng.integers(0, 9, (rows, tiles))).astype(
+            np.int32
+        ),
+        servo_counts=np.full(rows, -(2**31), np.int32),
+        servo_age_us=np.full(rows, -1, np.int32),
+        status=np.zeros((rows, tiles), np.uint8),
+        frame_status=np.where(lead, int(FrameStatus.LEAD), 0).astype(np.uint8),
+        reference_force_n=np.full(rows, np.nan, np.float32),
+    )
+
+
+def generate(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
+    from storage.journal import Journal
+
+    journal = Journal(folder / "journal" / "bench" / BOOT_ID, array(asked.tiles, asked.rate))
+    for number in range(round(asked.hours * 60)):
+        frames = minute(number, asked.tiles, asked.rate)
+        for begin in range(0, len(frames), BATCH_FRAMES):
+            journal.append(frames.rows(begin, min(begin + BATCH_FRAMES, len(frames))))
+        journal.sync()
+    journal.close()
+    return {"frames": journal.held.count, "bytes": journal.size_bytes}
+
+
+def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
+    from service.calibrations import find_calibration
+    from service.sealing import Sources, seal
+    from storage import session_file
+    from storage.content_hash import ContentDigest, write_file_hash
+    from storage.journal import Journal
+    from storage.ledger import StreamState, ledger_of
+    from storage.session import Part, Session, SessionFolder
+
+    hash_s = 0.0
+
+    class Timed(ContentDigest):
+        def feed(self, table: Any) -> None:
+            nonlocal hash_s
+            begin = time.perf_counter()
+            super().feed(table)
+            hash_s += time.perf_counter() - begin
+
+    def timed(path: Path) -> None:
+        nonlocal hash_s
+        begin = time.perf_counter()
+        write_file_hash(path)
+        hash_s += time.perf_counter() - begin
+
+    session_file.ContentDigest, session_file.write_file_hash = Timed, timed
+    info = array(asked.tiles, asked.rate)
+    journal = Journal(folder / "journal" / "bench" / BOOT_ID, info)
+    last = journal.held.last
+    assert last is not None
+    session = Session(
+        id=SESSION_ID,
+        name="long",
+        node="bench",
+        state="sealing",
+        started_t_ns=UTC_NS,
+        stopped_t_ns=UTC_NS + round(asked.hours * 3.6e12),
+        parts=(Part(boot_id=BOOT_ID, seq_first=0, seq_last=last),),
+        scene="benchmark",
+    )
+    calibration = find_calibration(
+        "paper-eq2-shape", list(info.serials), parts_seed=0, progress=lambda _: None
+    )
+    sources = Sources(session, info, {BOOT_ID: journal}, calibration, None, (), {})
+    ledger = ledger_of(session.parts, {BOOT_ID: StreamState(held=journal.held)}, finished=True)
+    sessions = SessionFolder(folder / "sessions")
+    sessions.save(session)
+    begin = time.perf_counter()
+    sealed = seal(sources, sessions.path(SESSION_ID), ledger)
+    seal_s = time.perf_counter() - begin
+    sessions.save(sealed)
+    return {
+        "seconds": seal_s,
+        "bytes": sealed.bytes,
+        "hash_share": hash_s / seal_s,
+        "problem": sealed.problem,
+    }
+
+
+def read_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
+    from storage.session_file import SessionReader
+
+    with SessionReader(folder / "sessions" / SESSION_ID / "frames.parquet") as reader:
+        frames = sum(len(batch) for batch, _ in reader.batches("grf_n", "force_n"))
+    return {"frames": frames}
+
+
+def column(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(folder / "sessions" / SESSION_ID / "frames.parquet") as file:
+        middle = file.num_row_groups // 2
+        rows = len(file.read_row_group(middle, columns=["grf_n"]))
+    return {"rows": rows}
+
+
+def verify_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
+    from storage.verify import verdict_of, verify
+
+    report = verify(folder / "sessions" / SESSION_ID)
+    return {"verdict": verdict_of(report), "problems": report.problems}
+
+
+def verify_journal(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
+    from storage.verify import verdict_of, verify
+
+    report = verify(folder / "journal" / "bench" / BOOT_ID)
+    return {"verdict": verdict_of(report), "problems": report.problems}
+
+
+def imports(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
+    import service.sealing
+    import storage.verify
+
+    return {"modules": [service.sealing.__name__, storage.verify.__name__]}
+
+
+STEPS = {
+    f.__name__: f for f in (imports, generate, seal_it, read_it, column, verify_it, verify_journal)
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--hours", type=float, default=10.0)
+    parser.add_argument("--tiles", type=int, default=8)
+    parser.add_argument("--rate", type=float, default=544.0)
+    parser.add_argument("--folder", type=Path, help="where to work; it is not emptied afterwards")
+    parser.add_argument("--step", choices=STEPS, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.step is not None:
+        begin = time.perf_counter()
+        found = STEPS[asked.step](asked.folder, asked)
+        seconds = found.pop("seconds", time.perf_counter() - begin)
+        print(json.dumps({"s": round(seconds, 3), "peak_mb": round(peak_mb()), **found}))
+        return
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = asked.folder or Path(temporary)
+        print(f"{asked.hours:g} h, {asked.tiles} tiles, {asked.rate:g} Hz")
+        for step in STEPS:
+            same = [f"--hours={asked.hours}", f"--tiles={asked.tiles}", f"--rate={asked.rate}"]
+            command = [sys.executable, __file__, f"--step={step}", f"--folder={folder}", *same]
+            said = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+            print(f"{step:15} {said.strip()}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

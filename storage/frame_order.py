@@ -1,0 +1,157 @@
+"""What frames say of their own completeness: per part the numbers that are there, and their order.
+
+`seq` rises within a part, `t_mono_ns` with it, and `t_ns` is `t_mono_ns` plus one offset. Whoever
+filters over time relies on that; a file from elsewhere, or an edited one, need not keep to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from devices.errors import FileFormatError
+from devices.frames import FrameBatch
+from storage.intervals import Intervals
+from storage.schema import Array
+
+_SAID_MAX = 3
+
+
+@dataclass
+class PartFrames:
+    """What was seen of one part.
+
+    Attributes:
+        part: its number, from 0.
+        seq_first: number of its first frame.
+        seq_last: number of its last frame.
+        frames: how many there were.
+        offset_ns: `t_ns - t_mono_ns` of its first frame.
+        t_mono_ns_first: instant of its first frame.
+        t_mono_ns_last: instant of its last frame.
+        held: numbers that were there.
+        disorder: what is wrong with their order, in words; the first few.
+        disorders: how often something was.
+    """
+
+    part: int
+    seq_first: int
+    seq_last: int
+    offset_ns: int
+    t_mono_ns_first: int
+    t_mono_ns_last: int
+    frames: int = 0
+    held: Intervals = field(default_factory=Intervals)
+    disorder: list[str] = field(default_factory=list)
+    disorders: int = 0
+
+    @property
+    def gaps(self) -> Intervals:
+        """Numbers between the first and the last that were not there."""
+        first, last = sorted((self.seq_first, self.seq_last))
+        return self.held.missing(first, last)
+
+
+class FrameOrder:
+    """Looks at frames as they come, in any cut; what it found is in `parts` and `disorder`."""
+
+    def __init__(self) -> None:
+        self.parts: list[PartFrames] = []
+        self.disorder: list[str] = []
+        """What is wrong with the order of the parts."""
+
+    @property
+    def problems(self) -> list[str]:
+        """All that is out of order, in words."""
+        found = list(self.disorder)
+        for part in self.parts:
+            found += [f"part {part.part}: {said}" for said in part.disorder]
+            if part.disorders > len(part.disorder):
+                more = part.disorders - len(part.disorder)
+                found.append(f"part {part.part}: and {more} more of the kind")
+        return found
+
+    def feed(self, columns: Mapping[str, Array]) -> None:
+        """Take the next frames.
+
+        Args:
+            columns: `seq`, `t_mono_ns`, `t_ns` and, if the file has it, `part`; n rows each.
+        """
+        rows = len(columns["seq"])
+        numbers = columns.get("part", np.zeros(rows, dtype=np.uint16))
+        if not rows:
+            return
+        cuts = [0, *(np.flatnonzero(numbers[1:] != numbers[:-1]) + 1).tolist(), rows]
+        for begin, end in pairwise(cuts):
+            cut = {name: columns[name][begin:end] for name in ("seq", "t_mono_ns", "t_ns")}
+            self._feed_part(int(numbers[begin]), cut["seq"], cut["t_mono_ns"], cut["t_ns"])
+
+    def _feed_part(self, number: int, seq: Array, t_mono_ns: Array, t_ns: Array) -> None:
+        if not self.parts or self.parts[-1].part != number:
+            if self.parts and number < self.parts[-1].part:
+                self.disorder.append(f"part {number} follows part {self.parts[-1].part}")
+            self.parts.append(
+                PartFrames(
+                    part=number,
+                    seq_first=int(seq[0]),
+                    seq_last=int(seq[0]),
+                    offset_ns=int(t_ns[0]) - int(t_mono_ns[0]),
+                    t_mono_ns_first=int(t_mono_ns[0]),
+                    t_mono_ns_last=int(t_mono_ns[0]),
+                )
+            )
+        part = self.parts[-1]
+        if part.frames:
+            seq = np.concatenate([np.array([part.seq_last], seq.dtype), seq])
+            before = np.array([part.t_mono_ns_last], t_mono_ns.dtype)
+            with_before = np.concatenate([before, t_mono_ns])
+        else:
+            with_before = t_mono_ns
+        falls = seq[1:] <= seq[:-1]
+        back = with_before[1:] < with_before[:-1]
+        for at in np.flatnonzero(falls).tolist():
+            _say(part, f"frame {seq[at + 1]} follows frame {seq[at]}")
+        for at in np.flatnonzero(back & ~falls).tolist():
+            late_ns = int(with_before[at]) - int(with_before[at + 1])
+            _say(part, f"time runs back by {late_ns} ns before frame {seq[at + 1]}")
+        shifted = t_ns - t_mono_ns != part.offset_ns
+        if shifted.any():
+            first = int(seq[len(seq) - len(t_ns) + int(np.argmax(shifted))])
+            _say(part, f"t_ns of frame {first} is not t_mono_ns plus the part's offset")
+        breaks = np.flatnonzero((seq[1:] - seq[:-1] != 1) | falls) + 1
+        cuts = [0, *breaks.tolist(), len(seq)]
+        for begin, end in pairwise(cuts):
+            part.held.add(int(seq[begin]), int(seq[end - 1]))
+        part.frames += len(t_ns)
+        part.seq_last, part.t_mono_ns_last = int(seq[-1]), int(t_mono_ns[-1])
+
+
+def in_order(
+    pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]], *, where: str
+) -> Iterator[tuple[FrameBatch, Mapping[str, Array]]]:
+    """The same frames, for whoever relies on their order.
+
+    Raises:
+        FileFormatError: the first frame out of order is reached.
+    """
+    order = FrameOrder()
+    for frames, extra in pieces:
+        columns = {"seq": frames.seq, "t_mono_ns": frames.t_mono_ns, "t_ns": frames.t_ns}
+        order.feed(columns | {name: extra[name] for name in ("part",) if name in extra})
+        if problems := order.problems:
+            raise FileFormatError(
+                f"its frames are out of order: {problems[0]}",
+                where=where,
+                expected="seq and t_mono_ns rising within a part, t_ns at one offset from it",
+                remedy="`foottile verify` lists what else is wrong",
+            )
+        yield frames, extra
+
+
+def _say(part: PartFrames, text: str) -> None:
+    part.disorders += 1
+    if len(part.disorder) < _SAID_MAX:
+        part.disorder.append(text)
