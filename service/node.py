@@ -83,9 +83,9 @@ async def run_node(
     """
     rig = options.rig
     journal = await asyncio.to_thread(NodeJournal, options.journal, rig.node)
-    journal.start()
     try:
         node = _Node(options, journal, report)
+        journal.start()  # it knows now what the node's own sessions need
         try:
             return await node.run(stop)
         finally:

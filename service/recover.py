@@ -25,6 +25,7 @@ from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
 from storage.ledger import NO_END, StreamState, ledger_of
 from storage.losses import GIVEN_UP, NODE_RESTARTED, Losses
+from storage.node_journal import settle_left_over
 from storage.session import Ledger, Part, Session, SessionFolder, new_session_id
 from storage.verify_session import EVENTS_NAME, verify_session
 
@@ -101,6 +102,8 @@ def recover(
     recovery = Recovery()
     sessions = SessionFolder(data / "sessions")
     recovery.removed += remove_stale_temporaries(data)
+    if not (data / "nodes").is_dir():
+        settle_left_over(data)  # a node's: what it had in flight when it was killed is there yet
     opened, recovery.problems = open_streams(data, tell)
     recovery.cut = {
         f"{node}/{boot_id}": stream.cut_bytes

@@ -59,15 +59,24 @@ class NodeJournal:
         root: the node's folder.
         node: its name.
         budget_bytes: what its journals may take.
+        is_recovery: nothing is dropped, and whoever uses this holds the folder's locks already.
 
     Raises:
         StorageError: another process uses it.
         FileFormatError: a file in it is damaged.
     """
 
-    def __init__(self, root: Path, node: str, *, budget_bytes: int = BUDGET_BYTES) -> None:
+    def __init__(
+        self,
+        root: Path,
+        node: str,
+        *,
+        budget_bytes: int = BUDGET_BYTES,
+        is_recovery: bool = False,
+    ) -> None:
         self.folder = root / "journal" / node
         self._budget_bytes = budget_bytes
+        self._may_drop = not is_recovery
         self._locks = ExitStack()
         self._trouble: tuple[str, str] | None = None
         """Reason and words, while the disk takes nothing."""
@@ -81,8 +90,9 @@ class NodeJournal:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="journal")
         try:
-            self._lock(root / ".lock", fcntl.LOCK_SH)
-            self._lock(self.folder / ".lock", fcntl.LOCK_EX)
+            if not is_recovery:
+                self._lock(root / ".lock", fcntl.LOCK_SH)
+                self._lock(self.folder / ".lock", fcntl.LOCK_EX)
             self.wanted = Wanted(self.folder / "wanted.json")
             self.streams: list[KeptStream] = self._found()
         except BaseException:
@@ -284,6 +294,8 @@ class NodeJournal:
                 self.wanted.save()
             except StorageError:
                 self._wants_changed = True
+        if not self._may_drop:
+            return
         past_ring = time.monotonic() - self._began_s > RING_NS * 1e-9
         for stream in list(self.streams):
             journal, is_present = stream.journal, not stream.has_ended
@@ -332,7 +344,7 @@ class NodeJournal:
     def _evict(self) -> bool:
         """Make room: delete the oldest frames that no session needs; was there anything?"""
         for stream in list(self.streams):
-            if stream.journal is not None:
+            if stream.journal is not None and self._may_drop:
                 gone = stream.journal.evict(self._keep(stream))
                 if gone:
                     stream.lose(gone, EVICTED)
@@ -372,6 +384,27 @@ class NodeJournal:
                 where=str(path.parent),
                 remedy="Stop it, or choose another folder with --journal or another --name",
             ) from error
+
+
+def settle_left_over(root: Path) -> None:
+    """Have what killed nodes left in flight in their journals, and note where their streams ended.
+
+    Args:
+        root: the nodes' folder, whose lock the caller holds.
+
+    Raises:
+        StorageError: it cannot be read, or not written to its end.
+    """
+    for folder in sorted(path for path in (root / "journal").glob("*") if path.is_dir()):
+        journal = NodeJournal(root, folder.name, is_recovery=True)
+        journal.start()
+        settled = journal.settle()
+        troubles = journal.troubles
+        journal.close()
+        if not settled:
+            raise StorageError(
+                "what was in flight cannot be written: " + "; ".join(troubles), where=str(folder)
+            )
 
 
 def taken_up(folder: Path, progress: Callable[[str], None] | None = None) -> KeptStream | None:

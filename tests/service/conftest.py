@@ -559,7 +559,13 @@ class Process:
         self.process = subprocess.Popen(
             [str(Path(sys.executable).parent / "foottile"), *map(str, arguments)],
             cwd=folder,
-            env={**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1", **environment},
+            env={
+                **os.environ,
+                "COLUMNS": "200",
+                "PYTHONUNBUFFERED": "1",
+                "XDG_STATE_HOME": str(folder.parent / "state"),  # journals of nodes
+                **environment,
+            },
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

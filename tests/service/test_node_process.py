@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
-import re
 import signal
 import tty
 from collections.abc import Callable
+from contextlib import closing
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus, TileStatus
+from storage.journal import Journal
 from storage.session_file import SessionReader
 
 pytestmark = pytest.mark.real_time
@@ -64,7 +66,7 @@ def test_an_emulated_node_streams_tares_and_ends_without_loss(
     assert node["clock"] is not None
     process.process.send_signal(signal.SIGTERM)
     assert process.ended(8.0) == 0, process.err
-    assert not any("never acknowledged" in line for line in process.err)
+    assert not any("wait on this disk" in line for line in process.err)
     until(lambda: not running.node("demo")["connected"])
     node = running.node("demo")
     seqs = np.concatenate([b.seq for b in running.journal(node["boot_id"], "demo").read(0, 2**61)])
@@ -137,16 +139,103 @@ def test_acquisition_ends_when_its_node_is_killed(
     until(lambda: not running.node("demo")["connected"], 8.0)
 
 
-def test_a_node_without_a_server_takes_frames_and_says_that_they_were_not_sent(
-    running: Running, foottile: Foottile, scene: Path
+def test_a_node_without_a_server_keeps_its_frames(
+    running: Running, foottile: Foottile, scene: Path, tmp_path: Path
 ) -> None:
     running.stop()
-    process = foottile("node", "--scene", scene, "--server", running.url)
+    process = foottile(
+        *("node", "--scene", scene, "--server", running.url, "--name", "leg"),
+        *("--journal", tmp_path / "node"),
+    )
     assert "trying again" in process.said("not connected to")
     process.process.send_signal(signal.SIGINT)
-    assert process.ended(12.0) == 3
-    said = [line for line in process.err if "never acknowledged" in line]
-    assert re.match(r"\d+ frames", said[0])
+    assert process.ended(12.0) == 0  # no session needs them
+    (folder,) = (tmp_path / "node" / "journal" / "leg").glob("?" * 32)
+    with closing(Journal.open(folder)) as journal:
+        assert journal.held.missing(0, 20).count == 0
+
+
+@pytest.fixture
+def leg(running: Running, foottile: Foottile, scene: Path, tmp_path: Path) -> Callable[..., Any]:
+    """A node with a journal that outlives it."""
+
+    def start(*arguments: object) -> Any:
+        return foottile(
+            *("node", "--scene", scene, "--name", "leg", "--journal", tmp_path / "node"),
+            *(arguments or ("--server", running.url)),
+        )
+
+    return start
+
+
+def streaming(running: Running, until: Until, more: int = 100) -> dict[str, Any]:
+    """Wait until the server has seen this many frames of the node's present stream."""
+    until(lambda: running.http.get("/nodes/leg").status_code == 200, 30.0)
+    until(lambda: running.node("leg")["connected"], 30.0)
+    until(lambda: (running.node("leg")["last_seq"] or 0) > more, 30.0)
+    node: dict[str, Any] = running.node("leg")
+    return node
+
+
+def test_a_killed_node_has_lost_nothing_and_its_session_goes_on(
+    running: Running, leg: Callable[..., Any], until: Until
+) -> None:
+    process = leg()
+    before = streaming(running, until)
+    session = running.http.post("/sessions", json={"node": "leg", "name": "killed"}).json()
+    until(lambda: running.node("leg")["last_seq"] > before["last_seq"] + 200, 30.0)
+    seen = running.node("leg")["last_seq"]
+    process.process.kill()
+    until(lambda: not running.node("leg")["connected"], 15.0)
+    again = leg()
+    until(lambda: running.node("leg")["boot_id"] != before["boot_id"], 30.0)
+    streaming(running, until)
+    running.http.post(f"/sessions/{session['id']}/stop")
+    found = running.sealed(session["id"])
+    assert (found["complete"], len(found["parts"])) == (True, 2)
+    assert found["parts"][0]["seq_last"] >= seen
+    again.process.send_signal(signal.SIGTERM)
+    assert again.ended(12.0) == 0, again.err
+
+
+def test_what_a_session_needs_waits_on_the_nodes_disk_until_both_are_back(
+    running: Running, leg: Callable[..., Any], until: Until
+) -> None:
+    process = leg()
+    streaming(running, until)
+    session = running.http.post("/sessions", json={"node": "leg", "name": "apart"}).json()
+    running.stop()
+    process.said("not connected to")
+    process.process.send_signal(signal.SIGINT)
+    assert process.ended(20.0) == 3
+    assert any("wait on this disk" in line for line in process.err)
+    running.start()
+    running.http.post(f"/sessions/{session['id']}/stop")
+    assert running.session(session["id"])["state"] == "pending"
+    again = leg()
+    found = running.sealed(session["id"])
+    assert found["complete"] is True
+    again.process.send_signal(signal.SIGTERM)
+    assert again.ended(20.0) == 0, again.err
+
+
+def test_a_node_alone_leaves_a_complete_session_that_proves_itself(
+    leg: Callable[..., Any], foottile: Foottile, tmp_path: Path, until: Until
+) -> None:
+    process = leg("--record", "third trial")
+    until(lambda: list((tmp_path / "node").glob("journal/leg/*/*.arrows")), 30.0)
+    process.process.kill()  # the battery held, the process did not
+    process.ended(5.0)
+    again = leg("--record", "third trial")
+    again.said("goes on")
+    until(lambda: len(list((tmp_path / "node").glob("journal/leg/*/*.arrows"))) > 1, 30.0)
+    again.process.send_signal(signal.SIGINT)
+    assert again.ended(30.0) == 0, again.err
+    assert "is complete" in again.said("session")
+    proof = foottile("verify", tmp_path / "node", "--json")
+    assert proof.ended(20.0) == 0, proof.out
+    (session,) = json.loads("".join(proof.out))["sessions"]
+    assert (session["complete"], len(session["parts"])) == (True, 2)
 
 
 def frames_of(running: Running, session_id: str) -> FrameBatch:

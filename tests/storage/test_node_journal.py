@@ -8,6 +8,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from devices.frames import ArrayInfo, FrameBatch, TileStatus
 from storage import in_flight, node_journal, segment
 from storage.in_flight import InFlight
 from storage.intervals import Intervals
+from storage.journal import Journal
 from storage.kept_stream import EncodedBatch, KeptStream
 from storage.ledger import NO_END
 from storage.node_journal import NodeJournal
@@ -409,3 +411,28 @@ def test_what_sessions_need_and_no_server_has_is_undelivered(
     stream.acknowledge(0, 79)
     assert journal.undelivered(stream) == Intervals([(80, 99)])
     assert journal.wanted.numbers("0" * 32) == Intervals([(50, NO_END)])
+
+
+def test_recovery_writes_what_was_in_flight_and_drops_nothing(
+    start: Start,
+    fill: Fill,
+    array_of: Arrays,
+    frames_of: Callable[..., FrameBatch],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    journal = start()
+    stream = journal.begin(array_of())
+    fill(journal, stream, 0, 99)
+    until(lambda: on_disk(stream) == Intervals([(0, 99)]))
+    flying(stream, frames_of(0, 117))
+    folder = killed(journal, tmp_path)
+    monkeypatch.setattr(node_journal, "RING_NS", 0)
+    monkeypatch.setattr(node_journal, "BUDGET_BYTES", 0)
+    node_journal.settle_left_over(folder)
+    notes = StreamNotes.load(folder / "journal" / "leg" / ("0" * 32))
+    assert notes is not None
+    assert notes.next_seq == 118
+    with closing(Journal.open(folder / "journal" / "leg" / ("0" * 32))) as found:
+        assert found.held == Intervals([(0, 117)])
+    assert not list(folder.rglob("in_flight"))
