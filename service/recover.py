@@ -19,13 +19,20 @@ import pyarrow.parquet as pq
 
 from devices.errors import FootTileError
 from service.recover_ends import with_ends
-from service.recover_sources import Stream, hello_of, open_streams, sources_of
+from service.recover_sources import (
+    Stream,
+    hello_of,
+    open_streams,
+    sources_of,
+    with_clock_logs,
+)
 from service.sealing import seal, write_events
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
 from storage.ledger import NO_END, StreamState, ledger_of
 from storage.losses import GIVEN_UP, NODE_RESTARTED, Losses
 from storage.node_journal import settle_left_over
+from storage.segment import UNREAD_SUFFIX
 from storage.session import Ledger, Part, Session, SessionFolder, new_session_id
 from storage.verify_session import EVENTS_NAME, verify_session
 
@@ -102,14 +109,13 @@ def recover(
     recovery = Recovery()
     sessions = SessionFolder(data / "sessions")
     recovery.removed += remove_stale_temporaries(data)
+    set_aside = _set_aside(data)
     if not (data / "nodes").is_dir():
         settle_left_over(data)  # a node's: what it had in flight when it was killed is there yet
     opened, recovery.problems = open_streams(data, tell)
-    recovery.cut = {
-        f"{node}/{boot_id}": stream.cut_bytes
-        for (node, boot_id), stream in opened.items()
-        if stream.cut_bytes
-    }
+    for path in sorted(_set_aside(data) - set_aside):
+        name = f"{path.parent.parent.name}/{path.parent.name}"
+        recovery.cut[name] = recovery.cut.get(name, 0) + path.stat().st_size
     known = []
     for session_id in sorted(sessions.ids()):
         try:
@@ -136,6 +142,7 @@ def _complete(
 ) -> Recovered:
     """Seal one session if that can be; say why not otherwise."""
     is_local = not (data / "nodes").is_dir()
+    session = with_clock_logs(session, streams)
     session = with_ends(session, streams, is_local=is_local, may_guess=is_local or give_up)
     if any(part.seq_last is None for part in session.parts):
         return Recovered(session, "waiting", "its node may still be recording it")
@@ -245,6 +252,11 @@ def _of_no_session(
                 )
             )
     return found
+
+
+def _set_aside(data: Path) -> set[Path]:
+    """What stood behind the last whole batch of a segment."""
+    return set(data.glob("journal/*/*/*" + UNREAD_SUFFIX))
 
 
 def _mend_events(session: Session, folder: Path) -> bool:

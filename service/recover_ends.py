@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from service.recover_sources import RATE_MAX_HZ, Stream, tail_max
+from service.recover_sources import RATE_MAX_HZ, Stream
 from storage.session import Part, Session
+from storage.stream_notes import unsynced_tail_max
 
 
 def with_ends(
@@ -36,7 +37,7 @@ def with_ends(
         if last is None and may_guess:
             known = stream.last if stream is not None else None
             last = max(part.seq_first - 1, -1 if known is None else known)
-            tail = stream.tail_max if stream is not None else tail_max(RATE_MAX_HZ)
+            tail = stream.tail_max if stream is not None else unsynced_tail_max(RATE_MAX_HZ)
             if not is_local and stream is not None:
                 tail = max(tail, _silent_frames(session, stream, last, offset_ns or 0))
             tails[part.boot_id] = max(tails.get(part.boot_id, 0), tail)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,21 +14,17 @@ from service.estimation.calibration import Calibration
 from service.estimation.tare import Tare
 from service.sealing import Sources
 from service.tares import TareHistory
+from storage.clock_log import ClockLog
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
 from storage.journal import Journal
-from storage.kernel import kernel_boot_id
 from storage.losses import CORRUPT, Losses
 from storage.segment import SUFFIX
-from storage.session import Session
-from storage.stream_notes import NOTES_FILE, StreamNotes
+from storage.session import ClockOffset, Session
+from storage.stream_notes import NOTES_FILE, StreamNotes, unsynced_tail_max
 
-SYNC_MAX_S = 0.5
-"""No frame is unsynced for longer (design.md 4)."""
-BATCH_MAX_S = 0.033
 RATE_MAX_HZ = 1000.0
 """Of a stream of which not even the description is left: no bus is faster."""
-_IN_FLIGHT = "in_flight"
 
 
 @dataclass
@@ -40,13 +35,13 @@ class Stream:
         journal: its frames.
         notes: its `stream.json`; None if there is none.
         losses: numbers that are lost, by reason.
-        cut_bytes: how much stood behind its last whole batch, and was set aside.
+        clock: measurements of its clock against the server's.
     """
 
     journal: Journal
     notes: StreamNotes | None
     losses: Losses
-    cut_bytes: int = 0
+    clock: tuple[ClockOffset, ...] = ()
 
     @property
     def last(self) -> int | None:
@@ -62,12 +57,7 @@ class Stream:
         notes = self.notes
         if notes is not None and notes.has_ended:
             return notes.unsynced_tail_max
-        in_flight = self.journal.folder / _IN_FLIGHT
-        nothing_waited = not in_flight.exists() or not in_flight.stat().st_size
-        taken_in = notes.kernel_boot_id if notes is not None else None
-        if taken_in is not None and taken_in == kernel_boot_id() and nothing_waited:
-            return 0  # the process was killed, and what it had appended the kernel has written
-        tail = tail_max(self.journal.info.nominal_rate_hz)
+        tail = unsynced_tail_max(self.journal.info.nominal_rate_hz)
         return max(tail, notes.unsynced_tail_max if notes is not None else 0)
 
     def note_losses(self) -> None:
@@ -102,11 +92,6 @@ class Stream:
                 return
 
 
-def tail_max(rate_hz: float) -> int:
-    """Frames that a power cut takes at most: half a second and one batch."""
-    return math.ceil(rate_hz * SYNC_MAX_S) + math.ceil(rate_hz * BATCH_MAX_S)
-
-
 def open_streams(
     data: Path, tell: Callable[[str], None]
 ) -> tuple[dict[tuple[str, str], Stream], list[str]]:
@@ -127,7 +112,6 @@ def open_streams(
             continue
         tell(f"journal {folder.parent.name}/{folder.name}")
         remove_stale_temporaries(folder)
-        before = _size_of(folder)
         try:
             journal = Journal.open(folder)
             notes = _notes_of(folder, problems)
@@ -137,7 +121,7 @@ def open_streams(
         losses = Losses(notes.lost if notes is not None else None)
         losses.add(journal.lost.all, CORRUPT)
         losses.found(journal.held)
-        stream = Stream(journal, notes, losses, before - _size_of(folder))
+        stream = Stream(journal, notes, losses, _clock_rows(folder))
         stream.note_losses()
         streams[(folder.parent.name, folder.name)] = stream
     return streams, problems
@@ -238,5 +222,16 @@ def _no_array(session: Session) -> ArrayInfo:
     )
 
 
-def _size_of(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.glob("*" + SUFFIX))
+def with_clock_logs(session: Session, streams: Mapping[tuple[str, str], Stream]) -> Session:
+    """The session with the clock rows that its streams' logs have beyond its own."""
+    rows = list(session.clock)
+    for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
+        stream = streams.get((session.node, boot_id))
+        if stream is not None:
+            known = max((r.t_mono_ns for r in rows if r.boot_id == boot_id), default=-1)
+            rows += [row for row in stream.clock if row.t_mono_ns > known]
+    return session.model_copy(update={"clock": tuple(rows)})
+
+
+def _clock_rows(folder: Path) -> tuple[ClockOffset, ...]:
+    return tuple(ClockLog(folder).rows())

@@ -30,7 +30,7 @@ from storage.kept_stream import EncodedBatch, KeptStream, opened
 from storage.kernel import kernel_boot_id
 from storage.losses import CORRUPT, DISK_FULL, DISK_SLOW, EVICTED, READ_ONLY
 from storage.schema import wire_schema
-from storage.stream_notes import StreamNotes
+from storage.stream_notes import PROMISE_S, StreamNotes, unsynced_tail_max
 from storage.wanted import ServerWants, Wanted
 from storage.wire import decode, encode
 
@@ -43,9 +43,6 @@ BUDGET_BYTES = 4 << 30
 WAITING_BYTES = 32 << 20
 """What may wait in memory for the disk: some minutes."""
 SYNC_S = 0.2
-PROMISE_S = 0.5
-"""No frame is longer unsynced, as long as the disk is not slower."""
-_BATCH_S = 0.03
 _TIDY_S = 2.0
 _AGAIN_S = 1.0
 _CLOSE_S = 10.0
@@ -175,6 +172,20 @@ class NodeJournal:
             self._wake.set()
             time.sleep(0.01)
         return True
+
+    def settle_here(self) -> None:
+        """The same without the thread, for recovery.
+
+        Raises:
+            StorageError: the disk does not take what was in flight.
+        """
+        self._work(at_once=True)
+        if not all(stream.is_settled for stream in self.streams):
+            raise StorageError(
+                "what was in flight cannot be written: " + "; ".join(self.troubles),
+                where=str(self.folder),
+                remedy="Free space on the disk, and run it again",
+            )
 
     # --- the writer's thread ----------------------------------------------------------------------
 
@@ -397,14 +408,7 @@ def settle_left_over(root: Path) -> None:
     """
     for folder in sorted(path for path in (root / "journal").glob("*") if path.is_dir()):
         journal = NodeJournal(root, folder.name, is_recovery=True)
-        journal.start()
-        settled = journal.settle()
-        troubles = journal.troubles
-        journal.close()
-        if not settled:
-            raise StorageError(
-                "what was in flight cannot be written: " + "; ".join(troubles), where=str(folder)
-            )
+        journal.settle_here()
 
 
 def taken_up(folder: Path, progress: Callable[[str], None] | None = None) -> KeptStream | None:
@@ -445,8 +449,7 @@ def taken_up(folder: Path, progress: Callable[[str], None] | None = None) -> Kep
                 stream.waiting_bytes += len(batch.payload)
         end = max(end, last + 1)
     elif left is None:
-        waited_s = max(PROMISE_S, stream.notes.sync_max_s) + _BATCH_S
-        tail = math.ceil(waited_s * stream.info.nominal_rate_hz) + 1
+        tail = unsynced_tail_max(stream.info.nominal_rate_hz, stream.notes.sync_max_s)
     stream.next_seq = end
     stream.has_ended = True
     stream.notes = stream.notes.model_copy(update={"unsynced_tail_max": tail})

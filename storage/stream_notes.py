@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -12,6 +13,19 @@ from storage.durable import write_whole
 from storage.losses import AsPairs
 
 NOTES_FILE = "stream.json"
+PROMISE_S = 0.5
+"""No frame of a node is longer unsynced, as long as its disk is not slower."""
+_BATCH_S = 0.033
+
+
+def unsynced_tail_max(rate_hz: float, waited_s: float = 0.0) -> int:
+    """How many frames a power cut takes at most: what waited for the disk, and one batch.
+
+    Args:
+        rate_hz: of the stream.
+        waited_s: the longest that frames are known to have waited for the disk.
+    """
+    return math.ceil(rate_hz * max(PROMISE_S, waited_s)) + math.ceil(rate_hz * _BATCH_S)
 
 
 class StreamNotes(BaseModel):

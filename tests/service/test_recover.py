@@ -18,14 +18,13 @@ from devices.errors import StorageError
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, FrameStatus
 from service import recover as recover_module
 from service.recover import Recovery, recover
-from service.recover_sources import tail_max
-from storage import kernel
 from storage.folder_lock import locked
+from storage.in_flight import InFlight
 from storage.journal import Journal
 from storage.losses import Losses
 from storage.session import ClockOffset, Event, Part, Session, SessionFolder
 from storage.session_file import SessionReader
-from storage.stream_notes import StreamNotes
+from storage.stream_notes import StreamNotes, unsynced_tail_max
 from storage.verify import as_dict, verdict_of, verify
 
 ID = "20200101T000000Z-00000a"
@@ -34,7 +33,7 @@ OTHER_BOOT = "b" * 32
 UTC_NS = 10**18
 PERIOD_NS = 2_000_000
 LEAD = 400
-TAIL = tail_max(500.0)
+TAIL = unsynced_tail_max(500.0)
 
 Frames = Callable[..., FrameBatch]
 
@@ -183,25 +182,29 @@ def test_without_tare_or_calibration_raw_frames_are_kept_and_it_says_so(
 
 
 def test_a_process_that_was_killed_on_a_machine_that_stayed_up_lost_nothing(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
 ) -> None:
-    folder = stream(
-        tmp_path, info_of(), (0, 99), closed=False, kernel_boot_id=kernel.kernel_boot_id()
-    )
-    kept = session(tmp_path)
+    folder = stream(tmp_path, info_of(), (0, 99), closed=False)
+    InFlight(folder, info_of()).close()
+    session(tmp_path)
     assert recover(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
     ledger = loaded(tmp_path).ledger
     assert ledger is not None
     assert ledger.complete
     assert verdict_of(verify(tmp_path)) == "complete"
-    # What it had in memory besides, nobody knows; nor after another start of the machine.
-    (folder / "in_flight").write_bytes(b"x")
-    SessionFolder(tmp_path / "sessions").save(kept)
-    assert recover(tmp_path).sessions[0].session.unsynced_tail_max == {BOOT: TAIL}
-    (folder / "in_flight").unlink()
-    monkeypatch.setattr("service.recover_sources.kernel_boot_id", lambda: "another")
-    SessionFolder(tmp_path / "sessions").save(kept)
-    assert recover(tmp_path).sessions[0].session.unsynced_tail_max == {BOOT: TAIL}
+
+
+def test_after_another_start_of_the_machine_what_was_in_flight_is_gone(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = stream(tmp_path, info_of(), (0, 99), closed=False)
+    InFlight(folder, info_of()).close()
+    monkeypatch.setattr("storage.in_flight.kernel_boot_id", lambda: "another")
+    session(tmp_path)
+    assert recover(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
+    ledger = loaded(tmp_path).ledger
+    assert ledger is not None
+    assert ledger.parts[0].unsynced_tail_max == TAIL
 
 
 def test_a_stream_whose_end_is_known_is_counted_to_it(
@@ -266,7 +269,7 @@ def test_a_session_of_which_nothing_reached_the_disk_is_sealed_as_that(tmp_path:
     (one,) = recover(tmp_path).sessions
     assert one.outcome == "sealed"
     assert one.ledger is not None
-    assert one.ledger.parts[0].unsynced_tail_max == tail_max(1000.0)
+    assert one.ledger.parts[0].unsynced_tail_max == unsynced_tail_max(1000.0)
     assert (loaded(tmp_path).frames, loaded(tmp_path).problem) == (0, "not one frame was recorded")
     assert recover(tmp_path).is_nothing
 
