@@ -153,10 +153,10 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
                 node.troubles, node.fault_counts = said.troubles, said.counts
                 server.tell_node(node)
             case Lost():
-                if said.boot_id != node.boot_id:
-                    raise HangUp(Close.MALFORMED, f"stream {said.boot_id[:80]!r} is not its own")
+                if said.boot_id not in node.order:
+                    raise HangUp(Close.MALFORMED, f"stream {said.boot_id[:80]!r} was not announced")
                 try:
-                    node.present.note_losses(said.lost)
+                    node.streams[said.boot_id].note_losses(said.lost)
                 except ValueError as error:
                     raise HangUp(Close.MALFORMED, f"lost: {error}") from error
             case Hello():

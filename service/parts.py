@@ -286,13 +286,13 @@ def _seq_at_stop(
     if session.stopped_t_ns is None or stream is None or journal is None or offset_ns is None:
         return None
     stop_t_ns = session.stopped_t_ns - offset_ns
-    last = journal.last_seq_until(stop_t_ns, at_least=part.seq_first)
-    if last is None:
+    found = stream.around(stop_t_ns, at_least=part.seq_first, waiting=waiting)
+    if found is None:
         return None
-    after = next(iter(journal.held.within(last + 1, NO_END)))[0]
-    gap = Intervals([(last + 1, after - 1)]) if after > last + 1 else Intervals()
-    if not gap:
+    last, after = found
+    if after == last + 1:
         return last
+    gap = Intervals([(last + 1, after - 1)])
     if waiting and common(gap, stream.may_come):
         return None
     # The stop lies among frames that are lost: by the rate, so many of them came after it.

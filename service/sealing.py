@@ -222,10 +222,12 @@ def sha256_of(path: Path) -> str:
 def _gathered(batches: Iterator[FrameBatch]) -> Iterator[FrameBatch]:
     """Fewer and longer batches: estimates of ten rows cost nearly what those of thousands do."""
     waiting: list[FrameBatch] = []
+    count = 0
     for batch in batches:
         waiting.append(batch)
-        if sum(len(b) for b in waiting) >= _GATHER_FRAMES:
+        count += len(batch)
+        if count >= _GATHER_FRAMES:
             yield FrameBatch.concatenate(waiting)
-            waiting = []
+            waiting, count = [], 0
     if waiting:
         yield FrameBatch.concatenate(waiting)

@@ -130,9 +130,9 @@ class Server:
             link.end(Close.RESTART, "the server is going down; connect again")
         await self.recorder.close()
         for node in self.nodes:
-            for journal in node.journals.values():
+            for stream in node.streams.values():
                 try:
-                    journal.close()
+                    stream.close()
                 except StorageError as error:
                     log.warning("%s", error)
         self._lock.close()

@@ -24,6 +24,7 @@ from storage.stream_notes import StreamNotes
 
 CLOCK_ROWS = 128
 """So many measurements of a clock are at hand for a pre-roll; all of them are in the log."""
+_AROUND_MAX = 32
 
 
 class KeptStream:
@@ -57,6 +58,7 @@ class KeptStream:
         self._forgotten = Intervals()
         self._guessed = False
         self._notes_on_disk: StreamNotes | None = None
+        self._around: dict[tuple[int, int], tuple[int, int]] = {}
         self._clock_log = ClockLog(folder)
         self._clock_unsynced = False
 
@@ -135,6 +137,42 @@ class KeptStream:
                 lost.add(numbers.without(self.may_come), reason)
         return lost
 
+    def around(self, t_ns: int, *, at_least: int, waiting: bool = False) -> tuple[int, int] | None:
+        """Numbers held next to an instant of the node's UTC: the last until it, the first after.
+
+        Asked again and again while frames between them are waited for; the journal's index is read
+        only when such frames have come.
+
+        Args:
+            t_ns: the instant.
+            at_least: earlier numbers do not count; the last is `at_least` - 1 if there is none.
+            waiting: look again only when all of those frames have come, or never will.
+
+        Returns:
+            Both; None while the stream has not passed the instant.
+
+        Raises:
+            DamagedFramesError: the frames that tell are damaged.
+        """
+        if self.journal is None:
+            return None
+        found, held = self._around.get((t_ns, at_least)), self.held
+        if found is not None:
+            last, after = found
+            ends = held.within(after, after) and (last < at_least or held.within(last, last))
+            missing = held.missing(last + 1, after - 1) if after > last + 1 else Intervals()
+            none_came = missing.count == after - last - 1
+            if ends and (none_came or (waiting and common(missing, self.may_come))):
+                return found
+        newest = self.journal.last_seq_until(t_ns, at_least=at_least)
+        if newest is None:
+            return None
+        found = newest, next(iter(held.within(newest + 1, NO_END)))[0]
+        if len(self._around) >= _AROUND_MAX:
+            self._around.clear()
+        self._around[t_ns, at_least] = found
+        return found
+
     def missing(self, newest: int) -> Intervals:
         """What should be here and is not, from the first frame known of up to `newest`."""
         if self._first_seq is None or newest < self._first_seq:
@@ -174,7 +212,8 @@ class KeptStream:
 
     def note_losses(self, lost: PairsByReason) -> None:
         """All that the node has lost of it by now."""
-        self._said(lost, next_seq=self.notes.next_seq)
+        notes = self.notes
+        self._said(lost, next_seq=notes.next_seq, unsynced_tail_max=notes.unsynced_tail_max)
 
     def take(self, frames: FrameBatch, payload: bytes, now_t_ns: int) -> None:
         """Keep frames that came.
@@ -232,6 +271,16 @@ class KeptStream:
         if self.journal is not None:
             for interval in self.journal.prune(before_t_ns, keep):
                 self._forgotten.add(*interval)
+
+    def close(self) -> None:
+        """Sync everything, and close the journal.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        self.sync()
+        if self.journal is not None:
+            self.journal.close()
 
     def delete(self) -> None:
         """Delete the journal."""

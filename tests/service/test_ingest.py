@@ -801,3 +801,82 @@ def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
     monkeypatch.setattr(running.server, "check_storage", lambda: None)
     assert closing(node.socket)[0] == 1012
     assert node.connect() == [(0, None)]
+
+
+def test_what_another_version_wrote_of_a_node_does_not_keep_the_server_from_starting(
+    running: Running, node: FakeNode
+) -> None:
+    node.connect()
+    node.send(10)
+    node.acknowledged(9)
+    running.stop()
+    path = running.data / "nodes" / "bench" / "hello.json"
+    path.write_text('{"type":"hello","protocol":1,"first_seq":0}')
+    running.start()
+    assert running.http.get("/nodes").json()["items"] == []
+    assert node.connect() == [(10, None)]
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"type": "stream", "boot_id": "f" * 32},
+        {"type": "stream", "boot_id": "../x"},
+        {"type": "lost", "boot_id": "f" * 32, "lost": {}},
+        {"type": "lost", "boot_id": None, "lost": {"evicted": [[5, 4]]}},
+    ],
+    ids=str,
+)
+def test_a_stream_that_was_not_announced_is_refused(
+    running: Running,
+    healthy: FakeNode,
+    node: FakeNode,
+    closing: Closing,
+    message: dict[str, Any],
+) -> None:
+    node.connect()
+    if message["boot_id"] is None:
+        message["boot_id"] = node.boot_id
+    node.socket.send(json.dumps(message))
+    code, _ = closing(node.socket)
+    assert code == 4004
+    assert_goes_on(running, healthy)
+
+
+@pytest.mark.parametrize("what", ["name", "tiles", "twice", "held"])
+def test_earlier_streams_that_cannot_be_are_refused(
+    running: Running, healthy: FakeNode, node: FakeNode, closing: Closing, what: str
+) -> None:
+    node.reboot()
+    [before] = node.before
+    changed: dict[str, Any] = {
+        "name": {"node": "other"},
+        "tiles": {"tiles": ()},
+        "twice": {"boot_id": node.boot_id},
+        "held": {},
+    }[what]
+    held = ((5, 4),) if what == "held" else ()
+    said = before.said(array_info=before.info.model_copy(update=changed), held=held)
+    node.open().send(node.hello(earlier=(said,)).model_dump_json())
+    assert closing(node.socket)[0] == 4001
+    assert_goes_on(running, healthy)
+
+
+def test_frames_of_an_earlier_stream_are_held_to_its_own_description(
+    running: Running, node: FakeNode, closing: Closing
+) -> None:
+    node.frames(20)
+    node.reboot()
+    node.tiles = 3
+    [before] = node.before
+    node.connect(earlier=(before.said(),))
+    node.send(10)
+    node.send_earlier(before, 0, 19)
+    node.send(10)
+    node.acknowledged(19)
+    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
+    assert_same(read_all(running.journal(before.boot_id)), before.sent[0])
+    assert running.node()["last_seq"] == 19
+    node.socket.send(json.dumps({"type": "stream", "boot_id": before.boot_id}))
+    node.socket.send(node.payload(node.frames(10)))  # of three tiles
+    assert closing(node.socket)[0] == 4004

@@ -316,3 +316,37 @@ def test_frames_that_are_damaged_here_may_come_again_while_the_node_has_them(tol
     assert not stream.lost
     told.connect(held=((5, 9),), next_seq=10)
     assert stream.lost.as_pairs() == {"corrupt": ((0, 4),)}
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    order=st.permutations(range(8)),
+    at=st.integers(-3, 8 * PER_MESSAGE + 3),
+    at_least=st.integers(0, 8 * PER_MESSAGE),
+    lost=st.integers(0, 7),
+)
+def test_what_is_held_next_to_an_instant_is_the_same_whether_it_was_asked_before_or_not(
+    order: list[int], at: int, at_least: int, lost: int, array_of: Array
+) -> None:
+    with TemporaryDirectory() as folder:
+        told = Told(Path(folder), array_of)
+        told.connect(held=((0, 8 * PER_MESSAGE - 1),), next_seq=8 * PER_MESSAGE)
+        t_ns = UTC_NS + 10**12 + at * PERIOD_NS
+        sent = Intervals()
+        for n in order:
+            if n == lost:
+                continue
+            told.take(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
+            sent.add(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
+            stream = told.node.present
+            found = stream.around(t_ns, at_least=at_least)
+            held = [seq for a, b in sent for seq in range(a, b + 1) if seq >= at_least]
+            until = max((seq for seq in held if seq <= at), default=at_least - 1)
+            after = min((seq for seq in held if seq > at), default=None)
+            assert found == (None if after is None else (until, after))
+            # While frames in between may come, it may answer as before, but says that they lack.
+            lazy = stream.around(t_ns, at_least=at_least, waiting=True)
+            assert (lazy is None) == (found is None)
+            if lazy is not None and lazy != found:
+                assert stream.may_come.within(lazy[0] + 1, lazy[1] - 1)
+        told.close()
