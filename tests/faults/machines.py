@@ -87,6 +87,7 @@ class Machine:
             **self.slow.environment(),
             "FAULTS_KILL_FILE": str(self.arm),
             "FAULTS_KILL": kill_at,
+            "FAULTS_PARENT": str(os.getpid()),
         }
         with self.said.open("ab") as said:
             self._process = subprocess.Popen(

@@ -25,7 +25,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -46,6 +46,7 @@ from tests.faults.stories import Story, draw_story  # noqa: E402
 
 ROUND_S = 150.0
 """A round that takes longer is ended and has failed."""
+_INTERRUPTED = 130
 
 
 @dataclass
@@ -124,8 +125,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     work = Path(tempfile.mkdtemp(prefix="foottile-rounds-"))
     results = []
     print("  seed  verdict  ledger    time    faults: recorded/lost/pending/tail of each part")
-    with ThreadPoolExecutor(options.jobs) as pool:
-        for result in pool.map(lambda seed: _in_a_process(seed, work, options.no_mount), seeds):
+    with ThreadPoolExecutor(options.jobs) as pool, _ended_together() as running:
+        for result in pool.map(
+            lambda seed: _in_a_process(seed, work, running, options.no_mount), seeds
+        ):
             results.append(result)
             print(result.line, flush=True)
             for finding in result.findings:
@@ -171,7 +174,22 @@ def _play_one(options: argparse.Namespace) -> int:
     return 1 if result.findings else 0
 
 
-def _in_a_process(seed: int, work: Path, no_mount: bool) -> Result:
+@contextmanager
+def _ended_together() -> Iterator[set[subprocess.Popen[str]]]:
+    """Rounds that are being played; Ctrl-C ends them, too, and begins no others."""
+    running: set[subprocess.Popen[str]] = set()
+    try:
+        yield running
+    except KeyboardInterrupt:
+        for process in list(running):
+            process.send_signal(signal.SIGINT)
+        print("ended", flush=True)
+        os._exit(_INTERRUPTED)
+
+
+def _in_a_process(
+    seed: int, work: Path, running: set[subprocess.Popen[str]], no_mount: bool
+) -> Result:
     """One round in a process group of its own, bounded in time."""
     folder = work / f"round-{seed}"
     command = [sys.executable, __file__, "--only", str(seed), "--folder", str(folder), "--json"]
@@ -182,6 +200,7 @@ def _in_a_process(seed: int, work: Path, no_mount: bool) -> Result:
         text=True,
         start_new_session=True,
     )
+    running.add(process)
     try:
         out, err = process.communicate(timeout=ROUND_S)
         return Result(**json.loads(out.splitlines()[-1]))
@@ -194,6 +213,8 @@ def _in_a_process(seed: int, work: Path, no_mount: bool) -> Result:
         return Result(seed, "?", [f"not finished within {ROUND_S:g} s"], folder=str(folder))
     except (IndexError, ValueError):
         return Result(seed, "?", [f"the harness failed: {err[-3000:]}"], folder=str(folder))
+    finally:
+        running.discard(process)
 
 
 def _again(seed: int) -> str:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import random
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -247,6 +248,30 @@ def test_a_kill_can_be_armed_while_the_process_runs(disk: Disk, run: Run, tmp_pa
     ended = run(BEGIN + code + "os.mkdir('c'); os.mkdir('d')", FAULTS_KILL_FILE=str(arm))
     assert ended.code == -signal.SIGKILL
     assert sorted(path.name for path in disk.root.iterdir()) == ["a", "b"]
+
+
+def test_a_process_under_test_does_not_outlive_a_harness_that_is_killed(
+    disk: Disk, run: Run
+) -> None:
+    code = """
+import os, signal, subprocess, sys
+sleeper = [sys.executable, "-c", "import time; print(1, flush=True); time.sleep(60)"]
+environment = {**os.environ, "FAULTS_PARENT": str(os.getpid())}
+child = subprocess.Popen(sleeper, env=environment, stdout=subprocess.PIPE)
+child.stdout.readline()
+print(child.pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    pid = int(run(code).out)
+    for _ in range(500):
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except (FileNotFoundError, ProcessLookupError):
+            return
+        if state == "Z":
+            return
+        time.sleep(0.01)
+    pytest.fail("it lives on")
 
 
 # --- the product's own protocol, and broken ones --------------------------------------------------

@@ -2,8 +2,10 @@
 
 import fault_boot_id
 import fault_clock
+import fault_orphan
 import fault_recorder
 
 fault_boot_id.install_from_environment()
 fault_clock.install_from_environment()
+fault_orphan.install_from_environment()
 fault_recorder.install_from_environment()
