@@ -1,0 +1,231 @@
+"""What keeping frames costs while they are taken, beside a bare write of the same bytes.
+
+Jobs take turns batch by batch, each with its own file on the same disk, and are measured by the CPU
+time of the thread that does them, calls of the kernel included. Paced, a batch comes every 25 ms as
+on a node, so that caches are as cold as there; otherwise one follows the other at once.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from recording_data import Recording, batches
+
+from devices.frames import FRAME_COLUMNS, FrameBatch
+from storage.in_flight import InFlight
+from storage.intervals import Intervals
+from storage.journal import Journal
+from storage.kept_stream import EncodedBatch
+from storage.node_journal import SYNC_S, NodeJournal
+from storage.schema import wire_schema
+from storage.wire import decode, encode
+
+SYNCS_PER_S = 4
+_IN_ORDER = ("seq", "t_mono_ns", "t_ns", "servo_counts", "servo_age_us", "reference_force_n",
+             "frame_status", "padc", "tadc", "sample_offset_us", "status")  # fmt: skip
+
+Batches = list[tuple[FrameBatch, bytes]]
+
+
+@dataclass
+class Cost:
+    """What one job took, an entry for each second of the recording.
+
+    Attributes:
+        cpu_s: CPU seconds, syncing included.
+        wall_s: as long as its thread was at it.
+        sync_cpu_s: of `cpu_s`, what syncing took.
+    """
+
+    cpu_s: list[float] = field(default_factory=list)
+    wall_s: list[float] = field(default_factory=list)
+    sync_cpu_s: list[float] = field(default_factory=list)
+
+    def begin_second(self) -> None:
+        """What is added from now on belongs to the next second."""
+        for values in (self.cpu_s, self.wall_s, self.sync_cpu_s):
+            values.append(0.0)
+
+    @contextmanager
+    def measured(self, *, syncing: bool = False) -> Iterator[None]:
+        """Add what the block takes."""
+        wall_s, cpu_s = time.perf_counter(), time.thread_time()
+        yield
+        spent_s = time.thread_time() - cpu_s
+        self.cpu_s[-1] += spent_s
+        self.wall_s[-1] += time.perf_counter() - wall_s
+        if syncing:
+            self.sync_cpu_s[-1] += spent_s
+
+    def beyond(self, other: Cost) -> list[float]:
+        """CPU seconds more than another job in the same second of the recording."""
+        return [mine - theirs for mine, theirs in zip(self.cpu_s, other.cpu_s, strict=True)]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is done with each batch, and four times a second."""
+
+    put: Callable[[FrameBatch, bytes], object]
+    sync: Callable[[], object]
+
+
+def encoded(recording: Recording) -> Batches:
+    """The recording in batches of 25 ms, each with its message."""
+    schema = wire_schema(recording.info)
+    return [(batch, encode(batch, schema)) for batch in batches(recording.frames)]
+
+
+def append_costs(recording: Recording, folder: Path, *, paced: bool) -> dict[str, Cost]:
+    """A bare write, the journal, and what goes with it, batch by batch in turns."""
+    schema = wire_schema(recording.info)
+    folder.mkdir()
+    with ExitStack() as stack:
+        journal = Journal(folder / "journal", recording.info)
+        stack.callback(journal.close)
+        raw = _raw_file(folder / "raw.arrows", stack)
+        costs = _in_turns(
+            {
+                "bare write": Job(lambda _, payload: os.write(raw, payload), lambda: os.fsync(raw)),
+                "Journal.append": Job(journal.append, journal.sync),
+                "decode (checks everything)": Job(lambda _, p: decode(p, schema), _nothing),
+                "encode": Job(lambda batch, _: encode(batch, schema), _nothing),
+            },
+            encoded(recording),
+            paced=paced,
+        )
+    _whole_seconds(costs)
+    return costs
+
+
+def node_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
+    """The node's journal with its thread, a session needing every frame; always at its pace."""
+    folder.mkdir()
+    with ExitStack() as stack:
+        raw = _raw_file(folder / "raw.arrows", stack)
+        keeper = NodeJournal(folder, "bench")
+        keeper.wanted.say_local({recording.info.boot_id: Intervals([(0, 2**61)])})
+        before = set(threading.enumerate())
+        keeper.start()
+        stack.callback(keeper.close)
+        (thread,) = set(threading.enumerate()) - before
+        clock = time.pthread_getcpuclockid(thread.ident or 0)
+        stream = keeper.begin(recording.info)
+
+        def put(batch: FrameBatch, payload: bytes) -> None:
+            keeper.put(stream, EncodedBatch(int(batch.seq[0]), int(batch.seq[-1]), payload))
+
+        bare, node = "bare write", "NodeJournal.put and its thread"
+        of_thread: list[float] = []
+        last_s = time.clock_gettime(clock)
+
+        def note_thread() -> None:
+            nonlocal last_s
+            now_s = time.clock_gettime(clock)
+            of_thread.append(now_s - last_s)
+            last_s = now_s
+
+        costs = _in_turns(
+            {
+                bare: Job(lambda _, payload: os.write(raw, payload), lambda: os.fsync(raw)),
+                node: Job(put, _nothing),
+            },
+            encoded(recording),
+            paced=True,
+            sync_s=SYNC_S,
+            each_second=note_thread,
+        )
+    # What was noted at the begin of a second is of the one before.
+    del of_thread[0]
+    _whole_seconds(costs, of_thread)
+    both = costs[node]
+    both.cpu_s = [put_s + thread_s for put_s, thread_s in zip(both.cpu_s, of_thread, strict=True)]
+    return costs
+
+
+def in_flight_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
+    """`InFlight.put` for each frame, as the loop that takes frames calls it."""
+    columns = [getattr(recording.frames, name).tolist() for name in _IN_ORDER]
+    rows = list(zip(*columns, strict=True))
+    keeper = InFlight(folder, recording.info)
+    tiles = recording.frames.tile_count
+    size = 4 + sum(
+        dtype(0).itemsize * (tiles if per_tile else 1) for dtype, per_tile in FRAME_COLUMNS.values()
+    )
+    bare = mmap.mmap(-1, size * 8192)
+    row_bytes = bytes(size)
+    costs = {"bare copy": Cost(), "InFlight.put": Cost()}
+    rate = round(recording.rate_hz)
+    for begin in range(0, len(rows) - rate + 1, rate):
+        for cost in costs.values():
+            cost.begin_second()
+        with costs["bare copy"].measured():
+            for seq in range(begin, begin + rate):
+                at = (seq % 8192) * size
+                bare[at : at + size] = row_bytes
+        with costs["InFlight.put"].measured():
+            for row in rows[begin : begin + rate]:
+                keeper.put(*row)
+    keeper.close()
+    bare.close()
+    return costs
+
+
+def _in_turns(
+    jobs: dict[str, Job],
+    every: Batches,
+    *,
+    paced: bool,
+    sync_s: float = 1.0 / SYNCS_PER_S,
+    each_second: Callable[[], None] | None = None,
+) -> dict[str, Cost]:
+    costs = {name: Cost() for name in jobs}
+    begin_ns = int(every[0][0].t_mono_ns[0])
+    begin_s = time.monotonic()
+    second, synced_s = -1, 0.0
+    for number, (batch, payload) in enumerate(every):
+        at_s = (int(batch.t_mono_ns[-1]) - begin_ns) * 1e-9
+        if int(at_s) > second:
+            if each_second is not None:
+                each_second()
+            second = int(at_s)
+            for cost in costs.values():
+                cost.begin_second()
+        if paced:
+            time.sleep(max(0.0, begin_s + at_s - time.monotonic()))
+        turn = list(jobs) if number % 2 == 0 else list(reversed(jobs))
+        for name in turn:
+            with costs[name].measured():
+                jobs[name].put(batch, payload)
+        if at_s - synced_s >= sync_s:
+            synced_s = at_s
+            for name in turn:
+                with costs[name].measured(syncing=True):
+                    jobs[name].sync()
+    if each_second is not None:
+        each_second()
+    return costs
+
+
+def _raw_file(path: Path, stack: ExitStack) -> int:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    stack.callback(os.close, descriptor)
+    return descriptor
+
+
+def _whole_seconds(costs: Mapping[str, Cost], *others: list[float]) -> None:
+    """Leave out the first second, which opens files, and the last, which is none."""
+    lists = [v for c in costs.values() for v in (c.cpu_s, c.wall_s, c.sync_cpu_s)]
+    for values in (*lists, *others):
+        del values[-1], values[0]
+
+
+def _nothing() -> None:
+    """Nothing is to be synced."""

@@ -1,0 +1,88 @@
+"""What sealing costs: the frames of a journal, raw or with estimates, into one Parquet file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow.parquet as pq
+from recording_data import Recording
+from recording_formats import flat_table, minute
+
+from service.calibrations import find_calibration
+from service.estimation.calibration import Calibration, paper_eq2_shape
+from service.sealing import SessionFrames, Sources, sha256_of
+from storage.journal import Journal
+from storage.session import Part, Session
+from storage.session_file import SessionWriter, parquet_options
+
+STATIC = ("unwrap", "static")
+LADDER = ("unwrap", "temperature", "gas", "static", "skew", "denoise", "hysteresis", "rubber")
+"""All models; `ambient` needs a bare reference tile, which no scene here has."""
+
+
+def sources_of(
+    journal: Journal, calibration: Calibration | None, models: tuple[str, ...] = ()
+) -> Sources:
+    """All that a journal holds, as a session."""
+    boot_id, last = journal.info.boot_id, journal.held.last
+    part = Part(boot_id=boot_id, seq_first=0, seq_last=last)
+    session = Session(
+        id="20200101T000000Z-000000",
+        name="benchmark",
+        node=journal.info.node,
+        state="sealing",
+        started_t_ns=0,
+        parts=(part,),
+        scene=journal.info.scene,
+    )
+    return Sources(
+        session=session,
+        info=journal.info.model_copy(update={"models": models}),
+        journals={boot_id: journal},
+        calibration=calibration,
+        problem=None if calibration is not None else "none was asked for",
+        tares=(),
+        notes={},
+    )
+
+
+def seal(sources: Sources, path: Path) -> int:
+    """Write the file and its hash, as `service.sealing.seal` does; how many frames it has."""
+    count = 0
+    frames = SessionFrames(sources)
+    with SessionWriter(path, sources.info, sources.notes) as writer:
+        for batch, columns in frames:
+            writer.append(batch, columns)
+            count += len(batch)
+    sha256_of(path)
+    if sources.calibration is not None:
+        assert frames.plan is not None, frames.problem
+    return count
+
+
+def jobs(
+    recording: Recording, folder: Path, *, with_ladder: bool
+) -> dict[str, Callable[[], object]]:
+    """Ways to seal the journal in `folder / "journal"`, and pyarrow's part of it alone."""
+    journal = Journal.open(folder / "journal")
+    table = flat_table(recording.frames)
+    rows = minute(recording.frames)
+
+    def bare() -> None:
+        options = parquet_options(table.schema)
+        pq.write_table(table, folder / "bare.parquet", row_group_size=rows, **options)
+
+    def sealing(name: str, calibration: Calibration | None, models: tuple[str, ...]) -> None:
+        count = seal(sources_of(journal, calibration, models), folder / f"{name}.parquet")
+        assert count == len(recording.frames)
+
+    found: dict[str, Callable[[], object]] = {
+        "pyarrow alone, from memory": bare,
+        "raw": lambda: sealing("raw", None, ()),
+        "with estimates, `static`": lambda: sealing("static", paper_eq2_shape(), STATIC),
+    }
+    if with_ladder:
+        bench = find_calibration("bench", recording.info.serials)
+        found["with estimates, the whole ladder"] = lambda: sealing("ladder", bench, LADDER)
+    return found

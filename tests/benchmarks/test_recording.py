@@ -1,0 +1,102 @@
+"""The benchmark of recordings still runs, and its bound is one. Nothing here is timed."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def recording(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module("recording")
+
+
+def tiny(recording: ModuleType, walk: Path) -> object:
+    return recording.Extent(
+        seconds=1.5, real_s=0.0, cost_s=3.0, sealed_s=1.5, sliced_s=10.0, turns=1, hours=0.001,
+        with_ladder=False, walk=walk,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["sizes", "writing", "sealing", "slices"])
+def test_every_section_gives_a_table(recording: ModuleType, tmp_path: Path, name: str) -> None:
+    title, measure = recording.SECTIONS[name]
+    lines = measure(tiny(recording, tmp_path / "nowhere"), tmp_path)
+    assert title
+    assert sum(line.startswith("|") for line in lines) > 3
+    assert not any("nan" in line for line in lines)
+
+
+def test_a_walk_that_is_not_there_is_said_to_be_missing(
+    recording: ModuleType, tmp_path: Path
+) -> None:
+    lines = recording.sizes(tiny(recording, tmp_path / "nowhere"), tmp_path)
+    assert any("a person's walk: not measured" in line for line in lines)
+
+
+def test_every_job_of_keeping_frames_is_measured_second_by_second(
+    recording: ModuleType, tmp_path: Path
+) -> None:
+    costs, data = recording.costs, recording.data
+    frames = data.lengthened(data.emulated(4, 1.5), 4.0, data.FULL_RATE_HZ)
+    for found in (
+        costs.append_costs(frames, tmp_path / "append", paced=False),
+        costs.in_flight_costs(frames, tmp_path / "flight"),
+    ):
+        for cost in found.values():
+            assert len(cost.cpu_s) >= 2
+            assert min(cost.cpu_s) > 0.0
+
+
+def test_a_long_journal_is_built_opened_read_and_sealed_whole(
+    recording: ModuleType, tmp_path: Path
+) -> None:
+    hours, data = recording.long_journal, recording.data
+    pattern = data.emulated(8, 1.5)
+    with hours.SessionWriter(tmp_path / "pattern.parquet", pattern.info, {}) as writer:
+        writer.append(pattern.frames, {})
+    steps = [hours.step(name, tmp_path, 0.001) for name in hours.STEPS]
+    assert {step.frames for step in steps} == {round(3.6 * data.FULL_RATE_HZ)}
+
+
+def test_sections_are_replaced_in_the_page_and_the_rest_of_it_stays(recording: ModuleType) -> None:
+    page = recording._replaced("# Title\n", "sizes", ["old"])
+    page = recording._replaced(page + "\nby hand\n", "sizes", ["new"])
+    assert "old" not in page
+    assert page.startswith("# Title\n")
+    assert page.index("new") < page.index("by hand")
+
+
+def test_the_code_of_the_bound_takes_what_such_numbers_must_take(recording: ModuleType) -> None:
+    code_bits = recording.entropy.code_bits
+    rng = np.random.default_rng(0)
+    n = 20_000
+    assert code_bits(np.full(n, 7)) == 0.0
+    for bits in (1, 4, 12, 20):
+        taken = code_bits(rng.integers(0, 2**bits, n)) / n
+        assert bits <= taken < bits + 0.3
+    sigma = 20.0  # of Gaussian noise: log2(sigma sqrt(2 pi e)) bits
+    taken = code_bits(np.rint(rng.normal(0.0, sigma, n)).astype(np.int64)) / n
+    assert 6.37 - 0.05 < taken < 6.37 + 0.1
+
+
+def test_the_bound_of_a_smooth_load_under_noise_is_little_more_than_the_noise(
+    recording: ModuleType,
+) -> None:
+    frames = recording.data.lengthened(recording.data.emulated(4, 1.5), 30.0).frames
+    n = len(frames)
+    slow = 400.0 + 100.0 * np.sin(np.arange(n)[:, None] / 500.0 + np.arange(4))
+    noise = np.random.default_rng(0).normal(0.0, 2.6, (n, 4))
+    counts = np.rint(slow + noise).astype(np.uint16)
+    bound = recording.entropy.bytes_per_frame(replace(frames, padc=counts))
+    noise_bits = np.log2(2.6 * np.sqrt(2.0 * np.pi * np.e))
+    assert noise_bits < bound["padc"] * 8 / 4 < noise_bits + 0.3
+    assert bound["t_ns"] < 0.05  # t_mono_ns says it already
