@@ -83,6 +83,8 @@ class Acquisition:
         is_new: the array was identified anew in a running node: the first frame says so.
         keeper: keeps frames while their batch is being filled. Readings that are out of range are
             flagged when a batch is whole, see `RangeFlag`.
+        lead_end_ns: frames before this instant are the lead of an emulated load; None: there is
+            none.
     """
 
     def __init__(
@@ -97,6 +99,7 @@ class Acquisition:
         servo: ServoSource | None = None,
         is_new: bool = False,
         keeper: FrameKeeper | None = None,
+        lead_end_ns: int | None = None,
     ) -> None:
         self.missed_slots = 0
         """Slots in which no frame was begun, because the loop was late."""
@@ -108,6 +111,7 @@ class Acquisition:
         self._servo = servo
         self._is_new = is_new
         self._keeper = keeper
+        self._lead_end_ns = lead_end_ns
         self._range = RangeFlag(tiles)
         self._next_seq = 0
         self._last_t_mono_ns = 0
@@ -174,6 +178,8 @@ class Acquisition:
             self._is_new = False
         if scan.bus_fault:
             frame_status |= FrameStatus.BUS_FAULT
+        if self._lead_end_ns is not None and t_mono_ns < self._lead_end_ns:
+            frame_status |= FrameStatus.LEAD
         servo_counts, servo_age_us = NO_SERVO_COUNTS, NO_SERVO_AGE
         if self._servo is not None:
             reading = self._servo.latest(t_mono_ns)

@@ -18,7 +18,7 @@ from service.steady import utc_ns
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
 from storage.kept_stream import KeptStream
-from storage.ledger import NO_END, StreamState, ledger_of
+from storage.ledger import NO_END, StreamState, ledger_of, lost_numbers
 from storage.node_journal import NodeJournal
 from storage.session import Part, Session, SessionFolder, new_session_id
 
@@ -155,7 +155,7 @@ class NodeRecording:
             ),
             problem=None if session.calibration else "the node had no calibration",
             tares=(),
-            notes=self._notes,
+            notes={**self._notes, "lost": lost_numbers(session.parts, states)},
         )
         sealed = seal(sources, folder, ledger)
         self._folder.save(sealed)

@@ -26,7 +26,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.link import PROTOCOL, Hello, Pairs, StreamNumbers
 from service.live_estimates import LiveEstimates
 from service.pipeline import Columns
-from service.streams import KeptStream, common
+from service.streams import ReceivedStream, common
 from service.tare_keeper import TareKeeper
 from service.tares import RecordedTare, TareHistory
 from storage.durable import make_folder, storage_errors, write_whole
@@ -62,7 +62,7 @@ class Node:
         self.hello = hello
         self.connected = False
         self.tares = TareHistory(folder / "tares.json")
-        self.streams: dict[str, KeptStream] = {}
+        self.streams: dict[str, ReceivedStream] = {}
         """By boot_id: those that are kept here, and those that it said it has."""
         self.has_spoken = False
         """Has it said hello since the server was started?"""
@@ -84,7 +84,7 @@ class Node:
         for path in sorted(journals.glob("*")):
             if _BOOT_ID.fullmatch(path.name):
                 try:
-                    self.streams[path.name] = KeptStream.open(path)
+                    self.streams[path.name] = ReceivedStream.open(path)
                 except FileFormatError as error:
                     log.warning("a journal is left out: %s", error)
         self.present = self._stream_of(self.info)
@@ -210,7 +210,7 @@ class Node:
         self._pace.clear()
 
     def take(
-        self, stream: KeptStream, payload: bytes, now_t_ns: int
+        self, stream: ReceivedStream, payload: bytes, now_t_ns: int
     ) -> tuple[int, int, list[Estimated]]:
         """One message of frames: kept, and estimated if it is news.
 
@@ -300,9 +300,9 @@ class Node:
             make_folder(self._folder)
         write_whole(self._folder / "hello.json", self.hello.model_dump_json().encode())
 
-    def _stream_of(self, info: ArrayInfo) -> KeptStream:
+    def _stream_of(self, info: ArrayInfo) -> ReceivedStream:
         if info.boot_id not in self.streams:
-            self.streams[info.boot_id] = KeptStream(self._journals_folder / info.boot_id, info)
+            self.streams[info.boot_id] = ReceivedStream(self._journals_folder / info.boot_id, info)
         return self.streams[info.boot_id]
 
     def _look_for_tare(self) -> None:

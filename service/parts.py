@@ -16,7 +16,7 @@ from devices.frames import ArrayInfo
 from service.estimation.tare import Tare
 from service.nodes import Node
 from service.steady import utc_ns
-from service.streams import KeptStream, common
+from service.streams import ReceivedStream, common
 from storage.intervals import Intervals
 from storage.ledger import NO_END, StreamState
 from storage.losses import GIVEN_UP
@@ -271,7 +271,7 @@ def _following(session: Session, node: Node) -> Iterable[str]:
 
 
 def _seq_at_stop(
-    session: Session, node: Node, stream: KeptStream | None, *, waiting: bool
+    session: Session, node: Node, stream: ReceivedStream | None, *, waiting: bool
 ) -> int | None:
     """The last frame of the open part's stream before the stop; None if it has not passed it.
 
@@ -301,7 +301,7 @@ def _seq_at_stop(
     return min(after - 1, max(last, after - late))
 
 
-def _at_end(session: Session, node: Node, stream: KeptStream | None) -> Session:
+def _at_end(session: Session, node: Node, stream: ReceivedStream | None) -> Session:
     """The session with its last part reaching to the end of a stream that has ended."""
     newest = stream.held.last if stream is not None else None
     beyond = 0 if newest is None else newest + 1
@@ -312,7 +312,7 @@ def _at_end(session: Session, node: Node, stream: KeptStream | None) -> Session:
     return ended(session, max(next_seq, beyond) - 1, tail=tail)
 
 
-def _silent_frames(session: Session, node: Node | None, stream: KeptStream | None) -> int:
+def _silent_frames(session: Session, node: Node | None, stream: ReceivedStream | None) -> int:
     """How many frames there may have been since the last that is known of, until now or the stop.
 
     The node does not say how its stream ended.

@@ -37,7 +37,6 @@ from service.link import (
     FromServer,
     Hello,
     Lost,
-    OpenPairs,
     Probe,
     Status,
     Stream,
@@ -218,7 +217,10 @@ class Publisher:
             return
         present, at = self._present(), hello.next_seq
         self._backlog = Backlog(
-            (lacks.boot_id, _before(lacks.numbers, hello, lacks.boot_id)) for lacks in welcome.lacks
+            # In the server's order: what sessions need comes first.
+            (lacks.boot_id, _before(pair, hello, lacks.boot_id))
+            for lacks in welcome.lacks
+            for pair in lacks.numbers
         )
         behind_frames = max(1, round(_LIVE_BEHIND_S * hello.array_info.nominal_rate_hz))
         chunk: deque[tuple[str, EncodedBatch]] = deque()
@@ -396,15 +398,12 @@ def _is_refusal(error: BaseException) -> bool:
     return isinstance(error, InvalidStatus)
 
 
-def _before(numbers: OpenPairs, hello: Hello, boot_id: str) -> Intervals:
+def _before(pair: tuple[int, int | None], hello: Hello, boot_id: str) -> Intervals:
     """What is lacking and was taken before hello; of the present stream all newer frames follow."""
     newest = hello.next_seq - 1 if boot_id == hello.array_info.boot_id else NO_END
-    found = Intervals()
-    for first, last in numbers:
-        end = newest if last is None else min(last, newest)
-        if end >= first:
-            found.add(first, end)
-    return found
+    first, last = pair
+    last = newest if last is None else min(last, newest)
+    return Intervals([(first, last)] if last >= first else ())
 
 
 def ingest_url(server: str) -> str:

@@ -32,7 +32,7 @@ from service.steady import utc_ns
 from service.streams import common
 from service.trash import Trash
 from storage.intervals import Intervals
-from storage.ledger import NO_END, ledger_of
+from storage.ledger import NO_END, ledger_of, lost_numbers
 from storage.session import Event, Ledger, Session, SessionFolder, new_session_id
 
 log = logging.getLogger("foottile.recorder")
@@ -366,7 +366,11 @@ class Recorder:
             calibration=calibration,
             problem=problem,
             tares=tares,
-            notes={"scene": session.scene_content, "emulated": node.hello.emulated},
+            notes={
+                "scene": session.scene_content,
+                "emulated": node.hello.emulated,
+                "lost": lost_numbers(session.parts, parts.states(session, node)),
+            },
         )
 
     def needed(self, node_name: str) -> dict[str, Intervals]:

@@ -6,11 +6,9 @@ import sys
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from devices.acquisition import Acquisition
 from devices.clock import SpinningClock, SystemClock, UtcAnchor
@@ -18,7 +16,7 @@ from devices.dynamixel import open_servo
 from devices.emulation.ground import press_on
 from devices.emulation.load_trace import CopTransform, LoadTrace
 from devices.errors import I2cError, TileSetupError
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus
+from devices.frames import ArrayInfo, FrameBatch
 from devices.i2c import open_bus
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
 from devices.scene import EMULATED, Scene, ServoScene
@@ -138,6 +136,7 @@ class Rig:
             servo=self._servo_source,
             is_new=is_new,
             keeper=self._in_flight,
+            lead_end_ns=self._lead_end_ns,
         )
 
     def batches(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
@@ -147,12 +146,7 @@ class Rig:
         the next call goes on with it.
         """
         while not stop():
-            for batch in self.acquisition.run(lambda: stop() or self._is_renewal_due()):
-                if self._lead_end_ns is None or int(batch.t_mono_ns[0]) >= self._lead_end_ns:
-                    yield batch
-                    continue
-                lead = np.where(batch.t_mono_ns < self._lead_end_ns, FrameStatus.LEAD, 0)
-                yield replace(batch, frame_status=batch.frame_status | lead.astype(np.uint8))
+            yield from self.acquisition.run(lambda: stop() or self._is_renewal_due())
             if not stop() and self._renew():
                 return
 

@@ -17,7 +17,7 @@ from service.live import Hub
 from service.nodes import Node, Nodes
 from service.recorder import Recorder
 from service.steady import utc_ns
-from service.streams import KeptStream
+from service.streams import ReceivedStream
 from service.trash import Trash, destroy
 from service.views import NodeView, SessionView
 from storage.durable import make_folder, remove_stale_temporaries, storage_errors, write_whole
@@ -39,7 +39,7 @@ class Link:
 
     def __init__(self, node: Node) -> None:
         self.node = node
-        self.stream: KeptStream = node.present
+        self.stream: ReceivedStream = node.present
         """Whose frames come."""
         self.wanted: Wanted | None = None
         """What sessions need, as the node was told last."""
@@ -211,7 +211,7 @@ class Server:
         streams = [stream for stream in node.streams.values() if stream.has_news]
         await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
 
-    async def _sync_stream(self, node: Node, stream: KeptStream) -> None:
+    async def _sync_stream(self, node: Node, stream: ReceivedStream) -> None:
         unsynced, stream.unsynced = stream.unsynced, Intervals()
         owed, stream.owed = stream.owed, Intervals()
         try:

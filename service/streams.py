@@ -27,7 +27,7 @@ CLOCK_ROWS = 128
 _AROUND_MAX = 32
 
 
-class KeptStream:
+class ReceivedStream:
     """One stream: what is here of it, what may come, what is lost.
 
     Args:
@@ -63,7 +63,7 @@ class KeptStream:
         self._clock_unsynced = False
 
     @classmethod
-    def open(cls, folder: Path) -> KeptStream:
+    def open(cls, folder: Path) -> ReceivedStream:
         """A stream that was kept before.
 
         Raises:
@@ -204,7 +204,10 @@ class KeptStream:
         self.node_has = Intervals(said.held)
         self.t_ns_first = said.t_ns_first
         self.missed_slots = said.missed_slots
-        self._said(said.lost, next_seq=said.next_seq, unsynced_tail_max=said.unsynced_tail_max)
+        # What a node lost with its power may have come here before.
+        beyond = max(0, (-1 if self.held.last is None else self.held.last) + 1 - said.next_seq)
+        tail = max(0, said.unsynced_tail_max - beyond)
+        self._said(said.lost, next_seq=said.next_seq + beyond, unsynced_tail_max=tail)
 
     def is_gone(self) -> None:
         """The node has not mentioned it: nothing more will come of it."""

@@ -142,11 +142,21 @@ class Journal:
                 raise failed
 
     def disown(self, doubtful: Intervals) -> None:
-        """Hold batches within `doubtful` no longer: they could not be synced, or are damaged."""
+        """Hold batches within `doubtful` no longer: they could not be synced, or are damaged.
+
+        A segment that was closed forgets them for ever, so that a copy that comes later is the one
+        that counts after a restart.
+        """
+        written = {writer.segment.path for writer in (*self._open, *self._closing)}
         for segment in self._segments:
+            if not any(segment.held.within(*interval) for interval in doubtful):
+                continue
             for record in segment.records():
                 if not Intervals([numbers(record)]).without(doubtful):
                     segment.held = segment.held.without(Intervals([numbers(record)]))
+            if segment.path not in written:
+                with suppress(StorageError, OSError):
+                    segment.rewrite_index()
         self._segments = [segment for segment in self._segments if segment.held]
         self._count_anew()
         with self._lock:

@@ -82,3 +82,24 @@ def ledger_of(
         parts=tuple(counted),
         missed_slots=sum(stream.missed_slots for stream in streams.values()),
     )
+
+
+def lost_numbers(
+    parts: tuple[Part, ...], streams: Mapping[str, StreamState]
+) -> dict[str, dict[str, list[tuple[int, int]]]]:
+    """Which numbers the ledger counts as lost, by boot_id and reason; for the sealed file."""
+    found: dict[str, Losses] = {}
+    for part in parts:
+        stream = streams.get(part.boot_id, StreamState())
+        if part.seq_last is None or part.seq_last < part.seq_first:
+            continue
+        gaps = stream.held.missing(part.seq_first, part.seq_last)
+        losses = found.setdefault(part.boot_id, Losses())
+        for reason, numbers in stream.lost.within(gaps).items():
+            losses.add(numbers, reason)
+        losses.add(gaps.without(stream.lost.all).without(stream.may_come), NODE_RESTARTED)
+    return {
+        boot_id: {reason: list(pairs) for reason, pairs in losses.as_pairs().items()}
+        for boot_id, losses in found.items()
+        if losses
+    }

@@ -284,9 +284,10 @@ class NodeJournal:
         try:
             if stream.journal is not None:
                 stream.journal.close()
-            if stream.next_seq:
+            # One that ended before its first frame is remembered if a server asks for it.
+            if stream.next_seq or self.wanted.numbers(stream.boot_id):
                 stream.save_notes(next_seq=stream.next_seq)
-            elif stream.folder.is_dir():  # it ended before its first frame
+            elif stream.folder.is_dir():
                 shutil.rmtree(stream.folder, ignore_errors=True)
         except StorageError:
             return

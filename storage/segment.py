@@ -97,6 +97,16 @@ class Segment:
         found = found[np.array(held, dtype=np.bool_)]
         return found[np.argsort(found["seq_first"], kind="stable")]
 
+    def rewrite_index(self) -> None:
+        """Have only what counts in the index, which says that it was closed.
+
+        Raises:
+            StorageError: the disk is full or not writable; the old index is still there then.
+        """
+        closing = _sealed(np.zeros(1, RECORD))
+        content = self.records().tobytes() + closing.tobytes()
+        write_whole(self.path.with_suffix(INDEX_SUFFIX), content)
+
     def delete(self) -> None:
         """Delete both files.
 

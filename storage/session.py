@@ -16,6 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import FileFormatError, UnknownError
+from storage.checked_json import with_check, without_check
 from storage.durable import make_folder, storage_errors, sync_folder, write_whole
 
 FRAMES_NAME = "frames.parquet"
@@ -150,7 +151,8 @@ class SessionFolder:
         folder = self.path(session.id)
         with storage_errors(folder):
             make_folder(folder)
-        write_whole(folder / "session.json", session.model_dump_json(indent=1).encode())
+        text = session.model_dump_json(indent=1).encode()
+        write_whole(folder / "session.json", with_check(text))
 
     def load(self, session_id: str) -> Session:
         """Read `session.json`.
@@ -161,7 +163,7 @@ class SessionFolder:
         """
         path = self.path(session_id) / "session.json"
         try:
-            return Session.model_validate_json(path.read_bytes())
+            return Session.model_validate_json(without_check(path.read_bytes()))
         except FileNotFoundError as error:
             raise UnknownError(f"no session {session_id!r}") from error
         except (OSError, ValidationError) as error:

@@ -431,6 +431,10 @@ def test_a_segment_that_was_closed_is_not_read_through_but_its_frames_are_checke
     assert (caught.value.seq_first, caught.value.seq_last) == (10, 19)
     journal.disown(Intervals([(10, 19)]))
     assert_holds(journal, {*range(10), *range(20, 30)})
+    # A copy that comes later is the one that counts, after a restart, too.
+    journal.append(part(10, 19))
+    journal.close()
+    assert_holds(reopened(tmp_path), set(range(30)))
 
 
 def test_a_truncation_exactly_at_a_batch_is_seen_by_the_index(tmp_path: Path) -> None:
