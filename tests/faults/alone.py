@@ -28,6 +28,8 @@ class Alone(Stage):
     nothing taken is.
     """
 
+    _known: frozenset[str] = frozenset()
+
     def begin(self) -> None:
         """Start it.
 
@@ -64,16 +66,22 @@ class Alone(Stage):
         def back() -> bool:
             if not self.node.is_alive:
                 raise RoundError(f"the node has ended: {self.node.said.read_text()[-2000:]}")
-            newest = self._boot_id()
-            if newest is None or newest == boot_before:
-                return False
-            columns = journal_of(self.node.root, newest).get(newest)
-            return columns is not None and len(columns["seq"]) >= _FRAMES
+            # A power cut touches old folders, too: what counts is a name that was not there.
+            for boot_id in self._boot_ids() - self._known:
+                columns = journal_of(self.node.root, boot_id).get(boot_id)
+                if columns is not None and len(columns["seq"]) >= _FRAMES:
+                    return True
+            return False
 
         wait_for("the node journals", back, _BACK_S)
+        self._known = self._boot_ids()
 
     def _set_up(self, small: Mapping[str, Path | None]) -> None:
         self._set_up_node(None, None, small.get("node"))
+
+    def _boot_ids(self) -> frozenset[str]:
+        folder = self.node.root / "journal" / NODE
+        return frozenset(path.name for path in folder.glob("*") if path.is_dir())
 
     def _boot_id(self) -> str | None:
         folders = [path for path in (self.node.root / "journal" / NODE).glob("*") if path.is_dir()]
@@ -100,6 +108,7 @@ class Alone(Stage):
                 ledger=session["ledger"] or {},
                 file=path.read_bytes() if path.exists() else None,
                 elsewhere=frozenset(set().union(*named) - streams),
+                lossy_elsewhere=any((other["ledger"] or {}).get("lossy") for other in sessions),
             )
 
     def _kill_and_recover(self, fault: Fault) -> None:

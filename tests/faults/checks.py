@@ -304,7 +304,8 @@ def _begins_with_the_start(facts: Facts) -> Iterator[str]:
 def _verified(facts: Facts, product: Product) -> Iterator[str]:
     if not product.verify:
         return
-    expected = _LOSSY if facts.ledger["lossy"] else _GOOD
+    is_lossy = facts.ledger["lossy"] or facts.lossy_elsewhere
+    expected = _LOSSY if is_lossy else _GOOD
     if facts.verify_code != expected:
         yield f"foottile verify ended with {facts.verify_code}: {facts.verify_said[-500:]}"
 

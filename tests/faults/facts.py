@@ -54,6 +54,8 @@ class Facts:
     """What was in the node's journal whenever it was looked at, by boot_id."""
     elsewhere: frozenset[str] = frozenset()
     """Streams that are parts of another session."""
+    lossy_elsewhere: bool = False
+    """Is another session in the same folder lossy?"""
     session: dict[str, Any] = field(default_factory=dict)
     """As the API gives it in the end."""
     ledger: dict[str, Any] = field(default_factory=dict)
