@@ -3,8 +3,8 @@
     python benchmarks/recording.py [--quick] [--only SECTION ...] [--out docs/results/recording.md]
 
 Every figure stands beside the bare library, or another format, that does the same job in the same
-run. CSV, HDF5 and Arrow files are written by their own libraries; h5py and hdf5plugin are optional.
-With `--out`, the sections that were run are replaced in that file, the others stay.
+run. CSV, HDF5 and Arrow files are written by their own libraries; h5py and hdf5plugin are the extra
+`bench`. With `--out`, the sections that were run are replaced in that file, the others stay.
 """
 
 from __future__ import annotations
@@ -393,13 +393,13 @@ def _replaced(page: str, name: str, body: Lines) -> str:
     return head + section + rest.partition(end)[2]
 
 
-def run(names: list[str], extent: Extent, parent: Path | None) -> dict[str, Lines]:
-    """The sections, each in a folder of its own that is deleted."""
+def run(names: list[str], extent: Extent) -> dict[str, Lines]:
+    """The sections, each in a temporary folder of its own; TMPDIR says on which disk."""
     done = {}
     for name in names:
         title, measure = SECTIONS[name]
         load = os.getloadavg()[0]
-        with tempfile.TemporaryDirectory(dir=parent) as folder:
+        with tempfile.TemporaryDirectory() as folder:
             lines = measure(extent, Path(folder))
         about = f"{machine()}, pyarrow {pa.__version__}. {_made_by(load)}"
         done[name] = [f"## {title}", "", about, "", *lines]
@@ -413,13 +413,12 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections; default: all")
     parser.add_argument("--hours", type=float, help="length of the long journal")
     parser.add_argument("--data", type=Path, help="folder of the measured walk")
-    parser.add_argument("--tmp", type=Path, help="disk to measure on; default: the temporary one")
     parser.add_argument("--out", type=Path, help="Markdown file whose sections are replaced")
     a = parser.parse_args()
     extent = QUICK if a.quick else Extent()
     given = {"hours": a.hours, "walk": a.data}
     extent = replace(extent, **{name: v for name, v in given.items() if v is not None})
-    done = run(a.only or list(SECTIONS), extent, a.tmp)
+    done = run(a.only or list(SECTIONS), extent)
     if a.out is not None:
         page = a.out.read_text("utf-8") if a.out.exists() else "# What a recording takes\n"
         for name, lines in done.items():

@@ -57,7 +57,8 @@ def walked(folder: Path, seconds: float) -> Recording | None:
     if not (folder / WALK).is_file():
         return None
     load = read_load_trace(folder / WALK)
-    return _simulated("8 tiles, a person's walk", load_scene("insole"), seconds, load)
+    there_s = float(load.time_s[-1] - load.time_s[0])  # after it the foot would hang in the air
+    return _simulated("8 tiles, a person's walk", load_scene("insole"), min(seconds, there_s), load)
 
 
 def on_real_clock(tiles: int, seconds: float) -> Recording:
