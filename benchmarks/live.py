@@ -49,7 +49,8 @@ def main() -> None:
         )
         assert server.stdout is not None
         url = server.stdout.readline().split()[-1].rstrip("/")
-        node = subprocess.Popen([*COMMAND, "node", f"--scene={scene}", f"--server={url}"])
+        options = [f"--scene={scene}", f"--server={url}", f"--journal={folder}/node"]
+        node = subprocess.Popen([*COMMAND, "node", *options])
         try:
             measure(url, server.pid, node.pid, seconds, Path(folder))
         finally:

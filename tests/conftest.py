@@ -18,3 +18,15 @@ def bench_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's cache folder for all tests: to press a tile on the emulated bench takes seconds."""
     given = os.environ.get("FOOTTILE_TEST_CACHE")
     return Path(given) if given else tmp_path_factory.mktemp("cache")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--soak", action="store_true", help="run what takes minutes, too")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--soak"):
+        return
+    for item in items:
+        if item.get_closest_marker("soak"):
+            item.add_marker(pytest.mark.skip(reason="takes minutes; run with --soak"))

@@ -51,6 +51,8 @@ STORIES = {
     "full node": ("full_disk_of_node",),
     "away": ("black_hole", "stop_while_away_and_kill_node"),
 }
+IN_EVERY_RUN = ("kills", "power", "flipped bits", "full node", "away", "alone, power")
+"""The others, and kills at every call, are played with `--soak`."""
 STORIES_ALONE = {
     "alone, kills": ("kill_node", "kill_acquisition", "kill_node_parent", "restart_node_twice"),
     "alone, power": ("power_node", "clock_of_node", "slow_fsync"),
@@ -85,7 +87,13 @@ def test_a_seed_is_a_story_and_nobody_is_asked_to_fill_a_disk_who_may_not() -> N
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("name", [*STORIES, *STORIES_ALONE])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in IN_EVERY_RUN else pytest.mark.soak)
+        for name in (*STORIES, *STORIES_ALONE)
+    ],
+)
 def test_a_chosen_round_is_good(name: str, tmp_path: Path, journal: Product) -> None:
     if name.startswith("full") and os.geteuid() != 0:
         pytest.skip("to mount a small disk one has to be root")
@@ -162,6 +170,7 @@ def stop_until_it_dies(stage: Stage, call: str) -> bool:
     return not server.is_alive
 
 
+@pytest.mark.soak
 @pytest.mark.real_time
 def test_a_server_killed_at_each_call_of_stopping_and_sealing_seals_all_the_same(
     stage: Stage,
@@ -175,6 +184,7 @@ def test_a_server_killed_at_each_call_of_stopping_and_sealing_seals_all_the_same
     judge(stage)
 
 
+@pytest.mark.soak
 @pytest.mark.real_time
 def test_a_power_cut_after_each_call_of_stopping_and_sealing_leaves_every_session_whole(
     stage: Stage, journal: Product
@@ -193,6 +203,7 @@ def test_a_power_cut_after_each_call_of_stopping_and_sealing_leaves_every_sessio
     judge(stage)
 
 
+@pytest.mark.soak
 @pytest.mark.real_time
 def test_a_server_killed_at_syncs_of_its_journal_keeps_what_it_has_promised(stage: Stage) -> None:
     for call in SYNCS:
@@ -216,7 +227,7 @@ def test_a_server_without_power_at_syncs_of_its_journal_keeps_what_it_has_promis
 
 
 @pytest.mark.real_time
-@pytest.mark.parametrize("how", ["killed", "power"])
+@pytest.mark.parametrize("how", [pytest.param("killed", marks=pytest.mark.soak), "power"])
 def test_a_node_killed_at_syncs_of_its_journal_loses_no_more_than_it_says(
     stage: Stage, journal: Product, how: str
 ) -> None:
