@@ -125,6 +125,8 @@ class Hello(_Message):
     """Why there is none."""
     earlier: tuple[EarlierStream, ...] = ()
     """Its streams before this one, oldest first."""
+    has_more: bool = False
+    """Are there still others, which did not fit? They are announced when these are delivered."""
 
 
 class StreamNumbers(_Message):

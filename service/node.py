@@ -153,7 +153,9 @@ class _Node:
             if message.error is not None:
                 await asyncio.to_thread(self._recording.stop)
                 raise message.error
-            await asyncio.to_thread(self._journal.settle)
+            if not await asyncio.to_thread(self._journal.settle):
+                self._report("the disk does not take the last frames: nothing is sealed yet")
+                return Outcome(is_lossy=self._options.record is not None)
             return await asyncio.to_thread(self._outcome)
         finally:
             for task in beside:
@@ -207,6 +209,12 @@ class _Node:
 
     def _hello(self) -> Hello:
         options, present = self._options, self._stream()
+        others = [stream for stream in self._journal.streams if stream is not present]
+        # As many as fit into a message, those that somebody waits for first.
+        waited_for = [stream for stream in others if self._journal.undelivered(stream)]
+        rest = [stream for stream in others if stream not in waited_for]
+        chosen = (*waited_for[:_EARLIER_MAX], *rest[-_EARLIER_MAX:])[:_EARLIER_MAX]
+        earlier = [stream for stream in others if stream in chosen]
         return Hello(
             protocol=PROTOCOL,
             array_info=present.info,
@@ -217,11 +225,8 @@ class _Node:
             emulated=options.rig.emulated,
             calibration=options.calibration,
             calibration_problem=options.calibration_problem,
-            earlier=tuple(
-                _earlier(stream)
-                for stream in self._journal.streams[-_EARLIER_MAX:]
-                if stream is not present
-            ),
+            earlier=tuple(_earlier(stream) for stream in earlier),
+            has_more=len(earlier) < len(others),
         )
 
     def _status(self, backlog_frames: int) -> Status:
@@ -273,8 +278,8 @@ class _Node:
         return sum(self._journal.undelivered(stream).count for stream in streams)
 
     def _seal_what_was_left(self) -> None:
-        self._journal.settle()
-        self._recording.seal_what_was_left()
+        if self._journal.settle():
+            self._recording.seal_what_was_left()
 
     def _outcome(self) -> Outcome:
         recorded, is_lossy = self._recording.stop()

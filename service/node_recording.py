@@ -55,6 +55,8 @@ class NodeRecording:
         self._notes = notes
         self._report = report
         self._session: Session | None = None
+        self._unreadable = False
+        """Is there a session of which nobody knows what it needs? Then everything is kept."""
         self._left_over = self._unfinished()
         self._need()
 
@@ -95,6 +97,7 @@ class NodeRecording:
             return None, False
         sealed = self._seal(session.model_copy(update={"stopped_t_ns": utc_ns()}))
         self._need()
+        self.seal_what_was_left()
         return sealed.id, sealed.ledger is None or not sealed.ledger.complete
 
     def seal_what_was_left(self) -> None:
@@ -187,6 +190,8 @@ class NodeRecording:
                 last = NO_END if part.seq_last is None else part.seq_last
                 if last >= part.seq_first:
                     needed.setdefault(part.boot_id, Intervals()).add(part.seq_first, last)
+        if self._unreadable:
+            needed = {stream.boot_id: Intervals([(0, NO_END)]) for stream in self._journal.streams}
         self._journal.wanted.say_local(needed)
 
     def _unfinished(self) -> list[Session]:
@@ -196,6 +201,7 @@ class NodeRecording:
                 session = self._folder.load(session_id)
             except FootTileError as error:
                 self._report(f"session {session_id} is left out: {error}")
+                self._unreadable = True
                 continue
             if session.state != "sealed" and session.node == self._node:
                 found.append(session)

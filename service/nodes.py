@@ -169,7 +169,7 @@ class Node:
         self.has_spoken, self.greeted_t_ns = True, now_t_ns
         for stream in self.streams.values():
             stream.owed = Intervals()
-            if stream.boot_id not in self.order:
+            if stream.boot_id not in self.order and not hello.has_more:
                 stream.is_gone()
         for earlier in hello.earlier:
             self._stream_of(earlier.array_info).has_ended(earlier)

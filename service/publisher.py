@@ -62,6 +62,7 @@ _REFUSED_BACK_OFF_S = (0.2, 5.0)
 _LIVE_BEHIND_S = 0.5
 """Frames that wait longer to be sent are no news: newer ones overtake them."""
 _CHUNK_FRAMES = 512
+_READ_AGAIN_S = 0.2
 _UNAUTHORISED = 401
 
 
@@ -195,7 +196,7 @@ class Publisher:
                 case Ack(boot_id=boot_id, seq_first=first, seq_last=last):
                     stream = self._streams().get(boot_id)
                     if stream is not None:
-                        stream.acknowledge(first, last)
+                        stream.acknowledge(self._server_id, first, last)
                 case Wanted():
                     self._take_wanted(message)
                 case Probe():
@@ -244,7 +245,8 @@ class Publisher:
             else:
                 # Reading may take long, beside a card that is being written.
                 if reading is None and self._backlog.count:
-                    reading = asyncio.create_task(asyncio.to_thread(self._next_chunk))
+                    chunk_of = asyncio.to_thread(self._next_chunk, self._backlog)
+                    reading = asyncio.create_task(chunk_of)
                     reading.add_done_callback(lambda _: self._news.set())
                 elif reading is not None and reading.done():
                     chunk += reading.result()
@@ -260,9 +262,9 @@ class Publisher:
             if self._flow.wants_mark:
                 await self._ask(socket)
 
-    def _next_chunk(self) -> list[tuple[str, EncodedBatch]]:
+    def _next_chunk(self, backlog: Backlog) -> list[tuple[str, EncodedBatch]]:
         """Batches of the backlog, read from where they are."""
-        wanted = self._backlog.next(_CHUNK_FRAMES)
+        wanted = backlog.next(_CHUNK_FRAMES)
         if wanted is None:
             return []
         boot_id, first, last = wanted
@@ -273,13 +275,18 @@ class Publisher:
                 found.extend(stream.batches(first, last))
             except DamagedFramesError as error:
                 self._damaged(stream, Intervals([(error.seq_first, error.seq_last)]))
-                self._backlog.done(boot_id, error.seq_first, error.seq_last)
+                backlog.done(boot_id, error.seq_first, error.seq_last)
                 last = max(first, error.seq_first) - 1
             except StorageError:
-                found = []  # evicted meanwhile, and counted
+                # Evicted meanwhile, and counted; what is still there is tried again.
+                found = []
+                for gone in Intervals([(first, last)]).without(stream.held):
+                    backlog.done(boot_id, *gone)
+                time.sleep(_READ_AGAIN_S)
+                return []
         if last >= first:
             # Batches are sent whole, and may reach further than what was asked for.
-            self._backlog.done(boot_id, first, max([last, *(b.seq_last for b in found[-1:])]))
+            backlog.done(boot_id, first, max([last, *(b.seq_last for b in found[-1:])]))
         return [(boot_id, batch) for batch in found]
 
     async def _watch(self, socket: ClientConnection) -> None:
@@ -343,14 +350,16 @@ class Publisher:
         return None
 
     async def _send_status(self, socket: ClientConnection) -> None:
-        present = self._present()
-        said = self._said_hello.lost if self._said_hello is not None else {}
+        hello = self._said_hello
+        said = {} if hello is None else {hello.array_info.boot_id: hello.lost}
+        said |= {} if hello is None else {s.array_info.boot_id: s.lost for s in hello.earlier}
         while True:
-            with present.lock:
-                lost = present.lost.as_pairs()
-            if lost != said:
-                said = lost
-                await socket.send(say(Lost(boot_id=present.boot_id, lost=lost)))
+            for boot_id, stream in self._streams().items():
+                with stream.lock:
+                    lost = stream.lost.as_pairs()
+                if boot_id in said and lost != said[boot_id]:
+                    said[boot_id] = lost
+                    await socket.send(say(Lost(boot_id=boot_id, lost=lost)))
             await socket.send(say(self._status(self._backlog.count)))
             await asyncio.sleep(STATUS_EVERY_S)
 

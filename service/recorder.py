@@ -73,11 +73,14 @@ class Recorder:
         self._sealing: dict[str, asyncio.Task[None]] = {}
         self._again_after: dict[str, float] = {}
         self._not_sealed: dict[str, str] = {}
+        self._unreadable = trash.has_unreadable
+        """Is there a session of which nobody knows what it needs? Then nothing is given up."""
         for session_id in folder.ids():
             try:
                 self._sessions[session_id] = self._with_clock(folder.load(session_id))
             except FootTileError as error:
                 log.warning("session %s is left out: %s", session_id, error)
+                self._unreadable = True
 
     def all(self) -> list[Session]:
         """All sessions, newest first."""
@@ -379,6 +382,8 @@ class Recorder:
         What is in the trash can be had back, so it needs its frames as well.
         """
         node = self._nodes.find(node_name)
+        if self._unreadable and node is not None:
+            return {boot_id: Intervals([(0, NO_END)]) for boot_id in node.streams}
         return parts.by_stream(
             parts.needed(session, node)
             for session in (*self._sessions.values(), *self.trash.all())
@@ -402,12 +407,22 @@ class Recorder:
         except DamagedFramesError as error:
             self._disown(session, error)
             return
-        if session.state == "pending":
-            unknown = session.parts[-1].seq_last is None
-            if not unknown and not any(p.pending for p in self.ledger(session_id).parts):
-                session = self._keep(session.model_copy(update={"state": "sealing"}))
+        if session.state == "pending" and self._is_all_here(session):
+            session = self._keep(session.model_copy(update={"state": "sealing"}))
         if session.state == "sealing" and session_id not in self._sealing:
             self._sealing[session_id] = asyncio.create_task(self._seal(session_id))
+
+    def _is_all_here(self, session: Session) -> bool:
+        """Is nothing more to come, and what is here on the disk?"""
+        if session.parts[-1].seq_last is None:
+            return False
+        node = self._nodes.find(session.node)
+        for part in session.parts:
+            stream = node.streams.get(part.boot_id) if node is not None else None
+            last = NO_END if part.seq_last is None else part.seq_last
+            if stream is not None and stream.unsynced.within(part.seq_first, last):
+                return False
+        return not any(part.pending for part in self.ledger_of(session).parts)
 
     def _follow(self, session: Session) -> Session:
         """The session as far as its node's streams go by now."""
@@ -436,6 +451,11 @@ class Recorder:
         try:
             sources = self.sources(session_id)
             ledger = self.ledger(session_id)
+            if not self._is_all_here(self._sessions[session_id]):
+                # A disk did not keep what it had taken: these frames have to come once more.
+                session = self._sessions[session_id]
+                self._keep(session.model_copy(update={"state": "pending"}))
+                return
             sealed = await asyncio.to_thread(seal, sources, self.folder.path(session_id), ledger)
             # Name, notes and events may have changed meanwhile.
             now = self._sessions[session_id]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from service.recover_sources import RATE_MAX_HZ, Stream
+from storage.ledger import NO_END
 from storage.session import Part, Session
 from storage.stream_notes import unsynced_tail_max
 
@@ -33,7 +34,7 @@ def with_ends(
             continue
         stream = streams.get((session.node, part.boot_id))
         offset_ns = 0 if is_local else _server_minus_node_ns(session, part.boot_id)
-        last = _end_at_stop(session, part, stream, offset_ns)
+        last = _end_at_stop(session, part, stream, offset_ns, may_guess=may_guess)
         if last is None and may_guess:
             known = stream.last if stream is not None else None
             last = max(part.seq_first - 1, -1 if known is None else known)
@@ -50,13 +51,28 @@ def with_ends(
 
 
 def _end_at_stop(
-    session: Session, part: Part, stream: Stream | None, offset_ns: int | None
+    session: Session,
+    part: Part,
+    stream: Stream | None,
+    offset_ns: int | None,
+    *,
+    may_guess: bool,
 ) -> int | None:
-    """The last frame before the session was stopped, if its stream has passed that."""
+    """The last frame before the session was stopped, if its stream has passed that.
+
+    If frames around the stop are missing, it is not known which was the last: then all of them
+    count, if that may be guessed. The newest frames come first, and the others behind them.
+    """
     if session.stopped_t_ns is None or offset_ns is None or stream is None:
         return None
     until_t_ns = session.stopped_t_ns - offset_ns
-    return stream.journal.last_seq_until(until_t_ns, at_least=part.seq_first)
+    last = stream.journal.last_seq_until(until_t_ns, at_least=part.seq_first)
+    if last is None:
+        return None
+    after = next(iter(stream.journal.held.within(last + 1, NO_END)), None)
+    if after is None or after[0] == last + 1:
+        return last
+    return after[0] - 1 if may_guess else None
 
 
 def _server_minus_node_ns(session: Session, boot_id: str) -> int | None:

@@ -23,6 +23,8 @@ class Trash:
     def __init__(self, folder: Path) -> None:
         self.folder = SessionFolder(folder)
         self._sessions: dict[str, Session] = {}
+        self.has_unreadable = False
+        """Is there one that cannot be read?"""
         for doomed in folder.glob(DOOMED_PREFIX + "*"):
             shutil.rmtree(doomed, ignore_errors=True)
         for session_id in self.folder.ids():
@@ -30,6 +32,7 @@ class Trash:
                 self._sessions[session_id] = self.folder.load(session_id)
             except FootTileError as error:
                 log.warning("session %s in the trash is left out: %s", session_id, error)
+                self.has_unreadable = True
 
     def __contains__(self, session_id: str) -> bool:
         return session_id in self._sessions

@@ -40,7 +40,8 @@ class ClockLog:
             StorageError: the disk is full or not writable. Earlier rows are untouched.
         """
         with storage_errors(self.path):
-            make_folder(self.path.parent)
+            if not self.path.parent.is_dir():
+                make_folder(self.path.parent)
             descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
             try:
                 end = os.fstat(descriptor).st_size

@@ -154,7 +154,9 @@ class Journal:
             for record in segment.records():
                 if not Intervals([numbers(record)]).without(doubtful):
                     segment.held = segment.held.without(Intervals([numbers(record)]))
-            if segment.path not in written:
+            if segment.path in written:
+                segment.is_doubtful = True
+            else:
                 with suppress(StorageError, OSError):
                     segment.rewrite_index()
         self._segments = [segment for segment in self._segments if segment.held]
@@ -190,8 +192,14 @@ class Journal:
             for segment in list(self._segments):
                 first, last = segment.span
                 if first < end and last >= at:
-                    with storage_errors(segment.path):
+                    try:
                         records = segment.records()
+                    except OSError as error:
+                        if isinstance(error, FileNotFoundError) and segment not in self._segments:
+                            continue  # pruned meanwhile
+                        raise StorageError(
+                            f"cannot be read: {error}", where=str(segment.path), errno=error.errno
+                        ) from error
                     inside = (records["seq_first"] >= at) & (records["seq_first"] < end)
                     found += [(numbers(r), segment.path, r) for r in records[inside]]
             found.sort(key=lambda item: item[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
 from storage.intervals import Intervals
 from storage.journal import Journal
-from storage.losses import Losses
+from storage.losses import NODE_BUSY, Losses
 from storage.schema import wire_schema
 from storage.stream_notes import StreamNotes
 from storage.wire import decode
@@ -50,8 +51,8 @@ class KeptStream:
         self.journal = journal
         """None as long as the disk does not let it be begun."""
         self.lost = Losses(notes.lost)
-        self.acked = Intervals()
-        """Numbers that are on a server's disk."""
+        self.acked_by: dict[str, Intervals] = {}
+        """Numbers that are on a server's disk, by server."""
         self.next_seq = notes.next_seq or 0
         """The number of the next frame to come."""
         self.missed_slots = notes.missed_slots
@@ -65,6 +66,8 @@ class KeptStream:
         self.has_ended = notes.has_ended
         self.is_settled = notes.has_ended
         """Is all of it on disk, with a note of where it ended?"""
+        self.waiting_since_s: float | None = None
+        """Since when the oldest frame that is not surely on the disk is here."""
         self._recent: deque[EncodedBatch] = deque()
         self._recent_bytes = 0
         if journal is not None:
@@ -94,6 +97,10 @@ class KeptStream:
     def put(self, batch: EncodedBatch, missed_slots: int) -> None:
         """Take in the newest frames."""
         with self.lock:
+            if batch.seq_first > self.next_seq:  # the node was too busy to take them over
+                self.lost.add(Intervals([(self.next_seq, batch.seq_first - 1)]), NODE_BUSY)
+            if self.waiting_since_s is None:
+                self.waiting_since_s = time.monotonic()
             self.waiting.append(batch)
             self.waiting_bytes += len(batch.payload)
             self._recent.append(batch)
@@ -103,10 +110,18 @@ class KeptStream:
             self.next_seq = batch.seq_last + 1
             self.missed_slots = missed_slots
 
-    def acknowledge(self, seq_first: int, seq_last: int) -> None:
+    @property
+    def acked(self) -> Intervals:
+        """Numbers that are on any server's disk."""
+        servers = list(self.acked_by.values())
+        if len(servers) == 1:
+            return Intervals(servers[0])
+        return Intervals(pair for numbers in servers for pair in numbers)
+
+    def acknowledge(self, server_id: str, seq_first: int, seq_last: int) -> None:
         """These frames are on a server's disk."""
         with self.lock:
-            self.acked.add(seq_first, seq_last)
+            self.acked_by.setdefault(server_id, Intervals()).add(seq_first, seq_last)
             self.lost.found(Intervals([(seq_first, seq_last)]))
 
     def recent(self, seq: int) -> list[EncodedBatch]:
@@ -145,10 +160,25 @@ class KeptStream:
                 yield from _on_disk(journal, first, last)
         yield from memory[at:]
 
-    def lose(self, numbers: Intervals, reason: str) -> None:
-        """Note frames that are not kept any more; those that a server has are not lost."""
+    def lose(self, numbers: Intervals, reason: str, needed_here: Intervals | None = None) -> None:
+        """Note frames that are not kept any more.
+
+        Args:
+            numbers: which ones. Those that a server has are not lost,
+            reason: why.
+            needed_here: but for these, which the node's own session needs.
+        """
         with self.lock:
-            self.lost.add(numbers.without(self.acked), reason)
+            elsewhere = self.acked
+            if needed_here is not None:
+                elsewhere = elsewhere.without(needed_here)
+            self.lost.add(numbers.without(elsewhere), reason)
+
+    def forget_recent(self) -> None:
+        """It has ended: nothing of it is news any more."""
+        with self.lock:
+            self._recent.clear()
+            self._recent_bytes = 0
 
     def save_notes(self, **changes: object) -> None:
         """Write down what is known of it.

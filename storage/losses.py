@@ -9,6 +9,7 @@ from storage.intervals import Intervals
 DISK_FULL = "disk_full"
 READ_ONLY = "read_only"
 DISK_SLOW = "disk_slow"
+NODE_BUSY = "node_busy"
 EVICTED = "evicted"
 CORRUPT = "corrupt"
 NODE_RESTARTED = "node_restarted"

@@ -15,13 +15,13 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from devices.acquisition import RangeFlag
 from devices.errors import StorageError
-from devices.frames import ArrayInfo
+from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import make_folder, storage_errors
 from storage.in_flight import delete_in_flight, read_in_flight
 from storage.intervals import Intervals
@@ -46,6 +46,7 @@ SYNC_S = 0.2
 _TIDY_S = 2.0
 _AGAIN_S = 1.0
 _CLOSE_S = 10.0
+_MESSAGE_FRAMES = 64
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -78,7 +79,7 @@ class NodeJournal:
         self._trouble: tuple[str, str] | None = None
         """Reason and words, while the disk takes nothing."""
         self._tried_s = -math.inf
-        self._tidied_s = self._synced_s = -math.inf
+        self._tidied_s = self._synced_s = self._weighed_s = -math.inf
         self._began_s = time.monotonic()
         self._wants_changed = False
         self._damaged: deque[tuple[KeptStream, Intervals]] = deque()
@@ -135,14 +136,15 @@ class NodeJournal:
     def put(self, stream: KeptStream, batch: EncodedBatch, missed_slots: int = 0) -> None:
         """Keep the newest frames; returns at once."""
         stream.put(batch, missed_slots)
-        while stream.waiting_bytes > WAITING_BYTES:
+        while sum(each.waiting_bytes for each in self.streams) > WAITING_BYTES:
             with stream.lock:
                 if len(stream.waiting) < 2:  # the writer has taken them meanwhile
                     break
                 oldest = stream.waiting.popleft()
                 stream.waiting_bytes -= len(oldest.payload)
             trouble = self._trouble
-            stream.lose(oldest.numbers, trouble[0] if trouble is not None else DISK_SLOW)
+            reason = trouble[0] if trouble is not None else DISK_SLOW
+            stream.lose(oldest.numbers, reason, self.wanted.local(stream.boot_id))
         self._wake.set()
 
     def want(self, server_id: str, wants: ServerWants) -> None:
@@ -159,9 +161,9 @@ class NodeJournal:
     def undelivered(self, stream: KeptStream) -> Intervals:
         """What sessions need of a stream and no server has yet, of what is held."""
         held = stream.held
-        wanted = self.wanted.numbers(stream.boot_id)
-        found = Intervals(pair for first, last in wanted for pair in held.within(first, last))
-        return found.without(stream.acked)
+        with stream.lock:
+            wanted = self.wanted.undelivered(stream.boot_id, stream.acked_by)
+        return Intervals(pair for first, last in wanted for pair in held.within(first, last))
 
     def settle(self, timeout_s: float = _CLOSE_S) -> bool:
         """Wait until every stream that has ended is on disk to its end; did it get there?"""
@@ -259,7 +261,10 @@ class NodeJournal:
     def _sync(self, stream: KeptStream) -> None:
         if stream.journal is None or not stream.unsynced:
             return
-        begin_s = time.monotonic()
+        with stream.lock:
+            since_s, stream.waiting_since_s = stream.waiting_since_s, None
+            if stream.waiting:  # came since the others were written
+                stream.waiting_since_s = time.monotonic()
         try:
             stream.journal.sync()
         except StorageError:
@@ -270,9 +275,10 @@ class NodeJournal:
                 stream.waiting.extendleft(reversed(stream.unsynced))
                 stream.waiting_bytes += sum(len(batch.payload) for batch in stream.unsynced)
             stream.unsynced = []
+            stream.waiting_since_s = since_s
             return
         stream.unsynced = []
-        took_s = SYNC_S + time.monotonic() - begin_s
+        took_s = 0.0 if since_s is None else time.monotonic() - since_s
         if took_s > max(PROMISE_S, stream.notes.sync_max_s):
             with suppress(StorageError):
                 stream.save_notes(sync_max_s=took_s)
@@ -280,6 +286,8 @@ class NodeJournal:
     def _settle(self, stream: KeptStream) -> None:
         """Note where a stream has ended, once all of it is on disk."""
         if stream.is_settled or not stream.has_ended or stream.waiting or stream.unsynced:
+            return
+        if self._rescue(stream):
             return
         try:
             if stream.journal is not None:
@@ -292,14 +300,30 @@ class NodeJournal:
         except StorageError:
             return
         delete_in_flight(stream.folder)
+        stream.forget_recent()
         stream.is_settled = True
+
+    def _rescue(self, stream: KeptStream) -> bool:
+        """Take over what acquisition had taken when it was killed; was there anything?"""
+        try:
+            left = read_in_flight(stream.folder)
+        except StorageError:
+            return False
+        if left is None or left[1] is None or int(left[1].seq[-1]) < stream.next_seq:
+            return False
+        frames = left[1]
+        rows = frames.rows(max(0, stream.next_seq - int(frames.seq[0])), len(frames))
+        RangeFlag(stream.info.tiles).flag(rows)
+        for batch in encoded(rows, stream.info):
+            stream.put(batch, stream.missed_slots)
+        return True
 
     def _tidy(self) -> None:
         while self._damaged:
             stream, numbers = self._damaged.popleft()
             if stream.journal is not None:
                 stream.journal.disown(numbers)
-                stream.lose(numbers, CORRUPT)
+                stream.lose(numbers, CORRUPT, self.wanted.local(stream.boot_id))
         if self._wants_changed:
             self._wants_changed = False
             try:
@@ -308,12 +332,12 @@ class NodeJournal:
                 self._wants_changed = True
         if not self._may_drop:
             return
-        past_ring = time.monotonic() - self._began_s > RING_NS * 1e-9
         for stream in list(self.streams):
             journal, is_present = stream.journal, not stream.has_ended
             if journal is None:
                 continue
             keep = self._keep(stream)
+            past_ring = self._is_past_ring(stream)
             newest = stream.recent(max(0, stream.next_seq - 1))
             before_ns: int | None = None
             if is_present and newest:
@@ -335,12 +359,27 @@ class NodeJournal:
                     stream.save_notes()
                     self._lost_before[stream.boot_id] = lost
 
+    def _is_past_ring(self, stream: KeptStream) -> bool:
+        """Has a stream that ended outlasted the ring, in this process or since it was written?"""
+        ring_s = RING_NS * 1e-9
+        if time.monotonic() - self._began_s > ring_s:
+            return True
+        try:
+            written_s = max(path.stat().st_mtime for path in stream.folder.iterdir())
+        except (OSError, ValueError):
+            return False
+        return stream.is_settled and time.time() - written_s > ring_s
+
     def _keep(self, stream: KeptStream) -> Intervals:
         """What must not be deleted."""
         with stream.lock:
-            return self.wanted.numbers(stream.boot_id).without(stream.acked)
+            return self.wanted.unmet(stream.boot_id, stream.acked_by)
 
     def _keep_to_budget(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._weighed_s < _AGAIN_S and self._trouble is None:
+            return
+        self._weighed_s = now_s
         while self._size_bytes() > self._budget_bytes:
             if not self._evict():
                 raise StorageError(
@@ -441,11 +480,8 @@ def taken_up(folder: Path, progress: Callable[[str], None] | None = None) -> Kep
         first, last = int(rescued.seq[0]), int(rescued.seq[-1])
         if first > end:  # more waited for the disk than was in flight
             stream.lost.add(Intervals([(end, first - 1)]), DISK_SLOW)
-        schema = wire_schema(stream.info)
         for a, b in held.missing(max(first, _oldest(held)), last):
-            for begin in range(a, b + 1, 64):
-                rows = rescued.rows(begin - first, min(begin + 64, b + 1) - first)
-                batch = EncodedBatch(int(rows.seq[0]), int(rows.seq[-1]), encode(rows, schema))
+            for batch in encoded(rescued.rows(a - first, b + 1 - first), stream.info):
                 stream.waiting.append(batch)
                 stream.waiting_bytes += len(batch.payload)
         end = max(end, last + 1)
@@ -457,6 +493,14 @@ def taken_up(folder: Path, progress: Callable[[str], None] | None = None) -> Kep
     if progress is not None:
         progress(f"stream {stream.boot_id}: taken up to frame {end - 1}")
     return stream
+
+
+def encoded(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
+    """Frames as messages of the size that nodes send."""
+    schema = wire_schema(info)
+    for begin in range(0, len(frames), _MESSAGE_FRAMES):
+        rows = frames.rows(begin, min(begin + _MESSAGE_FRAMES, len(frames)))
+        yield EncodedBatch(int(rows.seq[0]), int(rows.seq[-1]), encode(rows, schema))
 
 
 def _oldest(held: Intervals) -> int:

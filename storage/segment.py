@@ -64,6 +64,8 @@ class Segment:
     t_ns_first: int = 0
     t_ns_last: int = 0
     size_bytes: int = 0
+    is_doubtful: bool = False
+    """Has something in it been disowned while it was written? Then it is checked when opened."""
 
     @property
     def span(self) -> tuple[int, int]:
@@ -188,6 +190,8 @@ class SegmentWriter:
         """
         try:
             self.sync()
+            if self.segment.is_doubtful:
+                return
             with suppress(OSError):  # without it the batches are checked when it is opened again
                 write_all(self._index, _sealed(np.zeros(1, RECORD)).tobytes())
                 os.fsync(self._index.fileno())

@@ -81,6 +81,30 @@ class Wanted:
                 wanted.add(*interval)
         return wanted
 
+    def unmet(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
+        """What somebody needs and has not got: each server by its own acknowledgements.
+
+        What the node's own session needs is here only, whoever has it besides.
+        """
+        unmet = Intervals(self._local.get(boot_id, ()))
+        for server_id, server in list(self._servers.items()):
+            has = acked_by.get(server_id, Intervals())
+            for interval in server.numbers(boot_id).without(has):
+                unmet.add(*interval)
+        return unmet
+
+    def local(self, boot_id: str) -> Intervals:
+        """What the node's own session needs of a stream."""
+        return Intervals(self._local.get(boot_id, ()))
+
+    def undelivered(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
+        """What servers need and have not got."""
+        return Intervals(
+            interval
+            for server_id, server in list(self._servers.items())
+            for interval in server.numbers(boot_id).without(acked_by.get(server_id, Intervals()))
+        )
+
     def say(self, server_id: str, wants: ServerWants) -> bool:
         """A server has said what it needs; has that changed anything?"""
         if self._servers.get(server_id, ServerWants()) == wants:

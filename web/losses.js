@@ -4,6 +4,7 @@ const REASONS = {
   disk_full: "the node's disk was full",
   read_only: "the node's disk was read-only",
   disk_slow: "the node's disk was too slow",
+  node_busy: "the node was too busy to keep them",
   evicted: "the link was down for longer than the node could keep them",
   corrupt: "damaged on the disk",
   node_restarted: "the node came back without them",

@@ -55,7 +55,8 @@ def node_command(
         typer.Option(help="Folder for the journal and for sessions recorded here."),
     ] = None,
     record: Annotated[
-        str | None, typer.Option(help="Record a session of this name here, without any server.")
+        str | None,
+        typer.Option(help="Record a session of this name here; no server is needed for it."),
     ] = None,
     load: LoadOption = None,
     load_scale: LoadScaleOption = 1.0,

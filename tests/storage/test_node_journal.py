@@ -258,10 +258,10 @@ def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
     stream = journal.begin(array_of())
     journal.want("laptop", wants((200, 249)))
     fill(journal, stream, 0, 599)
-    stream.acknowledge(100, 149)
+    stream.acknowledge("laptop", 100, 149)
     until(lambda: on_disk(stream).within(0, 489) == Intervals([(200, 249)]))
     assert stream.lost.by_reason == {"evicted": Intervals([(0, 99), (150, 199), (250, 489)])}
-    stream.acknowledge(200, 249)
+    stream.acknowledge("laptop", 200, 249)
     until(lambda: not on_disk(stream).within(0, 489))
     until(lambda: "evicted" in stream.notes.lost)
 
@@ -288,7 +288,7 @@ def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
     held = stream.held
     assert held.count + full + 100 == 2000
     # A server has taken some of them after all: there is room, and it goes on.
-    stream.acknowledge(100, 1999)
+    stream.acknowledge("laptop", 100, 1999)
     fill(journal, stream, 2000, 2009)
     until(lambda: journal.troubles == () and on_disk(stream).last == 2009)
     assert "disk_full" not in stream.lost.as_pairs()
@@ -408,7 +408,7 @@ def test_what_sessions_need_and_no_server_has_is_undelivered(
     journal.want("laptop", wants((50, None)))
     fill(journal, stream, 0, 99)
     assert journal.undelivered(stream) == Intervals([(50, 99)])
-    stream.acknowledge(0, 79)
+    stream.acknowledge("laptop", 0, 79)
     assert journal.undelivered(stream) == Intervals([(80, 99)])
     assert journal.wanted.numbers("0" * 32) == Intervals([(50, NO_END)])
 
@@ -436,3 +436,81 @@ def test_recovery_writes_what_was_in_flight_and_drops_nothing(
     with closing(Journal.open(folder / "journal" / "leg" / ("0" * 32))) as found:
         assert found.held == Intervals([(0, 117)])
     assert not list(folder.rglob("in_flight"))
+
+
+def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
+    start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(node_journal, "RING_NS", 100_000_000)
+    monkeypatch.setattr("storage.journal.SEGMENT_NS", 20_000_000)
+    journal = start()
+    stream = journal.begin(array_of())
+    journal.wanted.say_local({stream.boot_id: Intervals([(0, NO_END)])})
+    fill(journal, stream, 0, 399)
+    stream.acknowledge("laptop", 0, 399)
+    until(lambda: on_disk(stream).last == 399)
+    time.sleep(0.2)  # several looks
+    assert on_disk(stream) == Intervals([(0, 399)])
+
+
+def test_what_one_server_has_another_still_gets(
+    start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(node_journal, "RING_NS", 100_000_000)
+    monkeypatch.setattr("storage.journal.SEGMENT_NS", 20_000_000)
+    journal = start()
+    stream = journal.begin(array_of())
+    journal.want("laptop", wants((0, 199)))
+    fill(journal, stream, 0, 399)
+    until(lambda: on_disk(stream).last == 399)
+    stream.acknowledge("other", 0, 399)
+    until(lambda: not on_disk(stream).within(200, 299))
+    assert on_disk(stream).within(0, 199) == Intervals([(0, 199)])
+    assert journal.undelivered(stream) == Intervals([(0, 199)])
+
+
+def test_what_acquisition_had_taken_when_it_was_killed_is_taken_over(
+    start: Start, fill: Fill, array_of: Arrays, frames_of: Callable[..., FrameBatch]
+) -> None:
+    """Its last batches never came through the pipe; the node itself lives on."""
+    journal = start()
+    stream = journal.begin(array_of())
+    fill(journal, stream, 0, 89)
+    flying(stream, frames_of(0, 99))
+    stream.has_ended = True
+    assert journal.settle()
+    assert on_disk(stream) == Intervals([(0, 99)])
+    assert (stream.next_seq, stream.lost.as_pairs()) == (100, {})
+
+
+def test_frames_that_were_not_handed_over_are_named(
+    start: Start, fill: Fill, array_of: Arrays
+) -> None:
+    journal = start()
+    stream = journal.begin(array_of())
+    fill(journal, stream, 0, 9)
+    fill(journal, stream, 30, 39)
+    assert stream.lost.as_pairs() == {"node_busy": ((10, 29),)}
+
+
+def test_the_bound_is_the_age_of_the_oldest_frame_when_it_is_on_the_disk(
+    start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame that comes during one sync waits for that one and for the next."""
+    journal = start()
+    stream = journal.begin(array_of())
+    real = os.fsync
+    stuck = threading.Event()
+
+    def slow(descriptor: int) -> None:
+        if "arrows" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            stuck.set()
+            time.sleep(0.35)
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    fill(journal, stream, 0, 9)
+    assert stuck.wait(5.0)
+    fill(journal, stream, 10, 19)
+    until(lambda: on_disk(stream).last == 19 and not stream.unsynced)
+    assert stream.notes.sync_max_s > 0.6
