@@ -15,24 +15,23 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from devices.acquisition import RangeFlag
 from devices.errors import StorageError
-from devices.frames import ArrayInfo, FrameBatch
+from devices.frames import ArrayInfo
 from storage.durable import make_folder, storage_errors
-from storage.in_flight import delete_in_flight, read_in_flight
+from storage.in_flight import delete_in_flight
 from storage.intervals import Intervals
 from storage.journal import Journal
-from storage.kept_stream import EncodedBatch, KeptStream, opened
+from storage.kept_stream import EncodedBatch, KeptStream
 from storage.kernel import kernel_boot_id
 from storage.losses import CORRUPT, DISK_FULL, DISK_SLOW, EVICTED, READ_ONLY
 from storage.schema import wire_schema
-from storage.stream_notes import PROMISE_S, StreamNotes, unsynced_tail_max
+from storage.stream_notes import PROMISE_S, StreamNotes
+from storage.taken_up import encoded, in_flight_since, taken_up
 from storage.wanted import ServerWants, Wanted
-from storage.wire import decode, encode
+from storage.wire import decode
 
 log = logging.getLogger("foottile.journal")
 
@@ -46,7 +45,6 @@ SYNC_S = 0.2
 _TIDY_S = 2.0
 _AGAIN_S = 1.0
 _CLOSE_S = 10.0
-_MESSAGE_FRAMES = 64
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -306,14 +304,11 @@ class NodeJournal:
     def _rescue(self, stream: KeptStream) -> bool:
         """Take over what acquisition had taken when it was killed; was there anything?"""
         try:
-            left = read_in_flight(stream.folder)
+            rows = in_flight_since(stream)
         except StorageError:
             return False
-        if left is None or left[1] is None or int(left[1].seq[-1]) < stream.next_seq:
+        if rows is None:
             return False
-        frames = left[1]
-        rows = frames.rows(max(0, stream.next_seq - int(frames.seq[0])), len(frames))
-        RangeFlag(stream.info.tiles).flag(rows)
         for batch in encoded(rows, stream.info):
             stream.put(batch, stream.missed_slots)
         return True
@@ -449,60 +444,3 @@ def settle_left_over(root: Path) -> None:
     for folder in sorted(path for path in (root / "journal").glob("*") if path.is_dir()):
         journal = NodeJournal(root, folder.name, is_recovery=True)
         journal.settle_here()
-
-
-def taken_up(folder: Path, progress: Callable[[str], None] | None = None) -> KeptStream | None:
-    """A stream that an earlier process left, with what it had in flight when it was killed.
-
-    If the machine itself went down, what was in flight is lost; how much that can have been is
-    noted: what was taken since the last sync, by the disk's slowest one.
-
-    Raises:
-        StorageError: it cannot be read.
-    """
-    left = read_in_flight(folder)
-    stream = opened(folder)
-    if stream is None:
-        if left is None:
-            return None
-        stream = KeptStream(folder, StreamNotes(array_info=left[0]), None)
-        stream.notes = stream.notes.model_copy(update={"kernel_boot_id": kernel_boot_id()})
-    if stream.notes.has_ended:
-        return stream
-    held = stream.held
-    end = (held.last + 1) if held.last is not None else 0
-    lost_last = stream.lost.all.last
-    end = max(end, (lost_last + 1) if lost_last is not None else 0)
-    rescued = left[1] if left is not None else None
-    tail = 0
-    if rescued is not None:
-        RangeFlag(stream.info.tiles).flag(rescued)
-        first, last = int(rescued.seq[0]), int(rescued.seq[-1])
-        if first > end:  # more waited for the disk than was in flight
-            stream.lost.add(Intervals([(end, first - 1)]), DISK_SLOW)
-        for a, b in held.missing(max(first, _oldest(held)), last):
-            for batch in encoded(rescued.rows(a - first, b + 1 - first), stream.info):
-                stream.waiting.append(batch)
-                stream.waiting_bytes += len(batch.payload)
-        end = max(end, last + 1)
-    elif left is None:
-        tail = unsynced_tail_max(stream.info.nominal_rate_hz, stream.notes.sync_max_s)
-    stream.next_seq = end
-    stream.has_ended = True
-    stream.notes = stream.notes.model_copy(update={"unsynced_tail_max": tail})
-    if progress is not None:
-        progress(f"stream {stream.boot_id}: taken up to frame {end - 1}")
-    return stream
-
-
-def encoded(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
-    """Frames as messages of the size that nodes send."""
-    schema = wire_schema(info)
-    for begin in range(0, len(frames), _MESSAGE_FRAMES):
-        rows = frames.rows(begin, min(begin + _MESSAGE_FRAMES, len(frames)))
-        yield EncodedBatch(int(rows.seq[0]), int(rows.seq[-1]), encode(rows, schema))
-
-
-def _oldest(held: Intervals) -> int:
-    """What is older than everything that is held was evicted, not lost in flight."""
-    return next(iter(held))[0] if held else 0
