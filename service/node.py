@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from devices.errors import FootTileError
 from service.acquirer import AcquisitionProcess, Batch, Failed, Health, Message, Started
 from service.estimation.calibration import Calibration
 from service.link import PROTOCOL, EarlierStream, Hello, Status, Wanted
@@ -121,6 +122,7 @@ class _Node:
         self._publisher: Publisher | None = None
         self._publishing: asyncio.Task[None] | None = None
         self._told: tuple[str, ...] = ()
+        self._is_closing = False
         loop = asyncio.get_running_loop()
         self._acquisition = AcquisitionProcess(
             replace(options.rig, streams=journal.folder),
@@ -162,8 +164,15 @@ class _Node:
                 task.cancel()
             await asyncio.gather(*beside, return_exceptions=True)
 
+    def _tell_failure(self, task: asyncio.Task[None]) -> None:
+        """A publisher that ended by itself ends the node: better that than to go on in silence."""
+        if not self._is_closing:
+            error = None if task.cancelled() else task.exception()
+            self._messages.put_nowait(Failed(error or FootTileError("the publisher has ended")))
+
     async def close(self) -> None:
         """End what runs beside."""
+        self._is_closing = True
         if self._publishing is not None:
             self._publishing.cancel()
             await asyncio.gather(self._publishing, return_exceptions=True)
@@ -200,7 +209,7 @@ class _Node:
             report=self._report,
         )
         self._publishing = asyncio.create_task(self._publisher.run())
-        self._publishing.add_done_callback(lambda task: _tell_failure(task, self._messages))
+        self._publishing.add_done_callback(self._tell_failure)
 
     def _stream(self) -> KeptStream:
         if self._present is None:
@@ -309,12 +318,6 @@ def _earlier(stream: KeptStream) -> EarlierStream:
         missed_slots=stream.missed_slots,
         t_ns_first=t_ns_first or 0,
     )
-
-
-def _tell_failure(task: asyncio.Task[None], messages: asyncio.Queue[Message]) -> None:
-    """A publisher that failed for good ends the node: better that than to go on in silence."""
-    if not task.cancelled() and task.exception() is not None:
-        messages.put_nowait(Failed(task.exception()))
 
 
 async def _started(

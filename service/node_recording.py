@@ -13,7 +13,6 @@ from pathlib import Path
 
 from devices.errors import FootTileError, StorageError
 from service.estimation.calibration import Calibration
-from service.sealing import Sources, seal
 from service.steady import utc_ns
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
@@ -130,6 +129,9 @@ class NodeRecording:
         )
 
     def _seal(self, session: Session) -> Session:
+        # Here, because a real node need not wait for scipy before its first frame.
+        from service.sealing import Sources, seal
+
         session = session.model_copy(update={"parts": self._closed(session), "state": "sealing"})
         streams = self._streams(session)
         states = {

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import random
+import socket as sockets
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from itertools import count
+from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import ValidationError
@@ -131,9 +133,9 @@ class Publisher:
             self._renewed.clear()
             try:
                 await self._connection(waits)
-            except* (OSError, ValueError, WebSocketException) as group:
-                self._say(f"not connected to {self._url}: {_reason(group)}; trying again")
-                waits.failed(group)
+            except (OSError, ValueError, WebSocketException) as error:
+                self._say(f"not connected to {self._url}: {_reason(error)}; trying again")
+                waits.failed(error)
             self._connected = False
             await asyncio.sleep(waits.next_s())
 
@@ -146,6 +148,12 @@ class Publisher:
         parts = urlsplit(self._url)
         secure = parts.scheme == "wss"
         tcp = await dial(parts.hostname or "", parts.port or (443 if secure else 80))
+        try:
+            await self._speak(tcp, waits)
+        finally:
+            tcp.close()  # if it was not handed over, or not yet let go
+
+    async def _speak(self, tcp: sockets.socket, waits: _Waits) -> None:
         async with connect(
             self._url,
             sock=tcp,
@@ -163,16 +171,15 @@ class Publisher:
             self._say(f"connected to {self._url}")
             waits.succeeded()
             self._connected = True
-            try:
-                async with asyncio.TaskGroup() as tasks:
-                    tasks.create_task(self._receive(socket))
-                    tasks.create_task(self._send_frames(socket, welcome))
-                    tasks.create_task(self._watch(socket))
-                    tasks.create_task(self._measure_clock(socket))
-                    tasks.create_task(self._send_status(socket))
-                    tasks.create_task(self._await_renewal())
-            except* _Renewed:
-                await socket.close(CloseCode.GOING_AWAY, "another stream has begun")
+            await _until_one_ends(
+                self._receive(socket),
+                self._send_frames(socket, welcome),
+                self._watch(socket),
+                self._measure_clock(socket),
+                self._send_status(socket),
+                self._renewed.wait(),
+            )
+            await socket.close(CloseCode.GOING_AWAY, "another stream has begun")
 
     async def _greet(self, socket: ClientConnection) -> Welcome:
         if socket.subprotocol != SUBPROTOCOL:
@@ -363,18 +370,27 @@ class Publisher:
             await socket.send(say(self._status(self._backlog.count)))
             await asyncio.sleep(STATUS_EVERY_S)
 
-    async def _await_renewal(self) -> None:
-        await self._renewed.wait()
-        raise _Renewed
-
     def _say(self, message: str) -> None:
         if message != self._last_report:
             self._report(message)
         self._last_report = message
 
 
-class _Renewed(Exception):  # noqa: N818  # no error: a reason to say hello again
-    """The node has begun another stream."""
+async def _until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
+    """Do all of it at once until one ends, and fail as that one failed.
+
+    Not by a TaskGroup: before Python 3.13 one that ends while its owner is about to go on may leave
+    the owner cancelled (CPython 117407), and a node without its link.
+    """
+    tasks = [asyncio.create_task(each) for each in work]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    for task in done:
+        task.result()
 
 
 class _Waits:
@@ -387,9 +403,8 @@ class _Waits:
     def succeeded(self) -> None:
         self._bounds, self._wait_s = _BACK_OFF_S, 0.0
 
-    def failed(self, group: BaseExceptionGroup[Exception]) -> None:
-        refused = group.subgroup(_is_refusal) is not None
-        bounds = _REFUSED_BACK_OFF_S if refused else _BACK_OFF_S
+    def failed(self, error: Exception) -> None:
+        bounds = _REFUSED_BACK_OFF_S if _is_refusal(error) else _BACK_OFF_S
         if bounds != self._bounds:
             self._bounds, self._wait_s = bounds, bounds[0]
 
@@ -444,10 +459,7 @@ def _parse(message: str | bytes) -> Welcome | Ack | Wanted | Probe:
         ) from error
 
 
-def _reason(group: BaseExceptionGroup[Exception]) -> str:
-    error: BaseException = group
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
+def _reason(error: Exception) -> str:
     if isinstance(error, ConnectionClosed) and error.rcvd is not None:
         return error.rcvd.reason or f"closed with code {error.rcvd.code}"
     if isinstance(error, InvalidStatus) and error.response.status_code == _UNAUTHORISED:

@@ -9,7 +9,7 @@ import hashlib
 import re
 
 CHECK = "check"
-_END = re.compile(rb',\s*"check": "([0-9a-f]{64})"\s*\}\s*\Z')
+_END = re.compile(rb',\n "check": "([0-9a-f]{64})"\n\}\Z')
 
 
 def with_check(text: bytes) -> bytes:

@@ -62,6 +62,7 @@ def remove_stale_temporaries(folder: Path) -> list[Path]:
     """
     removed = []
     with storage_errors(folder):
+        folder.stat()  # a folder that is not there has no files, says a search
         for path in sorted(folder.rglob(".*.tmp")):
             if _is_stale(path.name) and path.is_file():
                 path.unlink(missing_ok=True)
