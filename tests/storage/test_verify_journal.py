@@ -277,3 +277,18 @@ def test_what_was_cut_off_after_a_crash_is_mentioned(tmp_path: Path) -> None:
     report = verify_stream(folder)
     assert (report.problems, report.held.count) == ([], 40)
     assert "no whole batch" in "; ".join(report.remarks)
+
+
+def test_what_a_disk_refused_once_and_was_written_again_is_no_disorder(tmp_path: Path) -> None:
+    folder = tmp_path / "journal" / "bench" / array().boot_id
+    journal = Journal(folder, array())
+    for first in range(0, 40, 10):
+        journal.append(frames(first, first + 9))
+    journal.disown(Intervals([(20, 39)]))
+    for first in range(20, 60, 10):
+        journal.append(frames(first, first + 9))
+    StreamNotes(array_info=array(), next_seq=60).save(folder)
+    journal.close()
+    report = verify_stream(folder)
+    assert report.problems == []
+    assert list(report.held) == [(0, 59)]
