@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, StorageError
 from devices.frames import FrameBatch
 from storage.durable import write_whole
 from storage.intervals import Intervals
@@ -191,12 +191,24 @@ class SegmentWriter:
         try:
             self.sync()
             if self.segment.is_doubtful:
+                self._forget_doubtful()
                 return
             with suppress(OSError):  # without it the batches are checked when it is opened again
                 write_all(self._index, _sealed(np.zeros(1, RECORD)).tobytes())
                 os.fsync(self._index.fileno())
         finally:
             self.abandon()
+
+    def _forget_doubtful(self) -> None:
+        """Have only what counts in the files: what was disowned was written again elsewhere."""
+        with suppress(OSError, StorageError):
+            records = self.segment.records()
+            if not len(records):
+                self.segment.delete()
+                return
+            self._data.truncate(int((records["offset"] + records["length"]).max()))
+            os.fsync(self._data.fileno())
+            self.segment.rewrite_index()
 
     def abandon(self) -> None:
         """Close the files as they are."""
