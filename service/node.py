@@ -138,7 +138,7 @@ class _Node:
             if started is None:
                 return Outcome()
             stopping.add_done_callback(lambda _: self._acquisition.stop())
-            self._begin(started)
+            await self._begin(started)
             sealing = asyncio.create_task(asyncio.to_thread(self._seal_what_was_left))
             beside.append(sealing)
             if self._options.server is not None:
@@ -146,19 +146,21 @@ class _Node:
             while not isinstance(message := await self._messages.get(), Failed):
                 if isinstance(message, Started):
                     self._report("the tiles are described anew: a new stream begins")
-                    self._begin(message)
+                    await self._begin(message)
                 elif self._present is not None:
                     self._take(self._present, message)
             if self._present is not None:
                 self._present.has_ended = True
             await self._drain()
-            if message.error is not None:
-                await asyncio.to_thread(self._recording.stop)
-                raise message.error
-            if not await asyncio.to_thread(self._journal.settle):
+            # Sealed before it is settled, a session would end without what was in flight.
+            outcome = Outcome(is_lossy=self._options.record is not None)
+            if await asyncio.to_thread(self._journal.settle):
+                outcome = await asyncio.to_thread(self._outcome)
+            else:
                 self._report("the disk does not take the last frames: nothing is sealed yet")
-                return Outcome(is_lossy=self._options.record is not None)
-            return await asyncio.to_thread(self._outcome)
+            if message.error is not None:
+                raise message.error
+            return outcome
         finally:
             for task in beside:
                 task.cancel()
@@ -178,13 +180,13 @@ class _Node:
             await asyncio.gather(self._publishing, return_exceptions=True)
         await asyncio.to_thread(self._acquisition.close)
 
-    def _begin(self, started: Started) -> None:
+    async def _begin(self, started: Started) -> None:
         info = started.info
         self._report(f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s")
         for remark in started.remarks:
             self._report(remark)
         self._present = self._journal.begin(info)
-        self._recording.goes_on_in(self._present)
+        await asyncio.to_thread(self._recording.goes_on_in, self._present)
         if self._publisher is not None:
             self._publisher.renew()
 
@@ -218,6 +220,7 @@ class _Node:
 
     def _hello(self) -> Hello:
         options, present = self._options, self._stream()
+        next_seq = present.next_seq  # before what is held, which may go on meanwhile
         others = [stream for stream in self._journal.streams if stream is not present]
         # As many as fit into a message, those that somebody waits for first.
         waited_for = [stream for stream in others if self._journal.undelivered(stream)]
@@ -228,7 +231,7 @@ class _Node:
             protocol=PROTOCOL,
             array_info=present.info,
             held=tuple(present.held),
-            next_seq=present.next_seq,
+            next_seq=next_seq,
             lost=present.lost.as_pairs(),
             scene=options.rig.scene.model_dump(mode="json"),
             emulated=options.rig.emulated,

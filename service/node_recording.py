@@ -7,6 +7,7 @@ it is sealed as it is.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -54,6 +55,8 @@ class NodeRecording:
         self._notes = notes
         self._report = report
         self._session: Session | None = None
+        self._sealing = threading.Lock()
+        """Held while what was left is sealed: a node may be stopped meanwhile."""
         self._unreadable = False
         """Is there a session of which nobody knows what it needs? Then everything is kept."""
         self._left_over = self._unfinished()
@@ -101,18 +104,19 @@ class NodeRecording:
 
     def seal_what_was_left(self) -> None:
         """Seal sessions of earlier runs; one that cannot be is reported and stays."""
-        while self._left_over:
-            session = self._left_over[0]
-            try:
-                sealed = self._seal(session)
-            except FootTileError as error:
-                self._report(f"session {session.id} is not sealed: {error}")
-                del self._left_over[0]
-                continue
-            state = "complete" if sealed.ledger and sealed.ledger.complete else "lossy"
-            self._report(f"session {session.id} ({session.name}) was left behind: sealed, {state}")
-            del self._left_over[0]
-            self._need()
+        with self._sealing:
+            for session in list(self._left_over):
+                try:
+                    sealed = self._seal(session)
+                except FootTileError as error:
+                    self._report(f"session {session.id} is not sealed: {error}")
+                    continue
+                state = "complete" if sealed.ledger and sealed.ledger.complete else "lossy"
+                self._report(
+                    f"session {session.id} ({session.name}) was left behind: sealed, {state}"
+                )
+                self._left_over.remove(session)
+                self._need()
 
     def _new(self, part: Part, stream: KeptStream) -> Session:
         calibration = self._calibration
