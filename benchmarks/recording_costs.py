@@ -120,7 +120,7 @@ def node_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
         stream = keeper.begin(recording.info)
 
         def put(batch: FrameBatch, payload: bytes) -> None:
-            keeper.put(stream, EncodedBatch(int(batch.seq[0]), int(batch.seq[-1]), payload))
+            keeper.put(stream, EncodedBatch.of(batch, payload))
 
         bare, node = "bare write", "NodeJournal.put and its thread"
         of_thread: list[float] = []

@@ -21,9 +21,8 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from service.news import News
 from service.rig import Rig, RigOptions
-from storage.kept_stream import EncodedBatch
 from storage.schema import wire_schema
-from storage.wire import encode
+from storage.wire import EncodedBatch, encode
 
 _WAITING_MAX = 4096
 """Batches that may wait for a parent that does not read, 100 s; then frames are lost and counted
@@ -179,7 +178,7 @@ def _send(
     schema = wire_schema(info)
     while (item := waiting.get()) is not None:
         frames, missed_slots, news, health = item
-        encoded = EncodedBatch(int(frames.seq[0]), int(frames.seq[-1]), encode(frames, schema))
+        encoded = EncodedBatch.of(frames, encode(frames, schema))
         try:
             connection.send(Batch(encoded, missed_slots, news, health))
         except OSError:

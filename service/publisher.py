@@ -49,8 +49,9 @@ from service.link import (
     with_check,
 )
 from storage.intervals import Intervals
-from storage.kept_stream import EncodedBatch, KeptStream
+from storage.kept_stream import KeptStream
 from storage.ledger import NO_END
+from storage.wire import EncodedBatch
 
 PROBE_EVERY_S = 10.0
 STATUS_EVERY_S = 1.0
@@ -186,7 +187,8 @@ class Publisher:
             raise LinkError(
                 f"the server does not speak {SUBPROTOCOL}", where=self._url, expected=SUBPROTOCOL
             )
-        hello = self._said_hello = self._hello()
+        # In a thread: it looks into the journals of earlier streams.
+        hello = self._said_hello = await asyncio.to_thread(self._hello)
         await socket.send(say(hello))
         async with asyncio.timeout(SILENCE_S):
             answer = _parse(await socket.recv())

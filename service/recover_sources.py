@@ -81,7 +81,7 @@ class Stream:
         at = first
         while at <= last:
             try:
-                for _ in self.journal.payloads(at, last):
+                for _ in self.journal.messages(at, last):
                     pass
             except DamagedFramesError as error:
                 damaged = Intervals([(error.seq_first, error.seq_last)])

@@ -29,7 +29,7 @@ from storage.losses import CORRUPT, Losses
 from storage.schema import array_info, wire_schema
 from storage.segment import SUFFIX, Segment, SegmentWriter, numbers, payload_of, recover
 from storage.stream_notes import StreamNotes
-from storage.wire import FRAMES_MAX, decode, encode
+from storage.wire import FRAMES_MAX, EncodedBatch, decode, encode
 
 SEGMENT_NS = 60_000_000_000
 """A segment is closed after a minute of frames: what is not needed is deleted by segments."""
@@ -110,10 +110,23 @@ class Journal:
         new = self.held.missing(first, last)
         for a, b in new:
             if (a, b) == (first, last):  # nearly always, and views of it would cost a fifth
-                self._write(batch, payload)
+                payload = encode(batch, self._schema) if payload is None else payload
+                self._write(EncodedBatch.of(batch, payload))
             else:
-                self._write(batch.rows(a - first, b - first + 1), None)
+                rows = batch.rows(a - first, b - first + 1)
+                self._write(EncodedBatch.of(rows, encode(rows, self._schema)))
         return new
+
+    def append_message(self, message: EncodedBatch) -> None:
+        """The same for a message that this machine has encoded: it is not read again.
+
+        Raises:
+            StorageError: as for `append`.
+        """
+        if self.held.missing(message.seq_first, message.seq_last) == message.numbers:
+            self._write(message)
+        else:
+            self.append(decode(message.payload, self._schema), message.payload)
 
     def sync(self) -> None:
         """Return when everything appended before is on the disk; may run in another thread.
@@ -172,12 +185,11 @@ class Journal:
             DamagedFramesError: a batch on disk is damaged; which one, it says.
             StorageError: a segment cannot be read.
         """
-        for payload in self.payloads(seq_first, seq_last):
-            batch = decode(payload, self._schema)
-            first = int(batch.seq[0])
+        for message in self.messages(seq_first, seq_last):
+            batch, first = decode(message.payload, self._schema), message.seq_first
             yield batch.rows(max(0, seq_first - first), min(len(batch), seq_last - first + 1))
 
-    def payloads(self, seq_first: int, seq_last: int) -> Iterator[bytes]:
+    def messages(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
         """Batches with any of these frames, whole, in order, as the bytes in which they came.
 
         Raises:
@@ -190,8 +202,7 @@ class Journal:
             end = min(at + _WINDOW_FRAMES, seq_last + 1)
             found = []
             for segment in list(self._segments):
-                first, last = segment.span
-                if first < end and last >= at:
+                if segment.held and segment.span[0] < end and segment.span[1] >= at:
                     try:
                         records = segment.records()
                     except OSError as error:
@@ -203,7 +214,7 @@ class Journal:
                     inside = (records["seq_first"] >= at) & (records["seq_first"] < end)
                     found += [(numbers(r), segment.path, r) for r in records[inside]]
             found.sort(key=lambda item: item[0])
-            yield from self._bytes_of([item for item in found if item[0][1] >= seq_first])
+            yield from self._messages_of([item for item in found if item[0][1] >= seq_first])
             at = end
 
     def first_seq_since(self, t_ns: int) -> int | None:
@@ -349,13 +360,12 @@ class Journal:
     def _count_anew(self) -> None:
         self.held = Intervals(pair for segment in self._segments for pair in segment.held)
 
-    def _write(self, rows: FrameBatch, payload: bytes | None) -> None:
-        payload = encode(rows, self._schema) if payload is None else payload
-        first, last, t_ns = int(rows.seq[0]), int(rows.seq[-1]), int(rows.t_ns[0])
-        writer = self._writer_for(first, t_ns)
+    def _write(self, message: EncodedBatch) -> None:
+        first, last = message.seq_first, message.seq_last
+        writer = self._writer_for(first, message.t_ns_first)
         try:
             with storage_errors(writer.segment.path):
-                writer.append(rows, payload)
+                writer.append(message)
         except StorageError:
             # Whatever stands at the end of the file now: the next batch begins another one.
             self._retire(writer)
@@ -363,7 +373,7 @@ class Journal:
         if len(list(writer.segment.held)) == 1 and writer.segment.span == (first, last):
             self._segments.append(writer.segment)
         self.held.add(first, last)
-        self.lost.found(Intervals([(first, last)]))
+        self.lost.found(message.numbers)
 
     def _writer_for(self, seq_first: int, t_ns: int) -> SegmentWriter:
         """An open segment that these frames may follow in: the one that ends nearest before."""
@@ -399,7 +409,9 @@ class Journal:
         with suppress(OSError):
             writer.segment.delete()
 
-    def _bytes_of(self, found: list[tuple[tuple[int, int], Path, np.void]]) -> Iterator[bytes]:
+    def _messages_of(
+        self, found: list[tuple[tuple[int, int], Path, np.void]]
+    ) -> Iterator[EncodedBatch]:
         opened: dict[Path, int] = {}
         try:
             for (first, last), path, record in found:
@@ -416,7 +428,8 @@ class Journal:
                         seq_first=first,
                         seq_last=last,
                     )
-                yield payload
+                t_ns = int(record["t_ns_first"]), int(record["t_ns_last"])
+                yield EncodedBatch(first, last, *t_ns, payload)
         finally:
             for descriptor in opened.values():
                 os.close(descriptor)

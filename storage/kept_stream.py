@@ -6,7 +6,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from devices.errors import FileFormatError
@@ -14,26 +13,11 @@ from devices.frames import ArrayInfo
 from storage.intervals import Intervals
 from storage.journal import Journal
 from storage.losses import NODE_BUSY, Losses
-from storage.schema import wire_schema
 from storage.stream_notes import StreamNotes
-from storage.wire import decode
+from storage.wire import EncodedBatch
 
 RECENT_BYTES = 4 << 20
 """What is kept in memory of the newest frames, for the live picture."""
-
-
-@dataclass(frozen=True)
-class EncodedBatch:
-    """Consecutive frames as one message of the wire."""
-
-    seq_first: int
-    seq_last: int
-    payload: bytes
-
-    @property
-    def numbers(self) -> Intervals:
-        """Of its frames."""
-        return Intervals([(self.seq_first, self.seq_last)])
 
 
 class KeptStream:
@@ -157,7 +141,7 @@ class KeptStream:
                 yield memory[at]
                 at += 1
             if journal is not None:
-                yield from _on_disk(journal, first, last)
+                yield from journal.messages(first, last)
         yield from memory[at:]
 
     def lose(self, numbers: Intervals, reason: str, needed_here: Intervals | None = None) -> None:
@@ -215,10 +199,3 @@ def opened(folder: Path) -> KeptStream | None:
     if notes is None:
         return None
     return KeptStream(folder, notes, journal)
-
-
-def _on_disk(journal: Journal, first: int, last: int) -> Iterator[EncodedBatch]:
-    schema = wire_schema(journal.info)
-    for payload in journal.payloads(first, last):
-        seq = decode(payload, schema).seq
-        yield EncodedBatch(int(seq[0]), int(seq[-1]), payload)

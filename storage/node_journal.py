@@ -24,14 +24,13 @@ from storage.durable import make_folder, storage_errors
 from storage.in_flight import delete_in_flight
 from storage.intervals import Intervals
 from storage.journal import Journal
-from storage.kept_stream import EncodedBatch, KeptStream
+from storage.kept_stream import KeptStream
 from storage.kernel import kernel_boot_id
 from storage.losses import CORRUPT, DISK_FULL, DISK_SLOW, EVICTED, READ_ONLY
-from storage.schema import wire_schema
 from storage.stream_notes import PROMISE_S, StreamNotes
 from storage.taken_up import encoded, in_flight_since, taken_up
 from storage.wanted import ServerWants, Wanted
-from storage.wire import decode
+from storage.wire import EncodedBatch
 
 log = logging.getLogger("foottile.journal")
 
@@ -135,14 +134,8 @@ class NodeJournal:
         """Keep the newest frames; returns at once."""
         stream.put(batch, missed_slots)
         while sum(each.waiting_bytes for each in self.streams) > WAITING_BYTES:
-            with stream.lock:
-                if len(stream.waiting) < 2:  # the writer has taken them meanwhile
-                    break
-                oldest = stream.waiting.popleft()
-                stream.waiting_bytes -= len(oldest.payload)
-            trouble = self._trouble
-            reason = trouble[0] if trouble is not None else DISK_SLOW
-            stream.lose(oldest.numbers, reason, self.wanted.local(stream.boot_id))
+            if not self._drop_oldest():  # the writer has taken them meanwhile
+                break
         self._wake.set()
 
     def want(self, server_id: str, wants: ServerWants) -> None:
@@ -187,6 +180,21 @@ class NodeJournal:
                 remedy="Free space on the disk, and run it again",
             )
 
+    def _drop_oldest(self) -> bool:
+        """Give up what has waited longest, in any stream; was there anything but the newest?"""
+        for stream in self.streams:
+            newest = 1 if stream is self.streams[-1] else 0
+            with stream.lock:
+                if len(stream.waiting) <= newest:
+                    continue
+                oldest = stream.waiting.popleft()
+                stream.waiting_bytes -= len(oldest.payload)
+            trouble = self._trouble
+            reason = trouble[0] if trouble is not None else DISK_SLOW
+            stream.lose(oldest.numbers, reason, self.wanted.local(stream.boot_id))
+            return True
+        return False
+
     # --- the writer's thread ----------------------------------------------------------------------
 
     def _run(self) -> None:
@@ -215,7 +223,7 @@ class NodeJournal:
             for stream in list(self.streams):
                 self._sync(stream)
                 self._settle(stream)
-        if now_s - self._tidied_s >= _TIDY_S or self._wants_changed:
+        if now_s - self._tidied_s >= _TIDY_S or (self._wants_changed and not self._trouble):
             self._tidied_s = now_s
             self._tidy()
 
@@ -239,12 +247,12 @@ class NodeJournal:
             begun = Journal(stream.folder, stream.info)
             stream.save_notes()
             stream.journal = begun
-        journal, schema = stream.journal, wire_schema(stream.info)
+        journal = stream.journal
         while stream.waiting and journal is not None:
             batch = stream.waiting[0]
             try:
                 self._keep_to_budget()
-                journal.append(decode(batch.payload, schema), batch.payload)
+                journal.append_message(batch)
             except StorageError as error:
                 if error.errno in _FULL and self._evict():
                     continue
@@ -336,8 +344,7 @@ class NodeJournal:
             newest = stream.recent(max(0, stream.next_seq - 1))
             before_ns: int | None = None
             if is_present and newest:
-                schema = wire_schema(stream.info)
-                before_ns = int(decode(newest[-1].payload, schema).t_ns[-1]) - RING_NS
+                before_ns = newest[-1].t_ns_last - RING_NS
             elif not is_present and past_ring:
                 before_ns = 2**62
             if before_ns is not None:

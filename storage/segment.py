@@ -19,10 +19,9 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from devices.errors import FileFormatError, StorageError
-from devices.frames import FrameBatch
 from storage.durable import write_whole
 from storage.intervals import Intervals
-from storage.wire import decode
+from storage.wire import EncodedBatch, decode
 
 SUFFIX = ".arrows"
 INDEX_SUFFIX = ".idx"
@@ -149,15 +148,15 @@ class SegmentWriter:
             self.segment.delete()
             raise
 
-    def append(self, batch: FrameBatch, payload: bytes) -> None:
+    def append(self, message: EncodedBatch) -> None:
         """Write a batch and its record; all of it, or none.
 
         Raises:
             OSError: the disk is full or does not take it.
         """
         offset = self._data.tell()
-        record = record_of(batch, payload, offset)
-        write_all(self._data, payload)
+        record = record_of(message, offset)
+        write_all(self._data, message.payload)
         try:
             write_all(self._index, record.tobytes())
         except OSError:
@@ -216,13 +215,14 @@ class SegmentWriter:
         self._index.close()
 
 
-def record_of(batch: FrameBatch, payload: bytes, offset: int) -> Records:
+def record_of(message: EncodedBatch, offset: int) -> Records:
     """The index record of a batch: an array of one."""
     record = np.zeros(1, RECORD)
-    record["seq_first"] = batch.seq[0]
-    record["t_ns_first"], record["t_ns_last"] = batch.t_ns[0], batch.t_ns[-1]
-    record["offset"], record["length"] = offset, len(payload)
-    record["count"], record["crc32"] = len(batch), zlib.crc32(payload)
+    record["seq_first"] = message.seq_first
+    record["t_ns_first"], record["t_ns_last"] = message.t_ns_first, message.t_ns_last
+    record["offset"], record["length"] = offset, len(message.payload)
+    record["count"] = message.seq_last - message.seq_first + 1
+    record["crc32"] = zlib.crc32(message.payload)
     return _sealed(record)
 
 
@@ -343,17 +343,17 @@ def _checked(descriptor: int, path: Path, record: Any, end: int, schema: pa.Sche
             return record
         return record if payload_of(descriptor, record) is not None else None
     found = _message_at(path, end, schema)
-    if found is None or zlib.crc32(found[1]) != record["crc32"]:
+    if found is None or zlib.crc32(found.payload) != record["crc32"]:
         return None
-    return record_of(found[0], found[1], end)[0]
+    return record_of(found, end)[0]
 
 
 def _index_anew(path: Path, schema: pa.Schema) -> Records:
     records = []
     end = _header_length(path)
     while end and (found := _message_at(path, end, schema)) is not None:
-        records.append(record_of(*found, end))
-        end += len(found[1])
+        records.append(record_of(found, end))
+        end += len(found.payload)
     return np.concatenate(records) if records else np.zeros(0, RECORD)
 
 
@@ -367,12 +367,12 @@ def _header_length(path: Path) -> int:
         return file.tell()
 
 
-def _message_at(path: Path, offset: int, schema: pa.Schema) -> tuple[FrameBatch, bytes] | None:
+def _message_at(path: Path, offset: int, schema: pa.Schema) -> EncodedBatch | None:
     with pa.OSFile(str(path), "r") as file:
         try:
             file.seek(offset)
             pa.ipc.read_message(file)
             payload = os.pread(file.fileno(), file.tell() - offset, offset)
-            return decode(payload, schema), payload
+            return EncodedBatch.of(decode(payload, schema), payload)
         except (pa.ArrowException, EOFError, OSError, FileFormatError):
             return None

@@ -9,12 +9,12 @@ from devices.acquisition import RangeFlag
 from devices.frames import ArrayInfo, FrameBatch
 from storage.in_flight import read_in_flight
 from storage.intervals import Intervals
-from storage.kept_stream import EncodedBatch, KeptStream, opened
+from storage.kept_stream import KeptStream, opened
 from storage.kernel import kernel_boot_id
 from storage.losses import DISK_SLOW
 from storage.schema import wire_schema
 from storage.stream_notes import StreamNotes, unsynced_tail_max
-from storage.wire import encode
+from storage.wire import EncodedBatch, encode
 
 _MESSAGE_FRAMES = 64
 
@@ -66,7 +66,7 @@ def encoded(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
     schema = wire_schema(info)
     for begin in range(0, len(frames), _MESSAGE_FRAMES):
         rows = frames.rows(begin, min(begin + _MESSAGE_FRAMES, len(frames)))
-        yield EncodedBatch(int(rows.seq[0]), int(rows.seq[-1]), encode(rows, schema))
+        yield EncodedBatch.of(rows, encode(rows, schema))
 
 
 def _oldest(held: Intervals) -> int:

@@ -7,15 +7,43 @@ IPC stream that any tool can read.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyarrow as pa
 
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
+from storage.intervals import Intervals
 from storage.schema import from_record_batch, to_record_batch
 
 FRAMES_MAX = 4096
 """Frames in one message; a node sends some ten. More is not what a node sends."""
+
+
+@dataclass(frozen=True)
+class EncodedBatch:
+    """Consecutive frames as one message, and what a journal notes of it without reading it."""
+
+    seq_first: int
+    seq_last: int
+    t_ns_first: int
+    t_ns_last: int
+    payload: bytes
+
+    @classmethod
+    def of(cls, frames: FrameBatch, payload: bytes) -> EncodedBatch:
+        """The message `payload`, which holds these frames."""
+        return cls(
+            *(int(frames.seq[0]), int(frames.seq[-1])),
+            *(int(frames.t_ns[0]), int(frames.t_ns[-1])),
+            payload,
+        )
+
+    @property
+    def numbers(self) -> Intervals:
+        """Of its frames."""
+        return Intervals([(self.seq_first, self.seq_last)])
 
 
 def encode(batch: FrameBatch, schema: pa.Schema) -> bytes:

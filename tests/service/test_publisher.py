@@ -37,10 +37,10 @@ from service.link import (
 )
 from service.publisher import Publisher, ingest_url
 from storage.intervals import Intervals
-from storage.kept_stream import EncodedBatch, KeptStream
+from storage.kept_stream import KeptStream
 from storage.schema import wire_schema
 from storage.stream_notes import StreamNotes
-from storage.wire import decode
+from storage.wire import EncodedBatch, decode
 
 Running = Any
 FakeNode = Any
@@ -127,7 +127,7 @@ class Publishing:
 def batches(node: FakeNode, n: int) -> list[EncodedBatch]:
     frames = node.frames(n)
     return [
-        EncodedBatch(int(rows.seq[0]), int(rows.seq[-1]), node.payload(rows))
+        EncodedBatch.of(rows, node.payload(rows))
         for rows in (frames.rows(begin, begin + 10) for begin in range(0, n, 10))
     ]
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
-from storage.kept_stream import EncodedBatch
 from storage.schema import wire_schema
-from storage.wire import encode
+from storage.wire import EncodedBatch, encode
 
 PERIOD_NS = 2_000_000
 UTC_NS = 10**18
@@ -83,6 +82,7 @@ def batch_of(
     """The same frames as a node's message."""
 
     def build(first: int, last: int) -> EncodedBatch:
-        return EncodedBatch(first, last, encode(frames_of(first, last), wire_schema(array_of())))
+        frames = frames_of(first, last)
+        return EncodedBatch.of(frames, encode(frames, wire_schema(array_of())))
 
     return build

@@ -20,11 +20,12 @@ from storage import in_flight, node_journal, segment
 from storage.in_flight import InFlight
 from storage.intervals import Intervals
 from storage.journal import Journal
-from storage.kept_stream import EncodedBatch, KeptStream
+from storage.kept_stream import KeptStream
 from storage.ledger import NO_END
 from storage.node_journal import NodeJournal
 from storage.stream_notes import StreamNotes
 from storage.wanted import ServerWants
+from storage.wire import EncodedBatch
 
 Arrays = Callable[..., ArrayInfo]
 Batches = Callable[[int, int], EncodedBatch]
@@ -514,3 +515,26 @@ def test_the_bound_is_the_age_of_the_oldest_frame_when_it_is_on_the_disk(
     fill(journal, stream, 10, 19)
     until(lambda: on_disk(stream).last == 19 and not stream.unsynced)
     assert stream.notes.sync_max_s > 0.6
+
+
+def test_over_the_bound_of_memory_the_oldest_goes_first_of_whichever_stream(
+    start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stream that ended while the disk took nothing does not leave the next one without room."""
+    monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
+
+    def refuse(file: Any, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(segment, "write_all", refuse)
+    journal = start()
+    before = journal.begin(array_of())
+    fill(journal, before, 0, 149)
+    until(lambda: journal.troubles)
+    present = journal.begin(array_of(boot_id="1" * 32))
+    fill(journal, present, 0, 99)
+    assert present.held == Intervals([(0, 99)])
+    assert "disk_full" in before.lost.as_pairs()
+    fill(journal, present, 100, 499)
+    assert not before.held
+    assert present.held.last == 499
