@@ -5,8 +5,8 @@
 In virtual time: arrays of 1 to 64 tiles at 400 and 100 kHz, every part at 1.6 ms and drawn parts,
 the whole driver with self-test, audits and second looks, over emulated chips. The bound is the time
 that the transfers of a frame take on the wire with the true conversion times (hardware.md 4; the
-formulas are `devices.budget`, tested against its tables). In real time: CPU of a frame against as
-many bare ioctls.
+formulas are `devices.array.budget`, tested against its tables). In real time: CPU of a frame
+against as many bare ioctls.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from typing import Any, get_args
 
 from smbus2 import SMBus, i2c_msg
 
-from devices.budget import frame_s
+from devices.array.budget import frame_s
+from devices.array.startup import make_ready
+from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import VirtualClock
 from devices.emulation.world import World
-from devices.i2c import I2cBus, open_bus
-from devices.scene import Scene, ScheduleName, build_scene, load_scene
-from devices.startup import make_ready
+from devices.scene.file import Scene, ScheduleName, build_scene, load_scene
 
 COUNTS = (1, 2, 4, 8, 16, 32, 64)
 SECONDS, FRAMES_MIN = 4.0, 60

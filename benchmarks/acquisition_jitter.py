@@ -24,10 +24,10 @@ from acquisition import FreeAdapter, scene_of
 from smbus2 import i2c_msg
 
 from devices.acquisition import Acquisition
+from devices.array.startup import Ready, make_ready
+from devices.buses.i2c import I2cBus
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
-from devices.i2c import I2cBus
 from devices.realtime import sharpen_timers
-from devices.startup import Ready, make_ready
 
 RATE_HZ = 250.0
 CLIENTS = 50

@@ -21,7 +21,7 @@ from devices.frames import ArrayInfo, FrameBatch, TileInfo
 from service.estimation.calibration import paper_eq2_shape
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare import Tare
+from service.estimation.tare.tare import Tare
 
 GOAL = 2.0
 RUNS = 7

@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 
 from devices.acquisition import Acquisition
-from devices.bus_recovery import GpioRecovery
+from devices.array.startup import make_ready
+from devices.buses.i2c import open_bus
 from devices.clock import UtcAnchor, VirtualClock
-from devices.emulation.gpio import EmulatedLines
+from devices.emulation.buses.gpio import EmulatedLines
 from devices.emulation.witness import Verdict, Witness
 from devices.emulation.world import World
 from devices.frames import FrameBatch, TileStatus
-from devices.i2c import open_bus
-from devices.scene import Scene, build_scene, load_scene
-from devices.startup import make_ready
+from devices.recovery.recovery import GpioRecovery
+from devices.scene.file import Scene, build_scene, load_scene
 
 FAULT_S, PERIOD_S, LEAD_S = 0.3, 2.0, 1.0
 STRUCK = 1

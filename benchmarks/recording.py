@@ -33,7 +33,7 @@ import recording_hours as long_journal
 import recording_sealing as sealing
 from side_by_side import in_turns, spread, table
 
-from service.benchmark.run import machine
+from service.offline.benchmark.run import machine
 
 Lines = list[str]
 GOAL = 0.01

@@ -19,11 +19,11 @@ from pathlib import Path
 from recording_data import Recording, batches
 
 from devices.frames import FRAME_COLUMNS, FrameBatch
-from storage.in_flight import InFlight
 from storage.intervals import Intervals
-from storage.journal import Journal
-from storage.kept_stream import EncodedBatch
-from storage.node_journal import SYNC_S, NodeJournal
+from storage.journal.in_flight import InFlight
+from storage.journal.journal import Journal
+from storage.journal.node_journal import SYNC_S, NodeJournal
+from storage.journal.node_stream import EncodedBatch
 from storage.schema import wire_schema
 from storage.wire import decode, encode
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from devices.acquisition import BATCH_NS
-from devices.emulation.load_trace import LoadTrace
+from devices.emulation.ground.load_trace import LoadTrace
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
-from devices.scene import Scene, build_scene, load_scene
-from storage.load_trace_file import read_load_trace
+from devices.scene.file import Scene, build_scene, load_scene
+from storage.formats.load_trace import read_load_trace
 
 FULL_RATE_HZ = 544.0
 """What four tiles at 1.6 ms give on a bus of 400 kHz, pipelined."""
@@ -110,7 +110,7 @@ def batches(frames: FrameBatch) -> Iterator[FrameBatch]:
 
 
 def _simulated(title: str, scene: Scene, seconds: float, load: LoadTrace | None) -> Recording:
-    from service.simulate import SimulateOptions, Simulation
+    from service.offline.simulate import SimulateOptions, Simulation
 
     with ExitStack() as stack:
         simulation = Simulation(SimulateOptions(scene, seconds, load=load), stack)
@@ -119,7 +119,7 @@ def _simulated(title: str, scene: Scene, seconds: float, load: LoadTrace | None)
 
 
 def _on_real_clock(tiles: int, seconds: float) -> Recording:
-    from service.rig import Rig, RigOptions
+    from service.rig.rig import Rig, RigOptions
 
     with ExitStack() as stack:
         rig = Rig(RigOptions(_arc(tiles), "bench"), stack)

@@ -18,10 +18,10 @@ import pyarrow.parquet as pq
 from recording_data import Recording, batches
 
 from devices.frames import FrameBatch
-from storage.export import Slice, export
-from storage.journal import Journal
+from storage.formats.export import Slice, export
+from storage.journal.journal import Journal
 from storage.schema import FRAMES, flat_columns, wire_schema
-from storage.session_file import ROW_GROUP_NS, SessionReader, SessionWriter
+from storage.sessions.file import ROW_GROUP_NS, SessionReader, SessionWriter
 from storage.wire import encode
 
 Values = npt.NDArray[Any]

@@ -19,9 +19,9 @@ from pathlib import Path
 from recording_data import FULL_RATE_HZ, Recording, at_rate, batches, repeated
 from recording_formats import size_bytes
 
-from storage.journal import Journal
+from storage.journal.journal import Journal
 from storage.schema import wire_schema
-from storage.session_file import SessionReader, SessionWriter
+from storage.sessions.file import SessionReader, SessionWriter
 from storage.wire import encode
 
 STEPS = {

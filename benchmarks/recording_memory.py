@@ -94,7 +94,7 @@ def minute(number: int, tiles: int, rate_hz: float) -> Any:
 
 
 def generate(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from storage.journal import Journal
+    from storage.journal.journal import Journal
 
     journal = Journal(folder / "journal" / "bench" / BOOT_ID, array(asked.tiles, asked.rate))
     for number in range(round(asked.hours * 60)):
@@ -107,13 +107,13 @@ def generate(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 
 def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from service.calibrations import find_calibration
-    from service.sealing import Sources, seal
-    from storage import session_file
-    from storage.content_hash import ContentDigest, write_file_hash
-    from storage.journal import Journal
-    from storage.ledger import StreamState, ledger_of
-    from storage.session import Part, Session, SessionFolder
+    from service.offline.calibrations import find_calibration
+    from service.sessions.sealing import Sources, seal
+    from storage.journal.journal import Journal
+    from storage.sessions import file as session_file
+    from storage.sessions.content_hash import ContentDigest, write_file_hash
+    from storage.sessions.folder import Part, Session, SessionFolder
+    from storage.sessions.ledger import StreamState, ledger_of
 
     hash_s = 0.0
 
@@ -165,7 +165,7 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 
 def read_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from storage.session_file import SessionReader
+    from storage.sessions.file import SessionReader
 
     with SessionReader(folder / "sessions" / SESSION_ID / "frames.parquet") as reader:
         frames = sum(len(batch) for batch, _ in reader.batches("grf_n", "force_n"))
@@ -182,14 +182,14 @@ def column(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 
 def verify_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from storage.verify import verdict_of, verify
+    from storage.verify.data import verdict_of, verify
 
     report = verify(folder / "sessions" / SESSION_ID)
     return {"verdict": verdict_of(report), "problems": report.problems}
 
 
 def verify_journal(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from storage.verify import verdict_of, verify
+    from storage.verify.data import verdict_of, verify
 
     report = verify(folder / "journal" / "bench" / BOOT_ID)
     return {"verdict": verdict_of(report), "problems": report.problems}
@@ -197,9 +197,10 @@ def verify_journal(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 def imports(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     import service.sealing
+
     import storage.verify
 
-    return {"modules": [service.sealing.__name__, storage.verify.__name__]}
+    return {"modules": [service.sessions.sealing.__name__, storage.verify.data.__name__]}
 
 
 STEPS = {

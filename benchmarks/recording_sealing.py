@@ -9,12 +9,12 @@ import pyarrow.parquet as pq
 from recording_data import Recording
 from recording_formats import flat_table, minute
 
-from service.calibrations import find_calibration
 from service.estimation.calibration import Calibration, paper_eq2_shape
-from service.sealing import SessionFrames, Sources, sha256_of
-from storage.journal import Journal
-from storage.session import Part, Session
-from storage.session_file import SessionWriter, parquet_options
+from service.offline.calibrations import find_calibration
+from service.sessions.sealing import SessionFrames, Sources, sha256_of
+from storage.journal.journal import Journal
+from storage.sessions.file import SessionWriter, parquet_options
+from storage.sessions.folder import Part, Session
 
 STATIC = ("unwrap", "static")
 LADDER = ("unwrap", "temperature", "gas", "static", "skew", "denoise", "hysteresis", "rubber")
@@ -48,7 +48,7 @@ def sources_of(
 
 
 def seal(sources: Sources, path: Path) -> int:
-    """Write the file and its hash, as `service.sealing.seal` does; how many frames it has."""
+    """Write the file and its hash, as `service.sessions.sealing.seal` does; its frames."""
     count = 0
     frames = SessionFrames(sources)
     with SessionWriter(path, sources.info, sources.notes) as writer:

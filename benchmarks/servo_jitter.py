@@ -30,12 +30,12 @@ import numpy as np
 from acquisition_jitter import RATE_HZ, opened
 
 from devices.acquisition import Acquisition
+from devices.chips.dynamixel.reader import open_servo
+from devices.chips.dynamixel.servo import ServoReader
 from devices.clock import SystemClock, UtcAnchor
-from devices.dynamixel import open_servo
-from devices.emulation.dynamixel import EmulatedServo
+from devices.emulation.chips.dynamixel import EmulatedServo
 from devices.frames import FrameStatus
 from devices.realtime import sharpen_timers
-from devices.servo import ServoReader
 
 BAUDRATE = 1_000_000
 SERVO_HZ = 100.0

@@ -13,16 +13,16 @@ import tempfile
 import time
 from pathlib import Path
 
+from devices.buses.i2c import i2c_msg
 from devices.clock import VirtualClock
+from devices.emulation.buses.i2c import EmulatedI2cAdapter
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
+from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.faults import Faults
-from devices.emulation.i2c_bus import EmulatedI2cAdapter
-from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
-from devices.emulation.tca9548a import EmulatedTca9548a
-from devices.i2c import i2c_msg
-from devices.scene import load_scene
-from service.calibrations import find_calibration
-from service.pipeline import EstimateOptions
-from service.simulate import SimulateOptions, simulate
+from devices.scene.file import load_scene
+from service.offline.calibrations import find_calibration
+from service.offline.simulate import SimulateOptions, simulate
+from service.sessions.pipeline import EstimateOptions
 
 SECONDS = 30.0
 RUNS = 3

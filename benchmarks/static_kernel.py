@@ -12,13 +12,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MAX_KPA, PRESSURE_MIN_KPA, Coefficients
 from devices.frames import NOT_READ, FrameBatch, TileStatus
-from devices.mpl115a2 import (
-    COUNTS_MAX,
-    PRESSURE_MAX_KPA,
-    PRESSURE_MIN_KPA,
-    Coefficients,
-)
 from service.estimation.calibration import BASIS, LOOP_OPENS_N
 from service.estimation.estimate import HULL_SIGMAS
 from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan

@@ -11,9 +11,11 @@ from typing import Protocol
 
 import numpy as np
 
-from devices.array import TileArray
+from devices.array.array import TileArray
+from devices.array.scan import Scan
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.clock import Clock, UtcAnchor
-from devices.compensation import Compensation
 from devices.frames import (
     FRAME_COLUMNS,
     NO_SERVO_AGE,
@@ -24,8 +26,6 @@ from devices.frames import (
     TileInfo,
     TileStatus,
 )
-from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
-from devices.scan import Scan
 from devices.temperature import HeldTemperature, hold_temperature
 
 BATCH_NS = 25_000_000

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
+from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF, Mcp3208
 from devices.errors import SpiError
-from devices.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF, Mcp3208
-from devices.scene import ReferenceScene
+from devices.scene.file import ReferenceScene
 
 
 class ReferenceForce:

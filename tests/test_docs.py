@@ -15,7 +15,7 @@ import typer.main
 from pydantic import BaseModel
 
 from devices.frames import FRAME_COLUMNS, FrameBatch
-from devices.scene import (
+from devices.scene.file import (
     ArrayScene,
     EmulationScene,
     FaultScene,
@@ -29,14 +29,14 @@ from devices.scene import (
     TileScene,
     builtin_scenes,
 )
-from service.app import make_app
+from service.api.app import make_app
+from service.api.settings import Settings
 from service.cli.main import app
 from service.estimation.calibration import TileCalibration
 from service.estimation.estimates import EstimateStatus
 from service.link import Close
-from service.live import Encoder, sum_up
-from service.server import Server
-from service.settings import Settings
+from service.server.live import Encoder, sum_up
+from service.server.server import Server
 from storage.schema import KNOWN
 
 ROOT = Path(__file__).resolve().parents[1]

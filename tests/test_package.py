@@ -18,7 +18,7 @@ def test_a_wheel_holds_the_scenes_and_the_packages_and_no_tests(tmp_path: Path) 
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
     for scene in (ROOT / "devices" / "scenes").glob("*.toml"):
-        assert f"devices/scenes/{scene.name}" in names
+        assert f"devices/scene/builtin/{scene.name}" in names
     for path in (ROOT / "web").iterdir():
         assert f"service/web/{path.name}" in names
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {
@@ -31,7 +31,7 @@ def test_an_installed_wheel_and_a_checkout_both_find_the_page(tmp_path: Path) ->
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
     (wheel,) = tmp_path.glob("*.whl")
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
-    code = "import service.page; print(service.page.page_folder())"
+    code = "import service.api.page; print(service.api.page.page_folder())"
     for root, page in (
         (tmp_path / "installed", tmp_path / "installed" / "service" / "web"),
         (ROOT, ROOT / "web"),
@@ -52,7 +52,10 @@ def test_help_does_not_wait_for_heavy_libraries() -> None:
 
 
 def test_a_node_of_real_tiles_does_not_wait_for_scipy() -> None:
-    code = "import sys; import service.cli.node, service.node; print('scipy' in sys.modules)"
+    code = (
+        "import sys; import service.cli.commands.node, service.node.run;"
+        "print('scipy' in sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
     assert done.stdout.decode().strip() == "False"
 

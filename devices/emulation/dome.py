@@ -21,7 +21,7 @@ from scipy.signal import lfilter
 
 from devices.emulation.parts import DomePart, random_of
 from devices.emulation.surroundings import Surroundings
-from devices.scene import EmulationScene
+from devices.scene.file import EmulationScene
 
 Floats = npt.NDArray[np.float64]
 

@@ -12,12 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.mpl115a2 import (
-    CONVERSION_MAX_NS,
-    PRESSURE_MAX_KPA,
-    Coefficients,
-    padc_of_kpa,
-)
+from devices.chips.mpl115a2 import CONVERSION_MAX_NS, PRESSURE_MAX_KPA, Coefficients, padc_of_kpa
 
 
 @dataclass(frozen=True)

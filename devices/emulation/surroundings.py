@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.emulation.parts import random_of
-from devices.scene import EmulationScene
+from devices.scene.file import EmulationScene
 
 Floats = npt.NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from devices.compensation import Compensation
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import SAMPLE_PART_OF_CONVERSION, Coefficients, compensate_kpa
 from devices.emulation.world import World
 from devices.frames import NOT_READ, FrameBatch, TileInfo, TileStatus
-from devices.mpl115a2 import SAMPLE_PART_OF_CONVERSION, Coefficients, compensate_kpa
 from devices.temperature import hold_temperature
 
 _ROUNDING_NS = 2_000  # offsets are whole microseconds

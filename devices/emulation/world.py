@@ -1,7 +1,7 @@
 """A whole emulated foot: chips behind multiplexers under domes on a ground, and its ground truth.
 
-A driver gets the world's adapter through `devices.i2c.open_bus` and the pseudo-terminal of its
-servo, and nothing else. Truth is for whoever runs the scene, to judge an estimate by.
+A driver gets the world's adapter through `devices.buses.i2c.open_bus` and the pseudo-terminal of
+its servo, and nothing else. Truth is for whoever runs the scene, to judge an estimate by.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from typing import get_args
 import numpy as np
 import numpy.typing as npt
 
+from devices.chips.dynamixel.models import COUNTS_PER_TURN
 from devices.clock import Clock
-from devices.dynamixel_models import COUNTS_PER_TURN
+from devices.emulation.buses.i2c import EmulatedI2cAdapter
+from devices.emulation.buses.line import Line
+from devices.emulation.chips.dynamixel import EmulatedServo
+from devices.emulation.chips.front_end import FrontEnd
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
+from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.dome import Domes
-from devices.emulation.dynamixel import EmulatedServo
 from devices.emulation.faults import Faults
-from devices.emulation.front_end import FrontEnd
-from devices.emulation.ground import Rolling, make_ground, tile_positions_m
-from devices.emulation.hopping import Hopping
-from devices.emulation.i2c_bus import EmulatedI2cAdapter
-from devices.emulation.line import Line
-from devices.emulation.load_trace import Floats, PressedTrace
-from devices.emulation.mill import Indentation, Mill
-from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
+from devices.emulation.ground.grounds import Rolling, make_ground, tile_positions_m
+from devices.emulation.ground.hopping import Hopping
+from devices.emulation.ground.load_trace import Floats, PressedTrace
+from devices.emulation.ground.mill import Indentation, Mill
 from devices.emulation.parts import draw_chip, draw_dome, random_of
 from devices.emulation.surroundings import Surroundings
-from devices.emulation.tca9548a import EmulatedTca9548a
-from devices.scene import BUS, FaultKind, MudGround, Scene, ServoScene, TileFault
+from devices.scene.file import BUS, FaultKind, MudGround, Scene, ServoScene, TileFault
 
 _FORESIGHT_S = 0.4
 

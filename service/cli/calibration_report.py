@@ -9,8 +9,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from service.cli.report import ASSUMED_SCALE
+from service.estimation.bench.confidence import student_t_95
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.confidence import student_t_95
 from service.estimation.effects import Effects, Parameter
 from service.estimation.models.hysteresis import WIDTHS_N
 

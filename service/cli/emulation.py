@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import UsageError
-from devices.scene import EMULATED, Scene, load_scene
+from devices.scene.file import EMULATED, Scene, load_scene
 from service.cli.options import pair
 
 if TYPE_CHECKING:
-    from service.rig import RigOptions
+    from service.rig.rig import RigOptions
 
 LoadOption = Annotated[
     Path | None, typer.Option(help="Recorded load to press instead of the scene's ground.")
@@ -83,9 +83,9 @@ def rig_options(
         UsageError: options that do not fit.
         LoadTraceError: the load is not readable.
     """
-    from devices.emulation.load_trace import CopTransform
-    from service.rig import RigOptions
-    from storage.load_trace_file import read_load_trace
+    from devices.emulation.ground.load_trace import CopTransform
+    from service.rig.rig import RigOptions
+    from storage.formats.load_trace import read_load_trace
 
     check_load(load_scale, cop_scale, lead_s)
     if load is not None and scene.array.bus != EMULATED:

@@ -9,18 +9,18 @@ from typing import Annotated
 import typer
 
 from devices.errors import FootTileError
-from service.cli.bench import bench_command
-from service.cli.calibrate import calibrate_command
-from service.cli.demo import demo_command
-from service.cli.doctor import doctor_command
-from service.cli.domes import domes_command
-from service.cli.estimate import estimate_command
-from service.cli.node import node_command
-from service.cli.recover import recover_command
-from service.cli.serve import serve_command
-from service.cli.sessions import export_command, pull_command, sessions_command
-from service.cli.simulate import simulate_command
-from service.cli.verify import verify_command
+from service.cli.commands.bench import bench_command
+from service.cli.commands.calibrate import calibrate_command
+from service.cli.commands.demo import demo_command
+from service.cli.commands.doctor import doctor_command
+from service.cli.commands.domes import domes_command
+from service.cli.commands.estimate import estimate_command
+from service.cli.commands.node import node_command
+from service.cli.commands.recover import recover_command
+from service.cli.commands.serve import serve_command
+from service.cli.commands.sessions import export_command, pull_command, sessions_command
+from service.cli.commands.simulate import simulate_command
+from service.cli.commands.verify import verify_command
 from service.version import SOFTWARE
 
 _TYPER_INTERRUPTED = 130

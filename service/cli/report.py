@@ -8,8 +8,8 @@ from statistics import median
 
 from rich.table import Table
 
-from service.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
 from service.estimation.stances import Stance
+from service.offline.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
 
 PHASES = {
     "flight": "in flight",

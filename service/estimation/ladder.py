@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
-from devices.mpl115a2 import TADC_PER_KELVIN
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import EffectName
 from service.estimation.models.ambient import Ambient
@@ -24,7 +24,7 @@ from service.estimation.models.hysteresis import WIDTHS_N, Hysteresis
 from service.estimation.models.rubber import Rubber
 from service.estimation.models.static import StaticCurves
 from service.estimation.models.temperature import Temperature
-from service.estimation.tare import Tare
+from service.estimation.tare.tare import Tare
 
 Floats = npt.NDArray[np.float64]
 

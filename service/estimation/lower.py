@@ -7,14 +7,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.frames import NOT_READ, FrameBatch, TileStatus
-from devices.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
-from service.estimation.drift import has_warmed
 from service.estimation.estimates import EstimateStatus
 from service.estimation.models import ambient, gas, skew, temperature
 from service.estimation.models.outliers import despiked
 from service.estimation.models.unwrap import unwrap
 from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
+from service.estimation.tare.drift import has_warmed
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from devices.compensation import Compensation
+from devices.chips.compensation import Compensation
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.contact import ContactRule
 from service.estimation.geometry import grid_indices, hull
 from service.estimation.ladder import MODELS, Ladder, make_ladder
-from service.estimation.tare import Tare
+from service.estimation.tare.tare import Tare
 
 Floats = npt.NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from devices.scene import Scene
+from devices.scene.file import Scene
 
 
 @pytest.fixture

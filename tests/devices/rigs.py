@@ -8,19 +8,19 @@ from typing import get_args
 
 from smbus2 import i2c_msg
 
-from devices.array import TileArray
-from devices.budget import BusTiming
-from devices.bus_recovery import BusRecovery
+from devices.array.array import TileArray
+from devices.array.budget import BusTiming
+from devices.array.scan import Scan
+from devices.buses.i2c import I2cBus
 from devices.clock import VirtualClock
+from devices.emulation.buses.i2c import EmulatedI2cAdapter
+from devices.emulation.buses.line import Line
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
+from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.faults import Faults
-from devices.emulation.i2c_bus import EmulatedI2cAdapter
-from devices.emulation.line import Line
-from devices.emulation.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
-from devices.emulation.tca9548a import EmulatedTca9548a
 from devices.frames import TileInfo
-from devices.i2c import I2cBus
-from devices.scan import Scan
-from devices.scene import BUS, FaultKind, ReadDuringConversion, ScheduleName, TileFault
+from devices.recovery.recovery import BusRecovery
+from devices.scene.file import BUS, FaultKind, ReadDuringConversion, ScheduleName, TileFault
 
 DATA_SHEET = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 FORUM = (0x3591, 0xC0A2, 0xC625, 0x2C18)

@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.acquisition import Acquisition
-from devices.array import TileArray
-from devices.budget import BusTiming
+from devices.array.array import TileArray
+from devices.array.budget import BusTiming
+from devices.array.self_test import identify
+from devices.buses.i2c import I2cAdapter, I2cBus, open_bus
 from devices.clock import UtcAnchor, VirtualClock
-from devices.emulation.i2c_bus import EmulatedI2cAdapter
-from devices.emulation.mpl115a2 import EmulatedMpl115a2, Silicon
-from devices.emulation.tca9548a import EmulatedTca9548a
+from devices.emulation.buses.i2c import EmulatedI2cAdapter
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
+from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.world import World
 from devices.errors import BusMisuseError, BusSetupError
 from devices.frames import (
@@ -28,9 +30,7 @@ from devices.frames import (
     FrameStatus,
     TileStatus,
 )
-from devices.i2c import I2cAdapter, I2cBus, open_bus
-from devices.scene import Scene, ScheduleName, TileScene
-from devices.self_test import identify
+from devices.scene.file import Scene, ScheduleName, TileScene
 from tests.devices.rigs import SCHEDULES, SETTLED
 
 SceneOf = Callable[..., Scene]
@@ -343,7 +343,7 @@ def test_an_array_with_noise_is_not_called_stale(scene_of: SceneOf) -> None:
     same = (np.diff(batch.padc[:, 0].astype(int)) == 0) & (
         np.diff(batch.tadc[:, 0].astype(int)) == 0
     )
-    assert 0.05 < same.mean() < 0.2, "about one in nine, as devices.health says"
+    assert 0.05 < same.mean() < 0.2, "about one in nine, as devices.array.health says"
 
 
 class Failing:

@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import pytest
 
+from devices.buses.spi import SpiDevice
+from devices.chips.mcp3208 import Mcp3208
 from devices.clock import VirtualClock
-from devices.emulation.mcp3208 import EmulatedMcp3208, Volts, amplifier_volts
-from devices.mcp3208 import Mcp3208
+from devices.emulation.chips.mcp3208 import EmulatedMcp3208, Volts, amplifier_volts
 from devices.reference import ReferenceForce
-from devices.scene import ReferenceScene
-from devices.spi import SpiDevice
+from devices.scene.file import ReferenceScene
 
 SCENE = ReferenceScene(channel=3, zero_v=1.65, n_per_v=100 / 3.3)
 

@@ -24,10 +24,10 @@ from typing import Any, TypeVar
 import httpx
 import numpy as np
 import pytest
+import service.recorder
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-import service.recorder
 import service.server
 from devices.frames import (
     NO_SERVO_AGE,
@@ -37,7 +37,8 @@ from devices.frames import (
     FrameStatus,
     TileInfo,
 )
-from service.app import make_app
+from service.api.app import make_app
+from service.api.serve import listen, serving, urls_of
 from service.estimation.calibration import Calibration, TileCalibration
 from service.link import (
     INGEST_PATH,
@@ -52,10 +53,9 @@ from service.link import (
     heard,
     with_check,
 )
-from service.serve import listen, serving, urls_of
-from service.server import Server
+from service.server.server import Server
 from storage.intervals import Intervals
-from storage.journal import Journal
+from storage.journal.journal import Journal
 from storage.schema import wire_schema
 from storage.wire import encode
 
@@ -652,8 +652,8 @@ def serve_with(
     no_threads_left: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[..., Running]]:
     """A server with this token and these names; its ticks are quick, and so the tests are."""
-    monkeypatch.setattr(service.server, "TICK_S", TICK_S)
-    monkeypatch.setattr(service.recorder, "BEHIND_S", 1e9)  # its frames are long ago
+    monkeypatch.setattr(service.server.server, "TICK_S", TICK_S)
+    monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # its frames are long ago
     started: list[Running] = []
 
     def start(**options: Any) -> Running:

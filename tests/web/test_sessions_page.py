@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
-
 import service.recorder
 import service.routes.sessions
+from playwright.sync_api import Page, expect
+
 import service.server
 from tests.service.conftest import FakeNode, Play, Running
 from tests.web.conftest import wait_until
@@ -76,9 +76,9 @@ class Scripted:
 
 @pytest.fixture
 def scripted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scripted]:
-    monkeypatch.setattr(service.routes.sessions, "SETTLE_S", 0.1)
-    monkeypatch.setattr(service.server, "TICK_S", 0.05)
-    monkeypatch.setattr(service.recorder, "BEHIND_S", 1e9)  # its lead is long ago
+    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
+    monkeypatch.setattr(service.server.server, "TICK_S", 0.05)
+    monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # its lead is long ago
     one = Scripted(tmp_path)
     yield one
     one.close()

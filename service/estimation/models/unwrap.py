@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from devices.mpl115a2 import COUNTS_MAX, PRESSURE_MIN_KPA
+from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MIN_KPA
 
 
 def unwrap(kpa: npt.NDArray[np.float64], kpa_per_count: npt.ArrayLike) -> npt.NDArray[np.float64]:

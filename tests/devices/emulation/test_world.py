@@ -12,18 +12,18 @@ import numpy.typing as npt
 import pytest
 from smbus2 import i2c_msg
 
-from devices.array import TileArray
-from devices.budget import BusTiming
+from devices.array.array import TileArray
+from devices.array.budget import BusTiming
+from devices.array.self_test import identify
+from devices.buses.i2c import I2cBus, open_bus
+from devices.chips.dynamixel.reader import open_servo
+from devices.chips.mpl115a2 import Coefficients, compensate_kpa, padc_of_kpa
 from devices.clock import VirtualClock
-from devices.dynamixel import open_servo
 from devices.emulation.parts import draw_chip, draw_dome
 from devices.emulation.world import World
 from devices.errors import TileSetupError
 from devices.frames import TileInfo
-from devices.i2c import I2cBus, open_bus
-from devices.mpl115a2 import Coefficients, compensate_kpa, padc_of_kpa
-from devices.scene import Scene, load_scene
-from devices.self_test import identify
+from devices.scene.file import Scene, load_scene
 
 SceneOf = Callable[..., Scene]
 Plugs = tuple[tuple[int, int], ...]

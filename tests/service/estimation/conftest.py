@@ -36,7 +36,7 @@ from service.estimation.effects import (
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare import Tare
+from service.estimation.tare.tare import Tare
 
 COUNT_KPA = 130 / 1023
 UNLOADED_COUNTS = 500

@@ -21,7 +21,7 @@ from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
 from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
 from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare import Tare
+from service.estimation.tare.tare import Tare
 
 InfoOf = Callable[..., ArrayInfo]
 TileOf = Callable[..., TileCalibration]

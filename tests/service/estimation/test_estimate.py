@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.compensation import Compensation
+from devices.chips.compensation import Compensation
 from devices.frames import (
     NO_SERVO_COUNTS,
     ArrayInfo,
@@ -32,7 +32,7 @@ from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.lower import Felt
 from service.estimation.models.temperature import Temperature
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare import take_tare
+from service.estimation.tare.tare import take_tare
 
 InfoOf = Callable[..., ArrayInfo]
 TileOf = Callable[..., TileCalibration]

@@ -16,7 +16,7 @@ from service.estimation import warm
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.ladder import MODELS
 from service.estimation.plan import make_plan
-from service.estimation.tare import Tare
+from service.estimation.tare.tare import Tare
 from storage.schema import wire_schema
 from storage.wire import decode, encode
 

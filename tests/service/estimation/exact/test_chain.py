@@ -21,7 +21,7 @@ from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.ladder import MODELS
 from service.estimation.models.outliers import FAR
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare import Tare
+from service.estimation.tare.tare import Tare
 
 PARTS = [(0x3ECE, 0xB3F9, 0xC517, 0x33C8), (0x3591, 0xC0A2, 0xC625, 0x2C18)] * 2
 UNLOADED_COUNTS = (380, 287, 369, 302)

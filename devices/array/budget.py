@@ -1,0 +1,175 @@
+"""How long a frame takes on the wire, schedule by schedule, and which schedule is best.
+
+The timing model of hardware.md 4: START, repeated START and STOP count one SCL period each, nine
+per byte; every transaction may cost a fixed overhead on top, every sleep an overshoot. What the
+schedules do is in `devices.array.schedules`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+from devices.errors import SceneError
+from devices.scene.file import ScheduleName
+
+SELECT_BITS = 20
+CONVERT_BITS = 29
+_READ_BITS = 30
+_BYTE_BITS = 9
+
+PREFERENCE: tuple[ScheduleName, ...] = ("simultaneous", "per_mux", "pipelined", "sequential")
+"""Of schedules that are equally fast, the one with the least skew."""
+_AS_FAST = 0.995
+
+
+def read_bits(n_bytes: float) -> float:
+    """SCL periods of a read of `n_bytes` from a register."""
+    return _READ_BITS + _BYTE_BITS * n_bytes
+
+
+@dataclass(frozen=True)
+class BusTiming:
+    """What a bus, its host and the parts on it need.
+
+    Attributes:
+        scl_hz: the bus clock as it really is.
+        conversions_s: how long to wait for each tile, in the order of the tiles.
+        muxes: which mux each tile is behind.
+        bytes_read: bytes of a sample, 4 with temperature and 2 without; a mean if decimated.
+        transaction_s: overhead of one transaction beyond its bits.
+        sleep_s: how much too late a sleep ends.
+    """
+
+    scl_hz: float
+    conversions_s: tuple[float, ...]
+    muxes: tuple[int, ...]
+    bytes_read: float = 4.0
+    transaction_s: float = 0.0
+    sleep_s: float = 0.0
+
+    @property
+    def select_s(self) -> float:
+        """One write to a mux."""
+        return SELECT_BITS / self.scl_hz + self.transaction_s
+
+    @property
+    def convert_s(self) -> float:
+        """One CONVERT."""
+        return CONVERT_BITS / self.scl_hz + self.transaction_s
+
+    @property
+    def read_s(self) -> float:
+        """One read of a tile's sample."""
+        return read_bits(self.bytes_read) / self.scl_hz + self.transaction_s
+
+    @property
+    def tiles_by_mux(self) -> tuple[int, ...]:
+        """Number of tiles behind each mux."""
+        return tuple(self.muxes.count(mux) for mux in sorted(set(self.muxes)))
+
+
+def frame_s(schedule: ScheduleName, timing: BusTiming) -> float:
+    """Seconds from one frame to the next."""
+    n, m = len(timing.muxes), len(timing.tiles_by_mux)
+    s, c, r = timing.select_s, timing.convert_s, timing.read_s
+    waits = [wait + timing.sleep_s for wait in timing.conversions_s]
+    if n == 1:  # the mux stays as it is, and there is nothing to do in the wait
+        return c + waits[0] + r
+    if schedule == "sequential":
+        return n * (s + c + r) + sum(waits) + (m * s if m > 1 else 0.0)
+    if schedule == "simultaneous" or (schedule == "per_mux" and m == 1):
+        # The first select, and the closing of the other muxes, are hidden in the wait.
+        return m * s + c + max(*waits, m * s) + n * r + (n - 1) * s + (m - 1) * s
+    if schedule == "pipelined":
+        busy = n * (s + c + r) + (m * s if m > 1 else 0.0)
+        return max(busy, max(waits) + r + c)
+    start = 2 * s + c  # open a mux, convert, close it
+    reads = [count * (s + r) + s for count in timing.tiles_by_mux]
+    return max(m * start + sum(reads), max(waits) + start + max(reads))
+
+
+def turns_s(timing: BusTiming) -> tuple[float, ...]:
+    """From the begin of a pipelined frame to each tile's read, if none of them has to wait."""
+    turns = []
+    t_s, alone = 0.0, len(timing.muxes) == 1
+    for i, mux in enumerate(timing.muxes):
+        leaves = mux != timing.muxes[i - 1]  # the first tile comes after the last one
+        t_s += 0.0 if alone else (1 + leaves) * timing.select_s
+        turns.append(t_s)
+        t_s += timing.read_s + timing.convert_s
+    return tuple(turns)
+
+
+def rates_hz(timing: BusTiming) -> dict[ScheduleName, float]:
+    """Frames a second of every schedule."""
+    return {name: 1.0 / frame_s(name, timing) for name in get_args(ScheduleName)}
+
+
+def broadcast_width(schedule: ScheduleName, muxes: Sequence[int]) -> int:
+    """How many channels a schedule opens at once."""
+    if schedule == "simultaneous":
+        return len(muxes)
+    if schedule == "per_mux":
+        return max(muxes.count(mux) for mux in muxes)
+    return 1
+
+
+def check_broadcast(schedule: ScheduleName, muxes: Sequence[int], channels_max: int) -> None:
+    """Refuse a broadcast that the wires cannot carry.
+
+    Every open channel adds its pull-ups, and in a read one part alone has to sink them all: 3 mA at
+    0.4 V is what a part is good for (TCA9548A data sheet 9.2.1, hardware.md 2).
+
+    Raises:
+        SceneError: more channels at once than `channels_max`.
+    """
+    width = broadcast_width(schedule, muxes)
+    if width > channels_max:
+        raise SceneError(
+            f"schedule {schedule!r} opens {width} channels at once",
+            where="array.broadcast_channels",
+            expected=f"at most {channels_max}: one part has to sink the pull-ups of all of them",
+            remedy='Use schedule = "per_mux" or "pipelined"; raise the bound only if the pull-ups '
+            "of the channels are weak enough (10 kOhm for 8 channels)",
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A schedule, and in one sentence why this one."""
+
+    schedule: ScheduleName
+    reason: str
+
+
+def choose(timing: BusTiming, *, asked_hz: float, channels_max: int) -> Choice:
+    """The schedule for these tiles: without skew if that is fast enough, else the fastest.
+
+    Args:
+        timing: the bus and the parts, as measured.
+        asked_hz: frames a second that are wanted; 0: as many as there can be.
+        channels_max: how many channels may be open at once.
+    """
+    n, m = len(timing.muxes), len(timing.tiles_by_mux)
+    rates = {
+        name: rate
+        for name, rate in rates_hz(timing).items()
+        if broadcast_width(name, timing.muxes) <= channels_max
+    }
+    where = f"{n} tile{'s' * (n > 1)} on {m} mux{'es' * (m > 1)}"
+    if asked_hz and rates.get("simultaneous", 0.0) >= asked_hz:
+        return Choice(
+            "simultaneous",
+            f"{where}: simultaneous has no skew and holds the {asked_hz:g} frames/s asked for",
+        )
+    best = max(rates.values())
+    name = next(name for name in PREFERENCE if rates.get(name, 0.0) >= _AS_FAST * best)
+    return Choice(name, f"{where}: {listed(rates, name)}")
+
+
+def listed(rates: Mapping[ScheduleName, float], first: ScheduleName) -> str:
+    """Rates in words, `first` first."""
+    others = [f"{other} {rate:.0f}" for other, rate in rates.items() if other != first]
+    return f"{first} gives {rates[first]:.0f} frames/s, {', '.join(others)}"

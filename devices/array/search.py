@@ -1,0 +1,72 @@
+"""Looking for a tile that was lost: is it back, and is it itself?
+
+The protocol has no identity but the eight coefficients that are burnt into each part. Whoever comes
+back with others is another part, however well it answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from devices.array.health import TileHealth
+from devices.array.ports import TilePorts
+from devices.array.scan import Scan
+from devices.clock import Clock
+from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
+from devices.frames import TileStatus
+
+
+class Search:
+    """Looks for the lost tiles of an array, each ever more rarely."""
+
+    def __init__(self, ports: TilePorts, clock: Clock, health: Sequence[TileHealth]) -> None:
+        self._ports = ports
+        self._clock = clock
+        self._health = health
+
+    def note_absence(self, scan: Scan, tile: int) -> None:
+        """Flag a lost tile in a frame."""
+        replaced = self._health[tile].replaced
+        scan.flag(tile, TileStatus.IMPLAUSIBLE if replaced else TileStatus.NO_ANSWER)
+
+    def look_for(self, scan: Scan, tile: int) -> None:
+        """See whether a tile is back, if it is time to; its sample comes with the next frame."""
+        self.note_absence(scan, tile)
+        health = self._health[tile]
+        begin_ns = self._clock.now_ns()
+        if not health.is_probe_due(begin_ns):
+            return
+        try:
+            if self._is_itself(tile):
+                health.find()
+            else:
+                health.lose(self._clock.now_ns())
+        except TileSetupError:
+            scan.flag(tile, TileStatus.IMPLAUSIBLE)
+            health.lose(self._clock.now_ns())
+        except NoAcknowledgeError:
+            self._ports.forget([tile])
+            health.lose(self._clock.now_ns())
+        except BusFaultError:
+            scan.note_bus_fault()
+        scan.budget_ns -= self._clock.now_ns() - begin_ns
+
+    def _is_itself(self, tile: int) -> bool:
+        """Do its coefficients say so? If another part's do, it is noted as replaced."""
+        health = self._health[tile]
+        self._ports.connect(tile)
+        if self._ports.read_coefficients() == health.coefficient_bytes:
+            health.replaced = False
+            return True
+        # A disturbed bit, in the reading or in the select before it, must not make another part.
+        words = set()
+        for _ in range(2):
+            self._ports.router.forget()
+            self._ports.connect(tile)
+            words.add(self._ports.read_coefficient_words(tile))
+        if words == {health.coefficient_words}:
+            health.replaced = False
+            return True
+        # Each of them three times the same and plausible: a part, but not the one that was here.
+        health.replaced = len(words) == 1 and not self._ports.router.silent
+        return False

@@ -1,0 +1,268 @@
+"""From a scene and a bus to an array that is ready to take frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from devices.array.array import TileArray
+from devices.array.budget import BusTiming, Choice, choose, frame_s
+from devices.array.bus_watch import Help, help_bus
+from devices.array.self_test import WireTiming, identify, measure_conversion_ns, measure_wires
+from devices.buses.i2c import I2cBus, PatientBus
+from devices.chips.mpl115a2 import CONVERSION_MAX_NS
+from devices.chips.tca9548a import MuxRouter
+from devices.clock import Clock
+from devices.errors import BusFaultError, SceneError
+from devices.frames import TileInfo
+from devices.recovery.recovery import BusRecovery
+from devices.scene.file import AnySchedule, ArrayScene, Scene
+
+
+@dataclass(frozen=True)
+class Ready:
+    """An array that was identified and measured.
+
+    Attributes:
+        array: takes frames.
+        tiles: as identified, with the conversion times measured.
+        timing: of the bus and the parts.
+        choice: the schedule, and why.
+        predicted_hz: frames a second that it should give.
+        unmeasured: serials whose conversion time could not be measured; they are given 3 ms.
+    """
+
+    array: TileArray
+    tiles: tuple[TileInfo, ...]
+    timing: BusTiming
+    choice: Choice
+    predicted_hz: float
+    unmeasured: tuple[str, ...]
+
+
+def make_ready(
+    bus: I2cBus,
+    scene: Scene,
+    clock: Clock,
+    *,
+    schedule: AnySchedule | None = None,
+    recovery: BusRecovery | None = None,
+    beside: Callable[[], float] | None = None,
+) -> Ready:
+    """Identify the tiles of a scene, measure bus and parts, and choose how to ask them.
+
+    Args:
+        bus: what they hang on.
+        scene: what should be there.
+        clock: virtual or real.
+        schedule: instead of the scene's.
+        recovery: frees a stuck bus.
+        beside: as for `TileArray`.
+
+    Raises:
+        TileSetupError, I2cError: a tile or the bus does not work.
+        SceneError: the schedule does not suit the tiles.
+    """
+    free_bus(bus, scene, recovery)
+    found = measured(bus, scene, clock)
+    choice = chosen(scene, found.timing, schedule, has_reference=beside is not None)
+    return _ready(bus, scene, clock, found, choice, recovery, beside)
+
+
+def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
+    """Make sure that the wires move at all: a slave may hang in a byte since the last run.
+
+    Raises:
+        BusFaultError: SDA or SCL is stuck low, and nobody or nothing could free it.
+    """
+    router = MuxRouter(bus, [tile.mux for tile in scene.tile])
+    fault: BusFaultError | None = None
+
+    def moves() -> bool:
+        nonlocal fault
+        try:
+            # If nobody answers it moves: whose fault that is, identification says.
+            if router.echoes() or router.refused is not None:
+                return True
+            fault = BusFaultError(
+                "the multiplexers acknowledge, and none keeps what is written to it",
+                where=bus.name,
+                remedy="SDA is stuck low: pull the tiles' plugs one by one, cycle their supply, or "
+                "wire [recovery]",
+            )
+        except BusFaultError as error:
+            fault = error
+        return False
+
+    given = Help(worked=moves())
+    if not given.worked and recovery is not None:
+        given = help_bus(recovery, moves)
+    if not given.worked and fault is not None:
+        if given.problem:
+            fault.remedy += f". It could not be freed: {given.problem}"
+        raise fault
+
+
+def renew(
+    bus: I2cBus,
+    scene: Scene,
+    clock: Clock,
+    before: Ready,
+    *,
+    recovery: BusRecovery | None = None,
+    beside: Callable[[], float] | None = None,
+) -> Ready:
+    """The array with the parts that are there now in place of those that were replaced.
+
+    Only the new parts are identified and measured, so that the others rest for a moment only.
+
+    Raises:
+        TileSetupError, I2cError: a new part has gone again, or is none.
+    """
+    replaced = before.array.replaced
+    new = [tile for tile in scene.tile if tile.serial in replaced]
+    found = measured(bus, scene.model_copy(update={"tile": tuple(new)}), clock)
+    waits_s = dict(zip((tile.serial for tile in new), found.timing.conversions_s, strict=True))
+    by_serial = {tile.serial: tile for tile in found.tiles}
+    serials = [tile.serial for tile in before.tiles]
+    old_s = dict(zip(serials, before.timing.conversions_s, strict=True))
+    parts = Measured(
+        tiles=tuple(by_serial.get(tile.serial, tile) for tile in before.tiles),
+        timing=replace(
+            before.timing, conversions_s=tuple((old_s | waits_s)[serial] for serial in serials)
+        ),
+        unmeasured=(*(s for s in before.unmeasured if s not in by_serial), *found.unmeasured),
+    )
+    return _ready(bus, scene, clock, parts, before.choice, recovery, beside)
+
+
+def _ready(
+    bus: I2cBus,
+    scene: Scene,
+    clock: Clock,
+    found: Measured,
+    choice: Choice,
+    recovery: BusRecovery | None,
+    beside: Callable[[], float] | None,
+) -> Ready:
+    array = TileArray(
+        bus,
+        found.tiles,
+        clock,
+        schedule=choice.schedule,
+        timing=found.timing,
+        temperature_every=scene.array.temperature_every,
+        broadcast_channels=scene.array.broadcast_channels,
+        recovery=recovery,
+        beside=beside,
+    )
+    # Schedules that read what the frame before has started have to be started once.
+    array.scan()
+    predicted_hz = 1.0 / frame_s(choice.schedule, found.timing)
+    return Ready(array, found.tiles, found.timing, choice, predicted_hz, found.unmeasured)
+
+
+def chosen(
+    scene: Scene,
+    timing: BusTiming,
+    schedule: AnySchedule | None = None,
+    *,
+    has_reference: bool,
+    asked_hz: float = 0.0,
+) -> Choice:
+    """The schedule for a scene on a bus with this timing, and why.
+
+    Args:
+        scene: what it asks for.
+        timing: as measured.
+        schedule: instead of the scene's.
+        has_reference: is a reference force read with the tiles?
+        asked_hz: instead of the scene's rate.
+
+    Raises:
+        SceneError: the schedule does not suit a reference sensor.
+    """
+    asked = schedule or scene.array.schedule
+    if has_reference:
+        return _beside_reference(asked)
+    if asked == "auto":
+        return choose(
+            timing,
+            asked_hz=asked_hz or scene.rate_hz,
+            channels_max=scene.array.broadcast_channels,
+        )
+    return Choice(asked, "as the scene says" if schedule is None else "as asked for")
+
+
+def _beside_reference(asked: AnySchedule) -> Choice:
+    if asked in ("auto", "simultaneous"):
+        return Choice("simultaneous", "the reference force is read while all tiles convert at once")
+    if asked == "sequential":
+        return Choice(asked, "as the scene says")
+    raise SceneError(
+        f"schedule {asked!r} beside a reference sensor: its tiles are sampled one after another",
+        where="array.schedule",
+        expected='"simultaneous" or "sequential", in which the reference is read with the tiles',
+    )
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The tiles of a scene as found, the timing of bus and parts, and who could not be measured."""
+
+    tiles: tuple[TileInfo, ...]
+    timing: BusTiming
+    unmeasured: tuple[str, ...]
+
+
+def measured(bus: I2cBus, scene: Scene, clock: Clock) -> Measured:
+    """Identify the tiles of a scene and measure them.
+
+    With `array.wait_ms` the parts are not measured. A part whose words do not tell is given the
+    data sheet's longest time.
+
+    Raises:
+        TileSetupError, I2cError: as for `make_ready`.
+    """
+    bus = PatientBus(bus)
+    tiles = list(identify(bus, scene.tile))
+    wires = measure_wires(bus, clock, tiles[0])
+    unmeasured = []
+    conversions_ns: list[int | None] = [None] * len(tiles)
+    if scene.array.wait_ms is None:
+        for index, tile in enumerate(tiles):
+            conversion_ns = measure_conversion_ns(bus, clock, tile, wires)
+            conversions_ns[index] = conversion_ns
+            if conversion_ns is None:
+                unmeasured.append(tile.serial)
+            else:
+                tiles[index] = tile.model_copy(update={"conversion_ms": conversion_ns / 1e6})
+    timing = timing_of(scene.array, wires, [tile.mux for tile in tiles], conversions_ns)
+    return Measured(tuple(tiles), timing, tuple(unmeasured))
+
+
+def timing_of(
+    array: ArrayScene,
+    wires: WireTiming,
+    muxes: Sequence[int],
+    conversions_ns: Sequence[int | None],
+) -> BusTiming:
+    """The timing by which tiles are asked: waits as the scene says, else as measured.
+
+    Args:
+        array: what the scene says.
+        wires: as measured.
+        muxes: which mux each tile is behind.
+        conversions_ns: of each tile, as measured; None, where it is not known, is the data sheet's
+            longest.
+    """
+    if array.wait_ms is not None:
+        conversions_ns = [round(array.wait_ms * 1e6)] * len(muxes)
+    waits_ns = [CONVERSION_MAX_NS if known is None else known for known in conversions_ns]
+    return BusTiming(
+        scl_hz=wires.scl_hz,
+        conversions_s=tuple(wait_ns * 1e-9 for wait_ns in waits_ns),
+        muxes=tuple(muxes),
+        bytes_read=2.0 + 2.0 / array.temperature_every,
+        transaction_s=wires.transaction_s,
+    )

@@ -1,0 +1,80 @@
+"""Who is on a serial line whose protocol and baud rate nobody remembers."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from devices.buses.serial_line import open_line
+from devices.chips.dynamixel.models import FIRMWARES, known_model
+from devices.chips.dynamixel.reader import Dynamixel
+from devices.clock import Clock
+from devices.errors import ServoPacketError, ServoStatusError, ServoTimeoutError
+
+BAUDRATES = (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000)
+"""The factory's first, then by how usual they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundServo:
+    """One servo, as it answered."""
+
+    servo_id: int
+    baudrate: int
+    protocol: int
+    """Which protocol it answers in."""
+    model: str | None
+    """Name, if it is an MX-28 or MX-64."""
+    model_number: int
+    firmware_version: int
+
+
+def probe(
+    port: str,
+    clock: Clock,
+    *,
+    servo_ids: Iterable[int] = (1,),
+    baudrates: Iterable[int] = BAUDRATES,
+    timeout_s: float = 0.05,
+) -> list[FoundServo]:
+    """Ask for every id at every baud rate in both protocols; what answers, in that order.
+
+    Every silence costs `timeout_s` seconds: half a second for one id and all rates, two minutes
+    for all ids. The default is ample for an answer at 57600 baud (4 ms) through an FTDI adapter
+    with its default latency timer (16 ms). Servos are only read, never set.
+
+    Raises:
+        ServoSetupError: the port cannot be opened, or fails.
+    """
+    servo_ids = tuple(servo_ids)
+    found = []
+    for baudrate in baudrates:
+        with contextlib.closing(open_line(port, baudrate, timeout_s)) as line:
+            for protocol, firmware in FIRMWARES.items():
+                for servo_id in servo_ids:
+                    if servo_id > firmware.protocol.highest_id:
+                        continue
+                    servo = Dynamixel(
+                        line,
+                        clock,
+                        servo_id=servo_id,
+                        baudrate=baudrate,
+                        timeout_s=timeout_s,
+                        protocol=protocol,
+                    )
+                    # At a wrong rate an answer is noise, if anything comes at all.
+                    with contextlib.suppress(ServoTimeoutError, ServoPacketError, ServoStatusError):
+                        identity = servo.identify()
+                        known = known_model(identity.model_number)
+                        found.append(
+                            FoundServo(
+                                servo_id=servo_id,
+                                baudrate=baudrate,
+                                protocol=protocol,
+                                model=None if known is None else known[0],
+                                model_number=identity.model_number,
+                                firmware_version=identity.firmware_version,
+                            )
+                        )
+    return found

@@ -1,0 +1,98 @@
+"""Dynamixel Protocol 1.0, as pure functions of bytes.
+
+Requests and answers have the same form here, and a one-wire adapter hands one's own request back.
+An answer can be byte for byte its request: that to a ping, with the voltage bit set, is a ping. So
+nothing is asked for whose answer would have that length: no ping, no two bytes.
+
+Sources: e-manual protocol1.md, hardware.md 5.1.
+"""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+from devices.chips.dynamixel.packets import (
+    BROADCAST_ID,
+    DynamixelProtocol,
+    Instruction,
+    Packet,
+    Status,
+)
+
+# Instruction or error to checksum. Longer than the whole control table of an MX, which ends at
+# address 73, is noise: this header is short, and a wrong length would be waited for.
+_MIN_LENGTH, _MAX_LENGTH = 2, 2 + 74
+
+
+class Error(IntFlag):
+    """Bits of an answer's error byte (e-manual protocol1.md, "Error")."""
+
+    VOLTAGE = 0x01
+    ANGLE = 0x02
+    """The goal position is outside the limits; it says nothing of the present one."""
+    OVERHEAT = 0x04
+    RANGE = 0x08
+    CHECKSUM = 0x10
+    OVERLOAD = 0x20
+    INSTRUCTION = 0x40
+    UNDEFINED = 0x80
+
+    ALERT = VOLTAGE | ANGLE | OVERHEAT | OVERLOAD
+    """The servo complains of its state; it did what it was asked, and its data are valid."""
+
+
+_REFUSALS = {
+    Error.RANGE: "range",
+    Error.CHECKSUM: "checksum of the request",
+    Error.INSTRUCTION: "undefined instruction",
+    Error.UNDEFINED: "unknown",
+}
+
+
+def checksum(data: bytes) -> int:
+    """Inverted sum of `data`, which is everything from the id on (e-manual protocol1.md)."""
+    return ~sum(data) & 0xFF
+
+
+class _Protocol1(DynamixelProtocol):
+    """`FF FF ID LEN INST parameters SUM`; an answer has its error byte in the place of INST."""
+
+    version = 1
+    highest_id = 253
+    header = b"\xff\xff"
+    preamble_bytes = 4
+    shortest_bytes = 4 + _MIN_LENGTH
+
+    def size(self, preamble: bytes) -> int:
+        servo_id, length = preamble[2], preamble[3]
+        # An id of FF is the header's second byte, after an FF of noise.
+        plausible = servo_id <= BROADCAST_ID and _MIN_LENGTH <= length <= _MAX_LENGTH
+        return self.preamble_bytes + length if plausible else 0
+
+    def pack(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+        body = bytes([servo_id, len(parameters) + _MIN_LENGTH, instruction]) + parameters
+        return self.header + body + bytes([checksum(body)])
+
+    def unpack(self, wire: bytes) -> Packet:
+        intact = checksum(wire[2:-1]) == wire[-1]
+        return Packet(wire[2], wire[4], wire[5:-1], intact, wire)
+
+    def read_request(self, servo_id: int, address: int, length: int) -> bytes:
+        return self.pack(servo_id, Instruction.READ, bytes([address, length]))
+
+    def identity_request(self, servo_id: int) -> bytes:
+        return self.read_request(servo_id, 0, 3)
+
+    def status(self, packet: Packet) -> Status | None:
+        error = Error(packet.instruction)
+        return Status(
+            servo_id=packet.servo_id,
+            data=packet.parameters,
+            alert=bool(error & Error.ALERT),
+            refusal=", ".join(meaning for bit, meaning in _REFUSALS.items() if error & bit),
+            intact=packet.intact,
+            wire_bytes=len(packet.wire),
+        )
+
+
+PROTOCOL_1 = _Protocol1()

@@ -1,0 +1,116 @@
+"""The newest position of a servo, for frames to carry along.
+
+On a real clock a thread of its own reads the servo, so that its silence costs the tiles nothing. In
+a session on virtual time nothing runs beside the tile loop, so the servo is read in lock-step:
+at every instant a reading was due, on a clock of the servo's own line, and its value is known to
+the frames only from the instant at which its answer was complete.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from types import TracebackType
+from typing import Self
+
+from devices.chips.dynamixel.reader import Dynamixel, PositionReading
+from devices.clock import Clock
+from devices.errors import ServoError
+
+_RECENT = 16
+"""Readings kept for a frame that takes long: 64 tiles take 16 ms, a quick servo 1 ms."""
+
+
+class PolledServo:
+    """A `ServoSource` for virtual time: readings at fixed intervals on the servo line's clock.
+
+    It blocks while a servo is silent, so it is not for a real loop.
+    """
+
+    def __init__(self, servo: Dynamixel, line_clock: Clock, *, rate_hz: float) -> None:
+        self.failures = 0
+        """Readings that failed: silence, garbage, or an error status."""
+        self._servo = servo
+        self._clock = line_clock
+        self._period_ns = round(1e9 / rate_hz)
+        self._due_ns = line_clock.now_ns()
+        self._newest: PositionReading | None = None
+        self._on_the_way: deque[PositionReading] = deque()
+
+    @property
+    def stale_after_ns(self) -> int:
+        """Three intervals: one late answer is no fault."""
+        return 3 * self._period_ns
+
+    def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
+        """Newest position known at `t_mono_ns` with its sample instant; None before the first."""
+        while self._due_ns <= t_mono_ns:
+            self._clock.sleep_until_ns(self._due_ns)
+            try:
+                self._on_the_way.append(self._servo.read_position())
+            except ServoError:
+                self.failures += 1
+            self._due_ns = max(self._due_ns + self._period_ns, self._clock.now_ns())
+        while self._on_the_way and self._on_the_way[0].done_ns <= t_mono_ns:
+            self._newest = self._on_the_way.popleft()
+        return None if self._newest is None else (self._newest.counts, self._newest.t_mono_ns)
+
+
+class ServoReader:
+    """A `ServoSource` for a real clock: a thread reads the servo at a fixed rate.
+
+    Use as a context manager: the thread runs while the block does.
+    """
+
+    def __init__(self, servo: Dynamixel, clock: Clock, *, rate_hz: float) -> None:
+        self.failures = 0
+        """Readings that failed: silence, garbage, or an error status."""
+        self._servo = servo
+        self._clock = clock
+        self._period_ns = round(1e9 / rate_hz)
+        self._recent: tuple[PositionReading, ...] = ()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._read, name="servo", daemon=True)
+
+    @property
+    def stale_after_ns(self) -> int:
+        """Three intervals: one late answer is no fault."""
+        return 3 * self._period_ns
+
+    def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
+        """Newest position sampled by `t_mono_ns`, with its sample instant; None before the first.
+
+        The thread goes on while a frame is taken, so there are newer ones: they are for the next
+        frame. Only if there is no older one is the oldest given, with age 0.
+        """
+        recent = self._recent
+        if not recent:
+            return None
+        reading = next((r for r in recent if r.t_mono_ns <= t_mono_ns), recent[-1])
+        return reading.counts, min(reading.t_mono_ns, t_mono_ns)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _read(self) -> None:
+        due_ns = self._clock.now_ns()
+        while not self._stop.is_set():
+            try:
+                # Replaced as a whole, newest first: whoever looks sees the old or the new ones.
+                self._recent = (self._servo.read_position(), *self._recent[: _RECENT - 1])
+            except ServoError:
+                self.failures += 1
+                # A port that has gone fails at once: do not spin on it.
+                self._stop.wait(self._period_ns * 1e-9)
+            due_ns = max(due_ns + self._period_ns, self._clock.now_ns())
+            self._clock.sleep_until_ns(due_ns)

@@ -1,0 +1,152 @@
+"""TI TCA9548A: one control register, one bit per channel, in force after the next STOP.
+
+Source: TCA9548A data sheet SCPS207G, 8.5.3 and 8.5.4. Because the selection acts at STOP only, a
+select and the access behind it can never share a transaction; every method here is one transaction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from devices.buses.i2c import I2cBus, i2c_msg
+from devices.errors import NoAcknowledgeError
+
+ADDRESSES = range(0x70, 0x78)
+CHANNELS = range(8)
+
+_REFUSALS_MAX = 2
+
+
+class Tca9548a:
+    """One multiplexer: writes its control register and reads it back."""
+
+    def __init__(self, bus: I2cBus, address: int) -> None:
+        self.address = address
+        self._bus = bus
+        # No register address: the one data byte is the channel mask.
+        self._writes = [i2c_msg.write(address, [mask]) for mask in range(256)]
+        self._read = i2c_msg.read(address, 1)
+
+    def write_mask(self, mask: int) -> None:
+        """Connect the channels whose bits are set in `mask` (0..255) from the STOP on."""
+        self._bus.transfer(self._writes[mask])
+
+    def read_mask(self) -> int:
+        """The channels that are connected now."""
+        self._bus.transfer(self._read)
+        return bytes(self._read)[0]
+
+
+class MuxRouter:
+    """Keeps all multiplexers of a bus such that only what is asked for is connected.
+
+    All tiles share one address, so a channel left open on another mux would answer too: reads would
+    return the AND of two tiles, plausible and wrong. The state is cached, because a select costs
+    50 us; what is not known is written anew before anything else is connected.
+    """
+
+    def __init__(self, bus: I2cBus, addresses: Iterable[int]) -> None:
+        self._muxes = {address: Tca9548a(bus, address) for address in sorted(set(addresses))}
+        self._masks: dict[int, int | None] = dict.fromkeys(self._muxes)
+        self._refusals = dict.fromkeys(self._muxes, 0)
+        self.refused: int | None = None
+        """The mux that did not acknowledge in the last `connect`; None if all did."""
+        self.silent: set[int] = set()
+        """Muxes that did not let themselves be closed. They are taken to be without supply, which
+        connects nothing; whoever reads a tile of another mux has to make sure of that."""
+
+    @property
+    def addresses(self) -> tuple[int, ...]:
+        """Addresses of the multiplexers, ascending."""
+        return tuple(self._muxes)
+
+    def connect(self, masks: Mapping[int, int]) -> None:
+        """Connect exactly the channels of `masks` (address to mask); all other muxes are closed.
+
+        Muxes are closed before others are opened, so that no two overlap in between.
+
+        Raises:
+            I2cError: a mux did not answer. One that refuses to be closed twice in a row is
+                `silent` from then on, and in nobody's way.
+        """
+        self.refused = None
+        for address, mask in self._masks.items():
+            if mask != 0 and not masks.get(address):
+                self._close(address)
+        for address, mask in masks.items():
+            if self._masks[address] != mask:
+                self._write(address, mask)
+
+    def connect_only(self, address: int, channel: int) -> None:
+        """Connect one channel of one mux and nothing else."""
+        self.connect({address: 1 << channel})
+
+    def forget(self, address: int | None = None) -> None:
+        """Drop the cached state of one mux, or of all: the next `connect` writes it again."""
+        if address is not None:
+            self._masks[address] = None
+            return
+        self._masks = dict.fromkeys(self._muxes)
+        self._refusals = dict.fromkeys(self._muxes, 0)
+        self.silent.clear()
+
+    def audit(self) -> bool:
+        """Read back what every mux connects; True if it is what it should be.
+
+        A mux that was reset behind our back is forgotten, and so is one that does not answer.
+
+        Raises:
+            BusFaultError: the bus itself failed.
+        """
+        sound = True
+        for address, mask in self._masks.items():
+            if mask is None or address in self.silent:
+                continue
+            try:
+                found: int | None = self._muxes[address].read_mask()
+            except NoAcknowledgeError:
+                found = None
+            if found != mask:
+                self._masks[address] = None
+                sound = False
+        return sound
+
+    def echoes(self) -> bool:
+        """Does a mux keep what is written to it? Of a bus whose SDA is stuck low none seems to.
+
+        Such a bus acknowledges everything and reads as zeros (hardware.md 3.2), so one bit that
+        comes back is proof that the wires move. Tries the muxes one after another.
+
+        Raises:
+            BusFaultError: the bus itself failed.
+        """
+        self.forget()
+        for address, mux in self._muxes.items():
+            self.refused = address
+            try:
+                mux.write_mask(1)
+                self.refused = None
+                if mux.read_mask() == 1:
+                    return True
+            except NoAcknowledgeError:
+                continue
+        return False
+
+    def _close(self, address: int) -> None:
+        try:
+            self._write(address, 0)
+        except NoAcknowledgeError:
+            self._refusals[address] += 1
+            if self._refusals[address] < _REFUSALS_MAX:
+                raise
+            self.silent.add(address)
+            self._masks[address] = 0
+
+    def _write(self, address: int, mask: int) -> None:
+        self._masks[address] = None  # until the STOP nobody knows
+        self.refused = address
+        self._muxes[address].write_mask(mask)
+        self.refused = None
+        self._masks[address] = mask
+        self._refusals[address] = 0
+        self.silent.discard(address)

@@ -1,0 +1,237 @@
+"""An I2C adapter and its wires, at the level of bits: what a driver sees of emulated silicon.
+
+The adapter takes the very `i2c_msg` objects that `smbus2.SMBus.i2c_rdwr` takes, raises bare
+`OSError` with the Raspberry Pi's errno, and refuses what the Pi's bcm2835 adapter refuses
+(hardware.md 3.2). The wires are open-drain: an acknowledge is low if *anybody* pulls it low, a data
+bit is low if *anybody* pulls it low. Time on the bus is counted in SCL periods as bus_budget.py
+does: START, repeated START and STOP one each, nine per byte.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+from collections.abc import Iterable, Sequence
+from functools import partial, reduce
+from operator import and_
+from typing import Protocol
+
+from devices.buses.i2c import i2c_msg
+from devices.clock import Clock
+from devices.emulation.buses.line import Line
+from devices.emulation.faults import Faults
+
+I2C_RDWR_IOCTL_MAX_MSGS = 42
+MESSAGE_BYTES_MAX = 8192
+_FLAG_READ = 0x0001
+_TIMEOUT_UNIT_NS = 10_000_000
+_TIMEOUT_DEFAULT = 100  # the i2c core's second
+_NOT_ACKNOWLEDGED_BITS = 11  # START, address with direction and missing acknowledge, STOP
+
+
+class I2cDevice(Protocol):
+    """A chip on the wires. Times are the clock's, at the end of the bits in question."""
+
+    @property
+    def address(self) -> int:
+        """Its 7-bit address."""
+
+    def start(self, reading: bool, t_ns: int) -> bool:
+        """Its address was called: True to acknowledge and expect bytes."""
+
+    def write(self, value: int) -> bool:
+        """Take one byte; True to acknowledge."""
+
+    def read(self, count: int) -> bytes:
+        """Give `count` bytes."""
+
+    def stop(self, t_ns: int) -> None:
+        """STOP of a transaction in which it acknowledged, told once for each time it did."""
+
+
+class MuxDevice(I2cDevice, Protocol):
+    """A device that connects further segments of wire."""
+
+    @property
+    def mask(self) -> int:
+        """Channels that are in force now, one bit each."""
+
+    def connected(self) -> Iterable[I2cDevice]:
+        """Devices on the channels that are in force now."""
+
+    def suffer(self, t_ns: int) -> None:
+        """Let happen what has befallen it since it was last asked."""
+
+    def reset(self) -> None:
+        """Its RESET line was low."""
+
+
+_NOBODY: Sequence[I2cDevice] = ()
+
+
+class EmulatedI2cAdapter:
+    """The bus of an emulated Raspberry Pi: multiplexers on the trunk, chips behind them."""
+
+    def __init__(
+        self, muxes: Sequence[MuxDevice], clock: Clock, scl_hz: float, line: Line | None = None
+    ) -> None:
+        self.line = line if line is not None else Line(Faults(()), "")
+        self._muxes = muxes
+        self._mux_addresses = frozenset(mux.address for mux in muxes)
+        self._clock = clock
+        self._ns_per_bit = 1e9 / scl_hz
+        self._timeout_ns = _TIMEOUT_DEFAULT * _TIMEOUT_UNIT_NS
+        self._wires: dict[tuple[int, ...], dict[int, list[I2cDevice]]] = {}
+        self._wire = self._devices_by_address()
+
+    def set_timeout(self, units_10ms: int) -> None:
+        """How long a wedged transfer lasts, as by the ioctl I2C_TIMEOUT."""
+        self._timeout_ns = units_10ms * _TIMEOUT_UNIT_NS
+
+    def reset_muxes(self) -> None:
+        """The RESET line of all multiplexers, pulsed."""
+        for mux in self._muxes:
+            mux.reset()
+        self._wire = self._devices_by_address()
+
+    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
+        """One transaction, as the ioctl I2C_RDWR on a Pi would carry it out.
+
+        Raises:
+            OSError: EINVAL and EOPNOTSUPP for what the kernel or the adapter refuses before it
+                touches the bus, EREMOTEIO for a missing acknowledge, ETIMEDOUT if SCL is stuck.
+        """
+        _refuse_unsupported(i2c_msgs)
+        begin_ns = self._clock.now_ns()
+        disturbed = None if self.line.sound else self.line
+        if disturbed is not None:
+            for mux in self._muxes:
+                mux.suffer(begin_ns)
+            self._wire = self._devices_by_address()
+            if self._is_stuck(i2c_msgs, begin_ns):
+                return
+        addressed: list[I2cDevice] = []
+        bits = 0
+        routed = disturbed is not None
+        try:
+            for message in i2c_msgs:
+                bits += 10  # START or repeated START, address with direction, acknowledge
+                address, length = message.addr, message.len
+                reading = bool(message.flags & _FLAG_READ)
+                t_ns = begin_ns + round(bits * self._ns_per_bit)
+                listeners = self._wire.get(address, _NOBODY)
+                if disturbed is not None:
+                    listeners = self._called(address, reading, t_ns, disturbed)
+                if len(listeners) == 1:
+                    if not listeners[0].start(reading, t_ns):
+                        listeners = _NOBODY
+                else:
+                    listeners = [device for device in listeners if device.start(reading, t_ns)]
+                addressed += listeners
+                if not routed:
+                    routed = address in self._mux_addresses
+                if not listeners or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
+                    raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+                if reading:
+                    bits += 9 * length
+                    _read(message, listeners, t_ns, disturbed)
+                    continue
+                acknowledged = _write(message, listeners, t_ns, disturbed)
+                bits += 9 * length
+                if acknowledged < length:
+                    bits -= 9 * (length - acknowledged - 1)
+                    raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+        finally:
+            stop_ns = begin_ns + round((bits + 1) * self._ns_per_bit)
+            for device in addressed:
+                device.stop(stop_ns)
+            # Routing changes at STOP and at no other time, and only if a mux was written to.
+            if routed:
+                self._wire = self._devices_by_address()
+            self._clock.sleep_until_ns(stop_ns)
+
+    def _called(
+        self, address: int, reading: bool, t_ns: int, disturbed: Line
+    ) -> Sequence[I2cDevice]:
+        """Who hears a disturbed address byte as his own."""
+        heard = disturbed.disturbed(address << 1 | reading, t_ns)
+        if heard & 1 != reading:
+            return _NOBODY  # one side reads where the other does: nobody gets on with it
+        return self._wire.get(heard >> 1, _NOBODY)
+
+    def _is_stuck(self, messages: Sequence[i2c_msg], begin_ns: int) -> bool:
+        """Go through a transaction on wires that do not move; True if that looks like success."""
+        if self.line.wedged(begin_ns):
+            self._clock.sleep_until_ns(begin_ns + self._timeout_ns)
+            raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
+        if self.line.sda_high(begin_ns):
+            self._pass(begin_ns, _NOT_ACKNOWLEDGED_BITS)
+            raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+        if self.line.sda_low(begin_ns):
+            for message in messages:
+                if message.flags & _FLAG_READ:
+                    ctypes.memset(message.buf, 0, message.len)
+            self._pass(begin_ns, sum(10 + 9 * message.len for message in messages) + 1)
+            return True
+        return False
+
+    def _pass(self, begin_ns: int, bits: int) -> None:
+        self._clock.sleep_until_ns(begin_ns + round(bits * self._ns_per_bit))
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _devices_by_address(self) -> dict[int, list[I2cDevice]]:
+        routing = tuple([mux.mask for mux in self._muxes])
+        if routing in self._wires:
+            return self._wires[routing]
+        wire = self._wires[routing] = {}
+        for mux in self._muxes:
+            for device in (mux, *mux.connected()):
+                wire.setdefault(device.address, []).append(device)
+        return wire
+
+
+def _refuse_unsupported(messages: Sequence[i2c_msg]) -> None:
+    last = len(messages) - 1
+    if not 0 <= last < I2C_RDWR_IOCTL_MAX_MSGS:
+        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+    for index, message in enumerate(messages):
+        if message.len > MESSAGE_BYTES_MAX:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        # drivers/i2c/busses/i2c-bcm2835.c: "only one read message supported, has to be last"
+        if index < last and message.flags & _FLAG_READ:
+            raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+
+
+def _write(
+    message: i2c_msg, listeners: Sequence[I2cDevice], t_ns: int, disturbed: Line | None
+) -> int:
+    """Give the bytes of a message to who listens; how many were acknowledged."""
+    sent = bytes(message)
+    if disturbed is None and len(listeners) == 1:
+        write = listeners[0].write
+        for count, value in enumerate(sent, start=1):
+            if not write(value):
+                return count - 1
+        return len(sent)
+    for count, value in enumerate(sent, start=1):
+        heard = value if disturbed is None else disturbed.disturbed(value, t_ns)
+        acknowledged = True in [device.write(heard) for device in listeners]
+        if not acknowledged or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
+            return count - 1
+    return len(sent)
+
+
+def _read(
+    message: i2c_msg, listeners: Sequence[I2cDevice], t_ns: int, disturbed: Line | None
+) -> None:
+    if len(listeners) == 1:
+        values = listeners[0].read(message.len)
+    else:  # open drain: a bit is low if anybody pulls it low
+        given = [device.read(message.len) for device in listeners]
+        values = bytes(map(partial(reduce, and_), zip(*given, strict=True)))
+    if disturbed is not None:
+        values = bytes([disturbed.disturbed(value, t_ns) for value in values])
+    ctypes.memmove(message.buf, values, message.len)

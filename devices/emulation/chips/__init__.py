@@ -1,0 +1,1 @@
+"""Emulated chips at register level: what the wires show of one part."""

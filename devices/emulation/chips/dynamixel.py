@@ -1,0 +1,174 @@
+"""A Dynamixel MX servo behind a pseudo-terminal, for the very code that reads one.
+
+A thread answers at `port` whatever opens it: `devices.chips.dynamixel.reader`, or ROBOTIS's own
+SDK. A pseudo-terminal has no wire, so the time on the wire and the return delay pass on the
+injected clock: with a `SystemClock` an answer takes as long as a servo's, with a `VirtualClock` it
+takes as long in virtual time, while whoever asked is blocked. What it answers is its firmware's
+matter (`devices.emulation.chips.dynamixel_firmware`). Sources: hardware.md 5.1 and 5.2.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import select
+import termios
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+from devices.chips.dynamixel.packets import Packet, PacketDecoder, wire_time_ns
+from devices.clock import Clock
+from devices.emulation.chips.dynamixel_firmware import EMULATED_FIRMWARES
+
+# A rate as the pseudo-terminal keeps it.
+_SPEEDS = {
+    9_600: termios.B9600,
+    57_600: termios.B57600,
+    115_200: termios.B115200,
+    1_000_000: termios.B1000000,
+    2_000_000: termios.B2000000,
+    3_000_000: termios.B3000000,
+    4_000_000: termios.B4000000,
+}
+
+
+@dataclass(frozen=True)
+class _Faults:
+    silent: bool = False
+    garbage: bytes = b""
+    corrupt_crc: bool = False
+
+
+class EmulatedServo:
+    """One servo alone on its line, powered from construction until `close`.
+
+    `position` maps nanoseconds of the clock to signed counts; it is called on the servo's thread.
+    `protocol` is 1 or 2. `return_delay_us` is in microseconds, 0 to 508 in steps of 2.
+
+    Raises:
+        UsageError: no MX servo runs at `baudrate`, or none (below 4.5 M) that termios can name.
+    """
+
+    def __init__(
+        self,
+        position: Callable[[int], int],
+        clock: Clock,
+        *,
+        servo_id: int = 1,
+        model: str = "MX-64",
+        protocol: int = 2,
+        baudrate: int = 1_000_000,
+        return_delay_us: int = 500,
+        status_return_level: int = 2,
+    ) -> None:
+        self._clock = clock
+        self._baudrate = baudrate
+        self._firmware = EMULATED_FIRMWARES[protocol](
+            position,
+            servo_id=servo_id,
+            model=model,
+            baudrate=baudrate,
+            return_delay_us=return_delay_us,
+            status_return_level=status_return_level,
+        )
+        self._speed = _SPEEDS[baudrate]
+        self._faults = _Faults()
+        self._resources = contextlib.ExitStack()
+        self._power_up()
+
+    def _power_up(self) -> None:
+        # The slave's end stays open here too: else the line hangs up whenever a reader closes it.
+        self._line, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        """What to open: the path of the pseudo-terminal."""
+        # A servo does not wait for a listener; what nobody reads is lost.
+        os.set_blocking(self._line, False)
+        self._wake, wake_writer = os.pipe()
+        # A daemon only so that a forgotten `close` does not keep the interpreter from ending.
+        thread = threading.Thread(target=self._serve, name=f"servo at {self.port}", daemon=True)
+        thread.start()
+        # Unwound from the last to the first: closing the writer wakes and ends the thread.
+        for descriptor in (self._line, self._slave, self._wake):
+            self._resources.callback(os.close, descriptor)
+        self._resources.callback(thread.join)
+        self._resources.callback(os.close, wake_writer)
+
+    def close(self) -> None:
+        """Power off: end the thread and hang up. Closing twice does no harm."""
+        self._resources.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # Faults. Each lasts as long as its context and may be set from any thread.
+
+    def silent(self) -> contextlib.AbstractContextManager[None]:
+        """Answer nothing, as without power or with the plug pulled; but its state survives."""
+        return self._with(silent=True)
+
+    def garbage_before_reply(self, garbage: bytes) -> contextlib.AbstractContextManager[None]:
+        """Send `garbage` before every answer. Unrealistic: it is always the same."""
+        return self._with(garbage=garbage)
+
+    def corrupt_crc(self) -> contextlib.AbstractContextManager[None]:
+        """Invert the last byte of every answer, which is of its CRC or checksum.
+
+        Unrealistic: a bad line hits any bit, now and then.
+        """
+        return self._with(corrupt_crc=True)
+
+    @contextlib.contextmanager
+    def alert(self) -> Iterator[None]:
+        """Report an input voltage error. Unrealistic at its end: silicon keeps it until reboot."""
+        self._firmware.complain(of_voltage=True)
+        try:
+            yield
+        finally:
+            self._firmware.complain(of_voltage=False)
+
+    @contextlib.contextmanager
+    def _with(self, **changes: Any) -> Iterator[None]:
+        before = self._faults
+        self._faults = replace(before, **changes)
+        try:
+            yield
+        finally:
+            self._faults = before
+
+    # The servo's thread.
+
+    def _serve(self) -> None:
+        decoder = PacketDecoder(self._firmware.protocol)
+        while True:
+            ready, _, _ = select.select([self._line, self._wake], [], [])
+            if self._wake in ready:
+                return
+            data = os.read(self._line, 4096)
+            received_ns = self._clock.now_ns()
+            # The one thing of a wire that a pseudo-terminal keeps is the rate it was opened with.
+            # At any other than its own a servo hears noise.
+            if termios.tcgetattr(self._slave)[5] != self._speed:
+                continue
+            for packet in decoder.feed(data):
+                if self._firmware.is_answered(packet) and not self._faults.silent:
+                    self._answer(packet, received_ns)
+
+    def _answer(self, packet: Packet, received_ns: int) -> None:
+        request_end_ns = received_ns + wire_time_ns(len(packet.wire), self._baudrate)
+        begin_ns = request_end_ns + self._firmware.return_delay_ns
+        self._clock.sleep_until_ns(begin_ns)
+        answer = self._firmware.answer(packet, begin_ns)
+        if self._faults.corrupt_crc:
+            answer = answer[:-1] + bytes([answer[-1] ^ 0xFF])
+        reply = self._faults.garbage + answer
+        self._clock.sleep_until_ns(begin_ns + wire_time_ns(len(reply), self._baudrate))
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._line, reply)

@@ -1,0 +1,244 @@
+"""What an MX servo answers to a packet, in either of its two firmwares, and its control table.
+
+Sources: hardware.md 5 and 5.1, e-manual protocol1.md, protocol2.md and the MX control tables. Where
+they are silent: gaps in the control table read as zero, and a read may begin and end anywhere in it
+(so does an XM540, DynamixelSDK #175); there is one servo on the line, so it takes the first slot
+after a broadcast; in 1.0 a read of nothing, or of more than the table, is out of range. Where it
+knows less than silicon: it cannot be written to, and answers that, like a bulk read, as it answers
+an undefined instruction; fast sync read is not known to it; in 1.0 it knows neither the multi-turn
+offset nor the resolution divider.
+"""
+
+from __future__ import annotations
+
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from devices.chips.dynamixel.models import FIRMWARES
+from devices.chips.dynamixel.packets import BROADCAST_ID, Instruction, Packet
+from devices.chips.dynamixel.protocol1 import Error
+from devices.chips.dynamixel.protocol2 import ALERT
+from devices.errors import UsageError
+
+FIRMWARE_VERSION = 42
+MULTI_TURN_COUNTS = 28_672
+"""Seven turns: in Protocol 1.0 a servo goes no further either way (hardware.md 5)."""
+
+_ANSWERED_FROM: dict[int, int] = {Instruction.PING: 0, Instruction.READ: 1}
+_INSTRUCTION_ERROR, _CRC_ERROR, _DATA_RANGE_ERROR, _DATA_LENGTH_ERROR = 2, 3, 4, 5
+_INPUT_VOLTAGE_ERROR = 1
+_HARDWARE_ERROR = 70  # address, of the 2.0 table only
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """Addresses of the control table."""
+
+    size: int
+    firmware: int
+    servo_id: int
+    baud: int
+    return_delay: int
+    status_return_level: int
+    protocol_type: int | None = None
+
+
+class EmulatedFirmware(ABC):
+    """One servo's firmware and control table.
+
+    Args:
+        position: maps nanoseconds of the clock to signed counts.
+        servo_id: as in its table.
+        model: "MX-28" or "MX-64".
+        baudrate: of its line.
+        return_delay_us: 0 to 508 in steps of 2.
+        status_return_level: 0 ping only, 1 ping and reads, 2 all.
+
+    Raises:
+        UsageError: no MX servo with this firmware runs at `baudrate`.
+    """
+
+    version: ClassVar[int]
+    _layout: ClassVar[_Layout]
+    _baud_codes: ClassVar[Mapping[int, int]]
+    _answered_from: ClassVar[Mapping[int, int]] = _ANSWERED_FROM
+    """Status return level from which an instruction is answered; every other needs level 2."""
+
+    def __init__(
+        self,
+        position: Callable[[int], int],
+        *,
+        servo_id: int,
+        model: str,
+        baudrate: int,
+        return_delay_us: int,
+        status_return_level: int,
+    ) -> None:
+        if baudrate not in self._baud_codes:
+            raise UsageError(
+                f"no emulated servo runs at {baudrate} baud in protocol {self.version}",
+                expected=", ".join(str(rate) for rate in self._baud_codes),
+            )
+        firmware = FIRMWARES[self.version]
+        self.protocol = firmware.protocol
+        self._position = position
+        self._position_address = firmware.position_address
+        layout = self._layout
+        self.table = bytearray(layout.size)
+        struct.pack_into("<H", self.table, 0, firmware.model_numbers[model])
+        self.table[layout.firmware] = FIRMWARE_VERSION
+        self.table[layout.servo_id] = servo_id
+        self.table[layout.baud] = self._baud_codes[baudrate]
+        self.table[layout.return_delay] = return_delay_us // 2
+        self.table[layout.status_return_level] = status_return_level
+        if layout.protocol_type is not None:
+            self.table[layout.protocol_type] = self.version
+
+    @property
+    def return_delay_ns(self) -> int:
+        """Between the end of a request and the beginning of its answer."""
+        return self.table[self._layout.return_delay] * 2000
+
+    def is_answered(self, packet: Packet) -> bool:
+        """Does this servo say anything to `packet`?"""
+        level = self.table[self._layout.status_return_level]
+        if level < self._answered_from.get(packet.instruction, 2):
+            return False
+        if packet.servo_id == BROADCAST_ID:
+            called = packet.instruction == Instruction.PING or self._is_called_by(packet)
+            return packet.intact and called
+        return packet.servo_id == self._id and not self._is_an_answer(packet)
+
+    @abstractmethod
+    def answer(self, packet: Packet, t_ns: int) -> bytes:
+        """The status packet to `packet`, executed at `t_ns`."""
+
+    @abstractmethod
+    def complain(self, of_voltage: bool) -> None:
+        """Begin or end to report an input voltage error."""
+
+    def _is_called_by(self, packet: Packet) -> bool:
+        """Is this servo one of those that a broadcast names?"""
+        return False
+
+    def _is_an_answer(self, packet: Packet) -> bool:
+        """Another servo's answer, or the echo of an own one, is no request."""
+        return False
+
+    @property
+    def _id(self) -> int:
+        return self.table[self._layout.servo_id]
+
+    def _store_position(self, position: bytes) -> None:
+        self.table[self._position_address : self._position_address + len(position)] = position
+
+
+class _Firmware1(EmulatedFirmware):
+    """The factory's, Protocol 1.0. Its table ends behind Goal Acceleration."""
+
+    version = 1
+    _layout = _Layout(
+        size=74, firmware=2, servo_id=3, baud=4, return_delay=5, status_return_level=16
+    )
+    _baud_codes: ClassVar = {
+        9_600: 207,
+        57_600: 34,
+        115_200: 16,
+        1_000_000: 1,
+        2_000_000: 0,
+        3_000_000: 252,
+    }
+    _alerts = Error(0)
+
+    def answer(self, packet: Packet, t_ns: int) -> bytes:
+        error, data = self._execute(packet, t_ns)
+        return self.protocol.pack(self._id, self._alerts | error, data)
+
+    def complain(self, of_voltage: bool) -> None:
+        self._alerts = Error.VOLTAGE if of_voltage else Error(0)
+
+    def _execute(self, packet: Packet, t_ns: int) -> tuple[Error, bytes]:
+        if not packet.intact:
+            return Error.CHECKSUM, b""
+        if packet.instruction == Instruction.PING:
+            return Error(0), b""
+        if packet.instruction != Instruction.READ:
+            return Error.INSTRUCTION, b""
+        if len(packet.parameters) != 2:
+            return Error.RANGE, b""
+        address, length = packet.parameters
+        if length == 0 or address + length > len(self.table):
+            return Error.RANGE, b""
+        counts = max(-MULTI_TURN_COUNTS, min(self._position(t_ns), MULTI_TURN_COUNTS))
+        self._store_position(counts.to_bytes(2, "little", signed=True))
+        return Error(0), bytes(self.table[address : address + length])
+
+
+class _Firmware2(EmulatedFirmware):
+    """Protocol 2.0, called MX(2.0). Its table ends behind Indirect Data 56 (SDK mx_64.model)."""
+
+    version = 2
+    _layout = _Layout(
+        size=662,
+        firmware=6,
+        servo_id=7,
+        baud=8,
+        return_delay=9,
+        status_return_level=68,
+        protocol_type=13,
+    )
+    _baud_codes: ClassVar = {
+        9_600: 0,
+        57_600: 1,
+        115_200: 2,
+        1_000_000: 3,
+        2_000_000: 4,
+        3_000_000: 5,
+        4_000_000: 6,  # code 7, 4.5 M, has no termios constant
+    }
+    _answered_from: ClassVar = {**_ANSWERED_FROM, Instruction.SYNC_READ: 1}
+
+    def answer(self, packet: Packet, t_ns: int) -> bytes:
+        error, data = self._execute(packet, t_ns)
+        alert = ALERT if self.table[_HARDWARE_ERROR] else 0
+        return self.protocol.pack(self._id, Instruction.STATUS, bytes([alert | error]) + data)
+
+    def complain(self, of_voltage: bool) -> None:
+        self.table[_HARDWARE_ERROR] = _INPUT_VOLTAGE_ERROR if of_voltage else 0
+
+    def _is_called_by(self, packet: Packet) -> bool:
+        return packet.instruction == Instruction.SYNC_READ and self._id in packet.parameters[4:]
+
+    def _is_an_answer(self, packet: Packet) -> bool:
+        return packet.instruction == Instruction.STATUS
+
+    def _execute(self, packet: Packet, t_ns: int) -> tuple[int, bytes]:
+        """Error number and data."""
+        broadcast = packet.servo_id == BROADCAST_ID
+        if not packet.intact:
+            return _CRC_ERROR, b""
+        if packet.instruction == Instruction.PING:
+            return 0, bytes(self.table[0:2]) + bytes([self.table[self._layout.firmware]])
+        if packet.instruction == Instruction.READ:
+            return self._read(packet.parameters, t_ns)
+        if packet.instruction == Instruction.SYNC_READ and broadcast:
+            return self._read(packet.parameters[:4], t_ns)
+        return _INSTRUCTION_ERROR, b""
+
+    def _read(self, parameters: bytes, t_ns: int) -> tuple[int, bytes]:
+        if len(parameters) != 4:
+            return _DATA_LENGTH_ERROR, b""
+        address, length = struct.unpack("<HH", parameters)
+        if length == 0:
+            return _DATA_LENGTH_ERROR, b""
+        if address + length > len(self.table):
+            return _DATA_RANGE_ERROR, b""
+        self._store_position(self._position(t_ns).to_bytes(4, "little", signed=True))
+        return 0, bytes(self.table[address : address + length])
+
+
+EMULATED_FIRMWARES: dict[int, type[EmulatedFirmware]] = {1: _Firmware1, 2: _Firmware2}
+"""By the protocol that they speak."""

@@ -1,0 +1,116 @@
+"""From gas pressure to the two words of a conversion: the analogue side of one MPL115A2.
+
+Noise is that of a real part (hardware.md 1.3): 0.165 kPa in all, rounding included, with 1.2 % of
+readings more than 0.5 kPa off, most of them low. Counts past either end wrap, as real parts do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
+from devices.emulation.faults import Fault
+from devices.emulation.parts import ChipPart, DomePart, random_of
+from devices.emulation.surroundings import Surroundings
+from devices.scene.file import EmulationScene
+
+_KPA_PER_PCOMP = (PRESSURE_MAX_KPA - PRESSURE_MIN_KPA) / 1023
+_TADC_PER_KELVIN = -5.35
+_TADC_NOISE = 0.5
+
+_MEASURED_NOISE_KPA = 0.165
+_OUTLIER_RATE = 0.012
+_OUTLIER_KPA = (0.5, 1.2)
+_OUTLIERS_LOW = 0.85
+_DRAWN_AT_ONCE = 1024
+_FAR_OVER_RANGE_KPA = 45.0
+
+
+class FrontEnd:
+    """Samples one dome, or what is around a bare chip: a `Sense` for the emulated chip.
+
+    Before `begin` its dome is at rest at the scene's first instant. Fault `over_range`: it is
+    pressed 45 kPa harder, past its range; most wrap.
+    """
+
+    def __init__(
+        self,
+        chip: ChipPart,
+        dome: DomePart,
+        pressure_kpa: Callable[[float], float],
+        surroundings: Surroundings,
+        scene: EmulationScene,
+        label: str,
+        over_range: Fault | None = None,
+    ) -> None:
+        self._c = chip.coefficients
+        self._tadc_at_25 = chip.tadc_at_25_degc
+        self._chip_lag_s = dome.chip_lag_s
+        self._pressure_kpa = pressure_kpa
+        self._surroundings = surroundings
+        self._clip_kpa = scene.clip_kpa or math.inf
+        self._epoch_ns: int | None = None
+        self._over_range = over_range if over_range is not None else Fault()
+        self._noise = _noise(scene, self._lsb_kpa(), random_of(label))
+        self._correlated_s = scene.correlated_ms * 1e-3
+        self._core_kpa = 0.0
+        self._last_s = -math.inf
+        self._steady = surroundings.steady
+        self._steady_tadc = self._true_tadc(0.0)
+
+    def begin(self, epoch_ns: int) -> None:
+        """The scene's time begins at this instant of the clock."""
+        self._epoch_ns = epoch_ns
+
+    def __call__(self, t_ns: int) -> tuple[int, int]:
+        """Words `padc`, `tadc` of a conversion that samples at `t_ns`."""
+        # A conversion that was under way when the scene began saw its first instant.
+        t_s = 0.0 if self._epoch_ns is None else max(0.0, (t_ns - self._epoch_ns) * 1e-9)
+        core_kpa, outlier_kpa, tadc_noise = next(self._noise)
+        kpa = min(self._pressure_kpa(t_s), self._clip_kpa)
+        if self._over_range(t_ns):
+            kpa += _FAR_OVER_RANGE_KPA
+        kpa += self._correlate(core_kpa, t_ns * 1e-9) + outlier_kpa
+        # The transducer feels the true temperature; the word reported for it is a noisy one.
+        tadc = self._steady_tadc if self._steady else self._true_tadc(t_s)
+        c = self._c
+        pcomp = (kpa - PRESSURE_MIN_KPA) / _KPA_PER_PCOMP
+        padc = (pcomp - c.a0 - c.b2 * tadc) / (c.b1 + c.c12 * tadc)
+        return round(padc) % 1024, min(max(round(tadc + tadc_noise), 0), 1023)
+
+    def _true_tadc(self, t_s: float) -> float:
+        degc = self._surroundings.chip_degc(t_s, self._chip_lag_s)
+        return self._tadc_at_25 + (degc - 25.0) * _TADC_PER_KELVIN
+
+    def _lsb_kpa(self) -> float:
+        return abs(self._c.b1 + self._c.c12 * self._tadc_at_25) * _KPA_PER_PCOMP
+
+    def _correlate(self, white_kpa: float, t_s: float) -> float:
+        """Core noise with a correlation time: the same variance, less of it new in each sample."""
+        if self._correlated_s == 0.0:
+            return white_kpa
+        keep = math.exp(-(t_s - self._last_s) / self._correlated_s)
+        self._core_kpa = keep * self._core_kpa + math.sqrt(1.0 - keep * keep) * white_kpa
+        self._last_s = t_s
+        return self._core_kpa
+
+
+def _noise(
+    scene: EmulationScene, lsb_kpa: float, rng: np.random.Generator
+) -> Iterator[tuple[float, float, float]]:
+    """Core and outlier in kPa and temperature noise in counts, for one conversion after another."""
+    scale = scene.noise_kpa / _MEASURED_NOISE_KPA
+    low, high = (scale * limit for limit in _OUTLIER_KPA)
+    outlier_variance = _OUTLIER_RATE * (low * low + low * high + high * high) / 3
+    core_variance = scene.noise_kpa**2 - outlier_variance - lsb_kpa**2 / 12
+    core_kpa = math.sqrt(max(0.0, core_variance))
+    n = _DRAWN_AT_ONCE
+    while True:
+        core = core_kpa * rng.standard_normal(n)
+        size = rng.uniform(low, high, n) * np.where(rng.random(n) < _OUTLIERS_LOW, -1.0, 1.0)
+        outlier = np.where(rng.random(n) < _OUTLIER_RATE, size, 0.0)
+        temperature = _TADC_NOISE * rng.standard_normal(n)
+        yield from zip(core.tolist(), outlier.tolist(), temperature.tolist(), strict=True)

@@ -1,0 +1,112 @@
+"""An MCP3208 at bit level, and the amplifier in front of it.
+
+Source: data sheet DS21298E section 5 (figures 5-1 and 5-2, table 5-2). The chip knows no bytes: it
+waits for the first bit that is high, wherever in a transfer that is, and counts clocks from there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from devices.buses.spi import MAX_SPEED_HZ
+from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF
+from devices.clock import Clock
+from devices.scene.file import ReferenceScene
+
+Volts = Callable[[int, int], float]
+"""Input and instant in ns -> voltage there; noise and non-linearity are its business."""
+
+# Clocks behind the start bit: SGL/DIFF, D2, D1, D0, then the one in which sampling ends.
+_CONFIGURATION = 4
+_SAMPLING = 5
+
+
+class EmulatedMcp3208:
+    """One converter alone on its chip select: an `SpiDevice`.
+
+    The sample is taken at the end of the sampling clock, and the time on the wire passes on the
+    clock. A code begins half a count below its voltage.
+
+    Args:
+        volts: what is connected to the inputs.
+        clock: virtual or real.
+        vref_v: reference, in volts.
+        max_speed_hz: SPI clock.
+        floats_high: what is read while the chip leaves DOUT floating, which it does up to the null
+            bit. On a real board that is anything; high by default, since that helps no driver.
+    """
+
+    def __init__(
+        self,
+        volts: Volts,
+        clock: Clock,
+        *,
+        vref_v: float = 3.3,
+        max_speed_hz: int = MAX_SPEED_HZ,
+        floats_high: bool = True,
+    ) -> None:
+        self._volts = volts
+        self._clock = clock
+        self._counts_per_v = COUNTS_PER_VREF / vref_v
+        self._ns_per_bit = 1e9 / max_speed_hz
+        self._floating = int(floats_high)
+
+    def xfer2(self, data: list[int], /) -> list[int]:
+        """Exchange bytes in one chip select; like spidev, it writes them into `data`."""
+        begin_ns = self._clock.now_ns()
+        sent = [byte >> shift & 1 for byte in data for shift in range(7, -1, -1)]
+        received = self._answer(sent, begin_ns)
+        for index in range(len(data)):
+            byte = 0
+            for bit in received[8 * index : 8 * index + 8]:
+                byte = byte << 1 | bit
+            data[index] = byte
+        self._clock.sleep_until_ns(begin_ns + round(len(sent) * self._ns_per_bit))
+        return data
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _answer(self, sent: list[int], begin_ns: int) -> list[int]:
+        start = sent.index(1) if 1 in sent else len(sent)
+        sampling = start + _SAMPLING
+        if sampling >= len(sent):
+            return [self._floating] * len(sent)
+        single_ended, *number = sent[start + 1 : start + 1 + _CONFIGURATION]
+        d2, d1, d0 = number
+        sample_ns = begin_ns + round((sampling + 1) * self._ns_per_bit)
+        counts = self._convert(d2 << 2 | d1 << 1 | d0, bool(single_ended), sample_ns)
+        msb_first = [counts >> bit & 1 for bit in range(11, -1, -1)]
+        lsb_first = msb_first[-2::-1]  # B0 is not sent again
+        answer = [self._floating] * (sampling + 1) + [0] + msb_first + lsb_first
+        return (answer + [0] * len(sent))[: len(sent)]
+
+    def _convert(self, number: int, single_ended: bool, t_ns: int) -> int:
+        volts = self._volts(number, t_ns)
+        if not single_ended:  # the other input of the pair is the negative one (table 5-2)
+            volts -= self._volts(number ^ 1, t_ns)
+        return min(max(math.floor(volts * self._counts_per_v + 0.5), 0), COUNTS_MAX)
+
+
+def amplifier_volts(
+    force_n: Callable[[int], float],
+    scene: ReferenceScene,
+    *,
+    noise_n: Callable[[], float] | None = None,
+) -> Volts:
+    """The amplifier of a load cell at the scene's input; the other inputs are grounded.
+
+    Args:
+        force_n: force on the cell in newtons at an instant in ns.
+        scene: its scale, which is inverted here.
+        noise_n: draws the amplifier's noise of one reading, as a force in newtons; absent: none.
+    """
+
+    def volts(channel: int, t_ns: int) -> float:
+        if channel != scene.channel:
+            return 0.0
+        seen_n = force_n(t_ns) + (0.0 if noise_n is None else noise_n())
+        return scene.zero_v + seen_n / scene.n_per_v
+
+    return volts

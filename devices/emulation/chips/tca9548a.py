@@ -1,0 +1,66 @@
+"""TCA9548A at register level (data sheet SCPS207G, 8.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from devices.emulation.buses.i2c import I2cDevice
+from devices.emulation.faults import Fault
+
+
+class EmulatedTca9548a:
+    """One control register without a register address; bit n connects channel n.
+
+    A written value is latched with its acknowledge and comes into force at STOP (8.5.4). Of several
+    data bytes the last one counts. Power-up value 0: nothing is connected.
+
+    Faults: `brown_out`, its supply is gone, so it is silent and connects nothing; `mux_reset`, its
+    RESET line or a dip of the supply has deselected everything and it goes on as if new.
+    """
+
+    def __init__(
+        self,
+        address: int,
+        channels: Mapping[int, I2cDevice],
+        brown_out: Fault | None = None,
+        mux_reset: Fault | None = None,
+    ) -> None:
+        self.address = address
+        self._channels = dict(channels)
+        self._brown_out = brown_out if brown_out is not None else Fault()
+        self._mux_reset = mux_reset if mux_reset is not None else Fault()
+        self._seen_ns = 0
+        self._latched = 0
+        self.mask = 0
+        """Channels in force."""
+
+    def suffer(self, t_ns: int) -> None:
+        """Let happen what has befallen it since it was last asked."""
+        since_ns, self._seen_ns = self._seen_ns, t_ns
+        if self._brown_out.struck(since_ns, t_ns) or self._mux_reset.set_in(since_ns, t_ns):
+            self.reset()
+
+    def reset(self) -> None:
+        """As by its RESET line: nothing is connected any more."""
+        self._latched = self.mask = 0
+
+    def start(self, reading: bool, t_ns: int) -> bool:
+        """Acknowledge, in both directions, if it has a supply."""
+        return not self._brown_out(t_ns)
+
+    def write(self, value: int) -> bool:
+        """Latch the control register."""
+        self._latched = value
+        return True
+
+    def read(self, count: int) -> bytes:
+        """Give the control register; every byte of a longer read is the same one."""
+        return bytes([self._latched]) * count
+
+    def stop(self, t_ns: int) -> None:
+        """Bring the latched channels into force."""
+        self.mask = self._latched
+
+    def connected(self) -> Iterable[I2cDevice]:
+        """Devices on the channels in force."""
+        return [device for channel, device in self._channels.items() if self.mask >> channel & 1]

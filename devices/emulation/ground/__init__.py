@@ -1,0 +1,1 @@
+"""What the foot stands on: forces on the domes as a function of time, and nothing else."""

@@ -1,0 +1,260 @@
+"""What the foot stands on: forces on the domes as a function of time, and nothing else.
+
+Every ground is preceded by `lead_s` seconds without load. Forces are along each dome's axis, times
+in seconds since power-up. What is said here is the ground truth of a scene.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.emulation.ground.hopping import Hopping
+from devices.emulation.ground.load_trace import CopTransform, Floats, LoadTrace, PressedTrace, press
+from devices.emulation.ground.mill import Indentation
+from devices.emulation.parts import random_of
+from devices.errors import SceneError, UsageError
+from devices.scene.file import (
+    IndentationGround,
+    MudGround,
+    NoGround,
+    PlateGround,
+    PoppyGround,
+    RollingGround,
+    Scene,
+    TileScene,
+    TraceGround,
+)
+
+
+class Ground(Protocol):
+    """A load on all domes of a foot."""
+
+    @property
+    def duration_s(self) -> float | None:
+        """When its programme is over; None for one that goes on."""
+
+    def forces_n(self, t_s: Floats) -> Floats:
+        """Force on each dome along its axis, (len(t_s), tiles)."""
+
+    def angle_rad(self, t_s: Floats) -> Floats | None:
+        """Angle of the foot segment; None for a foot without a moving segment."""
+
+
+class NoLoad:
+    """A foot in the air."""
+
+    duration_s = None
+
+    def __init__(self, tiles: int) -> None:
+        self._tiles = tiles
+
+    def forces_n(self, t_s: Floats) -> Floats:
+        """Zero."""
+        return np.zeros((len(t_s), self._tiles))
+
+    def angle_rad(self, t_s: Floats) -> None:
+        """None: it does not turn."""
+
+
+class Standing:
+    """A constant load whose centre of pressure sways slowly, as in quiet standing."""
+
+    duration_s = None
+
+    _LOWERING_S = 0.3
+    _SWAY_HZ = (0.23, 0.61)  # incommensurate, so that it does not repeat soon
+
+    def __init__(
+        self,
+        ground: PlateGround,
+        positions_m: Floats,
+        bears: npt.NDArray[np.bool_],
+        seed: int,
+        lead_s: float,
+    ) -> None:
+        self._load_n = ground.load_n
+        self._lead_s = lead_s
+        self._phases = random_of(f"sway/{seed}").uniform(0, 2 * np.pi, len(self._SWAY_HZ))
+        x_m = positions_m[bears, 0] - positions_m[bears, 0].mean()
+        spread = (x_m**2).sum()
+        per_m = x_m / spread if spread > 0 else np.zeros(len(x_m))
+        even = 1.0 / len(x_m)
+        if ground.sway_m * np.abs(per_m).max() > even:
+            raise SceneError(
+                f"ground.sway_m = {ground.sway_m} would lift a tile off the plate",
+                expected=f"at most {even / np.abs(per_m).max():.4f} for this array",
+            )
+        self._even = np.where(bears, even, 0.0)
+        self._per_m = np.zeros(len(positions_m))
+        self._per_m[bears] = per_m
+        self._sway_m = ground.sway_m
+
+    def forces_n(self, t_s: Floats) -> Floats:
+        """The least squares among the tile forces of this load and centre of pressure."""
+        since = np.asarray(t_s) - self._lead_s
+        load_n = self._load_n * np.clip(since / self._LOWERING_S, 0.0, 1.0)
+        sway_m = sum(
+            self._sway_m / len(self._SWAY_HZ) * np.sin(2 * np.pi * hz * since + phase)
+            for hz, phase in zip(self._SWAY_HZ, self._phases, strict=True)
+        )
+        return np.asarray(load_n[:, None] * (self._even + np.outer(sway_m, self._per_m)))
+
+    def angle_rad(self, t_s: Floats) -> None:
+        """None: the segment stands still."""
+
+
+class Rolling:
+    """The foot's arc rolls over a rigid plate at constant speed, is lifted, and rolls again.
+
+    Axes as in the design: rolling forward turns the segment by a positive angle, and the contact
+    moves forward on the foot to the place whose arc angle is the segment's.
+    """
+
+    duration_s = None
+
+    _LOWERING_S = 0.2
+    _BACK_S = 1.0
+
+    def __init__(
+        self,
+        ground: RollingGround,
+        positions_m: Floats,
+        bears: npt.NDArray[np.bool_],
+        lead_s: float,
+    ) -> None:
+        self._ground = ground
+        self._lead_s = lead_s
+        self._bears = bears
+        self.arc_rad = np.arctan2(positions_m[:, 0], -positions_m[:, 2])
+        reach_rad = 0.5 * ground.patch_m / ground.radius_m
+        self._from_rad = self.arc_rad[bears].min() - reach_rad
+        self._to_rad = self.arc_rad[bears].max() + reach_rad
+        self._roll_s = (self._to_rad - self._from_rad) * ground.radius_m / ground.speed_m_s
+        self._cycle_s = 2 * self._LOWERING_S + self._roll_s + self._BACK_S
+
+    def forces_n(self, t_s: Floats) -> Floats:
+        """An elastic foundation under the contact patch; the load is its vertical sum."""
+        since = np.asarray(t_s) - self._lead_s
+        phase_s = np.mod(since, self._cycle_s)
+        lifting_s = phase_s - self._LOWERING_S - self._roll_s
+        load_n = self._ground.load_n * np.clip(
+            np.minimum(phase_s, -(lifting_s - self._LOWERING_S)) / self._LOWERING_S, 0.0, 1.0
+        )
+        load_n[since < 0] = 0.0
+        off_rad = self.arc_rad - self._angle(since)[:, None]
+        reach = self._ground.patch_m / self._ground.radius_m
+        pressed = np.where(self._bears, np.maximum(0.0, 1.0 - (off_rad / reach) ** 2), 0.0)
+        vertical = (pressed * np.cos(off_rad)).sum(axis=1)
+        vertical[vertical == 0.0] = np.inf  # nothing is touched
+        return np.asarray(pressed * (load_n / vertical)[:, None])
+
+    def angle_rad(self, t_s: Floats) -> Floats:
+        """Angle of the segment."""
+        return self._angle(np.asarray(t_s) - self._lead_s)
+
+    def _angle(self, since_s: Floats) -> Floats:
+        phase_s = np.mod(np.maximum(since_s, 0.0), self._cycle_s) - self._LOWERING_S
+        rolled = np.clip(phase_s / self._roll_s, 0.0, 1.0)
+        back = np.clip((phase_s - self._roll_s - self._LOWERING_S) / self._BACK_S, 0.0, 1.0)
+        return np.asarray(self._from_rad + (self._to_rad - self._from_rad) * (rolled - back))
+
+
+class TraceLoad:
+    """A recorded load, linear between its samples; over and over again if it is `looped`."""
+
+    _PAUSE_S = 1.0
+    """In the air between two rounds, long enough for a tare."""
+
+    def __init__(self, pressed: PressedTrace, lead_s: float = 0.0, *, looped: bool = False) -> None:
+        self._pressed = pressed
+        self._lead_s = lead_s
+        self._round_s = float(pressed.time_s[-1]) - lead_s + self._PAUSE_S if looped else np.inf
+
+    @property
+    def duration_s(self) -> float | None:
+        """End of the trace, after the foot has been lifted; None for one that is looped."""
+        return None if np.isfinite(self._round_s) else float(self._pressed.time_s[-1])
+
+    def forces_n(self, t_s: Floats) -> Floats:
+        """The trace's forces; zero before and after it."""
+        time_s, forces_n = self._pressed.time_s, self._pressed.forces_n
+        at_s = self._in_trace(t_s)
+        return np.stack(
+            [np.interp(at_s, time_s, f, left=0.0, right=0.0) for f in forces_n.T], axis=1
+        )
+
+    def angle_rad(self, t_s: Floats) -> Floats | None:
+        """The trace's angle, if it has one."""
+        if self._pressed.angle_rad is None:
+            return None
+        return np.interp(self._in_trace(t_s), self._pressed.time_s, self._pressed.angle_rad)
+
+    def _in_trace(self, t_s: Floats) -> Floats:
+        if not np.isfinite(self._round_s):
+            return t_s
+        since_s = np.asarray(t_s) - self._lead_s
+        return np.where(since_s < 0.0, t_s, np.mod(since_s, self._round_s) + self._lead_s)
+
+
+def make_ground(
+    scene: Scene,
+    *,
+    seed: int,
+    lead_s: float,
+    pressed: PressedTrace | None,
+    looped: bool = False,
+) -> Ground:
+    """The ground of a scene, or a recorded load in its place.
+
+    `looped`: what would have an end, a recorded load or three hops, begins again and again.
+
+    Raises:
+        UsageError: the scene wants a load trace and there is none.
+        SceneError: the ground's keys ask for the impossible.
+    """
+    positions_m = tile_positions_m(scene.tile)
+    bears = np.array([not tile.reference for tile in scene.tile])
+    if pressed is not None:
+        return TraceLoad(pressed, lead_s, looped=looped)
+    match scene.ground:
+        case NoGround():
+            return NoLoad(len(bears))
+        case PlateGround() as ground:
+            return Standing(ground, positions_m, bears, seed, lead_s)
+        case RollingGround() as ground:
+            return Rolling(ground, positions_m, bears, lead_s)
+        case PoppyGround() | MudGround() as ground:
+            return Hopping(ground, positions_m, bears, seed, lead_s, looped=looped)
+        case IndentationGround() as ground:
+            return Indentation(ground, scene.tile, lead_s)
+        case TraceGround():
+            raise UsageError(
+                f"scene {scene.name!r} presses a recorded load, and none was given",
+                remedy="Add --load FILE",
+            )
+
+
+def press_on(
+    scene: Scene, load: LoadTrace, *, load_scale: float, cop: CopTransform, lead_s: float
+) -> PressedTrace:
+    """A recorded load as forces on the scene's tiles; see `ground.load_trace.press`.
+
+    Raises:
+        LoadTraceError: it cannot be pressed on them.
+    """
+    return press(
+        load,
+        tile_positions_m(scene.tile)[:, :2],
+        np.array([not tile.reference for tile in scene.tile]),
+        load_scale=load_scale,
+        cop=cop,
+        lead_s=lead_s,
+    )
+
+
+def tile_positions_m(tiles: tuple[TileScene, ...]) -> Floats:
+    """Positions of tiles in the foot frame, (tiles, 3)."""
+    return np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in tiles])

@@ -1,0 +1,181 @@
+"""Three hops of a leg on poppy seeds or in mud, as forces on domes over time.
+
+The motion is integrated once and interpolated: the truth does not depend on who asks, or when.
+Every hop lands on a fresh place, which is a little firmer or softer than the scene says; the leg
+hops a little higher or lower, and is caught at the top of the last hop. The seed draws that.
+
+The sole is strips, one under each place of the tiles, all of the same area. Of each, the tile's
+dome bears the stated share, along its own axis; the rim of the sole bears the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.emulation.ground.hopping_leg import STEP_S, HoppingLeg, Leg, Strip
+from devices.emulation.ground.load_trace import Floats
+from devices.emulation.ground.soft_ground import SoftGround
+from devices.emulation.parts import random_of
+from devices.errors import SceneError
+from devices.scene.file import MudGround, PoppyGround
+
+HOPS = 3
+
+_AIR_S = 2.0
+"""In the air after the last hop, and before the first again: long enough for a tare."""
+_STANCE_S = 0.25
+"""About as long landing and push-off take; the segment turns that much longer than it stands."""
+_SWING_S = 0.12
+_FIRMNESS = 0.05
+_HEIGHT = 0.03
+_PITCH = 0.1
+_STEEPEST_RAD = 0.7
+
+
+class Hopping:
+    """A leg's three hops on soft ground.
+
+    Args:
+        ground: what it hops on.
+        positions_m: (tiles, 3), in the foot frame.
+        bears: (tiles,), False for bare reference tiles, which are in no strip.
+        seed: draws what differs from hop to hop.
+        lead_s: when it is dropped.
+        looped: is it dropped over and over again?
+
+    Raises:
+        SceneError: the tiles are not on an arc below the ankle, or the leg gets stuck.
+    """
+
+    def __init__(
+        self,
+        ground: PoppyGround | MudGround,
+        positions_m: Floats,
+        bears: npt.NDArray[np.bool_],
+        seed: int,
+        lead_s: float,
+        *,
+        looped: bool = False,
+    ) -> None:
+        self._positions_m = positions_m
+        self._lead_s = lead_s
+        self.arc_rad = np.arctan2(positions_m[:, 0], -positions_m[:, 2])
+        if np.abs(self.arc_rad[bears]).max() > _STEEPEST_RAD:
+            raise SceneError(
+                f"a foot that hops on {ground.kind} has its tiles on an arc below the ankle",
+                expected="z_m negative, and x_m no larger than it",
+            )
+        places_m, strips_of = np.unique(positions_m[bears][:, [0, 2]], axis=0, return_inverse=True)
+        tile_m2 = ground.sole_m2 / bears.sum()
+        tiles_of = np.bincount(strips_of.ravel())
+        self._strip_of = np.zeros(len(bears), dtype=np.intp)
+        self._strip_of[bears] = strips_of.ravel()
+        self._dome_m2 = np.where(bears, ground.dome_share * tile_m2, 0.0)
+        self._rim_m2 = np.where(bears, (1.0 - ground.dome_share) * tile_m2, 0.0)
+        strips = tuple(
+            Strip(float(x_m), float(z_m), float(tile_m2 * n))
+            for (x_m, z_m), n in zip(places_m, tiles_of, strict=True)
+        )
+        leg = Leg(ground.mass_kg, ground.leg_n_per_m, strips)
+        self._head_kpa_m = ground.head_kpa_per_m if isinstance(ground, MudGround) else 0.0
+        # Turns of the segment: when each begins, how long it takes, from where and to where.
+        self._begins_s: list[float] = [0.0]
+        self._turns: list[tuple[float, float, float]] = []
+        self.touch_s: list[float] = []
+        """When the sole touches the ground, of each hop."""
+        self.leave_s: list[float] = []
+        """When it has left it."""
+        self.strokes_m: list[float] = []
+        """By how much each push-off lengthens the leg."""
+        self._hop(ground, leg, random_of(f"hop/{seed}"))
+        self._round_s = self._end_s - lead_s if looped else math.inf
+
+    def _hop(self, ground: PoppyGround | MudGround, leg: Leg, rng: np.random.Generator) -> None:
+        firmness = 1.0 + _FIRMNESS * rng.uniform(-1.0, 1.0, HOPS)
+        heights_m = ground.drop_m * _HEIGHT * rng.uniform(-1.0, 1.0, HOPS)
+        pitches_rad = ground.pitch_rad * (1.0 + _PITCH * rng.uniform(-1.0, 1.0, HOPS))
+        self._turns.append((1.0, -pitches_rad[0], -pitches_rad[0]))
+        hopping = HoppingLeg(leg, ground.drop_m, self._lead_s)
+        for hop in range(HOPS):
+            place = SoftGround.of(ground, float(firmness[hop]))
+            hopping.fall(place, self._angle)
+            # Its force has been felt for a step, and rises from nothing during the one before.
+            self.touch_s.append(hopping.motion.t_s - 2.0 * STEP_S)
+            self._turn(hopping.motion.t_s, ground.stand_s + _STANCE_S, pitches_rad[hop])
+            hopping.stand(place, self._angle, hopping.motion.t_s + ground.stand_s)
+            height_m = hopping.release_m + heights_m[hop]
+            self.strokes_m.append(hopping.push_off(place, self._angle, height_m))
+            self.leave_s.append(hopping.motion.t_s)
+            # After the last hop as before the first, should it be dropped again.
+            self._turn(hopping.motion.t_s, _SWING_S, -pitches_rad[(hop + 1) % HOPS])
+            hopping.rise(place, self._angle)
+        self._end_s = hopping.motion.t_s + _AIR_S
+        self.recorded = hopping.recorded
+        self._time_s = np.array(self.recorded.t_s)
+        self._ankle_m = np.array(self.recorded.ankle_m)
+        self._stress_pa = np.array(self.recorded.stress_pa)
+        self._rest_n = np.array(self.recorded.rest_n)
+
+    def _turn(self, begin_s: float, duration_s: float, to_rad: float) -> None:
+        from_rad = self._angle(begin_s)
+        self._begins_s.append(begin_s)
+        self._turns.append((duration_s, from_rad, float(to_rad)))
+
+    def _angle(self, t_s: float) -> float:
+        turn = bisect_right(self._begins_s, t_s) - 1
+        duration_s, from_rad, to_rad = self._turns[turn]
+        done = min((t_s - self._begins_s[turn]) / duration_s, 1.0)
+        return from_rad + (to_rad - from_rad) * done * done * (3.0 - 2.0 * done)
+
+    @property
+    def duration_s(self) -> float | None:
+        """End of the time in the air after the last hop; None for a leg dropped again and again."""
+        return None if math.isfinite(self._round_s) else self._end_s
+
+    def forces_n(self, t_s: Floats) -> Floats:
+        """Force on each dome along its axis, (len(t_s), tiles)."""
+        return self._stresses_pa(self._in_round(t_s)) * self._dome_m2
+
+    def angle_rad(self, t_s: Floats) -> Floats:
+        """Angle of the segment."""
+        at_s = self._in_round(t_s)
+        turn = np.maximum(np.searchsorted(self._begins_s, at_s, side="right") - 1, 0)
+        duration_s, from_rad, to_rad = np.array(self._turns)[turn].T
+        done = np.minimum((at_s - np.array(self._begins_s)[turn]) / duration_s, 1.0)
+        return np.asarray(from_rad + (to_rad - from_rad) * done * done * (3.0 - 2.0 * done))
+
+    def rest_n(self, t_s: Floats) -> Floats:
+        """Vertical force on the foot that no dome bears: rim, drag, suction and buoyancy."""
+        at_s = self._in_round(t_s)
+        upright = np.cos(self.arc_rad - self.angle_rad(t_s)[:, None])
+        rim_n = (self._stresses_pa(at_s) * self._rim_m2 * upright).sum(axis=1)
+        return np.asarray(rim_n + np.interp(at_s, self._time_s, self._rest_n, left=0.0, right=0.0))
+
+    def depth_m(self, t_s: Floats) -> Floats:
+        """Depth of each tile below the surface, (len(t_s), tiles); negative above it."""
+        ankle_m = np.interp(self._in_round(t_s), self._time_s, self._ankle_m)[:, None]
+        angle_rad = self.angle_rad(t_s)[:, None]
+        x_m, z_m = self._positions_m[:, 0], self._positions_m[:, 2]
+        return np.asarray(np.sin(angle_rad) * x_m - np.cos(angle_rad) * z_m - ankle_m)
+
+    def head_kpa(self, t_s: Floats) -> Floats:
+        """Hydrostatic pressure on each tile, (len(t_s), tiles)."""
+        return self._head_kpa_m * np.maximum(self.depth_m(t_s), 0.0)
+
+    def _stresses_pa(self, at_s: Floats) -> Floats:
+        """Stress under each tile."""
+        pa = [
+            np.interp(at_s, self._time_s, strip, left=0.0, right=0.0) for strip in self._stress_pa.T
+        ]
+        return np.stack(pa, axis=1)[:, self._strip_of]
+
+    def _in_round(self, t_s: Floats) -> Floats:
+        t_s = np.asarray(t_s)
+        if not math.isfinite(self._round_s):
+            return t_s
+        since_s = t_s - self._lead_s
+        return np.where(since_s < 0.0, t_s, np.mod(since_s, self._round_s) + self._lead_s)

@@ -1,0 +1,160 @@
+"""The mill: a spindle presses one tile after another against a reference force sensor.
+
+`Indentation` is its programme, a ground like any other; `Mill` is what stands beside the tiles: the
+reference sensor, and the operator who notes what is being done.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.clock import Clock
+from devices.emulation.chips.mcp3208 import EmulatedMcp3208, amplifier_volts
+from devices.emulation.ground.load_trace import Floats
+from devices.scene.file import IndentationGround, ReferenceScene, TileScene
+
+_MILL_NOISE_N = 0.02
+
+
+class Indentation:
+    """The mill: slow repeats, held loads released at once, taps, and a soak at two temperatures.
+
+    One tile after another is pressed by the spindle; `phases` says what the spindle does.
+    """
+
+    _HOLDS = 5
+    _TAPS = 15
+    _SOAK_S = 15.0
+    PHASES = ("rest", "load", "unload", "hold", "release", "tap", "soak")
+
+    def __init__(
+        self, ground: IndentationGround, tiles: tuple[TileScene, ...], lead_s: float
+    ) -> None:
+        self.serials = tuple(tile.serial for tile in tiles)
+        self.soak_k = ground.soak_k
+        self._time_s: list[float] = [0.0]
+        self._force_n: list[float] = [0.0]
+        self._tile: list[int] = []
+        self._phase: list[int] = []
+        self._to(lead_s, 0.0, -1, "rest")
+        for index, tile in enumerate(tiles):
+            if not tile.reference:
+                self._press(ground, index)
+        self._to(self._SOAK_S, 0.0, -1, "soak")
+        self.warm_from_s = self._time_s[-1]
+        self._to(self._SOAK_S + 10.0, 0.0, -1, "soak")  # the gas follows within seconds
+        self._ends = np.array(self._time_s[1:])
+        self._tiles_of = np.array(self._tile)
+        self._phases_of = np.array(self._phase)
+
+    @property
+    def duration_s(self) -> float:
+        """End of the soak."""
+        return self._time_s[-1]
+
+    def _press(self, ground: IndentationGround, tile: int) -> None:
+        full_n = ground.load_n
+        for _ in range(ground.repeats):
+            self._to(0.3, 0.0, tile, "rest")
+            self._to(ground.stroke_s, full_n, tile, "load")
+            self._to(ground.stroke_s, 0.0, tile, "unload")
+        for _ in range(self._HOLDS):
+            self._to(0.4, 0.0, tile, "rest")
+            self._to(0.4, 0.7 * full_n, tile, "load")
+            self._to(0.5, 0.7 * full_n, tile, "hold")
+            self._to(0.005, 0.0, tile, "release")
+        self._to(0.4, 0.0, tile, "rest")
+        for _ in range(self._TAPS):
+            for quarter in (0.5, 1.0, 0.5, 0.0):
+                self._to(0.005, quarter * 0.5 * full_n, tile, "tap")
+            self._to(0.1, 0.0, tile, "rest")
+
+    def _to(self, duration_s: float, force_n: float, tile: int, phase: str) -> None:
+        """Move the spindle to a force, linearly."""
+        self._time_s.append(self._time_s[-1] + duration_s)
+        self._force_n.append(force_n)
+        self._tile.append(tile)
+        self._phase.append(self.PHASES.index(phase))
+
+    def _segment(self, t_s: Floats) -> npt.NDArray[np.intp]:
+        return np.minimum(np.searchsorted(self._ends, t_s, side="right"), len(self._ends) - 1)
+
+    def forces_n(self, t_s: Floats) -> Floats:
+        """The spindle's force on the tile under it, zero on all others."""
+        forces_n = np.zeros((len(t_s), len(self.serials)))
+        tile = self.pressed_tile(t_s)
+        rows = np.flatnonzero(tile >= 0)
+        forces_n[rows, tile[rows]] = np.interp(t_s, self._time_s, self._force_n, right=0.0)[rows]
+        return forces_n
+
+    def spindle_n(self, t_s: float) -> float | None:
+        """Force of the spindle; None where it stands over no tile."""
+        segment = bisect_right(self._time_s, t_s) - 1
+        if segment >= len(self._tile) or self._tile[segment] < 0:
+            return None
+        begin_s, end_s = self._time_s[segment : segment + 2]
+        begin_n, end_n = self._force_n[segment : segment + 2]
+        return begin_n + (t_s - begin_s) / (end_s - begin_s) * (end_n - begin_n)
+
+    def pressed_tile(self, t_s: Floats) -> npt.NDArray[np.intp]:
+        """Index of the tile under the spindle; -1 for none."""
+        return np.asarray(self._tiles_of[self._segment(t_s)])
+
+    def phase(self, t_s: Floats) -> npt.NDArray[np.intp]:
+        """Index into `PHASES`."""
+        return np.asarray(self._phases_of[self._segment(t_s)])
+
+    def angle_rad(self, t_s: Floats) -> None:
+        """None: the tile lies on the table."""
+
+
+class Mill:
+    """The reference force sensor of the indentation rig, with its own noise, and the operator.
+
+    Args:
+        ground: the programme.
+        seconds: time of the scene at instants of the clock in ns.
+        rng: draws the amplifier's noise.
+    """
+
+    def __init__(
+        self,
+        ground: Indentation,
+        seconds: Callable[[npt.NDArray[np.int64]], Floats],
+        rng: np.random.Generator,
+    ) -> None:
+        self._ground = ground
+        self._seconds = seconds
+        self._rng = rng
+
+    def adc(self, reference: ReferenceScene, clock: Clock) -> EmulatedMcp3208:
+        """A converter with the sensor's amplifier at the input that `reference` names.
+
+        Where the spindle presses no tile the sensor bears nothing, and reads about zero.
+        """
+        volts = amplifier_volts(self._borne_n, reference, noise_n=self._noise_n)
+        return EmulatedMcp3208(volts, clock, vref_v=reference.vref_v)
+
+    def _borne_n(self, t_mono_ns: int) -> float:
+        return self._ground.spindle_n(float(self._seconds(np.array([t_mono_ns]))[0])) or 0.0
+
+    def _noise_n(self) -> float:
+        return _MILL_NOISE_N * float(self._rng.standard_normal())
+
+    def notes(self, t_mono_ns: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[np.object_]]:
+        """What the mill's operator notes at each instant.
+
+        Returns:
+            `pressed_tile`, serial of the tile under the spindle or None, and `phase`.
+        """
+        t_s = self._seconds(t_mono_ns)
+        serials = np.array([*self._ground.serials, None], dtype=object)
+        phases = np.array(self._ground.PHASES, dtype=object)
+        return {
+            "pressed_tile": serials[self._ground.pressed_tile(t_s)],
+            "phase": phases[self._ground.phase(t_s)],
+        }

@@ -1,0 +1,134 @@
+"""How ground that gives way resists the strips of a sole: granular matter, and mud.
+
+Vertical motion only. What a strip feels is a stress, in Pa, normal to it:
+
+* **Strength**, proportional to depth, as resistive force theory has it for a flat plate: Li, Zhang
+  and Goldman, "A terradynamics of legged locomotion on granular media", Science 339, 1408 (2013);
+  poppy seeds are of the order of 0.3 N/cm^3. It is plastic: a strip that rises by a little has no
+  load any more, and one that sinks again finds the strength where it left it.
+* **Inertia** of what is pushed aside, proportional to the square of the speed, added to the
+  strength: Katsuragi and Durian, "Unified force law for granular impact cratering", Nature Physics
+  3, 420 (2007).
+* In mud also **viscosity** under the sole, and forces on the whole foot that reach no strip:
+  viscous drag on its sides, suction while it is pulled out, buoyancy. That mud has all of these:
+  Chen et al., "A foot resistive force model for legged locomotion on muddy terrains",
+  arXiv:2604.12006 (2026); how large they are differs by orders of magnitude with its water.
+
+Assumed, without a source of their own: the unloading stiffness, the depth over which a touching
+strip is wetted, and every number of the mud but its density (hardware.md 9: 1.5 to 1.8 kPa per
+0.1 m). Left out: friction along the sole, the dependence of strength on the strip's slope, grains
+that fall on the foot, and the mass of the grains that move with it (Aguilar and Goldman, Nature
+Physics 12, 278 (2016), find that it matters for fast push-offs).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from devices.scene.file import MudGround, PoppyGround
+
+GRAVITY_M_S2 = 9.81
+_PA_M_PER_N_CM3 = 1e6
+_WETTED_M = 0.002
+"""A strip is flat neither in itself nor against grains of a millimetre: it is in full touch when it
+is this deep. At 1.4 m/s that is 1.4 ms."""
+_FOOT_M = 0.02
+"""Thickness of the foot, which floats no more than that."""
+_SUCKS_M = 0.004
+_SUCKS_M_S = 0.05
+"""Pulled more slowly than this, mud flows in as the gap opens."""
+
+
+@dataclass(frozen=True)
+class SoftGround:
+    """What one place of the ground is like. `SoftGround.of` makes it from a scene.
+
+    Attributes:
+        strength_pa_m: strength per metre of depth.
+        unloading: how many times stiffer it is in unloading than in sinking in.
+        inertia_kg_m3: density of what is pushed aside, times its drag coefficient.
+        viscous_pa_s_m: stress under the sole per speed of sinking.
+        side_n_s_m2: viscous drag on the sides of foot and leg per speed and depth.
+        suction_pa: the most that sucks at the sole while it is pulled out.
+        head_pa_m: hydrostatic pressure per metre of depth; 0: none, it is no liquid.
+    """
+
+    strength_pa_m: float
+    unloading: float
+    inertia_kg_m3: float
+    viscous_pa_s_m: float = 0.0
+    side_n_s_m2: float = 0.0
+    suction_pa: float = 0.0
+    head_pa_m: float = 0.0
+
+    @classmethod
+    def of(cls, ground: PoppyGround | MudGround, firmness: float = 1.0) -> SoftGround:
+        """A place of a scene's ground, `firmness` times as strong as its scene says."""
+        strength_pa_m = firmness * ground.strength_n_per_cm3 * _PA_M_PER_N_CM3
+        if isinstance(ground, PoppyGround):
+            # Grains of 1.0 g/cm^3, 58 % of the volume when loosely packed; drag coefficient 1.5.
+            return cls(strength_pa_m, unloading=20.0, inertia_kg_m3=1.5 * 580.0)
+        head_pa_m = ground.head_kpa_per_m * 1e3
+        half_width_m = 0.5 * math.sqrt(ground.sole_m2)
+        return cls(
+            strength_pa_m,
+            unloading=10.0,
+            inertia_kg_m3=1.0 * head_pa_m / GRAVITY_M_S2,
+            # Of a disc in creeping flow 16 eta r v over pi r^2, half of it in front of the disc.
+            viscous_pa_s_m=8.0 / math.pi * ground.viscosity_pa_s / half_width_m,
+            # Sheared in a gap of 2 cm along the sole's edge, four sides long.
+            side_n_s_m2=ground.viscosity_pa_s * 8.0 * half_width_m / 0.02,
+            suction_pa=ground.suction_kpa * 1e3,
+            head_pa_m=head_pa_m,
+        )
+
+    def stress_pa(self, depth_m: float, sinking_m_s: float, set_m: float) -> tuple[float, float]:
+        """Stress on a strip, never negative, and its set.
+
+        Args:
+            depth_m: of the strip below the surface.
+            sinking_m_s: how fast it sinks.
+            set_m: depth at which the strip would bear nothing, from what it did before; 0 in
+                untouched ground.
+        """
+        if depth_m <= 0.0:
+            return 0.0, set_m
+        strength_pa = self.strength_pa_m * depth_m
+        stiffness_pa_m = self.unloading * self.strength_pa_m
+        stress_pa = stiffness_pa_m * (depth_m - set_m)
+        if stress_pa < strength_pa:  # unloaded, or loaded again: the grains hold still
+            return max(stress_pa, 0.0), set_m
+        if sinking_m_s > 0.0:
+            wetted = min(depth_m / _WETTED_M, 1.0)
+            stress_pa = strength_pa + wetted * sinking_m_s * (
+                self.inertia_kg_m3 * sinking_m_s + self.viscous_pa_s_m
+            )
+        else:
+            stress_pa = strength_pa
+        return stress_pa, depth_m - strength_pa / stiffness_pa_m
+
+    def on_the_foot_n(
+        self, depth_m: float, sinking_m_s: float, gap_m: float, sole_m2: float
+    ) -> float:
+        """Vertical force on the whole foot that presses no strip; negative pulls it down.
+
+        Args:
+            depth_m: of the middle of the sole.
+            sinking_m_s: how fast it sinks; negative while it is pulled out.
+            gap_m: between the sole and its bed; 0 while any strip bears.
+            sole_m2: area of the sole.
+        """
+        if depth_m <= 0.0 or self.head_pa_m == 0.0:
+            return 0.0
+        force_n = self.side_n_s_m2 * depth_m * sinking_m_s
+        force_n += self.head_pa_m * sole_m2 * min(depth_m, _FOOT_M)
+        if sinking_m_s < 0.0 < gap_m:
+            force_n -= sole_m2 * self.suction_at_pa(gap_m, -sinking_m_s)
+        return force_n
+
+    def suction_at_pa(self, gap_m: float, rising_m_s: float) -> float:
+        """What sucks at a sole that rises: most at `_SUCKS_M`, gone when the gap has filled."""
+        part = gap_m / _SUCKS_M
+        flow = rising_m_s / (rising_m_s + _SUCKS_M_S)
+        return self.suction_pa * part * math.exp(1.0 - part) * flow

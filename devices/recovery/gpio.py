@@ -1,0 +1,132 @@
+"""GPIO lines of a Raspberry Pi, through libgpiod's Python binding (version 2).
+
+SDA and SCL belong to the I2C controller. Taking them as GPIO disconnects it, and giving them back
+leaves them inputs: libgpiod knows no alternate functions. So Raspberry Pi OS's `pinctrl` (before
+2023: `raspi-gpio`) restores the pins' function, whatever happened in between.
+
+This module has not been run on a Raspberry Pi by this project. What it asks of libgpiod is tested
+with the library's own types, what it asks of `pinctrl` by its command line.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import TYPE_CHECKING
+
+from devices.errors import BusSetupError
+from devices.scene.file import RecoveryScene
+
+if TYPE_CHECKING:
+    from gpiod import LineRequest
+
+_TOOLS = ("pinctrl", "raspi-gpio")
+_TOOL_TIMEOUT_S = 5.0
+
+
+class GpioLine:
+    """One requested line, open-drain: an output that is let go is an input."""
+
+    def __init__(self, request: LineRequest, line: int) -> None:
+        self._request = request
+        self._line = line
+
+    def drive(self, *, low: bool) -> None:
+        """Pull it low, or let go."""
+        from gpiod.line import Value
+
+        self._request.set_value(self._line, Value.INACTIVE if low else Value.ACTIVE)
+
+    def high(self) -> bool:
+        """The level on the pin, whoever makes it."""
+        return bool(self._request.get_value(self._line))
+
+
+class GpioLines:
+    """SCL, SDA and RESET of one bus.
+
+    Raises:
+        BusSetupError: gpiod, or the tool that gives the pins back, is not installed.
+    """
+
+    def __init__(self, scene: RecoveryScene) -> None:
+        self._scene = scene
+        try:
+            import gpiod  # noqa: F401  # a later import must not be the first to fail
+        except ImportError as error:
+            raise BusSetupError(
+                "recovery of the bus needs gpiod",
+                where=scene.gpiochip,
+                remedy="Install the extra: pip install '.[gpio]', or remove [recovery]",
+            ) from error
+        tool = next(filter(None, map(shutil.which, _TOOLS)), None)
+        if tool is None:
+            raise BusSetupError(
+                "no tool to give SDA and SCL back to the I2C controller, so they are not taken",
+                where=scene.gpiochip,
+                expected=f"{' or '.join(_TOOLS)}, as on Raspberry Pi OS",
+                remedy="Install raspi-utils, or remove [recovery]",
+            )
+        self._give_back = [tool, "set", f"{scene.sda_line},{scene.scl_line}", scene.i2c_function]
+
+    @contextmanager
+    def bus(self) -> Iterator[tuple[GpioLine, GpioLine]]:
+        """SCL and SDA, taken from the I2C controller while the block runs.
+
+        Raises:
+            BusSetupError: they cannot be had or moved, or the controller did not get them back.
+        """
+        scl, sda = self._scene.scl_line, self._scene.sda_line
+        try:
+            with self._requested(scl, sda) as request:
+                yield GpioLine(request, scl), GpioLine(request, sda)
+        finally:
+            self._restore()
+
+    def reset(self) -> AbstractContextManager[GpioLine] | None:
+        """The multiplexers' RESET; None if the scene names no line for it."""
+        line = self._scene.reset_line
+        return None if line is None else self._reset(line)
+
+    @contextmanager
+    def _reset(self, line: int) -> Iterator[GpioLine]:
+        with self._requested(line) as request:
+            yield GpioLine(request, line)
+
+    @contextmanager
+    def _requested(self, *lines: int) -> Iterator[LineRequest]:
+        import gpiod
+        from gpiod.line import Direction, Drive, Value
+
+        # Let go from the first moment: no line is pulled low by being taken.
+        open_drain = gpiod.LineSettings(
+            direction=Direction.OUTPUT, drive=Drive.OPEN_DRAIN, output_value=Value.ACTIVE
+        )
+        try:
+            with gpiod.request_lines(
+                self._scene.gpiochip, consumer="foottile", config={lines: open_drain}
+            ) as request:
+                yield request
+        except OSError as error:
+            raise BusSetupError(
+                f"GPIO lines cannot be used ({error.strerror or error})",
+                where=f"{self._scene.gpiochip}, lines {', '.join(map(str, lines))}",
+                remedy="Check [recovery], that this user is in the group gpio, and that no other "
+                "program holds the lines (gpioinfo)",
+                errno=error.errno,
+            ) from error
+
+    def _restore(self) -> None:
+        try:
+            subprocess.run(  # noqa: S603  # found on the path, numbers from the scene
+                self._give_back, check=True, capture_output=True, text=True, timeout=_TOOL_TIMEOUT_S
+            )
+        except (OSError, subprocess.SubprocessError) as error:
+            said = (getattr(error, "stderr", None) or str(error)).strip()
+            raise BusSetupError(
+                f"SDA and SCL are still GPIO, the I2C controller is disconnected from them: {said}",
+                where=self._scene.gpiochip,
+                remedy=f"Run: sudo {' '.join(self._give_back)}; or reboot",
+            ) from error

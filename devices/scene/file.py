@@ -1,0 +1,192 @@
+"""Scene files: which tiles hang where, what the ground does, and what the estimate needs.
+
+A scene is TOML. Every key is listed with its unit and default where its section is described; an
+unknown key, a wrong type or a contradiction is a `SceneError` that names the key and the remedy.
+Built-in scenes are files of the same form in `devices/scene/builtin/`.
+
+Sections are described by noun in `devices.scene.hardware`, `scene_grounds`, `scene_emulation` and
+`scene_faults`, and imported from here.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from devices.errors import SceneError
+from devices.scene.emulation import EmulationScene, ReadDuringConversion
+from devices.scene.faults import BUS, RATE, BusFault, FaultKind, FaultScene, MuxFault, TileFault
+from devices.scene.grounds import (
+    GroundScene,
+    IndentationGround,
+    MudGround,
+    NoGround,
+    PlateGround,
+    PoppyGround,
+    RollingGround,
+    TraceGround,
+)
+from devices.scene.hardware import (
+    EMULATED,
+    AnySchedule,
+    ArrayScene,
+    RecoveryScene,
+    ReferenceScene,
+    ScheduleName,
+    ServoScene,
+    TileScene,
+)
+from devices.scene.quantities import NotNegative, Section
+
+__all__ = [
+    "BUS",
+    "EMULATED",
+    "RATE",
+    "AnySchedule",
+    "ArrayScene",
+    "BusFault",
+    "EmulationScene",
+    "FaultKind",
+    "FaultScene",
+    "GroundScene",
+    "IndentationGround",
+    "MudGround",
+    "MuxFault",
+    "NoGround",
+    "PlateGround",
+    "PoppyGround",
+    "ReadDuringConversion",
+    "RecoveryScene",
+    "ReferenceScene",
+    "RollingGround",
+    "Scene",
+    "ScheduleName",
+    "ServoScene",
+    "TileFault",
+    "TileScene",
+    "TraceGround",
+    "build_scene",
+    "builtin_scenes",
+    "load_scene",
+    "parse_scene",
+]
+
+
+class Scene(Section):
+    """One scene. See the module's text for what a file looks like."""
+
+    name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9._-]+$")]
+    models: tuple[str, ...] = Field(default=("unwrap", "static"), strict=False)
+    """The models that an estimate of this scene needs, in any order."""
+    rate_hz: NotNegative = 0.0
+    """Frame rate; 0: as fast as the schedule allows."""
+    calibration: str = "bench"
+    """A calibration file, a preset's name, or "bench": run the emulated bench once."""
+    auto_tare: bool = True
+    """May a server that sees the foot in the air let the baseline follow by itself?"""
+    array: ArrayScene = ArrayScene()
+    tile: Annotated[tuple[TileScene, ...], Field(min_length=1, strict=False)]
+    servo: ServoScene | None = None
+    reference: ReferenceScene | None = None
+    recovery: RecoveryScene | None = None
+    ground: GroundScene = NoGround(kind="none")
+    emulation: EmulationScene = EmulationScene()
+    fault: tuple[FaultScene, ...] = Field(default=(), strict=False)
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        serials = [tile.serial for tile in self.tile]
+        if twice := _repeated(serials):
+            raise ValueError(f"tile serial {twice!r} appears twice; every tile has its own")
+        plugs = [f"mux 0x{tile.mux:02x} channel {tile.channel}" for tile in self.tile]
+        if twice := _repeated(plugs):
+            raise ValueError(f"{twice} is used by two tiles; plug each into a channel of its own")
+        if all(tile.reference for tile in self.tile):
+            raise ValueError("every tile is a reference tile; at least one has to bear load")
+        if isinstance(self.ground, MudGround) and self.emulation.temperature_step_k:
+            raise ValueError(
+                "mud has a temperature step of its own; give ground.temperature_step_k, and leave "
+                "emulation.temperature_step_k away"
+            )
+        for fault in self.fault:
+            if fault.tile is not None and fault.tile not in serials:
+                raise ValueError(
+                    f"a fault names tile {fault.tile!r}, but there are only {', '.join(serials)}"
+                )
+            if fault.mux is not None and fault.mux not in {tile.mux for tile in self.tile}:
+                raise ValueError(f"a fault names mux 0x{fault.mux:02x}, and no tile is behind it")
+        return self
+
+
+def _repeated(values: list[str]) -> str | None:
+    return next((value for value, count in Counter(values).items() if count > 1), None)
+
+
+def builtin_scenes() -> tuple[str, ...]:
+    """Names of the scenes that come with FootTile."""
+    folder = resources.files("devices.scene") / "builtin"
+    return tuple(sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.is_file()))
+
+
+def load_scene(name_or_path: str) -> Scene:
+    """Read a built-in scene by its name, or a scene file by its path.
+
+    Raises:
+        SceneError: no such scene or file, not TOML, an unknown key, a wrong type, a contradiction.
+    """
+    if name_or_path in builtin_scenes():
+        folder = resources.files("devices.scene") / "builtin"
+        text = (folder / f"{name_or_path}.toml").read_text("utf-8")
+        return parse_scene(text, where=f"scene {name_or_path}")
+    try:
+        text = Path(name_or_path).read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(
+            f"no scene {name_or_path!r}: {error}",
+            expected=f"one of {', '.join(builtin_scenes())}, or the path of a scene file",
+        ) from error
+    return parse_scene(text, where=name_or_path)
+
+
+def parse_scene(text: str, *, where: str) -> Scene:
+    """Build a scene from the text of a scene file; `where` names it in errors.
+
+    Raises:
+        SceneError: as for `load_scene`.
+    """
+    try:
+        content = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise SceneError(f"not TOML: {error}", where=where) from error
+    return build_scene(content, where=where)
+
+
+def build_scene(content: Mapping[str, object], *, where: str) -> Scene:
+    """Build a scene from what a scene file holds.
+
+    Raises:
+        SceneError: as for `load_scene`.
+    """
+    try:
+        return Scene.model_validate(content)
+    except ValidationError as error:
+        raise SceneError(_first_complaint(error), where=where) from error
+
+
+def _first_complaint(error: ValidationError) -> str:
+    complaint = error.errors()[0]
+    key = ".".join(str(part) for part in complaint["loc"]) or "scene"
+    message = complaint["msg"].removeprefix("Value error, ")
+    if complaint["type"] == "extra_forbidden":
+        return f"unknown key {key!r}. Check its spelling, or remove it"
+    if complaint["type"] == "missing":
+        return f"key {key!r} is missing"
+    if complaint["type"] == "value_error" and isinstance(complaint["input"], dict):
+        return f"{key}: {message}"
+    return f"{key} = {complaint['input']!r}: {message}"

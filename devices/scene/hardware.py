@@ -1,0 +1,163 @@
+"""Sections of a scene file that say what is wired: bus, tiles, servo, rig, recovery lines."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from devices.chips.dynamixel.models import FIRMWARES
+from devices.chips.tca9548a import ADDRESSES, CHANNELS
+from devices.scene.quantities import GpioLine, Number, Position, Positive, Section
+
+EMULATED = "emulated"
+"""Name of a bus or port that is emulated."""
+
+ScheduleName = Literal["simultaneous", "pipelined", "per_mux", "sequential"]
+AnySchedule = Literal["auto", ScheduleName]
+
+
+class ArrayScene(Section):
+    """`[array]`: the bus and how it is asked."""
+
+    bus: str = EMULATED
+    """A device such as /dev/i2c-1, or "emulated"."""
+    scl_hz: Annotated[float, Field(ge=10_000, le=1_000_000)] = 400_000.0
+    """Bus clock of the emulation; on hardware it is set in config.txt. The bounds catch kHz."""
+    schedule: AnySchedule = "auto"
+    """How the bus is asked (`devices.array.schedules`); "auto": the best for these tiles."""
+    wait_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """How long the driver waits for a conversion. Absent: as long as each part is measured to take
+    at start-up. Too short gives stale results."""
+    temperature_every: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Temperature is read in every so many frames; the others save two bytes a tile."""
+    broadcast_channels: Annotated[int, Field(ge=1, le=64)] = 8
+    """How many channels may be open at once: the pull-ups of all of them have to be sunk by one
+    part (TCA9548A data sheet 9.2.1)."""
+    conversion_ms: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+    """Emulation only: conversion time of every part. Absent: drawn for each part."""
+
+
+class TileScene(Section):
+    """`[[tile]]`: one tile, where it is plugged in and where it sits in the foot frame."""
+
+    serial: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9._-]+$")]
+    mux: int
+    channel: int
+    x_m: Position
+    y_m: Position
+    z_m: Position
+    reference: bool = False
+    """A bare tile that measures the surroundings: it bears no load and is in no sum."""
+
+    @field_validator("mux")
+    @classmethod
+    def _mux_exists(cls, mux: int) -> int:
+        if mux not in ADDRESSES:
+            raise ValueError(f"0x{mux:02x} is no TCA9548A address, which are 0x70 to 0x77")
+        return mux
+
+    @field_validator("channel")
+    @classmethod
+    def _channel_exists(cls, channel: int) -> int:
+        if channel not in CHANNELS:
+            raise ValueError(f"{channel} is no channel of a TCA9548A, which are 0 to 7")
+        return channel
+
+
+class ServoScene(Section):
+    """`[servo]`: the Dynamixel whose position goes with the frames."""
+
+    port: str = EMULATED
+    """A device such as /dev/ttyUSB0, or "emulated"."""
+    model: Literal["MX-28", "MX-64"] = "MX-64"
+    protocol: Literal[1, 2] = 2
+    """What its firmware speaks; the factory's speaks 1."""
+    id: Annotated[int, Field(ge=0)] = 1
+    baudrate: Annotated[int, Field(gt=0)] = 1_000_000
+    rate_hz: Positive = 100.0
+    """How often the position is read."""
+    sign: Literal[-1, 1] = 1
+    zero_counts: Annotated[int, Field(ge=-(2**28), le=2**28)] = 2048
+    ratio: Number = 1.0
+    """Turns of the segment per turn of the servo."""
+    ankle_travel_m_per_rad: Number | None = None
+    """Forward travel of the ankle per radian of the segment; absent: not known."""
+
+    @field_validator("sign", "protocol", mode="before")
+    @classmethod
+    def _is_a_number(cls, value: object) -> object:
+        if isinstance(value, bool):  # true equals 1, and would pass
+            raise ValueError(f"{value} is no number")  # noqa: TRY004  # pydantic's
+        return value
+
+    @field_validator("id")
+    @classmethod
+    def _id_exists(cls, servo_id: int, info: ValidationInfo) -> int:
+        protocol = info.data.get("protocol", 2)
+        highest = FIRMWARES[protocol].protocol.highest_id
+        if servo_id > highest:
+            raise ValueError(
+                f"{servo_id} is no id of a servo with protocol {protocol}, which are 0 to {highest}"
+            )
+        return servo_id
+
+    @field_validator("ratio")
+    @classmethod
+    def _ratio_turns_the_segment(cls, ratio: float) -> float:
+        if ratio == 0.0:
+            raise ValueError("0 would never turn the segment")
+        return ratio
+
+
+class ReferenceScene(Section):
+    """`[reference]`: the force sensor of a calibration rig, read through an MCP3208 on SPI.
+
+    Force is (volts - zero_v) * n_per_v. Neither has a default: nobody knows them but whoever has
+    measured this sensor with this amplifier.
+    """
+
+    port: str = EMULATED
+    """A device such as /dev/spidev0.0, or "emulated"."""
+    channel: Annotated[int, Field(ge=0, le=7)] = 0
+    """Input of the converter."""
+    vref_v: Annotated[float, Field(ge=0.25, le=5.5)] = 3.3
+    """Voltage at the converter's VREF, which is its full scale."""
+    zero_v: Number
+    """Voltage without a force. At either rail it could not be told from a broken wire."""
+    n_per_v: Number
+    """Newtons per volt; negative if a push lowers the voltage."""
+
+    @field_validator("n_per_v")
+    @classmethod
+    def _a_volt_is_a_force(cls, n_per_v: float) -> float:
+        if n_per_v == 0.0:
+            raise ValueError("0 would make every voltage 0 N")
+        return n_per_v
+
+    @model_validator(mode="after")
+    def _zero_can_be_read(self) -> Self:
+        if not 0.0 < self.zero_v < self.vref_v:
+            raise ValueError(
+                f"zero_v = {self.zero_v:g} is not between the rails, 0 and vref_v = "
+                f"{self.vref_v:g}; shift the amplifier's output off the rail"
+            )
+        return self
+
+
+class RecoveryScene(Section):
+    """`[recovery]`: GPIO lines of a Raspberry Pi that free a stuck bus."""
+
+    gpiochip: str = "/dev/gpiochip0"
+    scl_line: GpioLine = 3
+    sda_line: GpioLine = 2
+    reset_line: GpioLine | None = None
+    """RESET of all multiplexers; absent: not wired."""
+    i2c_function: Annotated[str, Field(pattern=r"^a[0-8]$")] = "a0"
+    """What SDA and SCL are to be again, in words of `pinctrl`; on a Pi 5 "a3"."""
+
+    @model_validator(mode="after")
+    def _lines_differ(self) -> Self:
+        if len({self.scl_line, self.sda_line, self.reset_line}) < 3:
+            raise ValueError("scl_line, sda_line and reset_line have to be different lines")
+        return self

@@ -1,0 +1,1 @@
+"""The server's face: REST, websockets, page, and who may ask."""

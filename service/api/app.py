@@ -1,0 +1,92 @@
+"""The server's application: REST API, websockets and page over one `Server`."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterable
+from contextlib import asynccontextmanager
+
+from fastapi import APIRouter, FastAPI
+from fastapi.responses import FileResponse
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket
+
+from service.api import problems
+from service.api.guard import Guard
+from service.api.page import page_folder
+from service.api.routes import access, clock, data, health, nodes, sessions, trash
+from service.api.routes.live import live
+from service.link import INGEST_PATH, LIVE_PATH
+from service.server.ingest import ingest
+from service.server.server import Server
+from service.version import SOFTWARE
+
+API = "/api/v1"
+
+_DESCRIPTION = """
+Live data and recorded sessions of FootTile sensors on robot feet.
+
+Every error is `application/problem+json` (RFC 9457) whose `detail` says what to do. Quantities
+carry their unit in their name; `_t_ns` are nanoseconds since 1970 in UTC. Frames come live over the
+websocket `/api/v1/live`; nodes connect to `/api/v1/ingest` with the subprotocol `foottile.v1`.
+"""
+
+
+def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = None) -> FastAPI:
+    """Build the application.
+
+    Args:
+        server: the state it serves.
+        hosts: names under which it is reached, beside addresses and localhost.
+        token: asked for on every change of state and on ingest; None: not asked for.
+    """
+    page = page_folder()
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        running = asyncio.create_task(server.run())
+        try:
+            yield
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+            await server.close()
+
+    app = FastAPI(
+        title="FootTile",
+        version=SOFTWARE.rsplit(" ", 1)[1],
+        description=_DESCRIPTION,
+        openapi_url=f"{API}/openapi.json",
+        docs_url=None,  # its pages come from another host, which a field laptop does not reach
+        redoc_url=None,
+        lifespan=lifespan,
+    )
+    app.state.server = server
+    problems.install(app)
+    api = APIRouter(
+        prefix=API,
+        responses=access.problems(
+            _401="Off loopback a change needs the token.",
+            _403="The Host header, or the Origin of a change, is not this server's.",
+            _422="A parameter or the body is not as described.",
+        ),
+    )
+    for module in (health, nodes, sessions, trash, data, clock):
+        api.include_router(module.router)
+    app.include_router(api)
+
+    @app.websocket(LIVE_PATH)
+    async def live_socket(socket: WebSocket) -> None:
+        await live(socket, server)
+
+    @app.websocket(INGEST_PATH)
+    async def ingest_socket(socket: WebSocket) -> None:
+        await ingest(socket, server)
+
+    @app.get("/", include_in_schema=False)
+    async def index() -> FileResponse:
+        return FileResponse(page / "index.html", headers={"Cache-Control": "no-cache"})
+
+    app.mount("/static", StaticFiles(directory=page), name="static")
+    app.add_middleware(Guard, hosts=tuple(hosts), token=token)
+    return app

@@ -1,0 +1,74 @@
+"""How the clocks of a session go against the server's: drift, steps, and what is unknown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from fastapi import APIRouter, Response
+from fastapi.responses import FileResponse
+from starlette.concurrency import run_in_threadpool
+
+from devices.errors import StateError, UnknownError
+from service.api.routes.access import ServerState, problems
+from service.sessions.sealing import table_of_rows
+from storage.clock.file import CLOCK_NAME, clock_beside
+from storage.clock.summary import ClockSummary
+from storage.formats.export import MEDIA_TYPES
+from storage.sessions.file import SessionReader
+from storage.sessions.folder import FRAMES_NAME, Session
+
+router = APIRouter(prefix="/sessions", tags=["sessions"])
+
+_PARQUET = MEDIA_TYPES["parquet"]
+
+
+@router.get(
+    "/{session_id}/clock",
+    operation_id="getClock",
+    summary="Clocks",
+    response_model=ClockSummary,
+    responses={
+        200: {"description": "The summary, or the stored table.", "content": {_PARQUET: {}}},
+        **problems(
+            _404="No such session, or its clock table has been taken away.",
+            _409="The table is written when the session is sealed.",
+        ),
+    },
+)
+async def clock(
+    session_id: str,
+    server: ServerState,
+    format: Literal["json", "parquet"] = "json",  # noqa: A002
+) -> ClockSummary | Response:
+    """Stretches between steps with offset and drift of every stream; while recording, so far.
+
+    `format=parquet` is `clock.parquet`, the measurements themselves, as they lie beside the frames.
+    """
+    session = server.recorder.get(session_id)
+    if format == "parquet":
+        return _table(session, server.recorder.folder.path(session_id) / CLOCK_NAME)
+    if session.sha256 is None:
+        table = table_of_rows(server.recorder.sources(session_id))
+        return await run_in_threadpool(table.summary)
+    return await run_in_threadpool(_sealed, server.recorder.folder.path(session_id) / FRAMES_NAME)
+
+
+def _table(session: Session, path: Path) -> FileResponse:
+    if session.sha256 is None:
+        raise StateError(
+            f"session {session.id} is {session.state}, and its clock table is not written yet",
+            remedy="Stop it, or ask for format=json",
+        )
+    if not path.is_file():
+        raise UnknownError(f"the file {path.name} has been taken away", where=str(path))
+    return FileResponse(path, media_type=_PARQUET, filename=f"{session.id}.{path.name}")
+
+
+def _sealed(path: Path) -> ClockSummary:
+    if not path.is_file():
+        raise UnknownError(f"the file {path.name} has been taken away", where=str(path))
+    if not path.with_name(CLOCK_NAME).is_file():
+        raise UnknownError(f"the file {CLOCK_NAME} has been taken away", where=str(path.parent))
+    with SessionReader(path) as reader:
+        return clock_beside(reader).summary()

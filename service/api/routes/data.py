@@ -1,0 +1,232 @@
+"""A session's data: the sealed file as it is stored, or what is asked for made on request."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from base64 import b64encode
+from collections.abc import AsyncIterator, Iterator
+from http import HTTPStatus
+from pathlib import Path
+from typing import Annotated
+
+import pyarrow as pa
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import FileResponse, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
+from starlette.datastructures import MutableHeaders
+
+from devices.errors import StateError, UnknownError, UsageError
+from devices.frames import FRAME_COLUMNS
+from service.api.problems import problem
+from service.api.routes.access import ServerState, problems
+from service.server.server import Server
+from service.sessions.sealing import SessionFrames, sha256_of, table_of_rows
+from service.version import SOFTWARE
+from storage.clock.file import CLOCK_NAME, clock_beside
+from storage.formats.export import MEDIA_TYPES, ClockName, Format, Slice, export
+from storage.schema import KNOWN
+from storage.sessions.file import SessionReader
+from storage.sessions.folder import FRAMES_NAME, Session
+
+router = APIRouter(prefix="/sessions", tags=["data"])
+
+_CHUNK = 256 << 10  # three times the default's throughput (performance.md)
+_SINGLE_RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{0,18})|-(\d{1,18}))")
+_YEAR_S = 31_536_000
+
+
+class DataQuery(BaseModel):
+    """Which data, and how."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: Format = "parquet"
+    start_s: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = Field(
+        default=None, description="Seconds after the first frame."
+    )
+    end_s: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)] | None = Field(
+        default=None, description="Up to, not including, so many seconds after the first frame."
+    )
+    columns: str | None = Field(
+        default=None,
+        description="Names with commas between: of all tiles (`force_n`) or one (`force_n_0`).",
+        examples=["t_ns,grf_n,force_n_0"],
+    )
+    clock: ClockName = Field(
+        default="node",
+        description="`server` adds `t_server_ns`, the frame's instant in the server's UTC, and its "
+        "bound `t_server_uncertainty_ns`; null where the clocks were not compared.",
+    )
+
+    @property
+    def slice(self) -> Slice:
+        """Rows and columns."""
+        names = [name.strip() for name in (self.columns or "").split(",")]
+        return Slice(self.start_s, self.end_s, tuple(name for name in names if name))
+
+    @property
+    def canonical(self) -> str:
+        """The same for queries that ask for the same."""
+        part = self.slice
+        columns = ",".join(part.columns)
+        return f"{self.format}|{part.start_s}|{part.end_s}|{columns}|{self.clock}"
+
+    @property
+    def is_stored(self) -> bool:
+        """Is it the sealed file as it is?"""
+        return self.format == "parquet" and self.slice.is_all and self.clock == "node"
+
+
+@router.head("/{session_id}/data", include_in_schema=False)
+@router.get(
+    "/{session_id}/data",
+    operation_id="getData",
+    summary="Download",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "The data.",
+            "content": {media_type.split(";")[0]: {} for media_type in MEDIA_TYPES.values()},
+        },
+        206: {"description": "A range of the stored file."},
+        304: {"description": "It is what If-None-Match names."},
+        **problems(
+            _404="No such session, or nothing was recorded.",
+            _409="Parquet is there only when the session is sealed.",
+            _416="The range is outside the file.",
+            _422="No such format or column.",
+        ),
+    },
+)
+async def data(
+    session_id: str,
+    query: Annotated[DataQuery, Query()],
+    request: Request,
+    server: ServerState,
+) -> Response:
+    """A session as Parquet, Arrow or CSV.
+
+    Parquet without slice, columns or server's clock is the stored file: with ranges, a strong ETag
+    that is its SHA-256, and a digest. Everything else is made on request and streamed; while a
+    session is recorded it is what there is so far. `Foottile-Complete` says whether frames are
+    missing.
+    """
+    session = server.recorder.get(session_id)
+    ledger = server.recorder.ledger(session_id)
+    complete = "lossy" if ledger.lossy else str(ledger.complete).lower()
+    headers = {"Foottile-Complete": complete}
+    if session.state == "sealed" and session.sha256 is None:
+        raise UnknownError(f"session {session_id}: {session.problem}")
+    if session.state != "sealed" and query.format == "parquet":
+        raise StateError(
+            f"session {session_id} is {session.state}, and Parquet is made when it is sealed",
+            remedy="Stop it, or ask for format=arrow or csv",
+        )
+    if session.sha256 is not None and query.is_stored:
+        return _stored(session, session.sha256, request, server, headers)
+    return await _made(session, query, request, server, headers)
+
+
+def _stored(
+    session: Session, sha256: str, request: Request, server: Server, headers: dict[str, str]
+) -> Response:
+    path = server.recorder.folder.path(session.id) / FRAMES_NAME
+    if not path.is_file():
+        raise UnknownError(f"the file of session {session.id} has been taken away", where=str(path))
+    headers |= {
+        "ETag": f'"{sha256}"',
+        "Cache-Control": f"private, max-age={_YEAR_S}, immutable",
+        "Repr-Digest": f"sha-256=:{b64encode(bytes.fromhex(sha256)).decode()}:",
+    }
+    if _matches(request, sha256):
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    size = path.stat().st_size
+    wanted = request.headers.get("range")
+    if wanted is not None:
+        found = _SINGLE_RANGE.fullmatch(wanted.replace(" ", ""))
+        if found is None or (found[2] and found[1] and int(found[2]) < int(found[1])):
+            # RFC 9110 14.2: what is not understood, or is several, is ignored.
+            del MutableHeaders(scope=request.scope)["range"]
+        elif (found[1] and int(found[1]) >= size) or found[3] == "0":
+            return problem(
+                request.url.path,
+                HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
+                f"the range {wanted[:80]!r} is outside the file's {size} bytes",
+                {"Content-Range": f"bytes */{size}"},
+            )
+    answer = FileResponse(
+        path,
+        headers=headers,
+        media_type=MEDIA_TYPES["parquet"],
+        filename=f"{session.id}.parquet",
+        stat_result=path.stat(),
+    )
+    answer.chunk_size = _CHUNK
+    return answer
+
+
+async def _made(
+    session: Session, query: DataQuery, request: Request, server: Server, headers: dict[str, str]
+) -> Response:
+    clocks = ""
+    if query.clock == "server":
+        clocks = await run_in_threadpool(_clocks_hash, session, server)
+    if session.sha256 is not None:
+        about = f"{session.sha256}|{query.canonical}|{clocks}|{SOFTWARE}|{pa.__version__}"
+        tag = hashlib.sha256(about.encode()).hexdigest()
+        headers |= {"ETag": f'"{tag}"'}
+    else:
+        frames = sum(part.recorded for part in server.recorder.ledger(session.id).parts)
+        about = f"{session.id}|{session.state}|{frames}|{query.canonical}|{clocks}|{SOFTWARE}"
+        tag = hashlib.sha256(about.encode()).hexdigest()
+        headers |= {"ETag": f'W/"{tag}"'}
+    headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
+    if _matches(request, tag):
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    headers["Content-Disposition"] = f'attachment; filename="{session.id}.{query.format}"'
+    chunks = _chunks(session, query, server)
+    # The first chunk now: what is wrong with the query is then an answer, not a broken download.
+    first = await run_in_threadpool(next, chunks, None)
+    if first is None:
+        raise UsageError("the session has no frames")
+    if request.method == "HEAD":
+        answer = Response(headers=headers, media_type=MEDIA_TYPES[query.format])
+        del answer.headers["content-length"]  # it is not known before it is made
+        return answer
+
+    async def body() -> AsyncIterator[bytes]:
+        yield first
+        async for chunk in iterate_in_threadpool(chunks):
+            yield chunk
+
+    return StreamingResponse(body(), headers=headers, media_type=MEDIA_TYPES[query.format])
+
+
+def _clocks_hash(session: Session, server: Server) -> str:
+    path = server.recorder.folder.path(session.id) / CLOCK_NAME
+    if session.sha256 is not None and path.is_file():
+        return sha256_of(path)
+    return hashlib.sha256(repr(session.clock).encode()).hexdigest()
+
+
+def _chunks(session: Session, query: DataQuery, server: Server) -> Iterator[bytes]:
+    if session.sha256 is None:
+        sources = server.recorder.sources(session.id)
+        clock = table_of_rows(sources) if query.clock == "server" else None
+        return export(SessionFrames(sources), sources.info, {}, query.format, query.slice, clock)
+    return _chunks_of_file(server.recorder.folder.path(session.id) / FRAMES_NAME, query)
+
+
+def _chunks_of_file(path: Path, query: DataQuery) -> Iterator[bytes]:
+    with SessionReader(path) as reader:
+        extra = [name for name in KNOWN if name not in FRAME_COLUMNS and reader.has(name)]
+        clock = clock_beside(reader) if query.clock == "server" else None
+        pieces = reader.batches(*extra)
+        yield from export(pieces, reader.info, reader.notes, query.format, query.slice, clock)
+
+
+def _matches(request: Request, tag: str) -> bool:
+    given = request.headers.get("if-none-match", "")
+    return any(one.strip().removeprefix("W/") in (f'"{tag}"', "*") for one in given.split(","))

@@ -1,0 +1,217 @@
+"""Recorded sessions: start, stop, list, describe, mark."""
+
+from __future__ import annotations
+
+import re
+from http import HTTPStatus
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from service.api.routes.access import ServerState, problems
+from service.server.views import EventView, Page, SessionView
+from storage.sessions.folder import Ledger
+
+router = APIRouter(prefix="/sessions", tags=["sessions"])
+
+SETTLE_S = 5.0
+"""How long a stop waits for the sealed file before it answers."""
+
+_UNKNOWN = problems(_404="No such session.")
+_FULL = problems(_507="The data folder cannot be written.")
+
+Name = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200)]
+Text = Annotated[str, StringConstraints(max_length=10_000)]
+Tag = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=100)]
+Tags = Annotated[tuple[Tag, ...], Field(max_length=50)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class StartSession(_Body):
+    """What to record."""
+
+    node: str = Field(examples=["demo"])
+    name: Name = Field(examples=["mud, third trial"])
+    pre_roll_s: Annotated[float, Field(ge=0, le=600, allow_inf_nan=False)] = Field(
+        default=0.0, description="Begin so much earlier, as far as the server still has it."
+    )
+    subject: Name | None = None
+    notes: Text = ""
+    tags: Tags = ()
+
+
+class ChangeSession(_Body):
+    """What people say of a session; what is left out stays."""
+
+    name: Name | None = None
+    subject: Text | None = None
+    notes: Text | None = None
+    tags: Tags | None = None
+
+
+class MarkEvent(_Body):
+    """An event."""
+
+    label: Name = Field(examples=["stepped on a stone"])
+    t_ns: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
+        default=None, description="Server's UTC; left out: now."
+    )
+    id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")] | None = Field(
+        default=None, description="Your own, so that what is sent twice is marked once."
+    )
+
+
+@router.post(
+    "",
+    operation_id="startSession",
+    summary="Start recording",
+    status_code=HTTPStatus.CREATED,
+    responses={
+        **problems(_404="No such node.", _409="It is away, or far behind."),
+        **_FULL,
+    },
+)
+async def start(body: StartSession, server: ServerState, response: Response) -> SessionView:
+    """Record a node from its next frame on, or from `pre_roll_s` earlier.
+
+    Several sessions may be recorded on one node at a time; each is stopped by its own id.
+    """
+    session = server.recorder.start(
+        body.node,
+        body.name,
+        pre_roll_s=body.pre_roll_s,
+        subject=body.subject or "",
+        notes=body.notes,
+        tags=body.tags,
+    )
+    server.tell_node(server.nodes.get(body.node))
+    response.headers["Location"] = f"/api/v1/sessions/{session.id}"
+    return SessionView.of(session, server.recorder)
+
+
+@router.post(
+    "/{session_id}/stop",
+    operation_id="stopSession",
+    summary="Stop recording",
+    responses={**_UNKNOWN, **problems(_409="It was stopped before."), **_FULL},
+)
+async def stop(session_id: str, server: ServerState) -> SessionView:
+    """End a session now and seal it; answers when that is done, or after five seconds.
+
+    If the node is away the session is `pending`, and completes when the node has come back.
+    """
+    session = server.recorder.stop(session_id)
+    server.tell_node(server.nodes.get(session.node))
+    if server.nodes.get(session.node).connected:
+        session = await server.recorder.settled(session_id, SETTLE_S)
+    return SessionView.of(session, server.recorder)
+
+
+@router.post(
+    "/{session_id}/seal",
+    operation_id="sealSession",
+    summary="Seal without what is missing",
+    responses={**_UNKNOWN, **problems(_409="It is not pending."), **_FULL},
+)
+async def seal(session_id: str, server: ServerState) -> SessionView:
+    """Give up what a pending session waits for, because its node never comes back.
+
+    It is sealed as lossy: frames that were still to come are lost, reason `given_up`.
+    """
+    server.recorder.give_up(session_id)
+    session = await server.recorder.settled(session_id, SETTLE_S)
+    return SessionView.of(session, server.recorder)
+
+
+@router.get("", operation_id="listSessions", summary="Sessions, newest first")
+async def list_sessions(
+    server: ServerState,
+    cursor: Annotated[str | None, Query(description="From the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    q: Annotated[
+        str | None, Query(max_length=200, description="Text in name, subject, notes, tag or node.")
+    ] = None,
+) -> Page[SessionView]:
+    """A page of sessions."""
+    found = [s for s in server.recorder.all() if q is None or _mentions(s, q.casefold())]
+    if cursor is not None:
+        key = _key_of(cursor)
+        found = [session for session in found if (session.started_t_ns, session.id) < key]
+    page = found[:limit]
+    more = len(found) > limit
+    return Page(
+        items=[SessionView.of(session, server.recorder) for session in page],
+        next_cursor=f"{page[-1].started_t_ns}.{page[-1].id}" if more else None,
+    )
+
+
+@router.get("/{session_id}", operation_id="getSession", summary="A session", responses=_UNKNOWN)
+async def get_session(session_id: str, server: ServerState) -> SessionView:
+    """As it is now."""
+    return SessionView.of(server.recorder.get(session_id), server.recorder)
+
+
+@router.patch(
+    "/{session_id}",
+    operation_id="changeSession",
+    summary="Rename or annotate",
+    responses={**_UNKNOWN, **_FULL},
+)
+async def change(session_id: str, body: ChangeSession, server: ServerState) -> SessionView:
+    """Change name, subject, notes or tags; the sealed data does not change."""
+    changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
+    return SessionView.of(server.recorder.change(session_id, **changes), server.recorder)
+
+
+@router.delete(
+    "/{session_id}",
+    operation_id="deleteSession",
+    summary="Move to the trash",
+    status_code=HTTPStatus.NO_CONTENT,
+    responses={**_UNKNOWN, **problems(_409="It is being recorded, or sealed."), **_FULL},
+)
+async def delete(session_id: str, server: ServerState) -> None:
+    """It can be had back until the trash is emptied; its space is free only then."""
+    server.recorder.discard(session_id)
+    server.tell_deleted(session_id)
+
+
+@router.post(
+    "/{session_id}/events",
+    operation_id="markEvent",
+    summary="Mark an event",
+    status_code=HTTPStatus.CREATED,
+    responses={**_UNKNOWN, **_FULL},
+)
+async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventView:
+    """Note that something happened, now or at an instant."""
+    event = server.recorder.mark(session_id, body.label, body.t_ns, body.id)
+    return EventView(**event.model_dump())
+
+
+@router.get("/{session_id}/events", operation_id="listEvents", summary="Events", responses=_UNKNOWN)
+async def events(session_id: str, server: ServerState) -> Page[EventView]:
+    """In order of time."""
+    marked = sorted(server.recorder.get(session_id).events, key=lambda event: event.t_ns)
+    return Page(items=[EventView(**event.model_dump()) for event in marked])
+
+
+@router.get("/{session_id}/ledger", operation_id="getLedger", summary="Ledger", responses=_UNKNOWN)
+async def ledger(session_id: str, server: ServerState) -> Ledger:
+    """What became of every frame: recorded, lost for a reason, or still with the node."""
+    return server.recorder.ledger(session_id)
+
+
+def _mentions(session: object, q: str) -> bool:
+    said = [getattr(session, name) for name in ("id", "name", "subject", "notes", "node", "scene")]
+    return any(q in text.casefold() for text in (*said, *getattr(session, "tags", ())))
+
+
+def _key_of(cursor: str) -> tuple[int, str]:
+    t_ns, _, session_id = cursor.partition(".")
+    number = re.fullmatch(r"[0-9]{1,19}", t_ns)
+    return (int(t_ns), session_id) if number else (0, "")

@@ -1,0 +1,140 @@
+"""Runs the application in uvicorn on a socket known to be ours, until it is told to stop."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import signal
+import socket
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+
+import uvicorn
+from fastapi import FastAPI
+
+from devices.errors import LinkError
+from service.api.guard import is_loopback
+from service.estimation.warm import warm_up
+from service.link import MESSAGE_BYTES_MAX
+from storage.durable import storage_errors, write_whole
+
+_BACKLOG = 128
+_GRACE_S = 3
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket; port 0 is any that is free.
+
+    Raises:
+        LinkError: the port is in use, or the address is not this machine's.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listening = socket.socket(family, kind, protocol)
+    except OSError as error:
+        raise LinkError(f"cannot listen on {host}: {error}") from error
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(address)
+        listening.listen(_BACKLOG)
+    except OSError as error:
+        listening.close()
+        raise LinkError(
+            f"cannot listen on {host} port {port}: {error.strerror}",
+            remedy="Stop what uses the port, or choose another one with --port",
+        ) from error
+    return listening
+
+
+def urls_of(listening: socket.socket, host: str) -> list[str]:
+    """Addresses under which it is reached, from other machines first if they can."""
+    port = listening.getsockname()[1]
+    names = [host]
+    if host in ("0.0.0.0", "::", ""):  # noqa: S104  # compared only
+        names = [*_own_addresses(), "127.0.0.1"]
+    return [f"http://[{n}]:{port}" if ":" in n else f"http://{n}:{port}" for n in names]
+
+
+def _own_addresses() -> list[str]:
+    """This machine's address towards other networks, if it is in one."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            # Nothing is sent: connecting a datagram socket only chooses the way out.
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return []
+        return [name for name in (probe.getsockname()[0],) if not is_loopback(name)]
+
+
+def token_for(host: str, given: str | None, data: Path) -> str | None:
+    """The token to ask for: the one given; off loopback one that is kept in the data folder.
+
+    Raises:
+        StorageError: it cannot be kept.
+    """
+    if given or is_loopback(host):
+        return given or None
+    path = data / "token"
+    with storage_errors(path):
+        kept = path.read_text().strip() if path.exists() else ""
+        if not kept:
+            data.mkdir(parents=True, exist_ok=True)
+            kept = secrets.token_urlsafe(18)
+            write_whole(path, kept.encode() + b"\n", mode=0o600)
+    return kept
+
+
+@asynccontextmanager
+async def serving(app: FastAPI, listening: socket.socket) -> AsyncIterator[None]:
+    """Serve while the block runs; on a new machine the models are compiled before, in seconds."""
+    await asyncio.to_thread(warm_up)
+    config = uvicorn.Config(
+        app,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        ws="websockets-sansio",  # the fastest that is kept up (performance.md)
+        ws_max_size=MESSAGE_BYTES_MAX,
+        ws_per_message_deflate=False,
+        ws_ping_interval=20.0,
+        ws_ping_timeout=20.0,
+        timeout_graceful_shutdown=_GRACE_S,
+    )
+    logging.getLogger("uvicorn.error").addFilter(_is_news)
+    server = _Server(config)
+    task = asyncio.create_task(server.serve([listening]))
+    try:
+        while not server.started and not task.done():
+            await asyncio.sleep(0.01)
+        if task.done():
+            task.result()
+        yield
+    finally:
+        server.should_exit = True
+        await task
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    # We refuse a handshake with an HTTP answer that says why; uvicorn takes that for a mistake.
+    return "without completing handshake" not in record.getMessage()
+
+
+class _Server(uvicorn.Server):
+    """Leaves signals to whoever runs it."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+def stop_on_signals() -> asyncio.Event:
+    """An event that Ctrl-C or SIGTERM sets, in the running loop."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    return stop

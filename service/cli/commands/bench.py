@@ -1,0 +1,141 @@
+"""`foottile bench`: speed against error of the model ladder."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from devices.errors import UsageError
+from devices.scene.file import load_scene
+from service.cli.emulation import check_emulated
+from service.cli.options import JsonOption, json_text, print_json, remark, say, telling
+
+SCENES = ("rolling", "poppy", "mud")
+DRAWS, QUICK_DRAWS = 20, 3
+FRAMES, QUICK_FRAMES = 1_000_000, 100_000
+LIVE_FRAMES, QUICK_LIVE_FRAMES = 10_000, 2_000
+SECONDS_MAX = 1000.0
+"""A draw is held in memory: at 500 frames/s and four tiles this is about 100 MB."""
+REPETITIONS, QUICK_REPETITIONS = 5, 3
+
+
+def bench_command(
+    out: Annotated[
+        Path, typer.Option(help="Folder for bench.json, bench.md and bench.png; made if absent.")
+    ],
+    scene: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Scene, can be given again; default: {', '.join(SCENES)}."),
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help=f"{QUICK_DRAWS} draws and fewer timed frames, for a first look."
+        ),
+    ] = False,
+    draws: Annotated[
+        int | None,
+        typer.Option(min=1, help=f"Draws of tiles, calibration and noise; default {DRAWS}."),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Length of a draw; default: the scene's, or 20 if it has no end."),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help=f"Frames timed offline; default {FRAMES}.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Draws at the same time; default: one per core.")
+    ] = None,
+    whole_only: Annotated[
+        bool, typer.Option("--whole-only", help="Only the scenes' whole ladders, for many draws.")
+    ] = False,
+    repeatability: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=0.2,
+            help="Of the emulated domes, instead of the scene's; the paper's: 0.03.",
+        ),
+    ] = None,
+    correlated_ms: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1000.0,
+            help="Correlation time of the emulated noise, instead of the scene's.",
+        ),
+    ] = None,
+    check_goals: Annotated[
+        bool, typer.Option("--check-goals", help="Exit code 3 if a goal is not met.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure time per frame and error of every rung of the model ladder.
+
+    Each draw has other tiles, calibrated on the emulated bench as a user would, and other noise.
+    Rungs are built up model by model to the scene's whole ladder, and the whole is tried without
+    each of its models. Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but something could
+    not be measured (or, with --check-goals, a goal is not met).
+    """
+    from service.offline.benchmark.plot import plot_bench
+    from service.offline.benchmark.report import markdown
+    from service.offline.benchmark.run import BenchOptions, run_bench
+    from service.offline.plots import new_figure
+    from storage.durable import write_whole
+
+    scenes = tuple(load_scene(name) for name in scene or SCENES)
+    names = [the_scene.name for the_scene in scenes]
+    if len(set(names)) < len(names):
+        raise UsageError(f"scenes {', '.join(names)}", expected="each scene once")
+    for the_scene in scenes:
+        check_emulated(the_scene)
+    if seconds is not None and not 0.0 < seconds <= SECONDS_MAX:
+        raise UsageError(f"--seconds {seconds:g}", expected=f"0 to {SECONDS_MAX:g}")
+    new_figure(1.0, 1.0)  # says what is missing before anything takes time
+    folder = _folder(out)
+    options = BenchOptions(
+        scenes=scenes,
+        draws=draws or (QUICK_DRAWS if quick else DRAWS),
+        seconds=seconds,
+        jobs=jobs or os.cpu_count() or 1,
+        offline_frames=frames or (QUICK_FRAMES if quick else FRAMES),
+        live_frames=QUICK_LIVE_FRAMES if quick else LIVE_FRAMES,
+        repetitions=QUICK_REPETITIONS if quick else REPETITIONS,
+        whole_only=whole_only,
+        repeatability=repeatability,
+        correlated_ms=correlated_ms,
+    )
+    with telling("starting") as tell:
+        bench = run_bench(options, tell)
+        text, png = markdown(bench), plot_bench(bench.scenes)
+    content = json_text(bench.as_dict())
+    write_whole(folder / "bench.json", content.encode())
+    write_whole(folder / "bench.md", text.encode())
+    write_whole(folder / "bench.png", png)
+    if as_json:
+        print_json(bench.as_dict())
+    else:
+        say(text)
+        say(f"{folder}: bench.json, bench.md, bench.png")
+    for name, failure in bench.failures:
+        remark(f"not measured: {name}, {failure.what}: {failure.why}")
+    missed = [(name, goal) for name, goals in bench.goals.items() for goal in goals if not goal.met]
+    if check_goals:
+        for name, goal in missed:
+            remark(f"goal not met: {name}, {goal.mode}: {goal.figure}: {goal.value:.3g}")
+    if bench.failures or (check_goals and missed):
+        raise typer.Exit(3)
+
+
+def _folder(out: Path) -> Path:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"no folder {str(out)!r} can be made: {error}") from error
+    if not os.access(out, os.W_OK):
+        raise UsageError(f"{str(out)!r} cannot be written in")
+    return out.resolve()

@@ -1,0 +1,170 @@
+"""`foottile demo`: a server and an emulated node, to try everything without hardware."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from devices.errors import FootTileError, UsageError
+from devices.scene.file import EMULATED
+from service.cli.commands.node import calibration_of
+from service.cli.commands.serve import PREPARING, announce
+from service.cli.emulation import (
+    CopAxesOption,
+    CopOffsetOption,
+    CopScaleOption,
+    LeadOption,
+    LoadOption,
+    LoadScaleOption,
+    PartsSeedOption,
+    SeedOption,
+    rig_options,
+    scene_with,
+)
+from service.cli.options import remark
+
+if TYPE_CHECKING:
+    from service.server.server import Server
+
+NODE = "demo"
+_SEAL_S = 20.0
+_END_S = 8.0
+
+
+def demo_command(
+    scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")] = "rolling",
+    load: LoadOption = None,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any.")] = 8000,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder for sessions; default: one for demos.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="End after so long; default: at Ctrl-C.")
+    ] = None,
+    load_scale: LoadScaleOption = 1.0,
+    cop_scale: CopScaleOption = 1.0,
+    cop_offset_m: CopOffsetOption = "0,0",
+    cop_axes: CopAxesOption = "xy",
+    lead_s: LeadOption = 1.0,
+    seed: SeedOption = 0,
+    parts_seed: PartsSeedOption = 0,
+) -> None:
+    """Run a server and an emulated node, and show where the live page is.
+
+    The scene goes on for ever; a recorded load is pressed over and over again. Ctrl-C stops what is
+    being recorded, seals it, and ends both.
+    """
+    import uvloop
+    from platformdirs import user_data_path
+
+    the_scene = scene_with(scene, bus=None, servo=None)
+    servo = the_scene.servo
+    if the_scene.array.bus != EMULATED or (servo is not None and servo.port != EMULATED):
+        raise UsageError(
+            f"scene {the_scene.name!r} is of real hardware",
+            remedy="Use `foottile serve` and `foottile node`",
+        )
+    options = rig_options(
+        the_scene,
+        NODE,
+        load=load,
+        load_scale=load_scale,
+        cop_scale=cop_scale,
+        cop_offset_m=cop_offset_m,
+        cop_axes=cop_axes,
+        lead_s=lead_s,
+        seed=seed,
+        parts_seed=parts_seed,
+    )
+    calibration_of(options)  # the node finds it in the cache
+    node_options = {
+        "--scene": scene,
+        "--load": None if load is None else str(load),
+        "--load-scale": str(load_scale),
+        "--cop-scale": str(cop_scale),
+        "--cop-offset-m": cop_offset_m,
+        "--cop-axes": cop_axes,
+        "--lead-s": str(lead_s),
+        "--seed": str(seed),
+        "--parts-seed": str(parts_seed),
+    }
+    arguments = [f"{name}={value}" for name, value in node_options.items() if value is not None]
+    folder = data if data is not None else user_data_path("foottile") / "demo"
+    arguments.append(f"--journal={folder / 'node'}")
+    uvloop.run(_demo(host, port, folder, seconds, arguments))
+
+
+async def _demo(
+    host: str, port: int, data: Path, seconds: float | None, node_arguments: list[str]
+) -> None:
+    from service.api.app import make_app
+    from service.api.serve import listen, serving, stop_on_signals, token_for, urls_of
+    from service.server.server import Server
+
+    stop = stop_on_signals()
+    with listen(host, port) as listening:
+        server = Server(data)
+        token = token_for(host, os.environ.get("FOOTTILE_TOKEN"), data)
+        remark(PREPARING)
+        async with serving(make_app(server, token=token), listening):
+            urls = urls_of(listening, host)
+            node = await _start_node(urls[-1], token, node_arguments)
+            try:
+                announce(urls, data, token)
+                remark(f"what was recorded: foottile sessions --server {urls[-1]}")
+                ended = asyncio.create_task(node.wait())
+                stopped = asyncio.create_task(stop.wait())
+                done, _ = await asyncio.wait(
+                    {ended, stopped}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED
+                )
+                stopped.cancel()
+                if ended in done:
+                    raise FootTileError(
+                        f"the node ended with code {node.returncode}",
+                        remedy="What it said stands above",
+                    )
+                await _stop_recording(server)
+                if not stop.is_set():
+                    remark(f"ended after {seconds:g} s; data in {data}")
+            finally:
+                await _end(node)
+
+
+async def _start_node(
+    url: str, token: str | None, arguments: list[str]
+) -> asyncio.subprocess.Process:
+    code = "from service.cli.main import main; main()"
+    environment = {**os.environ, **({"FOOTTILE_TOKEN": token} if token else {})}
+    return await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", code, "node", f"--server={url}", f"--name={NODE}"),
+        "--end-with-parent",
+        *arguments,
+        env=environment,
+        stdin=asyncio.subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for us, who end it when the recording is stopped
+    )
+
+
+async def _stop_recording(server: Server) -> None:
+    for session in server.recorder.recording_on(NODE):
+        server.recorder.stop(session.id)
+        sealed = await server.recorder.settled(session.id, _SEAL_S)
+        remark(f"session {sealed.id} ({sealed.name}) is {sealed.state}")
+
+
+async def _end(node: asyncio.subprocess.Process) -> None:
+    with suppress(ProcessLookupError):
+        node.terminate()
+    try:
+        await asyncio.wait_for(node.wait(), _END_S)
+    except TimeoutError:
+        with suppress(ProcessLookupError):
+            node.kill()
+        await node.wait()

@@ -1,0 +1,157 @@
+"""`foottile doctor`: find the tiles of a bus, measure it, and say what rate it will hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from devices.buses.i2c import I2cBus, open_bus
+from devices.clock import Clock, SystemClock, VirtualClock
+from devices.errors import UsageError
+from devices.scene.file import EMULATED, Scene, ServoScene, load_scene
+from service.cli.options import JsonOption, print_json, progress, say, stdout
+
+if TYPE_CHECKING:
+    from service.offline.doctor import Diagnosis
+    from service.offline.servo_doctor import ServoDiagnosis
+
+_EMULATED_SCENE = "standing"
+
+
+def doctor_command(
+    scene: Annotated[
+        str | None,
+        typer.Option(help="Scene that says what should be there; default: whatever is."),
+    ] = None,
+    bus: Annotated[
+        str | None, typer.Option(help="I2C bus, /dev/i2c-1 or emulated; default: the scene's.")
+    ] = None,
+    rate_hz: Annotated[
+        float, typer.Option(min=0.0, help="Frames a second wanted; 0: the scene's, or the most.")
+    ] = 0.0,
+    servo: Annotated[
+        str | None,
+        typer.Option(help="Serial port of a servo, emulated, or none; default: the scene's."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the tiles of a bus, measure it, and say what rate it will hold and what to change.
+
+    Looks behind every multiplexer, reads each tile's coefficients three times, measures the bus
+    clock and every part's conversion time, and predicts the frame rate of every schedule. With a
+    servo, asks for it in both protocols at the usual baud rates. An emulated bus is examined in
+    virtual time. Exit codes: 0 all is well, 1 nothing works, 2 wrong usage, 3 something has to be
+    changed.
+    """
+    from service.offline.doctor import diagnose
+    from service.offline.servo_doctor import diagnose_servo
+
+    the_scene = load_scene(scene) if scene is not None else None
+    name = bus or (the_scene.array.bus if the_scene is not None else None)
+    if name is None:
+        raise UsageError("which bus?", remedy="Add --bus /dev/i2c-1, --bus emulated, or --scene")
+    if name == EMULATED and the_scene is None:
+        the_scene = load_scene(_EMULATED_SCENE)
+    with ExitStack() as stack, progress(f"examining {name}"):
+        opened, clock = _open(name, the_scene)
+        stack.callback(opened.close)
+        diagnosis = diagnose(opened, clock, the_scene, asked_hz=rate_hz)
+    wanted = the_scene.servo if the_scene is not None else None
+    port = servo or (wanted.port if wanted is not None else "none")
+    found = None
+    if port != "none":
+        with ExitStack() as stack, progress(f"asking for a servo at {port}"):
+            opened_port = port
+            if port == EMULATED:
+                opened_port = stack.enter_context(_emulated_servo(the_scene, wanted))
+            found = diagnose_servo(opened_port, SystemClock(), wanted)
+    if as_json:
+        print_json(_as_json(name, diagnosis, port, found))
+    else:
+        _print(name, diagnosis, the_scene)
+        if found is not None:
+            say(f"Servo at {port}: {found.verdict}")
+    if diagnosis.scl_hz is None:
+        raise typer.Exit(1)
+    if not diagnosis.holds or (found is not None and not found.is_well):
+        raise typer.Exit(3)
+
+
+@contextmanager
+def _emulated_servo(scene: Scene | None, wanted: ServoScene | None) -> Iterator[str]:
+    if scene is None or wanted is None:
+        raise UsageError(
+            "an emulated servo for a scene without servo", remedy="Add --scene rolling"
+        )
+    from devices.emulation.world import World
+
+    clock = SystemClock()
+    with World(scene, clock).servo(wanted, clock) as emulated:
+        yield emulated.port
+
+
+def _open(name: str, scene: Scene | None) -> tuple[I2cBus, Clock]:
+    if name != EMULATED or scene is None:
+        return open_bus(name), SystemClock()
+    from devices.emulation.world import World
+
+    clock = VirtualClock()
+    if scene.ground.kind == "trace":  # examined unloaded, so the load does not matter
+        scene = scene.model_copy(update={"ground": load_scene(_EMULATED_SCENE).ground})
+    world = World(scene, clock, begun=False)
+    return open_bus(name, world.i2c_adapter), clock
+
+
+def _as_json(
+    name: str, diagnosis: Diagnosis, port: str, servo: ServoDiagnosis | None
+) -> dict[str, object]:
+    return {
+        "bus": name,
+        "tiles": [asdict(tile) for tile in diagnosis.tiles],
+        "scl_hz": diagnosis.scl_hz,
+        "asked_scl_hz": diagnosis.asked_scl_hz,
+        "transaction_us": diagnosis.transaction_s * 1e6,
+        "rates_hz": dict(diagnosis.rates_hz),
+        "schedule": diagnosis.schedule,
+        "holds": diagnosis.holds,
+        "verdict": diagnosis.verdict,
+        "servo": None if servo is None else {**asdict(servo), "port": port},
+    }
+
+
+def _print(name: str, diagnosis: Diagnosis, scene: Scene | None) -> None:
+    where = f"{name}, scene {scene.name}" if scene is not None else name
+    if name == EMULATED:
+        where += ", in virtual time"
+    say(f"Bus {where}")
+    tiles = Table("tile", "mux", "channel", "a0 b1 b2 c12", "conversion", "problem")
+    for tile in diagnosis.tiles:
+        words = tile.coefficient_words
+        tiles.add_row(
+            tile.serial or "not in the scene" if scene is not None else "-",
+            f"0x{tile.mux:02x}",
+            str(tile.channel),
+            " ".join(f"{word:04x}" for word in words) if words is not None else "-",
+            f"{tile.conversion_ms:.3f} ms" if tile.conversion_ms is not None else "-",
+            tile.problem or "none",
+        )
+    stdout.print(tiles)
+    if diagnosis.scl_hz is not None:
+        say(
+            f"SCL {diagnosis.scl_hz / 1e3:.1f} kHz measured, {diagnosis.asked_scl_hz / 1e3:.0f} "
+            f"asked for; {diagnosis.transaction_s * 1e6:.0f} us per transaction beyond its bits"
+        )
+        rates = Table("schedule", "frames/s predicted", "")
+        for schedule, rate in diagnosis.rates_hz.items():
+            rates.add_row(
+                schedule,
+                f"{rate:.1f}" if rate is not None else "too many channels at once",
+                "best" if schedule == diagnosis.schedule else "",
+            )
+        stdout.print(rates)
+    say(diagnosis.verdict)

@@ -1,0 +1,99 @@
+"""`foottile domes`: which of the paper's domes for which load."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from devices.errors import UsageError
+from service.cli.options import JsonOption, print_json, say, stdout
+from service.estimation.bench.domes import DomeRange, dome_for, external_share, fast_share, ranges
+
+
+def domes_command(
+    load_n: Annotated[
+        float | None, typer.Option(help="Greatest load on one tile in newtons: which dome for it.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the domes of the paper's Table I, and say which one bears a load.
+
+    The paper states a range for one dome only, 11 mm of Vytaflex 60; the others are scaled by
+    modulus and area, which is an estimate. Exit codes: 0 good, 2 wrong usage, 3 every dome
+    saturates.
+    """
+    if load_n is not None and not 0.0 < load_n < float("inf"):
+        raise UsageError(f"--load-n {load_n} is no load", expected="newtons above 0")
+    chosen = None if load_n is None else dome_for(load_n)
+    if as_json:
+        print_json(
+            {
+                "load_n": load_n,
+                "dome": None if chosen is None else chosen.dome.name,
+                "verdict": None if chosen is None or load_n is None else chosen.verdict(load_n),
+                "basis": None if chosen is None else chosen.basis,
+                "fast_share": fast_share(),
+                "domes": [
+                    {
+                        "name": found.dome.name,
+                        "material": found.dome.material.name,
+                        "modulus_mpa": found.dome.material.modulus_mpa,
+                        "diameter_mm": found.dome.diameter_mm,
+                        "range_n": [found.low_n, found.high_n],
+                        "basis": found.basis,
+                        "external_share": external_share(found.dome),
+                        "verdict": None if load_n is None else found.verdict(load_n),
+                    }
+                    for found in ranges()
+                ],
+            }
+        )
+    else:
+        table = Table(
+            box=SIMPLE_HEAD,
+            pad_edge=False,
+            padding=(0, 1, 0, 0),
+            title="Domes",
+            title_justify="left",
+        )
+        headings = ["dome", "material", "mm", "MPa", "full scale N", "from", "outside"]
+        for heading in [*headings, *([] if load_n is None else [f"{load_n:g} N"])]:
+            table.add_column(heading, no_wrap=True)
+        for found in ranges():
+            table.add_row(
+                found.dome.name,
+                found.dome.material.name,
+                f"{found.dome.diameter_mm:.0f}",
+                f"{found.dome.material.modulus_mpa:.2f}",
+                f"{found.low_n:.0f} to {found.high_n:.0f}",
+                found.basis,
+                f"{100 * external_share(found.dome):.0f} %",
+                *([] if load_n is None else [found.verdict(load_n)]),
+            )
+        stdout.print(table)
+        say(_NOTES.format(fast=100 * fast_share()))
+        if load_n is not None:
+            say(f"For {load_n:g} N: {_answer(chosen, load_n)}")
+    if load_n is not None and chosen is None:
+        raise typer.Exit(3)
+
+
+_NOTES = """\
+Full scale: a slow load that takes the chip to its 115 kPa. The paper states it for
+v60-11; the others are scaled by modulus and area: press one before you rely on it.
+A load that comes within milliseconds reaches full scale at about {fast:.0f} % of it.
+Outside: estimated part of a change of air or water pressure that a tile reads."""
+
+
+def _answer(chosen: DomeRange | None, load_n: float) -> str:
+    if chosen is None:
+        return "none of them; share the load between tiles."
+    if chosen.verdict(load_n) == "covers":
+        return f"{chosen.dome.name} ({chosen.basis})."
+    return (
+        f"perhaps {chosen.dome.name}: it saturates somewhere between {chosen.low_n:.0f} and "
+        f"{chosen.high_n:.0f} N ({chosen.basis})."
+    )

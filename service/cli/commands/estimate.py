@@ -1,0 +1,100 @@
+"""`foottile estimate`: forces, GRF and COP of a recorded session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.commands.simulate import OFFLINE_LAG_MS
+from service.cli.options import (
+    JsonOption,
+    output_path,
+    pair,
+    print_json,
+    progress,
+    remark,
+    say,
+    stdout,
+)
+
+
+def estimate_command(
+    session: Annotated[Path, typer.Argument(metavar="IN.parquet", help="Session to estimate.")],
+    out: Annotated[Path, typer.Option(help="Session to write, with the new estimates.")],
+    calibration: Annotated[
+        str | None,
+        typer.Option(
+            help="Calibration file, preset, 'bench', or the id of the one in the session; default: "
+            "the one in the session, else the scene's."
+        ),
+    ] = None,
+    models: Annotated[
+        str | None, typer.Option(help="Comma-separated; default: those of the scene.")
+    ] = None,
+    lag_ms: Annotated[
+        float, typer.Option(help="Look-ahead of smoothing and contact.")
+    ] = OFFLINE_LAG_MS,
+    scene: Annotated[
+        str | None,
+        typer.Option(help="Scene whose models, calibration and tile positions to use."),
+    ] = None,
+    tare_s: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="Unloaded interval in seconds from the first frame."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Estimate a recorded session anew and write it with the estimates.
+
+    The tare comes from --tare-s, else from frames flagged as lead, else from the first interval
+    that can be recognised as unloaded. Exit codes: 0 good, 1 failed, 2 wrong usage.
+    """
+    from service.cli.report import ASSUMED_SCALE, accuracy_table, stances_json, stances_line
+    from service.offline.estimate import estimate_session
+
+    # The session itself may be written anew: it is replaced whole, and nothing raw is lost.
+    path = output_path(out, *(Path(name) for name in (calibration, scene) if name is not None))
+    with progress(f"estimating {session}"):
+        result = estimate_session(
+            session,
+            path,
+            calibration=calibration,
+            models=None if models is None else tuple(models.split(",")),
+            lag_ms=lag_ms,
+            scene=scene,
+            tare_s=pair(tare_s, "--tare-s"),
+            remark=remark,
+        )
+    plan = result.plan
+    if as_json:
+        print_json(
+            {
+                "out": str(path),
+                "frames": result.frames,
+                "calibration_id": plan.calibration.id,
+                "absolute_scale": "assumed" if plan.assumed_scale else "measured",
+                "models": list(plan.models),
+                "lag_ms": lag_ms,
+                "tare": {
+                    "source": plan.tare.source,
+                    "begin_s": plan.tare.begin_s,
+                    "end_s": plan.tare.end_s,
+                },
+                "stances": stances_json(result.stances),
+                "accuracy": result.accuracy.as_dict() if result.accuracy else None,
+            }
+        )
+        return
+    say(
+        f"{path}: {result.frames} frames, calibration {plan.calibration.name} "
+        f"({plan.calibration.id}), models {', '.join(plan.models)}, tare {plan.tare.source} "
+        f"{plan.tare.begin_s:.2f} to {plan.tare.end_s:.2f} s"
+    )
+    if plan.assumed_scale:
+        say(ASSUMED_SCALE)
+    if result.stances:
+        say(stances_line(result.stances))
+    if result.accuracy is not None:
+        stdout.print(accuracy_table(result.accuracy))

@@ -1,0 +1,179 @@
+"""`foottile node`: acquisition beside the robot."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from devices.errors import CalibrationError, UsageError
+from service.cli.emulation import (
+    CopAxesOption,
+    CopOffsetOption,
+    CopScaleOption,
+    LeadOption,
+    LoadOption,
+    LoadScaleOption,
+    PartsSeedOption,
+    SeedOption,
+    rig_options,
+    scene_with,
+)
+from service.cli.options import remark, say
+
+if TYPE_CHECKING:
+    from service.estimation.calibration import Calibration
+    from service.node.run import NodeOptions, Outcome
+    from service.rig.rig import RigOptions
+
+SERVER = "http://127.0.0.1:8000"
+
+
+def node_command(
+    scene: Annotated[str, typer.Option(help="Scene file, or a built-in scene.")],
+    server: Annotated[
+        str | None,
+        typer.Option(help=f"Address of the server; default {SERVER}, with --record: none."),
+    ] = None,
+    bus: Annotated[
+        str | None, typer.Option(help="I2C bus, /dev/i2c-1 or emulated; default: the scene's.")
+    ] = None,
+    servo: Annotated[
+        str | None,
+        typer.Option(help="Serial port, emulated, or none; default: the scene's."),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of this node; default: this machine's.")
+    ] = None,
+    journal: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the journal and for sessions recorded here."),
+    ] = None,
+    record: Annotated[
+        str | None,
+        typer.Option(help="Record a session of this name here; no server is needed for it."),
+    ] = None,
+    load: LoadOption = None,
+    load_scale: LoadScaleOption = 1.0,
+    cop_scale: CopScaleOption = 1.0,
+    cop_offset_m: CopOffsetOption = "0,0",
+    cop_axes: CopAxesOption = "xy",
+    lead_s: LeadOption = 1.0,
+    seed: SeedOption = 0,
+    parts_seed: PartsSeedOption = 0,
+    end_with_parent: Annotated[
+        bool, typer.Option("--end-with-parent", hidden=True, help="End when its parent dies.")
+    ] = False,
+) -> None:
+    """Take frames from an array, keep them on disk and publish them to a server.
+
+    Every frame is journaled: what sessions need stays until the server has it on its disk, the rest
+    for ten minutes. It keeps trying: when the server is away, or this node was switched off, frames
+    follow when both are back. With --record it needs no server: at Ctrl-C the session is sealed in
+    the folder of --journal. A server that wants a token gets the one in FOOTTILE_TOKEN. Options
+    from --load on are for emulated tiles.
+
+    Exit code 3: frames of a session are lost, or wait on this disk for their server.
+    """
+    from platformdirs import user_state_path
+
+    from service.node.publisher import ingest_url
+    from service.node.run import NodeOptions
+
+    if end_with_parent:
+        from devices import realtime
+
+        realtime.end_with_parent()
+    if server is None and record is None:
+        server = SERVER
+    if server is not None:
+        ingest_url(server)  # refuse a wrong address before anything else
+    if record is not None and not record.strip():
+        raise UsageError("--record without a name", expected="the name of the session")
+    the_scene = scene_with(scene, bus=bus, servo=servo)
+    options = rig_options(
+        the_scene,
+        _name(name),
+        load=load,
+        load_scale=load_scale,
+        cop_scale=cop_scale,
+        cop_offset_m=cop_offset_m,
+        cop_axes=cop_axes,
+        lead_s=lead_s,
+        seed=seed,
+        parts_seed=parts_seed,
+    )
+    calibration, problem = calibration_of(options)
+    outcome = asyncio.run(
+        _run(
+            NodeOptions(
+                rig=options,
+                journal=journal if journal is not None else user_state_path("foottile"),
+                server=server,
+                record=record,
+                calibration=calibration,
+                calibration_problem=problem,
+                token=os.environ.get("FOOTTILE_TOKEN"),
+            )
+        )
+    )
+    if outcome.recorded is not None:
+        say(f"session {outcome.recorded}" + (" is lossy" if outcome.is_lossy else " is complete"))
+    if outcome.lost_frames:
+        remark(f"{outcome.lost_frames} frames of sessions are lost")
+    if outcome.undelivered_frames:
+        remark(
+            f"{outcome.undelivered_frames} frames wait on this disk: the server gets them when "
+            "this node runs again"
+        )
+    if outcome.lost_frames or outcome.undelivered_frames or outcome.is_lossy:
+        raise typer.Exit(3)
+
+
+async def _run(options: NodeOptions) -> Outcome:
+    from service.api.serve import stop_on_signals
+    from service.node.run import run_node
+
+    return await run_node(options, stop=stop_on_signals(), report=remark)
+
+
+def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]:
+    """The calibration that the scene names, or why there is none: raw frames are worth having."""
+    from service.offline.calibrations import BENCH, find_calibration
+
+    scene = options.scene
+    if scene.calibration == "none":
+        return None, "the scene names no calibration"
+    if scene.calibration == BENCH and not options.emulated:
+        # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
+        problem = (
+            "the emulated bench knows emulated tiles only: press the tiles on a real bench, run "
+            "`foottile calibrate`, and name its file in the scene"
+        )
+        remark(f"no calibration, so no forces: {problem}")
+        return None, problem
+    try:
+        calibration = find_calibration(
+            scene.calibration,
+            [tile.serial for tile in scene.tile if not tile.reference],
+            parts_seed=options.parts_seed,
+            progress=remark,
+        )
+    except CalibrationError as error:
+        remark(f"no calibration, so no forces: {error}")
+        return None, str(error)
+    return calibration, None
+
+
+def _name(given: str | None) -> str:
+    name = given if given is not None else re.sub(r"[^A-Za-z0-9._-]", "-", socket.gethostname())
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}", name):
+        raise UsageError(
+            f"--name {name!r}", expected="1 to 64 letters, digits, '.', '_' or '-', no '.' first"
+        )
+    return name

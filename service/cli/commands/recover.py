@@ -1,0 +1,108 @@
+"""`foottile recover`: after a crash, journals to sessions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from devices.errors import UsageError
+from service.cli.options import JsonOption, print_json, remark, say, telling
+
+if TYPE_CHECKING:
+    from service.sessions.recover import Recovered, Recovery
+
+_FAILED, _NOT_ALL = 1, 3
+
+
+def recover_command(
+    folder: Annotated[Path, typer.Argument(help="Data folder of a server, or journal of a node.")],
+    streams: Annotated[
+        bool,
+        typer.Option("--streams", help="Make sessions of frames that belong to none, too."),
+    ] = False,
+    give_up: Annotated[
+        bool,
+        typer.Option(
+            "--give-up",
+            help="On a server: count what nodes have not brought as lost, and do not wait.",
+        ),
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Complete what a crash has left, without a server: mend journals, seal sessions, prove them.
+
+    A server does this by itself when it is started; this is for a folder that has none, and for a
+    node alone. It can be run again at any time. Exit codes: 0 good, 1 something could not be
+    recovered, 2 wrong usage, 3 done, but a session is lossy, or waits for its node.
+    """
+    from service.sessions.recover import recover
+    from storage.folder_lock import locked
+
+    if not any((folder / name).is_dir() for name in ("journal", "sessions")):
+        raise UsageError(
+            f"no data folder {str(folder)!r}",
+            expected="a folder with `journal` and `sessions`, of a server or a node",
+        )
+    with locked(folder), telling("opening journals") as tell:
+        recovery = recover(folder, streams=streams, give_up=give_up, tell=tell)
+    if as_json:
+        print_json(_as_dict(recovery))
+    else:
+        _tell(recovery)
+    if recovery.problems or any(one.outcome == "failed" for one in recovery.sessions):
+        raise typer.Exit(_FAILED)
+    if any(one.ledger is None or not one.ledger.complete for one in recovery.sessions):
+        raise typer.Exit(_NOT_ALL)
+
+
+def _as_dict(recovery: Recovery) -> dict[str, Any]:
+    return {
+        "sessions": [
+            {
+                **(one.ledger.model_dump(mode="json") if one.ledger is not None else {}),
+                "id": one.session.id,
+                "name": one.session.name,
+                "outcome": one.outcome,
+                "problem": one.problem or None,
+                "sha256": one.session.sha256,
+            }
+            for one in recovery.sessions
+        ],
+        "removed": [str(path) for path in recovery.removed],
+        "cut_bytes": recovery.cut,
+        "mended": recovery.mended,
+        "problems": recovery.problems,
+    }
+
+
+def _tell(recovery: Recovery) -> None:
+    for name, cut_bytes in recovery.cut.items():
+        say(f"journal {name}: {cut_bytes} bytes behind the last whole batch were set aside")
+    if recovery.removed:
+        say(f"{len(recovery.removed)} half-written files were removed")
+    for session_id in recovery.mended:
+        say(f"session {session_id}: events.parquet was written anew")
+    for one in recovery.sessions:
+        say(f"session {one.session.id} ({one.session.name}): {_outcome(one)}")
+        if one.problem:
+            say(f"  {one.problem}")
+    for problem in recovery.problems:
+        say(f"not recovered: {problem}")
+    if recovery.is_nothing:
+        say("nothing to recover")
+    if any(one.outcome == "waiting" for one in recovery.sessions):
+        remark("what waits for its node is completed by the server, or sealed with --give-up")
+
+
+def _outcome(one: Recovered) -> str:
+    ledger = one.ledger
+    if one.outcome != "sealed" or ledger is None:
+        return {"waiting": "waits for its node"}.get(one.outcome, "NOT recovered")
+    recorded = sum(part.recorded for part in ledger.parts)
+    lost = sum(sum(part.lost.values()) for part in ledger.parts)
+    tail = sum(part.unsynced_tail_max for part in ledger.parts)
+    text = f"sealed and proven, {recorded} frames"
+    text += f", {lost} lost" if lost else ""
+    return text + (f", at most {tail} more when it broke off" if tail else "")

@@ -1,0 +1,69 @@
+"""`foottile serve`: the server."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.cli.options import remark, say
+
+if TYPE_CHECKING:
+    from service.api.settings import Settings
+
+
+def serve_command(
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen on; default 127.0.0.1: this machine only.")
+    ] = None,
+    port: Annotated[int | None, typer.Option(help="TCP port; default 8000; 0: any.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder for sessions and journals.")] = None,
+    config: Annotated[Path | None, typer.Option(help="TOML file with settings.")] = None,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(help="Name under which the server is reached; may be given several times."),
+    ] = None,
+) -> None:
+    """Take in nodes, estimate, show live, record, and give sessions away over HTTP.
+
+    Settings come from options, else from FOOTTILE_HOST and the like, else from --config. On any
+    other address than loopback, changes need a token: FOOTTILE_TOKEN, or one that is made and kept
+    in the data folder. Ctrl-C ends it; what is being recorded goes on when it runs again.
+    """
+    import uvloop
+
+    from service.api.settings import load_settings
+
+    settings = load_settings(
+        config, host=host, port=port, data=data, allow_host=tuple(allow_host or ()) or None
+    )
+    uvloop.run(_serve(settings))
+
+
+async def _serve(settings: Settings) -> None:
+    from service.api.app import make_app
+    from service.api.serve import listen, serving, stop_on_signals, token_for, urls_of
+    from service.server.server import Server
+
+    stop = stop_on_signals()
+    with listen(settings.host, settings.port) as listening:
+        server = Server(settings.data)
+        token = token_for(settings.host, settings.token, settings.data)
+        app = make_app(server, hosts=settings.allow_host, token=token)
+        remark(PREPARING)
+        async with serving(app, listening):
+            announce(urls_of(listening, settings.host), settings.data, token)
+            await stop.wait()
+
+
+PREPARING = "preparing the models; on a new machine that takes some ten seconds"
+
+
+def announce(urls: list[str], data: Path, token: str | None) -> None:
+    """Say where the page is, and how a node gets there."""
+    for url in urls:
+        say(f"FootTile is at {url}/" + (f"#token={token}" if token else ""))
+    remark(f"data in {data}; Ctrl-C ends it")
+    if token:
+        remark(f"a node: FOOTTILE_TOKEN={token} foottile node --scene FILE --server {urls[0]}")

@@ -1,0 +1,187 @@
+"""`foottile sessions`, `pull` and `export`: what was recorded, and how to get it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from devices.errors import UsageError
+from service.cli.options import JsonOption, output_path, print_json, progress, remark, say, stdout
+
+if TYPE_CHECKING:
+    from storage.formats.export import Format
+
+SERVER = "http://127.0.0.1:8000"
+
+_LONG = {"ledger", "events", "clock", "calibration", "scene_content"}
+"""What a list of sessions leaves out."""
+
+ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
+
+
+def sessions_command(
+    server: ServerOption = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Data folder to look into, without any server.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List recorded sessions, newest first."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    if server is not None and data is not None:
+        raise UsageError("--server and --data are two places to look in", remedy="Name one")
+    if data is not None:
+        found = _in_folder(data)
+    else:
+        from service.offline.client import Client
+
+        with Client(server or SERVER) as client:
+            found = client.sessions()
+    if as_json:
+        print_json({"items": found})
+        return
+    table = Table(box=None, pad_edge=False)
+    for heading in ("session", "name", "node", "s", "frames", "state"):
+        right = heading in ("s", "frames")
+        table.add_column(
+            heading,
+            justify="right" if right else "left",
+            no_wrap=heading != "name",
+            overflow="fold",
+        )
+    for session in found:
+        lossy = ", lossy" if session["complete"] == "lossy" else ""
+        assumed = ", scale assumed" if session["absolute_scale"] == "assumed" else ""
+        table.add_row(
+            session["id"],
+            escape(session["name"]),
+            session["node"],
+            f"{session['duration_s']:.1f}",
+            str(session["frames"]),
+            session["state"] + lossy + assumed,
+        )
+    stdout.print(table)
+
+
+def pull_command(
+    session: Annotated[str, typer.Argument(help="Id of the session.")],
+    out: Annotated[Path, typer.Option(help="Folder to put it in; made if absent.")],
+    server: ServerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Download a sealed session: data, description, events. Goes on where it was broken off.
+
+    The data is compared with its hash. Exit code 3: the session is complete on disk, but lossy.
+    """
+    from service.offline.client import Client
+
+    with Client(server or SERVER) as client, progress(f"pulling {session}"):
+        pulled = client.pull(session, out)
+    if as_json:
+        print_json(pulled)
+    else:
+        say(f"{pulled['path']}: {pulled['frames']} frames, {pulled['bytes']} bytes, hash verified")
+        if pulled["resumed_bytes"]:
+            remark(f"{pulled['resumed_bytes']} bytes were there from before")
+    if pulled["complete"] == "lossy":
+        remark("the session is lossy: some frames are missing for good")
+        raise typer.Exit(3)
+
+
+def export_command(
+    session: Annotated[
+        str, typer.Argument(help="A sealed file, a session's folder, or an id in --data.")
+    ],
+    out: Annotated[Path, typer.Option(help="File to write.")],
+    to: Annotated[str, typer.Option("--format", help="parquet, arrow or csv.")],
+    data: Annotated[
+        Path | None, typer.Option(help="Data folder of the server; default: the user's.")
+    ] = None,
+    start_s: Annotated[
+        float | None, typer.Option(help="From so many seconds after the first frame.")
+    ] = None,
+    end_s: Annotated[float | None, typer.Option(help="Before so many seconds.")] = None,
+    columns: Annotated[
+        str | None, typer.Option(help="Names with commas between: t_ns,grf_n,force_n_0.")
+    ] = None,
+    clock: Annotated[
+        str, typer.Option(help="node, or server: adds t_server_ns and t_server_uncertainty_ns.")
+    ] = "node",
+) -> None:
+    """Write a sealed session, or a slice of it, in another format."""
+    from storage.clock.file import clock_beside
+    from storage.durable import storage_errors
+    from storage.formats.export import CLOCKS, FORMATS, Slice, export
+    from storage.schema import FRAMES, KNOWN
+    from storage.sessions.file import SessionReader
+
+    if to not in FORMATS:
+        raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))
+    if clock not in CLOCKS:
+        raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
+    chosen: Format = to
+    source = _sealed_file(session, data)
+    path = output_path(out, source)
+    names = tuple(name.strip() for name in (columns or "").split(",") if name.strip())
+    frame_names = {column.name for column in FRAMES}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with SessionReader(source) as reader:
+        extra = [name for name in KNOWN if name not in frame_names and reader.has(name)]
+        chunks = export(
+            reader.batches(*extra),
+            reader.info,
+            reader.notes,
+            chosen,
+            Slice(start_s, end_s, names),
+            clock_beside(reader) if clock == "server" else None,
+        )
+        try:
+            with storage_errors(path), progress(f"writing {path.name}"):
+                with temporary.open("wb") as file:
+                    for chunk in chunks:
+                        file.write(chunk)
+                temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    say(f"{path}: {path.stat().st_size} bytes")
+
+
+def _in_folder(data: Path) -> list[dict[str, Any]]:
+    from storage.sessions.folder import SessionFolder
+
+    if not data.is_dir():
+        raise UsageError(f"no data folder {str(data)!r}")
+    folder = SessionFolder(data / "sessions")
+    found = []
+    for session_id in folder.ids():
+        session = folder.load(session_id)
+        ledger = session.ledger
+        content = session.model_dump(mode="json", exclude=_LONG)
+        complete = False if ledger is None else "lossy" if ledger.lossy else ledger.complete
+        found.append({**content, "complete": complete})
+    return found
+
+
+def _sealed_file(session: str, data: Path | None) -> Path:
+    from platformdirs import user_data_path
+
+    from storage.sessions.folder import FRAMES_NAME, SessionFolder
+
+    path = Path(session)
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        root = data if data is not None else user_data_path("foottile")
+        path = SessionFolder(root / "sessions").path(session)
+    if not (path / FRAMES_NAME).is_file():
+        raise UsageError(
+            f"no sealed session {session!r}",
+            where=str(path),
+            expected=f"a file, a folder with {FRAMES_NAME}, or the id of a session in --data",
+        )
+    return path / FRAMES_NAME

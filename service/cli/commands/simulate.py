@@ -1,0 +1,202 @@
+"""`foottile simulate`: a session on emulated hardware in virtual time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast, get_args
+
+import typer
+
+from devices.errors import UsageError
+from devices.scene.file import AnySchedule, Scene, ScheduleName, load_scene
+from service.cli.emulation import (
+    CopAxesOption,
+    CopOffsetOption,
+    CopScaleOption,
+    LeadOption,
+    LoadOption,
+    LoadScaleOption,
+    PartsSeedOption,
+    SeedOption,
+    check_emulated,
+    check_load,
+)
+from service.cli.options import (
+    JsonOption,
+    output_path,
+    pair,
+    print_json,
+    progress,
+    remark,
+    say,
+    stdout,
+)
+from service.cli.report import ASSUMED_SCALE, accuracy_table, stances_json, stances_line
+
+if TYPE_CHECKING:
+    from service.offline.simulate import Simulated
+
+OFFLINE_LAG_MS = 100.0
+
+
+def simulate_command(
+    scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Session to write; default: SCENE.parquet here.")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Length, lead included; default: that of the load or programme."),
+    ] = None,
+    load: LoadOption = None,
+    load_scale: LoadScaleOption = 1.0,
+    cop_scale: CopScaleOption = 1.0,
+    cop_offset_m: CopOffsetOption = "0,0",
+    cop_axes: CopAxesOption = "xy",
+    lead_s: LeadOption = 1.0,
+    schedule: Annotated[
+        str | None,
+        typer.Option(
+            help="auto, simultaneous, pipelined, per_mux or sequential; default: the scene's."
+        ),
+    ] = None,
+    tiles: Annotated[
+        str | None, typer.Option(help="Indentation only: serials to press, T01,T02,...")
+    ] = None,
+    seed: SeedOption = 0,
+    parts_seed: PartsSeedOption = 0,
+    truth: Annotated[
+        bool, typer.Option("--truth", help="Add the true_* columns and print the error.")
+    ] = False,
+    no_estimates: Annotated[bool, typer.Option("--no-estimates", help="Raw frames only.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a scene on emulated hardware in virtual time and write the session.
+
+    The real driver reads emulated chips through an emulated bus; the same command and version give
+    the same bytes. Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but the bus cannot keep
+    the scene's frame rate.
+    """
+    # Imported here: the physics pulls in scipy, which `--help` need not wait for.
+    from devices.emulation.ground.load_trace import CopTransform
+    from service.estimation.ladder import check_models
+    from service.offline.calibrations import find_calibration, with_tiles
+    from service.offline.simulate import SimulateOptions, simulate
+    from service.sessions.pipeline import EstimateOptions
+    from storage.formats.load_trace import read_load_trace
+
+    the_scene = load_scene(scene)
+    if tiles is not None:
+        if the_scene.ground.kind != "indentation":
+            raise UsageError("--tiles chooses what the mill presses", expected="an indentation")
+        the_scene = with_tiles(the_scene, tiles.split(","))
+    _check(the_scene, seconds, lead_s, load_scale, cop_scale)
+    inputs = [Path(scene), *([load] if load is not None else [])]
+    path = output_path(out if out is not None else Path(f"{the_scene.name}.parquet"), *inputs)
+    options = SimulateOptions(
+        scene=the_scene,
+        seconds=seconds,
+        schedule=_schedule(schedule),
+        seed=seed,
+        parts_seed=parts_seed,
+        lead_s=lead_s,
+        truth=truth,
+        load=read_load_trace(load) if load is not None else None,
+        load_scale=load_scale,
+        cop=CopTransform(cop_scale, pair(cop_offset_m, "--cop-offset-m") or (0.0, 0.0), cop_axes),
+    )
+    has_estimates = not no_estimates and the_scene.calibration != "none"
+    if has_estimates:
+        check_models(the_scene.models)
+
+    def estimate() -> EstimateOptions:
+        calibration = find_calibration(
+            the_scene.calibration,
+            [tile.serial for tile in the_scene.tile if not tile.reference],
+            parts_seed=parts_seed,
+            progress=remark,
+        )
+        return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS)
+
+    with progress(f"simulating {the_scene.name}"):
+        result = simulate(options, path, estimate if has_estimates else None)
+    if as_json:
+        print_json(_as_json(result, path))
+    else:
+        _print(result, path)
+    if result.missed_slots:
+        raise typer.Exit(3)
+
+
+def _as_json(result: Simulated, path: Path) -> dict[str, object]:
+    pressed = result.pressed
+    return {
+        "out": str(path),
+        "frames": result.frames,
+        "seconds": result.seconds,
+        "rate_hz": result.rate_hz,
+        "schedule": result.choice.schedule,
+        "unmeasured": list(result.unmeasured),
+        "flags": {serial: dict(flags) for serial, flags in result.flags.items()},
+        "missed_slots": result.missed_slots,
+        "bytes": path.stat().st_size,
+        "moved_to_edge": pressed.moved_to_edge if pressed else None,
+        "limited": pressed.limited if pressed else None,
+        "absolute_scale": None
+        if result.assumed_scale is None
+        else "assumed"
+        if result.assumed_scale
+        else "measured",
+        "stances": stances_json(result.stances),
+        "accuracy": result.accuracy.as_dict() if result.accuracy else None,
+    }
+
+
+def _print(result: Simulated, path: Path) -> None:
+    size = path.stat().st_size
+    say(
+        f"{path}: {result.frames} frames in {result.seconds:.3f} s of virtual time, "
+        f"{result.rate_hz:.1f} frames/s, {size} bytes ({size / result.frames:.1f} a frame)"
+    )
+    remark(
+        f"{result.wall_s:.1f} s of wall time, {result.seconds / result.wall_s:.1f} times real time"
+    )
+    remark(f"schedule {result.choice.schedule}: {result.choice.reason}")
+    for serial in result.unmeasured:
+        say(f"tile {serial}: its conversion time could not be measured, so it was given 3 ms")
+    for serial, flags in result.flags.items():
+        said = ", ".join(f"{n} {reason}" for reason, n in flags.items())
+        say(f"tile {serial}: of {result.frames} frames {said}")
+    for serial in result.replaced:
+        say(f"tile {serial} was replaced by another part: its readings are flagged from then on")
+    if result.missed_slots:
+        say(f"{result.missed_slots} slots were missed: the bus cannot keep this rate")
+    if result.pressed is not None:
+        say(
+            f"load: {result.pressed.moved_to_edge} samples had their COP moved to the hull's edge, "
+            f"{result.pressed.limited} had a tile's force limited"
+        )
+    if result.assumed_scale:
+        say(ASSUMED_SCALE)
+    if result.stances:
+        say(stances_line(result.stances))
+    if result.accuracy is not None:
+        stdout.print(accuracy_table(result.accuracy))
+
+
+def _schedule(name: str | None) -> AnySchedule | None:
+    if name is None:
+        return None
+    names = ("auto", *get_args(ScheduleName))
+    if name not in names:
+        raise UsageError(f"--schedule {name!r}", expected=" or ".join(names))
+    return cast(AnySchedule, name)
+
+
+def _check(
+    scene: Scene, seconds: float | None, lead_s: float, load_scale: float, cop_scale: float
+) -> None:
+    check_emulated(scene)
+    if seconds is not None and not 0.0 < seconds < 1e9:
+        raise UsageError(f"--seconds {seconds:g}", expected="a sensible positive number")
+    check_load(load_scale, cop_scale, lead_s)

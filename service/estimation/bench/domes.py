@@ -1,0 +1,172 @@
+"""Which dome for which load: the paper's Table I, Boyle's law, and what follows from them.
+
+The paper gives the range of one dome only, 25 to 35 N for 11 mm of Vytaflex 60 (III-A). For the
+others there is a scaling, marked as an estimate, and nothing else: nobody has published their
+curves. PAPER is Ruppert and Badri-Sproewitz 2020, [D] a derivation in hardware.md 9.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+from typing import Literal
+
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
+
+SEAL_KPA = 100.0
+"""Pressure at which a bubble is sealed, about (PAPER II-A)."""
+ISOTHERMAL = 1.0
+ADIABATIC = 1.4
+"""Of air; a real load lies between the two, with a polytropic exponent that depends on how fast it
+comes, against a relaxation of 5 to 42 ms ([D])."""
+BUBBLE_RADIUS_MM = 3.0
+"""PAPER Table I, for the 11 mm dome; taken for the others."""
+
+Basis = Literal["paper", "estimate"]
+Verdict = Literal["covers", "perhaps", "saturates"]
+
+
+@dataclass(frozen=True)
+class Material:
+    """A polyurethane of the paper's Table I.
+
+    Its modulus is as the paper gives it, which is almost surely the maker's modulus at 100 % strain
+    and not the small-strain one ([D]).
+    """
+
+    name: str
+    modulus_mpa: float
+
+
+VYTAFLEX_40 = Material("Vytaflex 40", 0.69)
+VYTAFLEX_60 = Material("Vytaflex 60", 2.17)
+
+
+@dataclass(frozen=True)
+class Dome:
+    """One of the paper's domes."""
+
+    material: Material
+    diameter_mm: float
+
+    @property
+    def name(self) -> str:
+        """As `v60-11`: material and diameter."""
+        return f"v{self.material.name.split()[-1]}-{self.diameter_mm:.0f}"
+
+    @property
+    def area_mm2(self) -> float:
+        """Of its base."""
+        return pi * (self.diameter_mm / 2) ** 2
+
+
+DOMES = tuple(
+    Dome(material, diameter_mm)
+    for material in (VYTAFLEX_40, VYTAFLEX_60)
+    for diameter_mm in (10.0, 11.0, 12.0)
+)
+"""PAPER Table I."""
+PAPER_DOME = Dome(VYTAFLEX_60, 11.0)
+"""The one that was built (PAPER III-A)."""
+PAPER_RANGE_N = (25.0, 35.0)
+"""Load at which it reaches the chip's end (PAPER III-A)."""
+
+
+def volume_left(
+    p1_kpa: float = SEAL_KPA, p2_kpa: float = PRESSURE_MAX_KPA, exponent: float = ISOTHERMAL
+) -> float:
+    """V2/V1 of a bubble that goes from p1 to p2: p1 V1^k = p2 V2^k.
+
+    Slowly, k = 1, this is Boyle's law (PAPER eq. 1): 0.8696 is left at 115 kPa, 13 % are gone. Fast
+    loads reach full scale earlier: k = 1.4 leaves 0.9050.
+    """
+    return float((p1_kpa / p2_kpa) ** (1.0 / exponent))
+
+
+def pressure_kpa(part_left: float, p1_kpa: float = SEAL_KPA, exponent: float = ISOTHERMAL) -> float:
+    """Pressure of a bubble of which V2/V1 is left.
+
+    Squeezed fast to what is 115 kPa slowly, it is at 121.6 kPa: beyond the chip's range.
+    """
+    return float(p1_kpa * part_left**-exponent)
+
+
+def fast_share(p1_kpa: float = SEAL_KPA, exponent: float = ADIABATIC) -> float:
+    """Part of the slow full-scale change of volume that a fast load needs for full scale: 0.73.
+
+    As far as volume follows force in proportion, also the part of the load ([D], estimate).
+    """
+    fast = 1.0 - volume_left(p1_kpa, exponent=exponent)
+    return fast / (1.0 - volume_left(p1_kpa))
+
+
+def give_per_kpa(dome: Dome, bubble_radius_mm: float = BUBBLE_RADIUS_MM) -> float:
+    """Part of the bubble's volume that its wall gives way for a kPa of pressure difference.
+
+    Thick sphere of an incompressible rubber, 9 b^3 / (4 E (b^3 - a^3)): 0.00124 for Vytaflex 60,
+    0.00389 for Vytaflex 40, both of 11 mm ([D], estimate: half a sphere on a board is no sphere).
+    """
+    a3, b3 = bubble_radius_mm**3, (dome.diameter_mm / 2) ** 3
+    return 9.0 * b3 / (4.0 * dome.material.modulus_mpa * 1e3 * (b3 - a3))
+
+
+def external_share(dome: Dome, p1_kpa: float = SEAL_KPA) -> float:
+    """Part of a change of the surrounding pressure that the bubble sees.
+
+    11 % in Vytaflex 60 and 28 % in Vytaflex 40, both of 11 mm ([D], estimate): weather, height, and
+    the depth of mud. The gas' own stiffness is its pressure.
+    """
+    given = give_per_kpa(dome) * p1_kpa
+    return given / (1.0 + given)
+
+
+@dataclass(frozen=True)
+class DomeRange:
+    """Load at which a dome reaches the chip's end, slowly, and how that is known."""
+
+    dome: Dome
+    low_n: float
+    high_n: float
+    basis: Basis
+
+    def verdict(self, load_n: float) -> Verdict:
+        """Whether it bears a slow load without saturating."""
+        if load_n <= self.low_n:
+            return "covers"
+        return "perhaps" if load_n <= self.high_n else "saturates"
+
+
+def range_of(dome: Dome) -> DomeRange:
+    """The paper's range for the paper's dome; for others scaled by modulus and area.
+
+    The scaling takes the same shape and strain at full scale. It agrees with the paper in direction
+    only: stiffer and larger domes shift the curve to higher force (PAPER Fig. 5).
+    """
+    if dome == PAPER_DOME:
+        return DomeRange(dome, *PAPER_RANGE_N, "paper")
+    scale = (dome.material.modulus_mpa * dome.area_mm2) / (
+        PAPER_DOME.material.modulus_mpa * PAPER_DOME.area_mm2
+    )
+    return DomeRange(dome, scale * PAPER_RANGE_N[0], scale * PAPER_RANGE_N[1], "estimate")
+
+
+def ranges() -> list[DomeRange]:
+    """All domes of Table I, weakest first."""
+    return sorted((range_of(dome) for dome in DOMES), key=lambda found: found.low_n)
+
+
+def dome_for(load_n: float) -> DomeRange | None:
+    """The weakest dome that covers a slow load, which resolves it best.
+
+    Where none does for certain, the weakest that perhaps does; None if all saturate.
+
+    Raises:
+        ValueError: no load.
+    """
+    if not load_n > 0.0:
+        raise ValueError(f"a load of {load_n} N is no load")
+    for verdict in ("covers", "perhaps"):
+        for found in ranges():
+            if found.verdict(load_n) == verdict:
+                return found
+    return None

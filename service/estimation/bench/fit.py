@@ -1,0 +1,221 @@
+"""A tile's static curve: the cubic of force over gauge pressure through slow strokes (paper eq. 2).
+
+Pressure is centred and scaled before the fit: a cubic in raw 100 to 115 kPa has a condition number
+beyond 1e12. The curve has no constant term, because the tare makes zero pressure zero force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import nnls
+
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, indicative_degc
+from devices.errors import CalibrationError
+from service.estimation.bench.checks import (
+    baseline_drift_kpa,
+    before_saturation,
+    refuse_contradictions,
+    refuse_poor_fit,
+    refuse_saturated_reference,
+    refuse_unloaded,
+)
+from service.estimation.bench.confidence import curve_n, mean_band_n, new_loading_band_n
+from service.estimation.bench.indentation import (
+    Indentation,
+    Strokes,
+    place,
+    stroke_rows,
+    strokes,
+    unloaded,
+)
+from service.estimation.bench_facts import BandPoint, BenchFacts
+from service.estimation.calibration import (
+    LOOP_OPENS_N,
+    TileCalibration,
+    is_monotonic,
+    loop_share,
+)
+
+Floats = npt.NDArray[np.float64]
+
+BAND_STEPS = 10
+MEAN_STEPS = 30
+
+
+class _Cubic:
+    """Least squares with the basis u^k - u0^k, which is zero at zero pressure by construction."""
+
+    def __init__(self, high_kpa: float) -> None:
+        self.offset_kpa = self.scale_kpa = high_kpa / 2
+        self.u0 = -1.0
+
+    def design(self, gauge_kpa: Floats) -> Floats:
+        u = (gauge_kpa - self.offset_kpa) / self.scale_kpa
+        return np.stack([u**k - self.u0**k for k in (1, 2, 3)], axis=1)
+
+    def solve(self, blocks: Strokes) -> Floats:
+        solution, *_ = np.linalg.lstsq(self.design(blocks.gauge_kpa), blocks.force_n, rcond=None)
+        return np.asarray(solution)
+
+    def residual_n(self, blocks: Strokes, coefficients: Floats) -> Floats:
+        return np.asarray(blocks.force_n - self.design(blocks.gauge_kpa) @ coefficients)
+
+
+def fit_tile(*recordings: Indentation) -> TileCalibration:
+    """Fit the static curve of one tile to all its slow strokes, in one file or several.
+
+    Raises:
+        CalibrationError: there is no curve that could be believed (see `bench_checks`).
+    """
+    where = ", ".join(place(recording) for recording in recordings)
+    zeros = [unloaded(recording) for recording in recordings]
+    noise_kpa = _rms(np.array([zero.noise_kpa for zero in zeros]))
+    blocks = strokes(*recordings)
+    refuse_saturated_reference(recordings, blocks)
+    blocks, by_chip = before_saturation(recordings, blocks, noise_kpa)
+    refuse_unloaded(blocks, where)
+    drift_kpa = baseline_drift_kpa(recordings)
+    # Every repeat reaches the end of the range on average: beyond it there is nothing to go by.
+    high_kpa = float(np.mean(_tops(blocks, blocks.gauge_kpa)))
+    cubic = _Cubic(high_kpa)
+    coefficients = cubic.solve(blocks)
+    c1, c2, c3 = (float(c) for c in coefficients)
+    polynomial = (0.0, c1, c2, c3)
+    residual_n = cubic.residual_n(blocks, coefficients)
+    gains = _gains(blocks, blocks.force_n - residual_n)
+    refuse_contradictions(gains, where)
+    if not is_monotonic(polynomial, (cubic.u0, 1.0)):
+        raise CalibrationError(
+            "the fitted curve is not monotonic: force would fall while pressure rises",
+            where=where,
+            remedy="Look at the recording for slips of the spindle or a leaking dome",
+        )
+    spread_n = blocks.force_n - blocks.force_n.mean()
+    r2 = float(1 - (residual_n**2).sum() / (spread_n**2).sum())
+    refuse_poor_fit(r2, where)
+    left_out = _left_out(cubic, blocks)
+    loop = cubic.solve(blocks.rows(blocks.loading)) - cubic.solve(blocks.rows(~blocks.loading))
+    relative_misfit, loop_misfit_n = _misfit(left_out.force_n, left_out.residual_n)
+    baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
+    tile = TileCalibration(
+        serial=recordings[0].serial,
+        p_input="gauge_kpa",
+        p_offset_kpa=cubic.offset_kpa,
+        p_scale_kpa=cubic.scale_kpa,
+        f_offset_n=0.0,
+        f_scale_n=1.0,
+        zero_mode="subtract_f0",
+        coefficients=polynomial,
+        range_kpa=(0.0, high_kpa),
+        monotonic=True,
+        absolute_scale="measured",
+        covariance=tuple(tuple(float(c) for c in row) for row in left_out.covariance),
+        relative_misfit=relative_misfit,
+        loop_misfit_n=loop_misfit_n,
+        r2=r2,
+        rmse_n=_rms(residual_n),
+        cv_rmse_n=_rms(left_out.residual_n),
+        hysteresis_n=float(np.abs(cubic.design(np.linspace(0, high_kpa, 101)) @ loop).max()),
+        repeats=len(gains),
+        baseline_kpa=baseline_kpa,
+        noise_kpa=noise_kpa,
+    )
+    tadc = [zero.tadc_counts for zero in zeros if zero.tadc_counts is not None]
+    tadc_counts = float(np.mean(tadc)) if tadc else None
+    facts = BenchFacts(
+        recordings=sum(bool(stroke_rows(recording)) for recording in recordings),
+        end_n=float(np.mean(_tops(blocks, blocks.force_n))),
+        end_absolute_kpa=baseline_kpa + high_kpa,
+        spare_kpa=PRESSURE_MAX_KPA - baseline_kpa - high_kpa,
+        ended_by="chip" if by_chip else "load",
+        tadc_counts=tadc_counts,
+        degc=None if tadc_counts is None else float(indicative_degc(tadc_counts)),
+        r2_of_mean=_r2_of_mean(cubic, residual_n, blocks),
+        repeat_gains=tuple(gains.tolist()),
+        baseline_drift_kpa=drift_kpa,
+        band_95=_band(tile),
+    )
+    return tile.model_copy(update={"bench": facts})
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    """Every repeat against the curve of the others."""
+
+    force_n: Floats
+    residual_n: Floats
+    covariance: Floats
+    """Of the coefficients of all."""
+
+
+def _left_out(cubic: _Cubic, blocks: Strokes) -> _LeftOut:
+    # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
+    repeats = np.unique(blocks.repeat)
+    without = np.stack([cubic.solve(blocks.rows(blocks.repeat != r)) for r in repeats])
+    parts = [blocks.rows(blocks.repeat == r) for r in repeats]
+    deviation = without - without.mean(axis=0)
+    return _LeftOut(
+        force_n=np.concatenate([part.force_n for part in parts]),
+        residual_n=np.concatenate(
+            [cubic.residual_n(part, c) for part, c in zip(parts, without, strict=True)]
+        ),
+        covariance=(len(repeats) - 1) / len(repeats) * deviation.T @ deviation,
+    )
+
+
+def _tops(blocks: Strokes, values: Floats) -> list[float]:
+    """The greatest value of each repeat."""
+    return [float(values[blocks.repeat == r].max()) for r in np.unique(blocks.repeat)]
+
+
+def _gains(blocks: Strokes, fitted_n: Floats) -> Floats:
+    """Force of each repeat over that of the curve."""
+    parts = [blocks.repeat == r for r in np.unique(blocks.repeat)]
+    return np.array(
+        [float((blocks.force_n * fitted_n)[r].sum() / (fitted_n**2)[r].sum()) for r in parts]
+    )
+
+
+def _band(tile: TileCalibration) -> tuple[BandPoint, ...]:
+    gauge_kpa = np.linspace(0.0, tile.range_kpa[1], BAND_STEPS + 1)
+    columns = (
+        gauge_kpa,
+        curve_n(tile, gauge_kpa),
+        mean_band_n(tile, gauge_kpa),
+        new_loading_band_n(tile, gauge_kpa),
+    )
+    return tuple(
+        BandPoint(gauge_kpa=p, force_n=f, mean_n=mean, new_loading_n=new)
+        for p, f, mean, new in zip(*(column.tolist() for column in columns), strict=True)
+    )
+
+
+def _r2_of_mean(cubic: _Cubic, residual_n: Floats, blocks: Strokes) -> float:
+    """R2 of the cubic to the mean over repeats and branches, in equal steps of pressure."""
+    place_of = blocks.gauge_kpa / (2 * cubic.scale_kpa) * MEAN_STEPS
+    step = np.clip(place_of.astype(np.int64), 0, MEAN_STEPS - 1)
+    count = np.bincount(step, minlength=MEAN_STEPS)
+    full = count > 0
+    mean_n = np.bincount(step, blocks.force_n, MEAN_STEPS)[full] / count[full]
+    left_n = np.bincount(step, residual_n, MEAN_STEPS)[full] / count[full]
+    return float(1 - (left_n**2).sum() / ((mean_n - mean_n.mean()) ** 2).sum())
+
+
+def _misfit(force_n: Floats, residual_n: Floats) -> tuple[float, float]:
+    """Gain and loop part of the scatter of left-out residuals (see `TileCalibration`).
+
+    Non-negative least squares of the squared residuals, each relative to the size of its force,
+    so that small loads count as much as large ones.
+    """
+    weight = 1.0 / (force_n**2 + LOOP_OPENS_N**2)
+    parts = np.stack([force_n**2, loop_share(force_n) ** 2], axis=1)
+    variances, _ = nnls(parts * weight[:, None], residual_n**2 * weight)
+    relative, loop = np.sqrt(variances)
+    return float(relative), float(loop)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt((values**2).mean()))

@@ -1,0 +1,227 @@
+"""An indentation recording, reduced to what a curve is fitted to: averages along slow strokes.
+
+Readings are averaged in short blocks of a stroke, because the noise of single readings is an error
+in the variable that is fitted over, and would flatten the curve. A stroke is a `load` that goes
+straight over into an `unload`; holds, releases and taps are left to the models of fast effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.errors import CalibrationError
+from service.estimation.bench.soak import Soak
+
+Floats = npt.NDArray[np.float64]
+
+BLOCKS_PER_STROKE = 60
+BASELINE_NS = 1_000_000_000
+BASELINE_READINGS_MIN = 10
+REST_NS = 500_000_000
+
+
+@dataclass(frozen=True)
+class Indentation:
+    """One tile's part of a bench recording; arrays of n readings in the order of time.
+
+    Attributes:
+        serial: of the tile.
+        where: file it came from, for messages.
+        t_ns: instants of the readings.
+        kpa: absolute pressure; NaN where the tile was not readable, infinite where its chip's
+            count had run past its end.
+        reference_n: force of the reference sensor; NaN where the spindle was elsewhere.
+        phase: what the spindle did: "rest", "load", "unload", ...
+        under_spindle: whether it was this tile.
+    """
+
+    serial: str
+    where: str
+    t_ns: npt.NDArray[np.int64]
+    kpa: Floats
+    reference_n: Floats
+    phase: npt.NDArray[np.str_]
+    under_spindle: npt.NDArray[np.bool_]
+    tadc: Floats
+    """Temperature in counts; NaN where it is not known."""
+
+
+@dataclass(frozen=True)
+class Strokes:
+    """Block averages of all slow strokes of a tile, m blocks.
+
+    Attributes:
+        gauge_kpa: (m,), pressure above the tile's baseline.
+        force_n: (m,), reference force above its own zero.
+        repeat: (m,), number of the stroke, from 0.
+        loading: (m,), True on the way in.
+    """
+
+    gauge_kpa: Floats
+    force_n: Floats
+    repeat: npt.NDArray[np.int64]
+    loading: npt.NDArray[np.bool_]
+
+    def rows(self, mask: npt.NDArray[np.bool_]) -> Strokes:
+        """The blocks in `mask`."""
+        return Strokes(
+            self.gauge_kpa[mask], self.force_n[mask], self.repeat[mask], self.loading[mask]
+        )
+
+
+@dataclass(frozen=True)
+class Unloaded:
+    """A tile and the reference just before the tile is first pressed."""
+
+    baseline_kpa: float
+    noise_kpa: float
+    reference_zero_n: float
+    tadc_counts: float | None = None
+    """Mean temperature; None where it is not known."""
+
+
+def unloaded(recording: Indentation) -> Unloaded:
+    """Baseline and noise of the tile, and zero of the reference.
+
+    Raises:
+        CalibrationError: the tile is never pressed, or there is too little before it is.
+    """
+    where = place(recording)
+    pressed = recording.under_spindle & (recording.phase != "rest")
+    if not pressed.any():
+        raise CalibrationError(
+            "the recording never presses this tile",
+            where=where,
+            expected="phases load and unload with pressed_tile naming it",
+        )
+    first = int(np.argmax(pressed))
+    before = np.arange(len(pressed)) < first
+    before &= recording.t_ns >= recording.t_ns[first] - BASELINE_NS
+    kpa = recording.kpa[before & np.isfinite(recording.kpa)]
+    if len(kpa) < BASELINE_READINGS_MIN:
+        raise CalibrationError(
+            f"only {len(kpa)} readings before the tile is first pressed",
+            where=where,
+            expected=f"at least {BASELINE_READINGS_MIN} unloaded readings for the baseline",
+        )
+    reference_n = recording.reference_n[before & recording.under_spindle]
+    reference_n = reference_n[np.isfinite(reference_n)]
+    tadc = recording.tadc[before & np.isfinite(recording.tadc)]
+    return Unloaded(
+        baseline_kpa=float(kpa.mean()),
+        noise_kpa=float(kpa.std(ddof=1)),
+        reference_zero_n=float(reference_n.mean()) if len(reference_n) else 0.0,
+        tadc_counts=float(tadc.mean()) if len(tadc) else None,
+    )
+
+
+def strokes(*recordings: Indentation) -> Strokes:
+    """Block averages of every slow stroke of a tile, in one file or several.
+
+    Each file has its own baseline and its own zero of the reference. A file in which the tile is
+    only held or tapped has no stroke, and is none the worse for it beside others.
+
+    Raises:
+        CalibrationError: as for `unloaded`, or there is no slow stroke in any of them.
+    """
+    blocks: list[_Block] = []
+    count = 0
+    for recording in recordings:
+        zero = unloaded(recording)
+        for begin, turn, end in stroke_rows(recording):
+            for rows, loading in (
+                (np.arange(begin, turn), True),
+                (np.arange(turn, end), False),
+            ):
+                blocks += _blocks(recording, zero, rows, count, loading)
+            count += 1
+    if not blocks:
+        raise CalibrationError(
+            "no slow stroke of this tile in the recording",
+            where=", ".join(place(recording) for recording in recordings),
+            expected="phase load followed by phase unload, with reference_force_n",
+        )
+    gauge, force, repeat, loads = zip(*blocks, strict=True)
+    return Strokes(np.array(gauge), np.array(force), np.array(repeat), np.array(loads))
+
+
+_Block = tuple[float, float, int, bool]
+
+
+def stroke_rows(recording: Indentation) -> list[tuple[int, int, int]]:
+    """Of each slow stroke the row of its first reading, of its turning point, and past its end."""
+    label = np.where(recording.under_spindle, recording.phase, "")
+    begins = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
+    ends = np.append(begins[1:], len(label))
+    return [
+        (int(begins[i]), int(begins[i + 1]), int(ends[i + 1]))
+        for i in range(len(begins) - 1)
+        if (label[begins[i]], label[begins[i + 1]]) == ("load", "unload")
+    ]
+
+
+def _blocks(
+    recording: Indentation,
+    zero: Unloaded,
+    rows: npt.NDArray[np.int64],
+    repeat: int,
+    loading: bool,
+) -> list[_Block]:
+    # Past the end of the chip's counts the stroke is over: noise would pick readings from there.
+    past = np.flatnonzero(np.isinf(recording.kpa[rows]))
+    if len(past):
+        rows = rows[: past[0]] if loading else rows[past[-1] + 1 :]
+    rows = rows[np.isfinite(recording.kpa[rows]) & np.isfinite(recording.reference_n[rows])]
+    return [
+        (
+            float(recording.kpa[block].mean() - zero.baseline_kpa),
+            float(recording.reference_n[block].mean() - zero.reference_zero_n),
+            repeat,
+            loading,
+        )
+        for block in np.array_split(rows, BLOCKS_PER_STROKE)
+        if len(block)
+    ]
+
+
+def rests(recording: Indentation) -> Floats:
+    """Mean pressure in the last half second of rest before each slow stroke; NaN without rest."""
+    found = []
+    for begin, _, _ in stroke_rows(recording):
+        rest = np.arange(begin) >= _run_begin(recording.phase[:begin] == "rest")
+        rest &= recording.t_ns[:begin] >= recording.t_ns[begin] - REST_NS
+        kpa = recording.kpa[:begin][rest]
+        kpa = kpa[np.isfinite(kpa)]
+        found.append(float(kpa.mean()) if len(kpa) >= BASELINE_READINGS_MIN else np.nan)
+    return np.array(found)
+
+
+def _run_begin(rows: npt.NDArray[np.bool_]) -> int:
+    """Where the run of True that lasts to the end begins."""
+    off = np.flatnonzero(~rows)
+    return int(off[-1]) + 1 if len(off) else 0
+
+
+def pressed_in(recordings: Sequence[Indentation]) -> list[Indentation]:
+    """Those in which the tile is pressed: others are a soak and nothing else."""
+    return [recording for recording in recordings if recording.under_spindle.any()]
+
+
+def soak(recording: Indentation, noise_kpa: float) -> Soak:
+    """The part of the recording in which nothing presses and the surroundings warm up."""
+    rows = recording.phase == "soak"
+    return Soak(
+        t_s=(recording.t_ns[rows] - recording.t_ns[0]) * 1e-9,
+        kpa=recording.kpa[rows],
+        tadc=recording.tadc[rows],
+        noise_kpa=noise_kpa,
+    )
+
+
+def place(recording: Indentation) -> str:
+    """File and tile, for messages."""
+    return f"{recording.where}, tile {recording.serial}"

@@ -1,0 +1,119 @@
+"""Every loading of a tile on the bench, as one run of instants, forces and pressures.
+
+Slow strokes are averaged in blocks, because nothing happens within a block that the average would
+hide; holds, releases and taps are kept reading by reading. Spikes are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.estimation.bench.indentation import Indentation, Unloaded
+from service.estimation.models.outliers import spikes
+
+Floats = npt.NDArray[np.float64]
+
+BLOCK = 10
+_NOISE_MIN_KPA = 0.03
+"""Rounding to a count alone leaves this much."""
+_APART_S = 600.0
+"""Between two recordings the rubber forgets."""
+
+
+@dataclass(frozen=True)
+class Presses:
+    """m points in the order of time.
+
+    Attributes:
+        t_s: instants, from 0.
+        force_n: reference force above its zero.
+        kpa: absolute pressure; NaN where no reading is left.
+        weight: square root of the number of readings averaged, over the noise, in 1/kPa.
+        loading: number of the loading it belongs to, from 0.
+        fast: True for points of a hold, a release or a tap.
+    """
+
+    t_s: Floats
+    force_n: Floats
+    kpa: Floats
+    weight: Floats
+    loading: npt.NDArray[np.int64]
+    fast: npt.NDArray[np.bool_]
+
+    @property
+    def loadings(self) -> int:
+        """How often the tile was pressed."""
+        return int(self.loading.max()) + 1
+
+
+def presses(recording: Indentation, zero: Unloaded) -> Presses:
+    """All that was done to a tile, ready to be fitted."""
+    rows = recording.under_spindle & np.isfinite(recording.reference_n)
+    rows &= recording.phase != "soak"
+    t_s = (recording.t_ns[rows] - recording.t_ns[rows][0]) * 1e-9
+    force_n = recording.reference_n[rows] - zero.reference_zero_n
+    phase = recording.phase[rows]
+    kpa = np.where(np.isfinite(recording.kpa), recording.kpa, np.nan)[rows]
+    # What the reference explains is no spike: the top of a tap is a single reading, too.
+    unexplained_kpa = kpa - _kpa_per_n(kpa, force_n) * force_n
+    kpa = np.where(spikes(unexplained_kpa[:, None], np.array([zero.noise_kpa]))[:, 0], np.nan, kpa)
+    active = phase != "rest"
+    begins = active & ~np.concatenate([[False], active[:-1]])
+    loading = np.maximum(np.cumsum(begins) - 1, 0)
+    fast = np.isin(phase, ("hold", "release", "tap"))
+    # What follows a fast loading, and the load that precedes a hold, belong to it.
+    is_fast = np.zeros(int(loading[-1]) + 1, dtype=bool)
+    is_fast[loading[fast]] = True
+    fast = is_fast[loading]
+    # A block ends where it is full, and wherever reading by reading begins or ends.
+    run = np.cumsum(np.concatenate([[0], np.diff(fast.astype(np.int8)) != 0]))
+    index = np.arange(len(t_s))
+    first = np.searchsorted(run, run)
+    _, block = np.unique(
+        np.where(fast, index, first + (index - first) // BLOCK * BLOCK), return_inverse=True
+    )
+    size = np.bincount(block)
+    good = np.isfinite(kpa)
+    counted = np.bincount(block, good)
+    with np.errstate(invalid="ignore"):
+        mean_kpa = np.bincount(block, np.where(good, kpa, 0.0)) / counted
+    last = np.cumsum(size) - 1
+    return Presses(
+        t_s=np.bincount(block, t_s) / size,
+        force_n=np.bincount(block, force_n) / size,
+        kpa=mean_kpa,
+        weight=np.sqrt(counted) / max(zero.noise_kpa, _NOISE_MIN_KPA),
+        loading=loading[last],
+        fast=fast[last],
+    )
+
+
+def _kpa_per_n(kpa: Floats, force_n: Floats) -> float:
+    """Slope of pressure over force, all in all; 0 without any load."""
+    good = np.isfinite(kpa)
+    spread_n = force_n[good] - force_n[good].mean() if good.any() else np.zeros(1)
+    square = float((spread_n**2).sum())
+    return float((spread_n * kpa[good]).sum()) / square if square > 0.0 else 0.0
+
+
+def joined(parts: Sequence[Presses]) -> Presses:
+    """Several recordings as one run of loadings, far enough apart to know nothing of each other."""
+    begin_s, loadings = 0.0, 0
+    t_s, loading = [], []
+    for part in parts:
+        t_s.append(part.t_s + begin_s)
+        loading.append(part.loading + loadings)
+        begin_s = float(t_s[-1][-1]) + _APART_S
+        loadings += part.loadings
+    return Presses(
+        t_s=np.concatenate(t_s),
+        force_n=np.concatenate([part.force_n for part in parts]),
+        kpa=np.concatenate([part.kpa for part in parts]),
+        weight=np.concatenate([part.weight for part in parts]),
+        loading=np.concatenate(loading),
+        fast=np.concatenate([part.fast for part in parts]),
+    )

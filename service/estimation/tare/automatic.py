@@ -1,0 +1,173 @@
+"""The automatic tare: keeps a true baseline true while the stream runs, and tares no load away.
+
+A load that builds up slowly looks like a dome that warms up slowly. What tells them apart is the
+chip's own temperature, and what bounds the mistake is how far a baseline may be moved without it:
+by `NEAR_KPA` at once, `APART_NS` apart, and by `FAR_KPA` in all since somebody tared by hand.
+However slowly a load comes, no more of it is tared away than that: half a newton on a tile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.chips.compensation import Compensation
+from devices.errors import TareError
+from devices.frames import FrameBatch
+from service.estimation.calibration import Calibration
+from service.estimation.tare.drift import expected_shift_kpa, warmer_k
+from service.estimation.tare.flight import WINDOW_NS, tare_in_flight
+from service.estimation.tare.tare import LOADED_KPA, NEAR_BASELINE_KPA, Tare
+
+Floats = npt.NDArray[np.float64]
+
+APART_NS = 60_000_000_000
+"""Two automatic tares are at least a minute apart."""
+RATE_KPA_PER_S = 0.005
+"""A baseline is never moved faster: a kelvin a minute, which is what a dome does in the sun."""
+NEAR_KPA = 0.15
+"""How far a baseline may be moved at once beyond what the temperature explains: 0.3 N on a tile,
+the noise of a single reading."""
+FAR_KPA = 0.25
+"""And how far in all since the last tare that was not automatic: half a newton on a tile."""
+EXPLAINED_PART = 0.5
+"""Gas and chip do not warm at once, and the wall gives way: half of what is explained is open."""
+SETTLE_NS = 100_000_000
+"""The rubber recovers for so long after a contact, before a window may begin."""
+CONFIRM_NS = 900_000_000_000
+"""Where nothing has moved the tare is renewed so seldom, long before it is called old."""
+MOVED_SIGMAS = 4.0
+MOVED_MIN_KPA = 0.02
+"""Less than this is not worth an entry in the history."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a look at the last seconds has found.
+
+    Attributes:
+        tare: to be put in force, and `reason` says why; None if the one in force is good.
+        reason: in words, for the history.
+        doubt: the foot seems to be in the air, and the baseline does not fit: why it was left.
+    """
+
+    tare: Tare | None = None
+    reason: str = ""
+    doubt: str | None = None
+
+
+NOTHING = Look()
+
+
+def look_in_flight(
+    frames: FrameBatch,
+    compensation: Compensation,
+    calibration: Calibration,
+    serials: tuple[str, ...],
+    *,
+    present: Tare,
+    anchor: Tare | None,
+    free_since_t_ns: int,
+    bears: npt.NDArray[np.bool_] | None = None,
+) -> Look:
+    """Whether the baseline should follow what a foot in the air reads.
+
+    Args:
+        frames: the last `LOOK_BACK_NS` of the stream, in order.
+        compensation: of the array's chips.
+        calibration: of its tiles.
+        serials: of the tiles, in order.
+        present: the tare in force.
+        anchor: the last one that was not automatic; None if there is none any more.
+        free_since_t_ns: since when there has been no contact, nor any doubt about it.
+        bears: (tiles,), False for bare tiles, which follow the weather and no load; None: all do.
+    """
+    if bears is None:
+        bears = np.ones(len(serials), dtype=bool)
+    if not len(frames) or frames.t_ns[-1] - free_since_t_ns < SETTLE_NS + WINDOW_NS:
+        return NOTHING
+    try:
+        tare = tare_in_flight(
+            frames, compensation, calibration, serials, present=present, bears=bears
+        )
+    except TareError:  # it moves, a tile is silent, or it bears a load: no flight
+        return NOTHING
+    begin_t_ns = int(frames.t_ns[0]) + round(tare.begin_s * 1e9)
+    if begin_t_ns < free_since_t_ns + SETTLE_NS or tare.t_ns - present.t_ns < APART_NS:
+        return NOTHING
+    shift_kpa = np.where(bears, tare.baseline_kpa - present.baseline_kpa, 0.0)
+    doubt = _too_far(tare, present, NEAR_KPA, serials, bears, "the last tare")
+    if doubt is None and anchor is not None:
+        doubt = _too_far(tare, anchor, FAR_KPA, serials, bears, "the last tare by hand")
+    if doubt is not None:
+        return Look(doubt=doubt)
+    since_s = (tare.t_ns - present.t_ns) * 1e-9
+    if (np.abs(shift_kpa) > RATE_KPA_PER_S * since_s).any():
+        return NOTHING  # perhaps in a minute
+    sigma_kpa = np.hypot(tare.baseline_sigma_kpa, present.baseline_sigma_kpa)
+    moved = np.abs(shift_kpa) > np.maximum(MOVED_MIN_KPA, MOVED_SIGMAS * sigma_kpa)
+    if not moved.any() and tare.t_ns - present.t_ns < CONFIRM_NS:
+        return NOTHING
+    most = int(np.argmax(np.abs(shift_kpa)))
+    reason = (
+        f"in flight; {serials[most]} by {shift_kpa[most]:+.2f} kPa in {since_s / 60:.0f} min"
+        if moved.any()
+        else f"in flight; nothing has moved in {since_s / 60:.0f} min"
+    )
+    return Look(replace(tare, source="flight"), reason)
+
+
+def first_in_flight(
+    frames: FrameBatch,
+    compensation: Compensation,
+    calibration: Calibration,
+    serials: tuple[str, ...],
+) -> Look:
+    """A first tare without anybody's hand, if it can be no mistake.
+
+    The foot has to have been loaded in these seconds and to be off the ground at their end, every
+    tile near its baseline on the bench: a foot that merely stands light is quiet and near as well.
+    """
+    entries = [calibration.find(serial) for serial in serials]
+    benches = [entry.baseline_kpa if entry is not None else None for entry in entries]
+    known = [entry.baseline_kpa for entry in entries if entry is not None]
+    if not known or None in known or not len(frames):
+        return NOTHING
+    try:
+        tare = tare_in_flight(frames, compensation, calibration, serials, present=None)
+    except TareError:
+        return NOTHING
+    off_kpa = np.abs(tare.baseline_kpa - np.array(benches, dtype=np.float64))
+    above_kpa = compensation.readable_kpa(frames) - tare.baseline_kpa
+    # A sum over the foot, and for a tenth of a second: an outlier is no step.
+    steps = np.nansum(np.maximum(above_kpa, 0.0), axis=1) > LOADED_KPA * np.sqrt(len(serials))
+    stepped_ns = steps.mean() * float(frames.t_ns[-1] - frames.t_ns[0])
+    if (off_kpa > NEAR_BASELINE_KPA).any() or stepped_ns < SETTLE_NS:
+        return NOTHING
+    return Look(replace(tare, source="flight"), "in flight, between two steps; there was none yet")
+
+
+def _too_far(
+    tare: Tare,
+    other: Tare,
+    bound_kpa: float,
+    serials: tuple[str, ...],
+    bears: npt.NDArray[np.bool_],
+    which: str,
+) -> str | None:
+    """Why a baseline has moved too far from another one to be believed."""
+    warmer = np.nan_to_num(warmer_k(other, tare.tadc_counts), nan=0.0)
+    explained_kpa = expected_shift_kpa(other, warmer)
+    shift_kpa = tare.baseline_kpa - other.baseline_kpa
+    excess_kpa = np.abs(shift_kpa - explained_kpa) - EXPLAINED_PART * np.abs(explained_kpa)
+    excess_kpa = np.where(bears, excess_kpa, -np.inf)
+    worst = int(np.argmax(excess_kpa))
+    if excess_kpa[worst] <= bound_kpa:
+        return None
+    return (
+        f"tile {serials[worst]} reads {shift_kpa[worst]:+.2f} kPa against {which}, of which "
+        f"{abs(warmer[worst]):.1f} K explain {abs(explained_kpa[worst]):.2f} kPa: a light load, or "
+        "a baseline that has moved. If the foot is in the air, tare by hand"
+    )

@@ -1,0 +1,192 @@
+"""Acquisition in a process of its own, so that nothing else on the node disturbs its pace.
+
+The child opens the array, takes frames and encodes them; a thread of it sends them through a pipe.
+Whoever started it gets `Started`, then `Batch` after `Batch`, and `Started` again when the array
+has become another one, with which a new stream begins; a `Failed` ends it. The child ends when it
+is told to, or when the pipe breaks because its parent died.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import queue
+import signal
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+
+from devices.errors import FootTileError
+from devices.frames import ArrayInfo, FrameBatch
+from service.node.news import News
+from service.rig.rig import Rig, RigOptions
+from storage.schema import wire_schema
+from storage.wire import EncodedBatch, encode
+
+_WAITING_MAX = 4096
+"""Batches that may wait for a parent that does not read, 100 s; then frames are lost and counted
+as a gap in `seq`."""
+_END_S = 5.0
+_NEWS_NS = 500_000_000
+
+
+@dataclass(frozen=True)
+class Started:
+    """The array was found; frames follow."""
+
+    info: ArrayInfo
+    remarks: tuple[str, ...] = ()
+    """What a user should hear about it."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """How the array is.
+
+    Attributes:
+        troubles: what is wrong now, in words.
+        counts: of what went wrong since the stream began, by serial and reason.
+    """
+
+    troubles: tuple[str, ...] = ()
+    counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Frames, and what was counted beside them so far."""
+
+    batch: EncodedBatch
+    missed_slots: int
+    news: tuple[str, ...] = ()
+    """What has become wrong with the array, or right again."""
+    health: Health = Health()  # frozen, so one for all is safe
+
+
+@dataclass(frozen=True)
+class Failed:
+    """It ended for this reason, and no more will come; None: it was told to stop."""
+
+    error: BaseException | None
+
+
+Message = Started | Batch | Failed
+_Item = tuple[FrameBatch, int, tuple[str, ...], Health]
+
+
+class AcquisitionProcess:
+    """The child process, and a thread here that hands on what it says.
+
+    Args:
+        options: what to open.
+        on_message: called for every message, from that thread.
+    """
+
+    def __init__(self, options: RigOptions, on_message: Callable[[Message], None]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_run, args=(options, theirs), name="acquisition", daemon=True
+        )
+        self._on_message = on_message
+        self._process.start()
+        theirs.close()
+        self._thread = threading.Thread(target=self._listen, name="acquisition", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask it to end; the last frames still come, then `Failed(None)`."""
+        with suppress(OSError):
+            self._connection.send(None)
+
+    def close(self) -> None:
+        """Have it ended, gently if it lets itself be."""
+        self.stop()
+        self._process.join(_END_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join(_END_S)
+        self._thread.join(_END_S)
+        self._connection.close()
+
+    def _listen(self) -> None:
+        try:
+            while True:
+                message: Message = self._connection.recv()
+                self._on_message(message)
+                if isinstance(message, Failed):
+                    return
+        except (EOFError, OSError):
+            self._process.join(_END_S)
+            self._on_message(
+                Failed(
+                    FootTileError(
+                        f"the acquisition process ended with code {self._process.exitcode}",
+                        remedy="Look at what it wrote to stderr before",
+                    )
+                )
+            )
+
+
+def _run(options: RigOptions, connection: Connection) -> None:
+    """Body of the child process."""
+    # Ctrl-C and a service manager's stop go to the whole group; the parent decides when this ends.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    stop = threading.Event()
+    threading.Thread(target=_await_stop, args=(connection, stop), daemon=True).start()
+    with suppress(OSError):  # a parent that died wants no more messages
+        try:
+            with ExitStack() as stack:
+                rig = Rig(options, stack)
+                while not stop.is_set():  # a replaced part begins a new stream
+                    _stream(rig, connection, stop)
+        except FootTileError as error:
+            connection.send(Failed(error))
+        else:
+            connection.send(Failed(None))
+
+
+def _stream(rig: Rig, connection: Connection, stop: threading.Event) -> None:
+    connection.send(Started(rig.info, tuple(rig.remarks)))
+    rig.remarks.clear()
+    news, news_due_ns, health = News(), 0, Health()
+    waiting: queue.Queue[_Item | None] = queue.Queue(_WAITING_MAX)
+    sender = threading.Thread(target=_send, args=(rig.info, waiting, connection, stop))
+    sender.start()
+    try:
+        for batch in rig.batches(stop.is_set):
+            told: tuple[str, ...] = ()
+            if batch.t_mono_ns[-1] >= news_due_ns:
+                told = news.since(rig.troubles())
+                health = Health(news.lasting, rig.counts())
+                news_due_ns = int(batch.t_mono_ns[-1]) + _NEWS_NS
+            with suppress(queue.Full):
+                waiting.put_nowait((batch, rig.acquisition.missed_slots, told, health))
+    finally:
+        waiting.put(None)
+        sender.join()
+
+
+def _send(
+    info: ArrayInfo,
+    waiting: queue.Queue[_Item | None],
+    connection: Connection,
+    stop: threading.Event,
+) -> None:
+    schema = wire_schema(info)
+    while (item := waiting.get()) is not None:
+        frames, missed_slots, news, health = item
+        encoded = EncodedBatch.of(frames, encode(frames, schema))
+        try:
+            connection.send(Batch(encoded, missed_slots, news, health))
+        except OSError:
+            stop.set()
+            return
+
+
+def _await_stop(connection: Connection, stop: threading.Event) -> None:
+    with suppress(EOFError, OSError):
+        connection.recv()
+    stop.set()

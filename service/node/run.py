@@ -1,0 +1,350 @@
+"""A node: acquisition in its own process, a journal on disk, and the publisher that empties it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from devices.errors import FootTileError
+from service.estimation.calibration import Calibration
+from service.link import PROTOCOL, EarlierStream, Hello, Status, Wanted
+from service.node.acquisition import AcquisitionProcess, Batch, Failed, Health, Message, Started
+from service.node.publisher import Publisher
+from service.node.recording import NodeRecording
+from service.rig.rig import RigOptions
+from storage.journal.node_journal import NodeJournal
+from storage.journal.node_stream import KeptStream
+from storage.journal.wanted import ServerWants
+
+_LOOK_S = 0.02
+_DRAIN_S = 3.0
+_AWAY_LOOKS = 50
+_TROUBLES_S = 0.5
+_EARLIER_MAX = 64
+
+
+@dataclass(frozen=True)
+class NodeOptions:
+    """What a node does.
+
+    Attributes:
+        rig: the array to open.
+        journal: the node's folder.
+        server: address of the server; None: none, it records for itself.
+        record: name of a session that is recorded on the node itself; None: none is.
+        calibration: of its tiles, for the server to estimate with.
+        calibration_problem: why there is none.
+        token: for servers that want one.
+    """
+
+    rig: RigOptions
+    journal: Path
+    server: str | None
+    record: str | None = None
+    calibration: Calibration | None = None
+    calibration_problem: str | None = None
+    token: str | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of the frames of sessions when a node ended.
+
+    Attributes:
+        undelivered_frames: on the node's disk, for a server that has not got them yet.
+        lost_frames: neither on a disk of the node nor of a server, by reason; what was dropped
+            because no session wanted it is not among them.
+        recorded: id of the session that was recorded here; None: none was, or it is not sealed.
+        is_lossy: is that session not complete?
+    """
+
+    undelivered_frames: int = 0
+    lost_frames: int = 0
+    recorded: str | None = None
+    is_lossy: bool = False
+
+
+async def run_node(
+    options: NodeOptions, *, stop: asyncio.Event, report: Callable[[str], None]
+) -> Outcome:
+    """Take frames, keep them and publish them until `stop`.
+
+    Args:
+        options: what to do.
+        stop: ends the node, gently.
+        report: told what happens to link, disk and array.
+
+    Raises:
+        FootTileError: the array cannot be opened or failed for good, or another node has the
+            folder.
+    """
+    rig = options.rig
+    journal = await asyncio.to_thread(NodeJournal, options.journal, rig.node)
+    try:
+        node = _Node(options, journal, report)
+        journal.start()  # it knows now what the node's own sessions need
+        try:
+            return await node.run(stop)
+        finally:
+            await node.close()
+    finally:
+        await asyncio.to_thread(journal.close)
+
+
+class _Node:
+    """The parts of a running node, and how they are joined."""
+
+    def __init__(
+        self, options: NodeOptions, journal: NodeJournal, report: Callable[[str], None]
+    ) -> None:
+        self._options = options
+        self._journal = journal
+        self._report = report
+        self._recording = NodeRecording(
+            options.journal,
+            options.rig.node,
+            journal,
+            name=options.record,
+            calibration=options.calibration,
+            notes={
+                "scene": options.rig.scene.model_dump(mode="json"),
+                "emulated": options.rig.emulated,
+            },
+            report=report,
+        )
+        self._health = Health()
+        self._present: KeptStream | None = None
+        self._messages: asyncio.Queue[Message] = asyncio.Queue()
+        self._publisher: Publisher | None = None
+        self._publishing: asyncio.Task[None] | None = None
+        self._told: tuple[str, ...] = ()
+        self._is_closing = False
+        loop = asyncio.get_running_loop()
+        self._acquisition = AcquisitionProcess(
+            replace(options.rig, streams=journal.folder),
+            lambda message: _hand_over(loop, self._messages, message),
+        )
+
+    async def run(self, stop: asyncio.Event) -> Outcome:
+        """Until it is stopped, or the array fails for good."""
+        stopping = asyncio.create_task(stop.wait())
+        beside: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._watch_disk())]
+        try:
+            started = await _started(self._messages, stopping)
+            if started is None:
+                return Outcome()
+            stopping.add_done_callback(lambda _: self._acquisition.stop())
+            await self._begin(started)
+            sealing = asyncio.create_task(asyncio.to_thread(self._seal_what_was_left))
+            beside.append(sealing)
+            if self._options.server is not None:
+                self._publish(self._options.server)
+            while not isinstance(message := await self._messages.get(), Failed):
+                if isinstance(message, Started):
+                    self._report("the tiles are described anew: a new stream begins")
+                    await self._begin(message)
+                elif self._present is not None:
+                    self._take(self._present, message)
+            if self._present is not None:
+                self._present.has_ended = True
+            await self._drain()
+            # Sealed before it is settled, a session would end without what was in flight.
+            outcome = Outcome(is_lossy=self._options.record is not None)
+            if await asyncio.to_thread(self._journal.settle):
+                outcome = await asyncio.to_thread(self._outcome)
+            else:
+                self._report("the disk does not take the last frames: nothing is sealed yet")
+            if message.error is not None:
+                raise message.error
+            return outcome
+        finally:
+            for task in beside:
+                task.cancel()
+            await asyncio.gather(*beside, return_exceptions=True)
+
+    def _tell_failure(self, task: asyncio.Task[None]) -> None:
+        """A publisher that ended by itself ends the node: better that than to go on in silence."""
+        if not self._is_closing:
+            error = None if task.cancelled() else task.exception()
+            self._messages.put_nowait(Failed(error or FootTileError("the publisher has ended")))
+
+    async def close(self) -> None:
+        """End what runs beside."""
+        self._is_closing = True
+        if self._publishing is not None:
+            self._publishing.cancel()
+            await asyncio.gather(self._publishing, return_exceptions=True)
+        await asyncio.to_thread(self._acquisition.close)
+
+    async def _begin(self, started: Started) -> None:
+        info = started.info
+        self._report(f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s")
+        for remark in started.remarks:
+            self._report(remark)
+        self._present = self._journal.begin(info)
+        await asyncio.to_thread(self._recording.goes_on_in, self._present)
+        if self._publisher is not None:
+            self._publisher.renew()
+
+    def _take(self, stream: KeptStream, message: Batch) -> None:
+        self._journal.put(stream, message.batch, message.missed_slots)
+        self._health = message.health
+        if self._publisher is not None:
+            self._publisher.notify()
+        for news in message.news:
+            self._report(news)
+
+    def _publish(self, server: str) -> None:
+        self._publisher = Publisher(
+            server,
+            present=self._stream,
+            streams=lambda: {stream.boot_id: stream for stream in self._journal.streams},
+            hello=self._hello,
+            status=self._status,
+            wanted=self._want,
+            damaged=self._journal.damaged,
+            token=self._options.token,
+            report=self._report,
+        )
+        self._publishing = asyncio.create_task(self._publisher.run())
+        self._publishing.add_done_callback(self._tell_failure)
+
+    def _stream(self) -> KeptStream:
+        if self._present is None:
+            raise RuntimeError("no stream has begun")
+        return self._present
+
+    def _hello(self) -> Hello:
+        options, present = self._options, self._stream()
+        next_seq = present.next_seq  # before what is held, which may go on meanwhile
+        others = [stream for stream in self._journal.streams if stream is not present]
+        # As many as fit into a message, those that somebody waits for first.
+        waited_for = [stream for stream in others if self._journal.undelivered(stream)]
+        rest = [stream for stream in others if stream not in waited_for]
+        chosen = (*waited_for[:_EARLIER_MAX], *rest[-_EARLIER_MAX:])[:_EARLIER_MAX]
+        earlier = [stream for stream in others if stream in chosen]
+        return Hello(
+            protocol=PROTOCOL,
+            array_info=present.info,
+            held=tuple(present.held),
+            next_seq=next_seq,
+            lost=present.lost.as_pairs(),
+            scene=options.rig.scene.model_dump(mode="json"),
+            emulated=options.rig.emulated,
+            calibration=options.calibration,
+            calibration_problem=options.calibration_problem,
+            earlier=tuple(_earlier(stream) for stream in earlier),
+            has_more=len(earlier) < len(others),
+        )
+
+    def _status(self, backlog_frames: int) -> Status:
+        return Status(
+            missed_slots=self._stream().missed_slots,
+            backlog_frames=backlog_frames,
+            troubles=(*self._health.troubles, *self._journal.troubles),
+            counts={serial: dict(counts) for serial, counts in self._health.counts.items()},
+        )
+
+    def _want(self, server_id: str, wanted: Wanted, known: tuple[str, ...]) -> None:
+        streams = {stream.boot_id: stream.numbers for stream in wanted.streams}
+        wants = ServerWants(streams=streams, recording=wanted.recording, known=known)
+        self._journal.want(server_id, wants)
+
+    async def _watch_disk(self) -> None:
+        """Say when the disk takes nothing any more, and when it does again."""
+        while True:
+            await asyncio.sleep(_TROUBLES_S)
+            kinds = tuple(trouble.partition(";")[0] for trouble in self._journal.troubles)
+            for kind in kinds:
+                if kind not in self._told:
+                    self._report(kind)
+            for kind in self._told:
+                if kind not in kinds:
+                    self._report(f"no longer: {kind}")
+            self._told = kinds
+
+    async def _drain(self) -> None:
+        """Give the server, if it is there, a moment to take what its sessions need."""
+        publisher = self._publisher
+        if publisher is None:
+            return
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_DRAIN_S):
+                away = 0
+                while self._undelivered(everything=True) and away < _AWAY_LOOKS:
+                    away = 0 if publisher.is_connected else away + 1
+                    await asyncio.sleep(_LOOK_S)
+
+    def _undelivered(self, *, everything: bool = False) -> int:
+        streams = self._journal.streams
+        if everything and self._present is not None:
+            present = self._present
+            behind = present.held.without(present.acked).count
+            return behind + sum(
+                self._journal.undelivered(stream).count for stream in streams if stream != present
+            )
+        return sum(self._journal.undelivered(stream).count for stream in streams)
+
+    def _seal_what_was_left(self) -> None:
+        if self._journal.settle():
+            self._recording.seal_what_was_left()
+
+    def _outcome(self) -> Outcome:
+        recorded, is_lossy = self._recording.stop()
+        lost = 0
+        for stream in self._journal.streams:
+            wanted = self._journal.wanted.numbers(stream.boot_id)
+            lost += sum(numbers.count for numbers in stream.lost.within(wanted).values())
+        return Outcome(
+            undelivered_frames=self._undelivered() if self._options.server is not None else 0,
+            lost_frames=lost,
+            recorded=recorded,
+            is_lossy=is_lossy,
+        )
+
+
+def _earlier(stream: KeptStream) -> EarlierStream:
+    held = stream.held
+    first = next(iter(held))[0] if held else 0
+    journal = stream.journal
+    t_ns_first = journal.t_ns_near(first, newest=False) if journal is not None else None
+    return EarlierStream(
+        array_info=stream.info,
+        held=tuple(held),
+        next_seq=stream.next_seq,
+        lost=stream.lost.as_pairs(),
+        unsynced_tail_max=stream.notes.unsynced_tail_max,
+        missed_slots=stream.missed_slots,
+        t_ns_first=t_ns_first or 0,
+    )
+
+
+async def _started(
+    messages: asyncio.Queue[Message], stopping: asyncio.Task[bool]
+) -> Started | None:
+    """The array, once it is open; None if the node is stopped before."""
+    first = asyncio.create_task(messages.get())
+    await asyncio.wait({first, stopping}, return_when=asyncio.FIRST_COMPLETED)
+    if not first.done():
+        first.cancel()
+        return None
+    match first.result():
+        case Started() as started:
+            return started
+        case Failed(error) if error is not None:
+            raise error
+        case _:
+            return None
+
+
+def _hand_over(
+    loop: asyncio.AbstractEventLoop, messages: asyncio.Queue[Message], message: Message
+) -> None:
+    try:
+        loop.call_soon_threadsafe(messages.put_nowait, message)
+    except RuntimeError:  # the loop has ended; nobody listens any more
+        return

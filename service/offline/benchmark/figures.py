@@ -1,0 +1,193 @@
+"""From draws to figures: medians with their range, pooled coverage, the Pareto front."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from service.offline.accuracy import PHASES, Accuracy, Covered
+from service.offline.benchmark.draws import LAGS_MS, Drawn, Failure
+from service.offline.benchmark.rungs import Rung
+
+MAGNITUDES = ("flight_mean_n", "grf_bias_n")
+"""Figures with a sign: of them the magnitude is taken, or draws of both signs would cancel."""
+
+
+BUDGETED = ("grf_mae_n", "cop_p95_m")
+"""Figures that are compared with those of the whole ladder, draw by draw."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A figure over draws or repetitions: median, 5th and 95th percentile, and of how many."""
+
+    median: float
+    low: float
+    high: float
+    n: int
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """Of all values that are finite."""
+        finite = [value for value in values if math.isfinite(value)]
+        if not finite:
+            return cls(math.nan, math.nan, math.nan, 0)
+        low, median, high = np.percentile(finite, [5.0, 50.0, 95.0]).tolist()
+        return cls(median, low, high, len(finite))
+
+    def as_dict(self) -> dict[str, float | int | None]:
+        """For JSON."""
+        names = {"median": self.median, "p5": self.low, "p95": self.high}
+        return {n: v if math.isfinite(v) else None for n, v in names.items()} | {"n": self.n}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One rung in one mode.
+
+    Attributes:
+        lag_ms: its look-ahead.
+        ns_per_frame: over repetitions.
+        figures: over draws, by the names of `Accuracy`; magnitudes of those that have a sign.
+        coverage: pooled over all frames of all draws: GRF in all frames and in each of `PHASES`,
+            and "cop_x".
+        beyond_whole: how much greater `BUDGETED` figures are than those of the whole ladder in the
+            same draw, over draws.
+    """
+
+    lag_ms: float
+    ns_per_frame: Spread
+    figures: Mapping[str, Spread]
+    coverage: Mapping[str, Covered]
+    beyond_whole: Mapping[str, Spread]
+
+
+@dataclass(frozen=True)
+class SceneFigures:
+    """All that was measured of one scene."""
+
+    scene: str
+    tiles: int
+    rate_hz: float
+    absent_models: tuple[str, ...]
+    assumed_scale: bool
+    draws: int
+    """Draws that gave figures."""
+    frames: Spread
+    rungs: tuple[Rung, ...]
+    measured: Mapping[tuple[str, str], Measured]
+    """By mode and label of the rung."""
+    failures: tuple[Failure, ...]
+
+    @property
+    def default(self) -> Rung:
+        """The scene's whole ladder."""
+        return next(rung for rung in self.rungs if rung.is_default)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "scene": self.scene,
+            "tiles": self.tiles,
+            "rate_hz": self.rate_hz,
+            "models": list(self.default.models),
+            "absent_models": list(self.absent_models),
+            "absolute_scale": "assumed" if self.assumed_scale else "measured",
+            "draws": self.draws,
+            "frames": self.frames.as_dict(),
+            "failures": [{"what": f.what, "why": f.why} for f in self.failures],
+            "rungs": [
+                {
+                    "label": rung.label,
+                    "models": list(rung.models),
+                    "adds": rung.adds,
+                    "lacks": rung.lacks,
+                    "spare": rung.spare,
+                    "default": rung.is_default,
+                    **{mode: _as_dict(self.measured[mode, rung.label]) for mode in LAGS_MS},
+                }
+                for rung in self.rungs
+            ],
+        }
+
+
+def _as_dict(m: Measured) -> dict[str, Any]:
+    return {
+        "lag_ms": m.lag_ms,
+        "ns_per_frame": m.ns_per_frame.as_dict(),
+        "figures": {name: spread.as_dict() for name, spread in m.figures.items()},
+        "coverage": {name: covered.as_dict() for name, covered in m.coverage.items()},
+        "beyond_whole": {name: spread.as_dict() for name, spread in m.beyond_whole.items()},
+    }
+
+
+def measured_of(
+    rungs: Sequence[Rung],
+    draws: Sequence[Drawn],
+    times_ns: Mapping[tuple[str, str], Sequence[float]],
+) -> dict[tuple[str, str], Measured]:
+    """Every rung in every mode, by mode and label."""
+    measured = {}
+    whole = next(rung for rung in rungs if rung.is_default)
+    for rung in rungs:
+        for mode, lag_ms in LAGS_MS.items():
+            key = mode, rung.label
+            judged = [d.accuracy[key] for d in draws if key in d.accuracy]
+            both = [
+                (d.accuracy[key], d.accuracy[mode, whole.label])
+                for d in draws
+                if key in d.accuracy and (mode, whole.label) in d.accuracy
+            ]
+            measured[key] = Measured(
+                lag_ms,
+                Spread.of(times_ns.get(key, ())),
+                figures_of(judged),
+                coverage_of(judged),
+                {
+                    name: Spread.of([getattr(a, name) - getattr(b, name) for a, b in both])
+                    for name in BUDGETED
+                },
+            )
+    return measured
+
+
+def figures_of(judged: Sequence[Accuracy]) -> dict[str, Spread]:
+    """Every number of `Accuracy` over draws."""
+    names = [f.name for f in fields(Accuracy) if f.type in ("float", "int")]
+    figures = {}
+    for name in names:
+        values = [float(getattr(a, name)) for a in judged]
+        figures[name] = Spread.of([abs(v) for v in values] if name in MAGNITUDES else values)
+    return figures
+
+
+def coverage_of(judged: Sequence[Accuracy]) -> dict[str, Covered]:
+    """Coverage of the 95 % interval over the frames of all draws together."""
+    nothing = Covered(0, 0)
+    phases = {phase: sum((a.grf_phases[phase] for a in judged), nothing) for phase in PHASES}
+    return {
+        "all": sum(phases.values(), nothing),
+        **phases,
+        "cop_x": sum((a.cop_covered for a in judged), nothing),
+    }
+
+
+def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points that no other beats, by rising first coordinate.
+
+    A point is beaten by one that is no worse in both coordinates and better in one. What is not
+    finite is on no front.
+    """
+    order = sorted(
+        (i for i, point in enumerate(points) if all(map(math.isfinite, point))),
+        key=lambda i: points[i],
+    )
+    front: list[int] = []
+    for i in order:
+        if not front or points[i][1] < points[front[-1]][1]:
+            front.append(i)
+    return front

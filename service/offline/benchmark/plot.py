@@ -1,0 +1,249 @@
+"""Time per frame against GRF error, one panel per scene, with the Pareto front of each mode.
+
+A panel has a half for each mode: their times lie two decades apart, with nothing in between.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from service.offline.benchmark.draws import LAGS_MS
+from service.offline.benchmark.figures import SceneFigures, Spread, pareto
+from service.offline.benchmark.goals import GRF_MAE_N
+from service.offline.benchmark.placing import Box, free_place
+from service.offline.benchmark.report import draws_text
+from service.offline.benchmark.rungs import Rung
+from service.offline.plots import DPI, new_figure, png_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Two of Okabe and Ito's colours, and two shapes, so that neither colour nor print is needed.
+STYLES = {"live": ("#0072B2", "o"), "offline": ("#D55E00", "s")}
+HALVES = ("offline", "live")
+GREY = "#595959"
+GOAL_DASHES = (0, (5, 4))
+_NEAR_PX = 14
+
+
+@dataclass(frozen=True)
+class _Mark:
+    rung: Rung
+    ns: float
+    error_n: Spread
+
+    @property
+    def name(self) -> str:
+        if self.rung.is_built_up:
+            return self.rung.label
+        return f"++{self.rung.spare}" if self.rung.spare else f"\N{MINUS SIGN}{self.rung.lacks}"
+
+
+def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
+    """The plot as a PNG.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+    """
+    figure = new_figure(9.0, 1.4 + 5.0 * len(scenes))
+    panels = figure.subplots(len(scenes), 2, squeeze=False)
+    to_label: list[tuple[Axes, str, list[_Mark]]] = []
+    for figures, (left, right) in zip(scenes, panels, strict=True):
+        for mode, axes in zip(HALVES, (left, right), strict=True):
+            to_label.append((axes, mode, _half(axes, figures, mode)))
+        left.set_ylabel("GRF error, mean absolute, N")
+        right.tick_params(axis="y", length=0, labelleft=False)
+        right.spines["left"].set_visible(False)
+        left.set_title(
+            f"{figures.scene}: {figures.tiles} tiles, median of {draws_text(figures.draws)}",
+            loc="left",
+            fontsize=12,
+            pad=22,
+        )
+    figure.suptitle("What the estimate of a frame costs, and how far its force is off", fontsize=14)
+    _legend(figure)
+    # Places are known in pixels only after everything else has found its own.
+    figure.set_dpi(DPI)
+    engine: Any = figure.get_layout_engine()
+    engine.set(wspace=0.02, hspace=0.05)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes, mode, marks in to_label:
+        _label(axes, mode, marks)
+    return png_of(figure)
+
+
+def _half(axes: Axes, figures: SceneFigures, mode: str) -> list[_Mark]:
+    """Marks, bars, front and goal of one mode."""
+    colour, shape = STYLES[mode]
+    marks = []
+    for rung in figures.rungs:
+        m = figures.measured[mode, rung.label]
+        mark = _Mark(rung, m.ns_per_frame.median, m.figures["grf_mae_n"])
+        if math.isfinite(mark.ns) and math.isfinite(mark.error_n.median):
+            marks.append(mark)
+    for mark in marks:
+        error_n, is_default = mark.error_n, mark.rung.is_default
+        axes.errorbar(
+            *([mark.ns], [error_n.median]),
+            yerr=[[error_n.median - error_n.low], [error_n.high - error_n.median]],
+            marker=shape,
+            markersize=12 if is_default else 6.5,
+            markerfacecolor=colour if mark.rung.is_built_up else "white",
+            markeredgecolor="black" if is_default else colour,
+            markeredgewidth=2.0 if is_default else 1.2,
+            ecolor=colour,
+            elinewidth=0.8,
+            linestyle="none",
+            zorder=4 if is_default else 3,
+        )
+    points = [(mark.ns, mark.error_n.median) for mark in marks]
+    front = [points[i] for i in pareto(points)]
+    axes.plot([x for x, _ in front], [y for _, y in front], color=colour, linewidth=1.5, zorder=2)
+    goal_n = GRF_MAE_N.get(figures.scene, {}).get(mode)
+    if goal_n is not None:
+        axes.axhline(goal_n, color=GREY, linewidth=1.0, linestyle=GOAL_DASHES, zorder=1)
+    _scales(axes, figures, [x for x, _ in points])
+    axes.text(
+        *(0.5, 1.015),
+        f"{mode}, {LAGS_MS[mode]:g} ms look-ahead",
+        transform=axes.transAxes,
+        ha="center",
+        color=colour,
+        fontsize=10,
+        fontweight="bold",
+    )
+    return marks
+
+
+def _scales(axes: Axes, figures: SceneFigures, times_ns: Sequence[float]) -> None:
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    axes.set_xscale("log")
+    if times_ns:
+        middle = math.sqrt(min(times_ns) * max(times_ns))
+        reach = 2.2 * math.sqrt(max(times_ns) / min(times_ns))
+        axes.set_xlim(middle / reach, middle * reach)
+    highs = [m.figures["grf_mae_n"].high for m in figures.measured.values()]
+    goals_n = GRF_MAE_N.get(figures.scene, {}).values()
+    known = [high for high in highs if math.isfinite(high)] + list(goals_n)
+    axes.set_ylim(0.0, 1.08 * max(known, default=1.0))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(time_text)
+    axes.tick_params(labelsize=9)
+    axes.set_xlabel("CPU time per frame")
+    axes.grid(visible=True, color="#E6E6E6")
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def time_text(ns: float, _: object = None) -> str:
+    """A time of so many nanoseconds in the unit that suits it."""
+    for unit, size in (("ms", 1e6), ("µs", 1e3)):
+        if ns >= size:
+            return f"{ns / size:g} {unit}"
+    return f"{ns:g} ns"
+
+
+def _legend(figure: Figure) -> None:
+    from matplotlib.lines import Line2D
+
+    def mark(face: str, edge: str, width: float, size: float, label: str) -> Line2D:
+        return Line2D(
+            *([], []),
+            marker="o",
+            markerfacecolor=face,
+            markeredgecolor=edge,
+            markeredgewidth=width,
+            markersize=size,
+            linestyle="none",
+            label=label,
+        )
+
+    figure.legend(
+        handles=[
+            mark("#BFBFBF", "black", 2.0, 11, "the scene's whole ladder"),
+            mark(GREY, GREY, 1.2, 6, "built up, one model more each"),
+            mark(
+                "white",
+                GREY,
+                1.2,
+                6,
+                "whole ladder without (\N{MINUS SIGN}) or with one more (++) model",
+            ),
+            Line2D([], [], color=GREY, linewidth=1.5, label="Pareto front"),
+            Line2D([], [], color=GREY, linewidth=1.0, linestyle=GOAL_DASHES, label="goal"),
+        ],
+        loc="outside lower center",
+        ncols=3,
+        frameon=False,
+        fontsize=9,
+        title="Emulated feet. Bars: 5 to 95 % of the draws of tiles, calibration and noise.",
+        title_fontsize=9,
+    )
+
+
+def _label(axes: Axes, mode: str, marks: Sequence[_Mark]) -> None:
+    """Write every name where nothing is yet, as near to its mark as there is room."""
+    from matplotlib.patheffects import withStroke
+
+    canvas: Any = axes.figure.canvas
+    renderer = canvas.get_renderer()
+    colour, _ = STYLES[mode]
+    window = axes.get_window_extent(renderer)
+    inside = (window.x0, window.y0, window.x1, window.y1)
+    taken: list[Box] = []
+    places: list[tuple[float, float]] = []
+    for mark in marks:
+        ends = [(mark.ns, y) for y in (mark.error_n.low, mark.error_n.median, mark.error_n.high)]
+        (x, low), (_, y), (_, high) = axes.transData.transform(np.array(ends)).tolist()
+        places.append((x, y))
+        half = 12.0 if mark.rung.is_default else 8.0
+        taken += [(x - half, y - half, x + half, y + half), (x - 1.5, low, x + 1.5, high)]
+    taken += _along([places[i] for i in pareto([(m.ns, m.error_n.median) for m in marks])])
+    # The scene's own ladder first, then what is built up: they get the best places.
+    order = sorted(
+        zip(places, marks, strict=True),
+        key=lambda pair: (not pair[1].rung.is_default, not pair[1].rung.is_built_up),
+    )
+    for (x, y), mark in order:
+        text = axes.annotate(
+            mark.name,
+            (mark.ns, mark.error_n.median),
+            xytext=(0, 0),
+            textcoords="offset pixels",
+            fontsize=9.5 if mark.rung.is_default else 8.5,
+            fontweight="bold" if mark.rung.is_default else "normal",
+            color="black" if mark.rung.is_default else colour,
+            path_effects=[withStroke(linewidth=2.0, foreground="white")],
+            zorder=6,
+        )
+        size = text.get_window_extent(renderer)
+        dx, dy = free_place((x, y), (size.width, size.height), taken, inside)
+        text.set_position((dx, dy))
+        left, bottom = x + dx, y + dy
+        right, top = left + size.width, bottom + size.height
+        taken.append((left, bottom, right, top))
+        nearest = (min(max(x, left), right), min(max(y, bottom), top))
+        if math.dist((x, y), nearest) > _NEAR_PX:
+            ends_of = axes.transData.inverted().transform(np.array([(x, y), nearest]))
+            axes.plot(*ends_of.T, color=colour, linewidth=0.6, alpha=0.8, zorder=2.5)
+
+
+def _along(line: Sequence[tuple[float, float]]) -> list[Box]:
+    """Small boxes along a line of points in pixels."""
+    boxes: list[Box] = []
+    for begin, end in itertools.pairwise(line):
+        steps = max(1, round(math.dist(begin, end) / 6.0))
+        for x, y in np.linspace(begin, end, steps + 1).tolist():
+            boxes.append((x - 2.0, y - 2.0, x + 2.0, y + 2.0))
+    return boxes

@@ -1,0 +1,191 @@
+"""From indentation recordings to a calibration: reads sealed sessions, fits each tile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import PRESSURE_MIN_KPA
+from devices.errors import CalibrationError
+from devices.frames import NOT_READ, FrameBatch
+from devices.temperature import hold_temperature
+from service.estimation.bench.effects_fit import fit_effects
+from service.estimation.bench.fit import fit_tile
+from service.estimation.bench.indentation import Indentation, pressed_in
+from service.estimation.calibration import Calibration, TileCalibration
+from storage.sessions.file import SessionReader
+
+
+@dataclass(frozen=True)
+class Pressed:
+    """A tile's part of one file, and the chip and stream it came from."""
+
+    indentation: Indentation
+    chip: tuple[int, int, int, int]
+    boot_id: str
+    seq: tuple[int, int]
+    """First and last frame."""
+
+
+def calibrate(paths: Sequence[Path], *, name: str, reference: str) -> Calibration:
+    """Fit every tile that was pressed in the files; see `calibrate_recordings`.
+
+    Raises:
+        FileFormatError: a file is no such recording.
+        CalibrationError: files contradict one another, or no tile has a curve.
+    """
+    return calibrate_recordings(read_recordings(paths), name=name, reference=reference)
+
+
+def calibrate_recordings(
+    recordings: Mapping[str, Sequence[Pressed]], *, name: str, reference: str
+) -> Calibration:
+    """Fit every tile that was pressed.
+
+    Repeats of a tile may be spread over several files: each has its own baseline and reference
+    zero. A file that is only a soak counts for every tile that is pressed in another. A tile
+    without a believable curve is left out, with the reason in `refused`.
+
+    Args:
+        recordings: of each serial.
+        name: for people.
+        reference: the force sensor.
+
+    Raises:
+        CalibrationError: no tile has a curve.
+    """
+    tiles: list[TileCalibration] = []
+    refused: dict[str, str] = {}
+    for serial, pressed in recordings.items():
+        try:
+            tiles.append(_fitted(pressed))
+        except CalibrationError as error:
+            if len(recordings) == 1:
+                raise
+            refused[serial] = str(error)
+    if not tiles:
+        raise CalibrationError(
+            "no tile has a curve: "
+            + "; ".join(f"{serial}: {reason}" for serial, reason in refused.items())
+        )
+    newest_ns = max(
+        int(pressed.indentation.t_ns[-1]) for all_of in recordings.values() for pressed in all_of
+    )
+    return Calibration(
+        name=name,
+        reference=reference,
+        date=datetime.fromtimestamp(newest_ns // 1_000_000_000, tz=UTC).isoformat(),
+        tiles=tuple(tiles),
+        refused=refused,
+    )
+
+
+def read_recordings(paths: Sequence[Path]) -> dict[str, list[Pressed]]:
+    """Every tile's recordings, by serial.
+
+    Raises:
+        FileFormatError: a file is no session.
+        CalibrationError: a file is no indentation, a serial stands for two chips, or the same
+            frames are given twice.
+    """
+    found: dict[str, list[Pressed]] = {}
+    for path in paths:
+        with SessionReader(path) as session:
+            chips = {tile.serial: tile.coefficient_words for tile in session.info.tiles}
+            indentations, seq = _read(session)
+            for indentation in indentations:
+                pressed = Pressed(indentation, chips[indentation.serial], session.info.boot_id, seq)
+                others = found.setdefault(indentation.serial, [])
+                for other in others:
+                    _refuse_contradiction(other, pressed)
+                others.append(pressed)
+    # Tiles that were only soaked have nothing to be fitted to.
+    bench = {
+        serial: all_of
+        for serial, all_of in sorted(found.items())
+        if pressed_in([one.indentation for one in all_of])
+    }
+    if not bench:
+        raise CalibrationError(
+            "no tile is pressed in any of the recordings",
+            where=", ".join(str(path) for path in paths),
+            expected="phases load and unload, with pressed_tile naming a tile",
+        )
+    return bench
+
+
+def _refuse_contradiction(one: Pressed, other: Pressed) -> None:
+    serial, files = one.indentation.serial, f"{one.indentation.where} and {other.indentation.where}"
+    if one.chip != other.chip:
+        raise CalibrationError(
+            f"tile {serial} has another chip in each of two recordings: coefficients {one.chip} "
+            f"and {other.chip}",
+            where=files,
+            remedy="Give the replaced part a serial of its own, and calibrate each by itself",
+        )
+    # A repeat that counts twice would look like agreement.
+    if one.boot_id == other.boot_id and one.seq[0] <= other.seq[1] and other.seq[0] <= one.seq[1]:
+        raise CalibrationError(
+            f"tile {serial}: the same frames are given twice",
+            where=files,
+            remedy="Name each recording once",
+        )
+
+
+def _fitted(pressed: Sequence[Pressed]) -> TileCalibration:
+    recordings = [each.indentation for each in pressed]
+    tile = fit_tile(*pressed_in(recordings))
+    return tile.model_copy(
+        update={
+            "coefficient_words": pressed[0].chip,
+            "effects": fit_effects(recordings, tile),
+        }
+    )
+
+
+def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
+    """Every tile's part of a bench recording, and its first and last frame."""
+    if not session.has("pressed_tile", "phase"):
+        raise CalibrationError(
+            "not an indentation recording",
+            where=str(session.path),
+            expected="columns pressed_tile and phase beside reference_force_n",
+            remedy="Record one with the mill, or `foottile simulate --scene indentation`",
+        )
+    pieces = list(session.batches("pressed_tile", "phase"))
+    frames = FrameBatch.concatenate([frames for frames, _ in pieces])
+    pressed = np.concatenate([extra["pressed_tile"] for _, extra in pieces])
+    phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
+    # A soak by itself is one of all tiles.
+    only_soak = bool((phase == "soak").any()) and not np.isin(pressed, session.info.serials).any()
+    held, _ = hold_temperature(frames)
+    readable_kpa = Compensation(session.info.tiles).readable_kpa(held)
+    # A count that ran past its end reads as next to no pressure (model `unwrap`): here it says
+    # only that the tile was pressed beyond what its chip can tell.
+    kpa = np.where(readable_kpa < PRESSURE_MIN_KPA, np.inf, readable_kpa)
+    tiles = [
+        Indentation(
+            serial=serial,
+            where=str(session.path),
+            t_ns=frames.t_ns,
+            kpa=kpa[:, i],
+            reference_n=frames.reference_force_n.astype(np.float64),
+            phase=phase,
+            under_spindle=pressed == serial,
+            tadc=np.where(held.tadc[:, i] == NOT_READ, np.nan, held.tadc[:, i].astype(np.float64)),
+        )
+        for i, serial in enumerate(session.info.serials)
+        if (pressed == serial).any() or only_soak
+    ]
+    if not tiles:
+        raise CalibrationError(
+            "no tile of the array is pressed in the recording",
+            where=str(session.path),
+            expected="pressed_tile naming one of " + ", ".join(session.info.serials),
+        )
+    return tiles, (int(frames.seq[0]), int(frames.seq[-1]))

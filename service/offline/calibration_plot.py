@@ -1,0 +1,178 @@
+"""The picture of a calibration: curve, residuals, and what fast loads do, for each tile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from service.estimation.bench.confidence import curve_n, mean_band_n, new_loading_band_n
+from service.estimation.bench.indentation import Indentation, pressed_in, strokes
+from service.estimation.bench.replay import Replay, replays
+from service.estimation.calibration import Calibration, TileCalibration
+from service.offline.plots import new_figure, png_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Okabe and Ito: told apart with any colour vision, and by shape besides.
+BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+BRANCHES = ((True, "loading", BLUE, "o"), (False, "unloading", VERMILION, "^"))
+COLUMNS = 4
+"""Tiles side by side; more go on below."""
+FAST = {"release": "release of a held load", "tap": "tap"}
+_HEIGHTS = (3.0, 1.5, 1.5, 1.5)
+_LETTERS_PER_IN = 11.0
+
+
+def plot_calibration(
+    calibration: Calibration, recordings: Mapping[str, Sequence[Indentation]]
+) -> bytes:
+    """Curve with its bands, residuals and fast behaviour of every tile, as a PNG.
+
+    Args:
+        calibration: fitted.
+        recordings: what each tile was fitted to, by serial.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+    """
+    tiles = calibration.tiles
+    fast = {tile.serial: replays(recordings[tile.serial], tile) for tile in tiles}
+    kinds = [kind for kind in FAST if any(kind in found for found in fast.values())]
+    lines = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
+    columns = min(COLUMNS, len(tiles))
+    heights = _HEIGHTS[: 2 + len(kinds)]
+    width_in = max(6.4, 1.2 + 3.7 * columns)
+    figure = new_figure(width_in, 1.0 + len(lines) * 1.15 * sum(heights))
+    title = (
+        f"Calibration {calibration.name} ({calibration.id}), {calibration.date[:10]}, "
+        f"reference: {calibration.reference}"
+    )
+    figure.suptitle(fill(title, round(_LETTERS_PER_IN * width_in)), fontsize=10)
+    blocks = figure.subfigures(len(lines), 1, squeeze=False)[:, 0]
+    for block, line in zip(blocks, lines, strict=True):
+        axes = block.subplots(
+            len(heights), columns, squeeze=False, gridspec_kw={"height_ratios": heights}
+        )
+        for column, tile in enumerate(line):
+            own = axes[:, column]
+            _curve(own[0], own[1], tile, recordings[tile.serial])
+            for axis, kind in zip(own[2:], kinds, strict=True):
+                _fast(axis, kind, fast[tile.serial].get(kind))
+        for column in range(len(line), columns):
+            for axis in axes[:, column]:
+                axis.set_visible(False)
+        axes[0, 0].set_ylabel("reference force, N")
+        axes[1, 0].set_ylabel("residual, N")
+        for axis in axes[2:, 0]:
+            axis.set_ylabel("gauge pressure, kPa")
+        for row in axes:
+            _same_scale(row[: len(line)])
+        axes[0, 0].legend(markerscale=2.5, fontsize=7.5, loc="upper left", framealpha=0.9)
+        for axis in axes[2:, 0]:
+            if axis.get_legend_handles_labels()[0]:
+                axis.legend(fontsize=7.5, loc="upper right", framealpha=0.9)
+    return png_of(figure)
+
+
+def _curve(
+    curve: Axes, residual: Axes, tile: TileCalibration, recordings: Sequence[Indentation]
+) -> None:
+    blocks = strokes(*pressed_in(recordings))
+    end_kpa = tile.range_kpa[1]
+    grid_kpa = np.linspace(0.0, end_kpa, 200)
+    force_n = curve_n(tile, grid_kpa)
+    mean_n, new_n = mean_band_n(tile, grid_kpa), new_loading_band_n(tile, grid_kpa)
+    left_n = blocks.force_n - curve_n(tile, blocks.gauge_kpa)
+    for axis, centre_n in ((curve, force_n), (residual, np.zeros_like(force_n))):
+        axis.fill_between(
+            grid_kpa,
+            centre_n - new_n,
+            centre_n + new_n,
+            color="#DDDDDD",
+            linewidth=0,
+            label="95 % of new loadings",
+        )
+        axis.fill_between(
+            grid_kpa,
+            centre_n - mean_n,
+            centre_n + mean_n,
+            color="#AAAAAA",
+            linewidth=0,
+            label="95 % of the mean curve",
+        )
+        for loading, name, colour, marker in BRANCHES:
+            rows = blocks.loading == loading
+            values_n = blocks.force_n if axis is curve else left_n
+            axis.plot(
+                blocks.gauge_kpa[rows],
+                values_n[rows],
+                marker,
+                color=colour,
+                markersize=2.5,
+                markeredgewidth=0,
+                label=name,
+            )
+        axis.plot(grid_kpa, centre_n, color="black", linewidth=1.2, label="cubic")
+        axis.axvline(end_kpa, color="black", linewidth=0.9, linestyle="--", label="end of range")
+        axis.set_xlim(-0.03 * end_kpa, 1.12 * end_kpa)
+        axis.grid(alpha=0.25)
+    curve.tick_params(labelbottom=False)
+    residual.set_xlabel("gauge pressure, kPa")
+    facts = tile.bench
+    end = f"range to {end_kpa:.2f} kPa"
+    if facts is not None:
+        beyond = "left to" if facts.spare_kpa >= 0.0 else "beyond"
+        end += f" ({facts.end_n:.1f} N), {abs(facts.spare_kpa):.2f} kPa {beyond} the chip's 115"
+        for axis in (curve, residual):
+            axis.axvline(end_kpa + facts.spare_kpa, color=GREEN, linestyle=":", label="115 kPa")
+    curve.set_title(
+        f"{tile.serial}: R² {_text(tile.r2, 4)}, RMSE {_text(tile.rmse_n, 2)} N\n"
+        f"left-out repeat {_text(tile.cv_rmse_n, 2)} N, loop {_text(tile.hysteresis_n, 2)} N\n"
+        f"{end}",
+        fontsize=8.5,
+    )
+
+
+def _fast(axis: Axes, kind: str, replay: Replay | None) -> None:
+    axis.grid(alpha=0.25)
+    axis.set_title(FAST[kind], fontsize=8.5)
+    axis.set_xlabel("time, ms")
+    if replay is None:
+        axis.text(0.5, 0.5, "not recorded", ha="center", va="center", transform=axis.transAxes)
+        return
+    time_ms = replay.t_s * 1e3
+    axis.plot(
+        time_ms,
+        replay.measured_kpa,
+        "o",
+        color=BLUE,
+        markersize=3,
+        markeredgewidth=0,
+        label="measured",
+    )
+    axis.plot(
+        time_ms,
+        replay.static_kpa,
+        color=GREY,
+        linewidth=1.1,
+        linestyle="--",
+        label="curve alone",
+    )
+    axis.plot(time_ms, replay.modelled_kpa, color=VERMILION, linewidth=1.4, label="with effects")
+
+
+def _same_scale(axes: Sequence[Axes]) -> None:
+    """One scale of force or pressure for tiles side by side, labelled once."""
+    low = min(axis.get_ylim()[0] for axis in axes)
+    high = max(axis.get_ylim()[1] for axis in axes)
+    for i, axis in enumerate(axes):
+        axis.set_ylim(low, high)
+        axis.tick_params(labelleft=i == 0)
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

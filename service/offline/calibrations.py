@@ -1,0 +1,122 @@
+"""Where a calibration comes from by its name: a preset, a file, or the emulated bench.
+
+The bench presses each tile alone, as a user would on the mill, and fits what was recorded. A serial
+is for ever the same tile, so its result is kept in the user's cache; it is found again by serial,
+parts seed and version, and would come out the same if it were made anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from platformdirs import user_cache_path
+
+from devices.errors import CalibrationError
+from devices.scene.file import Scene, build_scene, load_scene
+from service.estimation.calibration import PRESETS, Calibration
+from service.version import SOFTWARE
+from storage.durable import write_whole
+
+BENCH = "bench"
+BENCH_REFERENCE = "emulated mill, 12 bit over 100 N"
+
+Progress = Callable[[str], None]
+
+
+def find_calibration(
+    name: str,
+    serials: Sequence[str],
+    *,
+    parts_seed: int = 0,
+    cache: Path | None = None,
+    progress: Progress = lambda message: None,
+) -> Calibration:
+    """The calibration called `name`, checked to cover `serials`.
+
+    Args:
+        name: "bench", a preset's name, or the path of a file.
+        serials: tiles that it must cover.
+        parts_seed: which parts the emulated bench presses.
+        cache: where the bench's results are kept; default: the user's cache.
+        progress: told what takes time.
+
+    Raises:
+        CalibrationError: no such calibration, or it lacks a tile.
+    """
+    if name == BENCH:
+        folder = cache if cache is not None else user_cache_path("foottile") / "bench"
+        entries = [_bench_tile(serial, parts_seed, folder, progress) for serial in serials]
+        return Calibration(
+            name=BENCH,
+            reference=BENCH_REFERENCE,
+            date=entries[0].date,
+            tiles=tuple(tile for entry in entries for tile in entry.tiles),
+        )
+    calibration = PRESETS[name]() if name in PRESETS else read_calibration(Path(name))
+    for serial in serials:
+        calibration.of(serial)
+    return calibration
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read a calibration file.
+
+    Raises:
+        CalibrationError: there is none, or it is not one.
+    """
+    try:
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(
+            f"no calibration {str(path)!r}: {error}",
+            expected=f"a file, {BENCH!r}, or a preset: {', '.join(PRESETS)}",
+        ) from error
+    return Calibration.from_json(text, where=str(path))
+
+
+def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) -> Calibration:
+    scene = bench_scene(serial)
+    # Another version or another bench is another result.
+    made_by = hashlib.sha256(f"{SOFTWARE}/{parts_seed}/{scene.model_dump_json()}".encode())
+    kept = folder / f"{serial}-{made_by.hexdigest()[:16]}.json"
+    if kept.exists():
+        try:
+            return read_calibration(kept)
+        except CalibrationError:
+            kept.unlink(missing_ok=True)  # a damaged cache is no calibration, and no reason to fail
+    # Here, because only the emulated bench needs the physics.
+    from service.offline.calibrate import calibrate
+    from service.offline.simulate import SimulateOptions, simulate
+
+    progress(f"pressing tile {serial} on the emulated bench")
+    with tempfile.TemporaryDirectory(prefix="foottile-bench-") as work:
+        recording = Path(work) / f"bench-{serial}.parquet"
+        simulate(SimulateOptions(scene, parts_seed=parts_seed), recording, None)
+        calibration = calibrate([recording], name=f"{BENCH}-{serial}", reference=BENCH_REFERENCE)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(kept, calibration.to_json().encode())
+    return calibration
+
+
+def bench_scene(serial: str) -> Scene:
+    """The mill with one tile under it."""
+    return with_tiles(load_scene("indentation"), [serial])
+
+
+def with_tiles(scene: Scene, serials: Sequence[str]) -> Scene:
+    """The same scene with these tiles, plugged in and placed one after another."""
+    tiles = [
+        {
+            "serial": serial,
+            "mux": 0x70 + i // 8,
+            "channel": i % 8,
+            "x_m": 0.014 * i,
+            "y_m": 0.0,
+            "z_m": -0.15,
+        }
+        for i, serial in enumerate(serials)
+    ]
+    return build_scene({**scene.model_dump(), "tile": tiles}, where=f"scene {scene.name}")

@@ -1,0 +1,189 @@
+"""A client of the REST API: lists sessions and downloads them whole, resuming and verifying."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+
+from devices.errors import LinkError, StateError, UsageError
+from service.sessions.sealing import sha256_of
+from storage.clock.file import CLOCK_NAME
+from storage.durable import storage_errors, sync_folder, write_whole
+from storage.sessions.folder import FRAMES_NAME
+
+API = "/api/v1"
+_CHUNK = 1 << 20
+_PARTIAL = 206
+_NOT_FOUND = 404
+
+
+class Client:
+    """One server. Use as a context manager.
+
+    Args:
+        server: its address.
+
+    Raises:
+        UsageError: that is no address.
+    """
+
+    def __init__(self, server: str) -> None:
+        self.server = server.rstrip("/")
+        try:
+            self._http = httpx.Client(base_url=self.server + API, timeout=10.0, trust_env=False)
+        except (httpx.InvalidURL, ValueError) as error:
+            raise UsageError(f"{server!r} is no server address: {error}") from error
+        if self._http.base_url.scheme not in ("http", "https"):
+            raise UsageError(f"{server!r} is no server address", expected="http://HOST:PORT")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._http.close()
+
+    def sessions(self) -> list[dict[str, Any]]:
+        """All sessions, newest first.
+
+        Raises:
+            LinkError: the server does not answer, or not as one of ours.
+        """
+        found: list[dict[str, Any]] = []
+        cursor: str | None = None
+        while True:
+            query = {"limit": "500"} | ({"cursor": cursor} if cursor else {})
+            page = self._get("/sessions", query)
+            found += page["items"]
+            cursor = page["next_cursor"]
+            if cursor is None:
+                return found
+
+    def pull(self, session_id: str, out: Path) -> dict[str, Any]:
+        """Download a sealed session into the folder `out`/`session_id`.
+
+        Returns:
+            Where it is, and what is known of it.
+
+        Raises:
+            LinkError: the server does not answer, the download broke off, or its hash is wrong.
+            StateError: the session is not sealed.
+            StorageError: it cannot be written.
+        """
+        if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
+            raise UsageError(
+                f"{session_id!r} is no session id", remedy="List them with `foottile sessions`"
+            )
+        session = self._get(f"/sessions/{session_id}")
+        if session["sha256"] is None:
+            raise StateError(
+                f"session {session_id} is {session['state']}"
+                + (f": {session['problem']}" if session["problem"] else ""),
+                expected="a sealed session",
+                remedy="Stop it first, or wait until it is sealed",
+            )
+        folder = out / session_id
+        with storage_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        path = folder / FRAMES_NAME
+        resumed = 0
+        if not (path.is_file() and sha256_of(path) == session["sha256"]):
+            resumed = self._download(session, path)
+        events = self._get(f"/sessions/{session_id}/events")
+        ledger = self._get(f"/sessions/{session_id}/ledger")
+        for name, content in (("session", session), ("events", events), ("ledger", ledger)):
+            write_whole(folder / f"{name}.json", _json(content))
+        self._pull_clock(session_id, folder / CLOCK_NAME)
+        return {**session, "path": str(path), "resumed_bytes": resumed}
+
+    def _download(self, session: dict[str, Any], path: Path) -> int:
+        """Download to a partial file that is kept if it breaks off; bytes that were there."""
+        partial = path.with_name(f".{path.name}.part")
+        have = partial.stat().st_size if partial.is_file() else 0
+        headers = {"Accept-Encoding": "identity"}
+        if have:
+            headers |= {"Range": f"bytes={have}-", "If-Range": f'"{session["sha256"]}"'}
+        url = f"/sessions/{session['id']}/data?format=parquet"
+        try:
+            with self._http.stream("GET", url, headers=headers) as answer:
+                if answer.is_error and not (have and answer.status_code == 416):
+                    answer.read()
+                    raise self._refused(answer)
+                resumed = have if answer.status_code == _PARTIAL else 0
+                if not answer.is_error:
+                    with storage_errors(partial), partial.open("ab" if resumed else "wb") as file:
+                        for chunk in answer.iter_bytes(_CHUNK):
+                            file.write(chunk)
+                        file.flush()
+                        os.fsync(file.fileno())
+                else:
+                    resumed = have
+        except httpx.HTTPError as error:
+            raise LinkError(
+                f"the download broke off: {error}",
+                where=self.server,
+                remedy="Run the same command again: it goes on where it stopped",
+            ) from error
+        if sha256_of(partial) != session["sha256"]:
+            partial.unlink()
+            raise LinkError(
+                "what was downloaded has not the hash that the server states",
+                where=str(path),
+                remedy="Run the same command again",
+            )
+        with storage_errors(path):
+            partial.replace(path)
+            sync_folder(path.parent)
+        return resumed
+
+    def _pull_clock(self, session_id: str, path: Path) -> None:
+        answer = self._answer(f"/sessions/{session_id}/clock", {"format": "parquet"})
+        if answer.status_code == _NOT_FOUND:  # taken away, or a server that knows no clocks yet
+            return
+        if answer.is_error:
+            raise self._refused(answer)
+        write_whole(path, answer.content)
+
+    def _get(self, path: str, query: dict[str, str] | None = None) -> dict[str, Any]:
+        answer = self._answer(path, query)
+        if answer.is_error:
+            raise self._refused(answer)
+        try:
+            content = answer.json()
+        except ValueError:
+            content = None
+        if not isinstance(content, dict):
+            raise LinkError("the answer is not a foottile server's", where=self.server)
+        return content
+
+    def _answer(self, path: str, query: dict[str, str] | None) -> httpx.Response:
+        try:
+            return self._http.get(path, params=query)
+        except httpx.HTTPError as error:
+            raise LinkError(
+                f"no answer: {error}",
+                where=self.server,
+                remedy="Is `foottile serve` running there? Name it with --server",
+            ) from error
+
+    def _refused(self, answer: httpx.Response) -> LinkError:
+        try:
+            detail = str(answer.json()["detail"])
+        except (ValueError, KeyError, TypeError):
+            detail = answer.reason_phrase
+        return LinkError(f"{detail} (HTTP {answer.status_code})", where=self.server)
+
+
+def _json(content: dict[str, Any]) -> bytes:
+    import json
+
+    return json.dumps(content, indent=1).encode()

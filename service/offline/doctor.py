@@ -1,0 +1,282 @@
+"""What hangs on a bus, how fast it can be asked, and what to change, in words.
+
+Everything is measured over the bus; a scene only says what should be there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from devices.array.budget import BusTiming, broadcast_width, choose, frame_s, rates_hz
+from devices.array.self_test import Plug, find_tiles, measure_conversion_ns, measure_wires
+from devices.array.startup import chosen, timing_of
+from devices.buses.i2c import I2cBus, PatientBus
+from devices.chips.mpl115a2 import CONVERSION_TYPICAL_NS
+from devices.clock import Clock
+from devices.errors import I2cError
+from devices.frames import TileInfo
+from devices.scene.file import ArrayScene, Scene, ScheduleName, TileScene
+
+_AS_ASKED = 0.95
+_PI_TRAP = 0.625  # core clock 250 MHz where the kernel believes in 400 MHz (hardware.md 3.2)
+_PI_TRAP_WITHIN = 0.03
+_SPARE = 0.98
+_WORTH_SAYING = 1.05
+
+
+@dataclass(frozen=True)
+class TileFinding:
+    """One tile, or what stands in its place.
+
+    Attributes:
+        serial: as the scene calls it; empty if the scene does not know of it.
+        mux, channel: where it is plugged in.
+        coefficient_words: a0, b1, b2, c12; None if none could be read.
+        conversion_ms: as measured; None if it could not be.
+        problem: what is wrong; empty if nothing is.
+    """
+
+    serial: str
+    mux: int
+    channel: int
+    coefficient_words: tuple[int, int, int, int] | None
+    conversion_ms: float | None
+    problem: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found, and what it means.
+
+    Attributes:
+        tiles: every tile of the scene, and every one beside it.
+        scl_hz: bus clock as measured; None without a tile to measure it with.
+        asked_scl_hz: what it should be.
+        transaction_s: what a transaction costs beyond its bits.
+        rates_hz: frames a second by schedule; None where it would open too many channels.
+        schedule: the best one; None without tiles.
+        holds: will the rate asked for be held, by tiles that are all well?
+        verdict: all of it in a sentence or two, with what to change.
+    """
+
+    tiles: tuple[TileFinding, ...]
+    scl_hz: float | None
+    asked_scl_hz: float
+    transaction_s: float
+    rates_hz: Mapping[ScheduleName, float | None]
+    schedule: ScheduleName | None
+    holds: bool
+    verdict: str
+
+
+def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float = 0.0) -> Diagnosis:
+    """Examine a bus.
+
+    Args:
+        bus: which one.
+        clock: virtual or real.
+        scene: what should be there; None: whatever is.
+        asked_hz: frames a second that are wanted; 0: as many as there can be.
+
+    Raises:
+        BusFaultError: the bus itself does not work.
+        BusSetupError: it cannot be used.
+    """
+    array = scene.array if scene is not None else ArrayScene()
+    bus = PatientBus(bus)
+    findings = _findings(find_tiles(bus), scene.tile if scene is not None else ())
+    well = [(finding, _info(finding)) for finding in findings if not finding.problem]
+    if not well:
+        return Diagnosis(
+            findings, None, array.scl_hz, 0.0, {}, None, holds=False, verdict=_nobody(findings)
+        )
+    wires = measure_wires(bus, clock, well[0][1])
+    measured: dict[tuple[int, int], TileFinding] = {}
+    conversions_ns: list[int | None] = []
+    for finding, info in well:
+        try:
+            conversion_ns = measure_conversion_ns(bus, clock, info, wires)
+            never = "its words never change: is it converting?"
+            problem = "" if conversion_ns is not None else never
+        except I2cError as error:
+            conversion_ns, problem = None, f"it went silent while it was measured: {error}"
+        conversions_ns.append(conversion_ns)
+        measured[finding.mux, finding.channel] = TileFinding(
+            finding.serial,
+            finding.mux,
+            finding.channel,
+            finding.coefficient_words,
+            None if conversion_ns is None else conversion_ns / 1e6,
+            problem,
+        )
+    findings = tuple(measured.get((f.mux, f.channel), f) for f in findings)
+    asked = tuple(measured.values())
+    timing = timing_of(array, wires, [f.mux for f in asked], conversions_ns)
+    rates: dict[ScheduleName, float | None] = {
+        name: rate if broadcast_width(name, timing.muxes) <= array.broadcast_channels else None
+        for name, rate in rates_hz(timing).items()
+    }
+    asked_hz = asked_hz or (scene.rate_hz if scene is not None else 0.0)
+    choice = choose(timing, asked_hz=asked_hz, channels_max=array.broadcast_channels)
+    schedule = choice.schedule
+    if scene is not None:
+        has_reference = scene.reference is not None
+        schedule = chosen(scene, timing, has_reference=has_reference, asked_hz=asked_hz).schedule
+    advice = _advice(findings, timing, rates, array, asked_hz, choice.schedule, schedule)
+    hints = (
+        *advice.hints,
+        _pace_setter(asked, timing, schedule, rates[schedule]),
+        _disturbance(bus.repeated),
+    )
+    return Diagnosis(
+        findings,
+        wires.scl_hz,
+        array.scl_hz,
+        wires.transaction_s,
+        rates,
+        choice.schedule,
+        holds=not advice.wrong,
+        verdict=" ".join(filter(None, (advice.summary, *advice.wrong, *hints))),
+    )
+
+
+def _findings(plugs: tuple[Plug, ...], wanted: tuple[TileScene, ...]) -> tuple[TileFinding, ...]:
+    serials = {(tile.mux, tile.channel): tile.serial for tile in wanted}
+    found = [
+        TileFinding(
+            serials.get((plug.mux, plug.channel), ""),
+            plug.mux,
+            plug.channel,
+            plug.coefficient_words,
+            None,
+            plug.problem,
+        )
+        for plug in plugs
+    ]
+    there = {(plug.mux, plug.channel) for plug in plugs}
+    absent = [
+        TileFinding(tile.serial, tile.mux, tile.channel, None, None, "it does not answer")
+        for tile in wanted
+        if (tile.mux, tile.channel) not in there
+    ]
+    return tuple(sorted((*found, *absent), key=lambda f: (f.mux, f.channel)))
+
+
+def _info(finding: TileFinding) -> TileInfo:
+    assert finding.coefficient_words is not None  # noqa: S101  # without a problem there are some
+    return TileInfo(
+        serial=finding.serial or f"0x{finding.mux:02x}.{finding.channel}",
+        mux=finding.mux,
+        channel=finding.channel,
+        coefficient_words=finding.coefficient_words,
+        x_m=0.0,
+        y_m=0.0,
+        z_m=0.0,
+        reference=False,
+        conversion_ms=CONVERSION_TYPICAL_NS / 1e6,
+    )
+
+
+def _nobody(findings: tuple[TileFinding, ...]) -> str:
+    if any(finding.coefficient_words or "answer" not in finding.problem for finding in findings):
+        return "No tile works: look at the problems above."
+    return (
+        "Nothing answers at 0x70 to 0x77. Check the multiplexers' supply, that SDA and SCL are not "
+        "swapped, and that this is the right bus."
+    )
+
+
+@dataclass(frozen=True)
+class _Advice:
+    summary: str
+    wrong: tuple[str, ...]
+    hints: tuple[str, ...]
+
+
+def _advice(
+    findings: tuple[TileFinding, ...],
+    timing: BusTiming,
+    rates: Mapping[ScheduleName, float | None],
+    array: ArrayScene,
+    asked_hz: float,
+    best: ScheduleName,
+    chosen: ScheduleName,
+) -> _Advice:
+    wrong: list[str] = []
+    hints: list[str] = []
+    ill = [f for f in findings if f.problem]
+    if ill:
+        names = ", ".join(f.serial or f"0x{f.mux:02x} channel {f.channel}" for f in ill)
+        wrong.append(f"{names} {'needs' if len(ill) == 1 else 'need'} attention first.")
+    part = timing.scl_hz / array.scl_hz
+    if part < _AS_ASKED:
+        slow = f"The bus runs at {timing.scl_hz / 1e3:.0f} kHz where {array.scl_hz / 1e3:.0f} are"
+        if abs(part - _PI_TRAP) < _PI_TRAP_WITHIN:
+            slow += (
+                " asked for: this Raspberry Pi derives it from a core that idles at 250 MHz. Fix "
+                "the core's clock in config.txt (core_freq and core_freq_min alike, or "
+                "enable_uart=1)."
+            )
+        else:
+            slow += " asked for: check dtparam=i2c_arm_baudrate in config.txt."
+        hints.append(slow)
+    rate = rates[chosen]
+    best_hz = rates[best] or 0.0
+    tiles = f"{len(timing.muxes)} tile{'s' * (len(timing.muxes) > 1)}"
+    if rate is None:
+        wrong.append(
+            f"{chosen} would open more than {array.broadcast_channels} channels at once: "
+            f"use {best}."
+        )
+        summary = (
+            f"{tiles} on {len(timing.tiles_by_mux)} mux{'es' * (len(timing.tiles_by_mux) > 1)}."
+        )
+        return _Advice(summary, tuple(wrong), tuple(hints))
+    summary = f"{tiles}: {chosen} gives {rate:.0f} frames/s."
+    if asked_hz and rate < asked_hz:
+        change = f"ask for {_SPARE * best_hz:.0f} or less"
+        if best_hz >= asked_hz:
+            change = f"use schedule {best}"
+        wrong.append(f"The {asked_hz:g} frames/s asked for will not hold: {change}.")
+    elif asked_hz:
+        summary += f" The {asked_hz:g} frames/s asked for will hold."
+    elif chosen != best:
+        hints.append(f"Schedule {best} would give {best_hz:.0f}.")
+    return _Advice(summary, tuple(wrong), tuple(hints))
+
+
+def _pace_setter(
+    asked: tuple[TileFinding, ...],
+    timing: BusTiming,
+    schedule: ScheduleName,
+    rate_hz: float | None,
+) -> str:
+    """Which part holds all others up, if one does; `asked` are those that `timing` is of."""
+    slowest_s = max(timing.conversions_s)
+    slow = asked[timing.conversions_s.index(slowest_s)]
+    if rate_hz is None or slow.conversion_ms is None:
+        return ""
+    usual_s = sorted(timing.conversions_s)[len(timing.conversions_s) // 2]
+    like_others = replace(
+        timing, conversions_s=tuple(min(wait_s, usual_s) for wait_s in timing.conversions_s)
+    )
+    without_hz = 1.0 / frame_s(schedule, like_others)
+    if without_hz < _WORTH_SAYING * rate_hz:
+        return ""
+    name = slow.serial or f"The tile at 0x{slow.mux:02x} channel {slow.channel}"
+    return (
+        f"{name} converts slowest ({slowest_s * 1e3:.2f} ms) and sets the pace: with a part like "
+        f"the others it would be {without_hz:.0f}."
+    )
+
+
+def _disturbance(repeated: int) -> str:
+    """What transfers that were acknowledged only when they were repeated say of the wires."""
+    if not repeated:
+        return ""
+    transfers = "1 transfer was" if repeated == 1 else f"{repeated} transfers were"
+    return (
+        f"{transfers} acknowledged only when repeated: look for a loose plug, and keep the leads "
+        "short and away from motors."
+    )

@@ -1,0 +1,161 @@
+"""A sealed session in, the same session with new estimates out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+
+from devices.errors import CalibrationError, FileFormatError, TareError, UsageError
+from devices.frames import ArrayInfo
+from devices.scene.file import Scene, load_scene
+from service.estimation.calibration import Calibration
+from service.estimation.plan import EstimationPlan
+from service.estimation.stances import Stance, Stances
+from service.estimation.tare.tare import Tare
+from service.offline.accuracy import JUDGED, Accuracy
+from service.offline.calibrations import BENCH, find_calibration
+from service.offline.simulate import judged_of
+from service.sessions.pipeline import EstimateOptions, EstimateStream, notes_of
+from storage.schema import MILL, PARTS, TRUTH
+from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.frame_order import in_order
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """What came of it."""
+
+    frames: int
+    plan: EstimationPlan
+    stances: tuple[Stance, ...]
+    accuracy: Accuracy | None
+
+
+def estimate_session(
+    source: Path,
+    out: Path,
+    *,
+    calibration: str | None,
+    models: tuple[str, ...] | None,
+    lag_ms: float,
+    scene: str | None,
+    tare_s: tuple[float, float] | None,
+    remark: Callable[[str], None],
+) -> Estimated:
+    """Estimate a session; see `foottile estimate --help` for what is taken from where.
+
+    Raises:
+        FootTileError: the session, scene, calibration or tare is not usable; `out` is untouched.
+    """
+    the_scene = load_scene(scene) if scene is not None else None
+    with SessionReader(source) as session:
+        info = _placed(session.info, the_scene)
+        options = EstimateOptions(
+            calibration=_calibration(session, the_scene, calibration, remark),
+            models=models or (the_scene.models if the_scene else info.models),
+            lag_ms=lag_ms,
+            tare_s=tare_s,
+            tares=_recorded_tares(session) if tare_s is None else (),
+        )
+        kept = [c.name for c in (*PARTS, *TRUTH, *MILL) if session.has(c.name)]
+        judging = all(c.name in kept for c in TRUTH)
+        stream = EstimateStream(info, options)
+        judged: list[Mapping[str, npt.NDArray[Any]]] = []
+        stances = Stances()
+        frames = 0
+        with SessionWriter(out, info, session.notes) as writer:
+            ordered = in_order(session.batches(*kept), where=str(source))
+            for batch, extra in stream.run(ordered):
+                if not frames and stream.plan is not None:
+                    writer.add_notes(notes_of(stream.plan, options.tares))
+                writer.append(batch, extra)
+                frames += len(batch)
+                stances.feed(batch.t_ns, extra["grf_n"], extra["contact"])
+                if judging:
+                    columns = {"t_ns": batch.t_ns, **extra}
+                    judged.append({name: columns[name] for name in JUDGED})
+    if stream.plan is None:
+        raise FileFormatError("the session has no frames", where=str(source))
+    return Estimated(frames, stream.plan, stances.finish(), judged_of(judged, stream))
+
+
+def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:
+    """Tares that were taken while the session was recorded, oldest first."""
+    recorded = session.notes.get("tares", [])
+    tiles = len(session.info.tiles)
+    try:
+        return tuple(Tare.from_dict(content, tiles=tiles) for content in recorded)
+    except (TareError, TypeError) as error:
+        raise FileFormatError(
+            f"its tares are not readable: {error}",
+            where=str(session.path),
+            remedy="Name an unloaded interval with --tare-s BEGIN,END",
+        ) from error
+
+
+def _placed(info: ArrayInfo, scene: Scene | None) -> ArrayInfo:
+    """The array with its tiles where the scene says they are."""
+    if scene is None:
+        return info
+    places = {tile.serial: tile for tile in scene.tile}
+    if set(places) != set(info.serials):
+        raise UsageError(
+            f"scene {scene.name!r} has the tiles {', '.join(sorted(places))}, "
+            f"the session {', '.join(sorted(info.serials))}",
+            remedy="Name the scene it was recorded with",
+        )
+    tiles = tuple(
+        tile.model_copy(
+            update={
+                name: getattr(places[tile.serial], name)
+                for name in ("x_m", "y_m", "z_m", "reference")
+            }
+        )
+        for tile in info.tiles
+    )
+    return info.model_copy(update={"tiles": tiles})
+
+
+def _calibration(
+    session: SessionReader,
+    scene: Scene | None,
+    wanted: str | None,
+    remark: Callable[[str], None],
+) -> Calibration:
+    notes = session.notes
+    where = str(session.path)
+    inside = None
+    if "calibration" in notes:
+        try:
+            inside = Calibration.model_validate(notes["calibration"])
+        except ValueError as error:
+            if wanted is None:
+                raise FileFormatError(
+                    f"its calibration is not readable: {error}", where=where
+                ) from error
+    if inside is not None and wanted in (None, inside.id):
+        return inside
+    name = wanted or (scene.calibration if scene is not None else None)
+    if name is None:
+        raise CalibrationError(
+            "no calibration: the session brings none and none was named",
+            where=where,
+            remedy="Add --calibration FILE, or --scene with a scene that names one",
+        )
+    if name == BENCH and "parts_seed" not in notes:
+        # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
+        raise CalibrationError(
+            "the emulated bench knows emulated tiles only, and this session is of real ones",
+            where=where,
+            remedy="Press the tiles on a real bench and run `foottile calibrate`",
+        )
+    return find_calibration(
+        name,
+        [tile.serial for tile in session.info.tiles if not tile.reference],
+        parts_seed=int(notes.get("parts_seed", 0)),
+        progress=remark,
+    )

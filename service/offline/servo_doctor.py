@@ -1,0 +1,70 @@
+"""Who is on a servo's serial line, and whether it is the one that a scene means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from devices.buses.serial_line import latency_remark, latency_timer_ms
+from devices.chips.dynamixel.probe import BAUDRATES, FoundServo, probe
+from devices.clock import Clock
+from devices.scene.file import ServoScene
+
+
+@dataclass(frozen=True)
+class ServoDiagnosis:
+    """Who is on a serial line.
+
+    Attributes:
+        found: every servo that answered.
+        latency_timer_ms: of the adapter; None if it has none.
+        is_well: is the one that is wanted there, as the scene says, and the adapter quick?
+        verdict: all of it in a sentence or two, with what to change.
+    """
+
+    found: tuple[FoundServo, ...]
+    latency_timer_ms: int | None
+    is_well: bool
+    verdict: str
+
+
+def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoDiagnosis:
+    """Ask for a servo in both protocols at the usual baud rates.
+
+    Args:
+        port: its serial port.
+        clock: a real one.
+        wanted: what the scene says of it; None: whoever has id 1.
+
+    Raises:
+        ServoSetupError: the port cannot be opened.
+    """
+    servo_id = wanted.id if wanted is not None else 1
+    rates = dict.fromkeys((*((wanted.baudrate,) if wanted is not None else ()), *BAUDRATES))
+    found = tuple(probe(port, clock, servo_ids=[servo_id], baudrates=rates))
+    said = [
+        f"{servo.model or f'model {servo.model_number}'}, protocol {servo.protocol}, "
+        f"{servo.baudrate} baud, id {servo.servo_id}."
+        for servo in found
+    ]
+    wrong = []
+    if not found:
+        wrong.append(
+            f"Nobody answers as id {servo_id}. Check power, cable and id; an MX leaves the factory "
+            "with id 1 at 57600 baud."
+        )
+    elif wanted is not None and not any(_is_wanted(servo, wanted) for servo in found):
+        wrong.append(
+            f"The scene says {wanted.model}, protocol {wanted.protocol}, {wanted.baudrate} baud: "
+            "change the scene's [servo], or the servo."
+        )
+    if remark := latency_remark(port):
+        wrong.append(remark)
+    return ServoDiagnosis(found, latency_timer_ms(port), not wrong, " ".join((*said, *wrong)))
+
+
+def _is_wanted(servo: FoundServo, wanted: ServoScene) -> bool:
+    return (servo.model, servo.protocol, servo.baudrate) == (
+        wanted.model,
+        wanted.protocol,
+        wanted.baudrate,
+    )

@@ -1,0 +1,288 @@
+"""A session on emulated silicon in virtual time: the real driver, frames, estimates, one file.
+
+The same command and version give the same bytes: time is virtual, every draw comes from the seeds.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.acquisition import Acquisition
+from devices.array.budget import Choice
+from devices.array.startup import make_ready
+from devices.buses.i2c import open_bus
+from devices.chips.dynamixel.reader import open_servo
+from devices.chips.dynamixel.servo import PolledServo
+from devices.clock import UtcAnchor, VirtualClock
+from devices.emulation.ground.grounds import press_on
+from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace
+from devices.emulation.world import World
+from devices.errors import UsageError
+from devices.frames import FrameBatch, FrameStatus, TileStatus
+from devices.scene.file import AnySchedule, Scene, ServoScene
+from service.estimation.stances import Stance, Stances
+from service.offline.accuracy import JUDGED, Accuracy, judge
+from service.rig.description import describe
+from service.rig.reference import recovery_of, reference_of
+from service.sessions.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
+from storage.sessions.file import SessionWriter
+
+START_NS = 1_577_836_800_000_000_000
+"""2020-01-01T00:00:00Z, at which every emulated session begins."""
+
+NODE = "emulated"
+
+_GATHER = 64
+
+# Real time, in which a busy machine may be late: a reading lost to that would be another file.
+_ANSWER_S = 10.0
+
+
+@dataclass(frozen=True)
+class SimulateOptions:
+    """What to emulate; see `foottile simulate --help`."""
+
+    scene: Scene
+    seconds: float | None = None
+    otherwise_s: float | None = None
+    """Length of a scene that has no end of its own, if `seconds` does not say one either."""
+    schedule: AnySchedule | None = None
+    seed: int = 0
+    parts_seed: int = 0
+    lead_s: float = 1.0
+    truth: bool = False
+    load: LoadTrace | None = None
+    load_scale: float = 1.0
+    cop: CopTransform = CopTransform()  # noqa: RUF009  # frozen, so one for all is safe
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What came of it."""
+
+    frames: int
+    seconds: float
+    rate_hz: float
+    missed_slots: int
+    choice: Choice
+    replaced: tuple[str, ...]
+    """Serials in whose place another part answered."""
+    unmeasured: tuple[str, ...]
+    """Serials whose conversion time could not be measured: they were given 3 ms."""
+    flags: Mapping[str, Mapping[str, int]]
+    """Frames in which a tile was flagged, by serial and reason."""
+    pressed: PressedTrace | None
+    stances: tuple[Stance, ...]
+    accuracy: Accuracy | None
+    assumed_scale: bool | None
+    """Whether newtons rest on an assumed scale; None without estimates."""
+    wall_s: float
+    """What taking, estimating and writing the frames took, set-up and bench left out."""
+
+
+class Simulation:
+    """One emulated foot, identified over its bus and ready to run."""
+
+    def __init__(self, options: SimulateOptions, stack: ExitStack) -> None:
+        scene = options.scene
+        self._options = options
+        self.pressed = None
+        if options.load is not None:
+            self.pressed = press_on(
+                scene,
+                options.load,
+                load_scale=options.load_scale,
+                cop=options.cop,
+                lead_s=options.lead_s,
+            )
+        self._clock = VirtualClock()
+        self._world = World(
+            scene,
+            self._clock,
+            seed=options.seed,
+            parts_seed=options.parts_seed,
+            lead_s=options.lead_s,
+            pressed=self.pressed,
+            begun=False,
+        )
+        duration_ns = _duration_ns(options, self._world.ground.duration_s)
+        ready = make_ready(
+            open_bus("emulated", self._world.i2c_adapter),
+            scene,
+            self._clock,
+            schedule=options.schedule,
+            recovery=recovery_of(scene, self._clock, self._world),
+            beside=reference_of(scene, self._clock, self._world, stack),
+        )
+        self.choice = ready.choice
+        self.unmeasured = ready.unmeasured
+        self.array = ready.array
+        # The machine was switched on earlier, the session and its scene begin now.
+        self._world.begin()
+        self._begin_ns = self._clock.now_ns()
+        self._end_ns = self._begin_ns + duration_ns
+        anchor = UtcAnchor.of(self._begin_ns, START_NS, clock_set=True)
+        servo = None
+        if scene.servo is not None:
+            servo = _polled_servo(self._world, scene.servo, self._begin_ns, stack)
+        self.rate_hz = min(scene.rate_hz or ready.predicted_hz, ready.predicted_hz)
+        self.info = describe(
+            scene,
+            ready.tiles,
+            anchor,
+            node=NODE,
+            boot_id=f"{options.seed:032x}",
+            schedule=ready.choice.schedule,
+            rate_hz=self.rate_hz,
+        )
+        self.acquisition = Acquisition(
+            ready.array, ready.tiles, self._clock, anchor, rate_hz=scene.rate_hz, servo=servo
+        )
+
+    def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
+        """Frames with what the emulation adds: truth if asked for, the mill's notes."""
+        lead_ns = self._begin_ns + round(self._options.lead_s * 1e9)
+        mill = self._world.mill
+        batches = self.acquisition.run(lambda: self._clock.now_ns() >= self._end_ns)
+        # Nobody watches, so frames may gather: batching does not change a bit of the result.
+        while gathered := list(islice(batches, _GATHER)):
+            batch = FrameBatch.concatenate(gathered)
+            lead = np.where(batch.t_mono_ns < lead_ns, FrameStatus.LEAD, 0).astype(np.uint8)
+            extra: dict[str, npt.NDArray[Any]] = {}
+            if self._options.truth:
+                extra |= asdict(self._world.truth(batch.t_mono_ns))
+            batch = replace(batch, frame_status=batch.frame_status | lead)
+            if mill is not None:
+                extra |= mill.notes(batch.t_mono_ns)
+                # What the sensor reads while nothing is pressed is no reference for any tile.
+                idle = np.array([tile is None for tile in extra["pressed_tile"]])
+                force_n = np.where(idle, np.float32(np.nan), batch.reference_force_n)
+                batch = replace(batch, reference_force_n=force_n)
+            yield batch, extra
+
+
+def simulate(
+    options: SimulateOptions, out: Path, estimate: Callable[[], EstimateOptions] | None
+) -> Simulated:
+    """Run a session and seal it at `out`; without `estimate`, raw frames only.
+
+    `estimate` is asked for once the scene is known to run, since a calibration may take a while.
+
+    Raises:
+        FootTileError: anything wrong with scene, load or calibration; `out` is not touched then.
+    """
+    notes: dict[str, object] = {
+        "scene": options.scene.model_dump(mode="json"),
+        "seed": options.seed,
+        "parts_seed": options.parts_seed,
+        "lead_s": options.lead_s,
+    }
+    judged: list[Mapping[str, npt.NDArray[Any]]] = []
+    frames = 0
+    first_ns = last_ns = 0
+    flagged: Counter[tuple[int, str]] = Counter()
+    stances = Stances()
+    with ExitStack() as stack:
+        simulation = Simulation(options, stack)
+        pieces: Iterator[tuple[FrameBatch, Extra]] = simulation.pieces()
+        stream = None
+        if estimate is not None:
+            stream = EstimateStream(simulation.info, estimate())
+            pieces = iter(stream.run(pieces))
+        writer = stack.enter_context(SessionWriter(out, simulation.info, notes))
+        began_s = time.perf_counter()
+        for batch, extra in pieces:
+            if stream is not None and stream.plan is not None and not frames:
+                writer.add_notes(notes_of(stream.plan))
+            writer.append(batch, extra)
+            first_ns = first_ns or int(batch.t_ns[0])
+            last_ns = int(batch.t_ns[-1])
+            frames += len(batch)
+            flagged.update(_flags(batch))
+            if stream is not None:
+                stances.feed(batch.t_ns, extra["grf_n"], extra["contact"])
+            if options.truth and estimate is not None:
+                columns = {"t_ns": batch.t_ns, **extra}
+                judged.append({name: columns[name] for name in JUDGED})
+    seconds = (last_ns - first_ns) * 1e-9
+    return Simulated(
+        frames=frames,
+        seconds=seconds,
+        rate_hz=(frames - 1) / seconds if seconds else float("nan"),
+        missed_slots=simulation.acquisition.missed_slots,
+        choice=simulation.choice,
+        replaced=simulation.array.replaced,
+        unmeasured=simulation.unmeasured,
+        flags={
+            serial: {reason: n for (i, reason), n in sorted(flagged.items()) if i == tile}
+            for tile, serial in enumerate(simulation.info.serials)
+            if any(i == tile for i, _ in flagged)
+        },
+        pressed=simulation.pressed,
+        stances=stances.finish(),
+        accuracy=judged_of(judged, stream),
+        assumed_scale=stream.plan.assumed_scale if stream and stream.plan else None,
+        wall_s=time.perf_counter() - began_s,
+    )
+
+
+def _flags(batch: FrameBatch) -> dict[tuple[int, str], int]:
+    """Frames of a batch in which a tile has a flag, by its index and the flag's name."""
+    if not batch.status.any():
+        return {}
+    counts = {}
+    for bit in TileStatus:
+        for tile, n in enumerate(((batch.status & np.uint8(bit)) != 0).sum(axis=0).tolist()):
+            if n and bit.name:
+                counts[tile, bit.name.lower()] = n
+    return counts
+
+
+def judged_of(
+    pieces: list[Mapping[str, npt.NDArray[Any]]], stream: EstimateStream | None
+) -> Accuracy | None:
+    """How far off the estimates of a stream were; None if there is no truth to compare with."""
+    if not pieces or stream is None or stream.plan is None:
+        return None
+    return judge(joined(pieces), lag_ms=stream.plan.lag_ns * 1e-6)
+
+
+def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArray[Any]]:
+    """Columns of all pieces, one after another."""
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+
+def _duration_ns(options: SimulateOptions, ground_s: float | None) -> int:
+    lengths_s = (options.seconds, ground_s, options.otherwise_s)
+    seconds = next((s for s in lengths_s if s is not None), None)
+    if seconds is None:
+        raise UsageError(
+            f"scene {options.scene.name!r} has no end of its own", remedy="Add --seconds S"
+        )
+    return round(seconds * 1e9)
+
+
+def _polled_servo(world: World, scene: ServoScene, now_ns: int, stack: ExitStack) -> PolledServo:
+    line_clock = VirtualClock(now_ns)
+    emulated = stack.enter_context(world.servo(scene, line_clock))
+    servo = open_servo(
+        emulated.port,
+        baudrate=scene.baudrate,
+        clock=line_clock,
+        servo_id=scene.id,
+        model=scene.model,
+        protocol=scene.protocol,
+        timeout_s=_ANSWER_S,
+    )
+    stack.callback(servo.close)
+    return PolledServo(servo, line_clock, rate_hz=scene.rate_hz)

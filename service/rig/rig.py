@@ -1,0 +1,237 @@
+"""An array and its servo, opened on a real clock and ready to stream: real, emulated, or mixed."""
+
+from __future__ import annotations
+
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from devices.acquisition import Acquisition
+from devices.array.startup import make_ready, renew
+from devices.buses.i2c import open_bus
+from devices.chips.dynamixel.reader import open_servo
+from devices.chips.dynamixel.servo import ServoReader
+from devices.clock import SpinningClock, SystemClock, UtcAnchor
+from devices.emulation.ground.grounds import press_on
+from devices.emulation.ground.load_trace import CopTransform, LoadTrace
+from devices.errors import I2cError, TileSetupError
+from devices.frames import ArrayInfo, FrameBatch
+from devices.realtime import clock_is_set, run_before_others, sharpen_timers
+from devices.scene.file import EMULATED, Scene, ServoScene
+from service.rig.description import describe
+from service.rig.reference import recovery_of, reference_of
+from storage.journal.in_flight import InFlight, open_in_flight
+
+if TYPE_CHECKING:
+    from devices.array.array import TileArray
+    from devices.emulation.world import World
+
+_TRIAL_FRAMES = 100
+_RENEW_AGAIN_NS = 2_000_000_000
+
+# Threads of an emulated world must not make the bus wait for Python's lock longer than a bit or so.
+_SWITCH_S = 0.0002
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """What to open; everything but `scene` and `node` is for emulation."""
+
+    scene: Scene
+    node: str
+    load: LoadTrace | None = None
+    load_scale: float = 1.0
+    cop: CopTransform = CopTransform()  # noqa: RUF009  # frozen, so one for all is safe
+    lead_s: float = 1.0
+    seed: int = 0
+    parts_seed: int = 0
+    streams: Path | None = None
+    """Folder of the node's journals: frames in flight are kept there, each stream's in its own."""
+
+    @property
+    def emulated(self) -> bool:
+        """Are the tiles emulated?"""
+        return self.scene.array.bus == EMULATED
+
+
+class Rig:
+    """One array, identified over its bus, with its servo beside it.
+
+    Args:
+        options: what to open.
+        stack: what is opened is closed with it.
+
+    Raises:
+        I2cError, TileSetupError, ServoSetupError, LoadTraceError, UsageError: it cannot be opened.
+    """
+
+    def __init__(self, options: RigOptions, stack: ExitStack) -> None:
+        scene = options.scene
+        sharpen_timers()
+        self._options = options
+        self._clock = SpinningClock()
+        # What runs beside the loop, or plays the wires, must not keep it from its core.
+        self._line_clock = SystemClock()
+        self._lead_end_ns: int | None = None
+        world = self._world(options, stack)
+        self._bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
+        stack.callback(self._bus.close)
+        self._recovery = recovery_of(scene, self._clock, world)
+        self._beside = reference_of(scene, self._clock, world, stack)
+        self._ready = make_ready(
+            self._bus, scene, self._clock, recovery=self._recovery, beside=self._beside
+        )
+        self.remarks = [f"schedule {self._ready.choice.schedule}: {self._ready.choice.reason}"]
+        """What a user should hear about it."""
+        self.remarks += [
+            f"the conversion time of tile {serial} could not be measured: it is given 3 ms"
+            for serial in self._ready.unmeasured
+        ]
+        self._servo_source = (
+            self._servo(scene.servo, world, stack) if scene.servo is not None else None
+        )
+        self._renew_at_ns = 0
+        self._in_flight: InFlight | None = None
+        # Before the world begins: on a busy machine the trial would use up the lead.
+        bus_hz = self._bus_hz(self._ready.array)
+        if world is not None:
+            world.begin()
+            if options.emulated:
+                self._lead_end_ns = world.epoch_ns + round(options.lead_s * 1e9)
+        self._begin_stream(bus_hz, is_new=False)
+        if not options.emulated:
+            # Last, and only this thread: an emulated world would starve the rest of the machine.
+            run_before_others()
+
+    def _begin_stream(self, bus_hz: float, *, is_new: bool) -> None:
+        scene, ready = self._options.scene, self._ready
+        anchor = UtcAnchor.now(clock_set=clock_is_set())
+        self.info: ArrayInfo = describe(
+            scene,
+            ready.tiles,
+            anchor,
+            node=self._options.node,
+            boot_id=uuid.uuid4().hex,
+            schedule=ready.choice.schedule,
+            rate_hz=min(scene.rate_hz or bus_hz, bus_hz),
+        )
+        if self._in_flight is not None:
+            self._in_flight.close()
+        streams = self._options.streams
+        folder = None if streams is None else streams / self.info.boot_id
+        self._in_flight = open_in_flight(folder, self.info)
+        if folder is not None and self._in_flight is None:
+            self.remarks.append("no room for frames in flight: a crash may cost the last batches")
+        self.acquisition = Acquisition(
+            ready.array,
+            ready.tiles,
+            self._clock,
+            anchor,
+            rate_hz=scene.rate_hz,
+            expected_hz=bus_hz,
+            servo=self._servo_source,
+            is_new=is_new,
+            keeper=self._in_flight,
+            lead_end_ns=self._lead_end_ns,
+        )
+
+    def batches(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
+        """Frames until `stop()`; those before an emulated load begins are marked as lead.
+
+        Ends before that when another part was plugged in: then `info` describes a new stream, and
+        the next call goes on with it.
+        """
+        while not stop():
+            yield from self.acquisition.run(lambda: stop() or self._is_renewal_due())
+            if not stop() and self._renew():
+                return
+
+    def troubles(self) -> dict[str, str]:
+        """What is wrong now, in words, by what it is wrong with."""
+        return self._ready.array.troubles()
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """How often what went wrong since the stream began, by serial and reason."""
+        array = self._ready.array
+        return {
+            tile.serial: dict(health.counts)
+            for tile, health in zip(array.tiles, array.health, strict=True)
+            if health.counts
+        }
+
+    def _is_renewal_due(self) -> bool:
+        return bool(self._ready.array.replaced) and self._clock.now_ns() >= self._renew_at_ns
+
+    def _renew(self) -> bool:
+        try:
+            self._ready = renew(
+                self._bus,
+                self._options.scene,
+                self._clock,
+                self._ready,
+                recovery=self._recovery,
+                beside=self._beside,
+            )
+        except (I2cError, TileSetupError):  # it is being plugged: go on with the others
+            self._renew_at_ns = self._clock.now_ns() + _RENEW_AGAIN_NS
+            self._ready.array.resume()
+            return False
+        self._begin_stream(self._bus_hz(self._ready.array), is_new=True)
+        return True
+
+    def _world(self, options: RigOptions, stack: ExitStack) -> World | None:
+        scene = options.scene
+        if not options.emulated and (scene.servo is None or scene.servo.port != EMULATED):
+            return None
+        # Here, because a real node need not wait for scipy, nor have room for it.
+        from devices.emulation.world import World
+
+        sys.setswitchinterval(_SWITCH_S)
+        pressed = None
+        if options.load is not None:
+            pressed = press_on(
+                scene,
+                options.load,
+                load_scale=options.load_scale,
+                cop=options.cop,
+                lead_s=options.lead_s,
+            )
+        world = World(
+            scene,
+            self._line_clock,
+            seed=options.seed,
+            parts_seed=options.parts_seed,
+            lead_s=options.lead_s,
+            pressed=pressed,
+            looped=True,
+            begun=False,
+        )
+        stack.enter_context(world.foresight())
+        return world
+
+    def _servo(self, scene: ServoScene, world: World | None, stack: ExitStack) -> ServoReader:
+        port = scene.port
+        if port == EMULATED and world is not None:
+            port = stack.enter_context(world.servo(scene, self._line_clock)).port
+        servo = open_servo(
+            port,
+            baudrate=scene.baudrate,
+            clock=self._line_clock,
+            servo_id=scene.id,
+            model=scene.model,
+            protocol=scene.protocol,
+        )
+        stack.callback(servo.close)
+        self.remarks += servo.remarks
+        return stack.enter_context(ServoReader(servo, self._line_clock, rate_hz=scene.rate_hz))
+
+    def _bus_hz(self, array: TileArray) -> float:
+        """What rate this bus gives, from some frames before the stream begins."""
+        begin_ns = self._clock.now_ns()
+        for _ in range(_TRIAL_FRAMES):
+            array.scan()
+        return 1e9 * _TRIAL_FRAMES / (self._clock.now_ns() - begin_ns)

@@ -1,0 +1,235 @@
+"""The server's end of the link: takes in what a node sends, and hangs up with a reason."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from contextlib import suppress
+
+from pydantic import ValidationError
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from devices.errors import FileFormatError, LinkError, StorageError
+from service.link import (
+    MESSAGE_BYTES_MAX,
+    PROTOCOL,
+    SILENCE_S,
+    SUBPROTOCOL,
+    Ack,
+    ClockRow,
+    Close,
+    FromNode,
+    HangUp,
+    Hello,
+    Lost,
+    Probe,
+    Status,
+    Stream,
+    Welcome,
+    checked,
+    close_reason,
+    heard,
+    say,
+)
+from service.server.server import Link, Server
+from service.server_clock import utc_ns
+
+log = logging.getLogger("foottile.ingest")
+
+
+async def ingest(socket: WebSocket, server: Server) -> None:
+    """Serve one node's connection until it ends."""
+    offered = socket.scope.get("subprotocols", [])
+    await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
+    link: Link | None = None
+    try:
+        link = await _greet(socket, server, offered)
+        await _serve(socket, server, link)
+    except HangUp as end:
+        await _close(socket, end)
+    except (WebSocketDisconnect, RuntimeError):  # it went away, perhaps while we were sending
+        pass
+    finally:
+        if link is not None:
+            _leave(server, link)
+
+
+async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
+    if SUBPROTOCOL not in offered:
+        raise HangUp(
+            Close.WRONG_VERSION,
+            f"subprotocol {', '.join(offered) or 'none'} offered; this server speaks {SUBPROTOCOL}",
+        )
+    first = await _receive(socket)
+    if (protocol := _protocol_of(first)) is not None and protocol != PROTOCOL:
+        # Before it is read: another version's hello has other fields.
+        raise HangUp(
+            Close.WRONG_VERSION,
+            f"protocol {protocol}; this server speaks {PROTOCOL}: update the "
+            + ("node" if protocol < PROTOCOL else "server"),
+        )
+    hello = _parse(first, Close.BAD_HELLO)
+    if not isinstance(hello, Hello):
+        raise HangUp(Close.BAD_HELLO, "the first message has to be hello")
+    name, boot_id = hello.array_info.node, hello.array_info.boot_id
+    other = server.links.get(name)
+    if other is not None:
+        # A node that was switched off and on again knows the stream it had before.
+        known = {boot_id, *(stream.array_info.boot_id for stream in hello.earlier)}
+        if other.node.boot_id not in known:
+            raise HangUp(
+                Close.NAME_TAKEN,
+                f"a node {name!r} is connected already; give this one another name (--name)",
+            )
+        other.end(Close.SUPERSEDED, "the same node has connected again")
+    try:
+        node = server.nodes.greet(hello)
+        node.attach(hello, utc_ns())
+        server.recorder.follow(node)
+    except (LinkError, StorageError) as error:
+        code = Close.TRY_LATER if isinstance(error, StorageError) else Close.BAD_HELLO
+        raise HangUp(code, str(error)) from error
+    node.connected = True
+    link = server.links[name] = Link(node)
+    link.wanted = server.recorder.wanted(name)
+    lacks = node.lacks(server.recorder.needed(name))
+    welcome = Welcome(protocol=PROTOCOL, server_id=server.id, lacks=lacks, wanted=link.wanted)
+    try:
+        await socket.send_text(say(welcome))
+    except BaseException:  # it went away before it was welcomed
+        _leave(server, link)
+        raise
+    log.info("node %s connected, stream %s", name, boot_id)
+    server.tell_node(node)
+    return link
+
+
+async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
+    tasks = [
+        asyncio.create_task(_take(socket, server, link)),
+        asyncio.create_task(_tell(socket, server, link)),
+        asyncio.create_task(link.ended.wait()),
+    ]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+        if link.closing is not None:
+            raise HangUp(*link.closing)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _take(socket: WebSocket, server: Server, link: Link) -> None:
+    node = link.node
+    while True:
+        message = await _receive(socket)
+        if isinstance(message, bytes):
+            tare_before = node.live.tare
+            try:
+                *_, due = node.take(link.stream, checked(message), utc_ns())
+            except FileFormatError as error:
+                raise HangUp(Close.MALFORMED, f"node {node.name!r}: {error}") from error
+            server.hub.publish(node, due)
+            if node.live.tare is not tare_before:
+                server.tell_node(node)
+            continue
+        said = _parse(message, Close.MALFORMED)
+        match said:
+            case Probe(id=number):
+                answer = Probe(id=number, server_t_ns=utc_ns())
+                await socket.send_text(say(answer))
+            case Stream(boot_id=boot_id):
+                if boot_id not in node.order:
+                    raise HangUp(Close.MALFORMED, f"stream {boot_id[:80]!r} was not announced")
+                link.stream = node.streams[boot_id]
+            case ClockRow():
+                server.recorder.note_clock(node, said)
+            case Status():
+                node.present.missed_slots = said.missed_slots
+                node.troubles, node.fault_counts = said.troubles, said.counts
+                server.tell_node(node)
+            case Lost():
+                if said.boot_id not in node.order:
+                    raise HangUp(Close.MALFORMED, f"stream {said.boot_id[:80]!r} was not announced")
+                try:
+                    node.streams[said.boot_id].note_losses(said.lost)
+                except ValueError as error:
+                    raise HangUp(Close.MALFORMED, f"lost: {error}") from error
+            case Hello():
+                raise HangUp(Close.MALFORMED, "hello was said before")
+
+
+async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
+    """Tell the node what is on the disk, and what sessions need whenever that changes."""
+    while True:
+        await link.news.wait()
+        link.news.clear()
+        # First what is to be kept: what is acknowledged before may be forgotten.
+        wanted = server.recorder.wanted(link.node.name)
+        if wanted != link.wanted:
+            link.wanted = wanted
+            await socket.send_text(say(wanted))
+        for boot_id, numbers in link.acks().items():
+            for first, last in numbers:
+                ack = Ack(boot_id=boot_id, seq_first=first, seq_last=last)
+                await socket.send_text(say(ack))
+
+
+async def _receive(socket: WebSocket) -> str | bytes:
+    try:
+        async with asyncio.timeout(SILENCE_S):
+            message = await socket.receive()
+    except TimeoutError as error:
+        raise HangUp(Close.SILENT, f"nothing was heard for {SILENCE_S:g} s") from error
+    if message["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(message.get("code", 1005))
+    data: str | bytes | None = message.get("bytes")
+    if data is None:
+        data = message["text"]
+    if len(data) > MESSAGE_BYTES_MAX:
+        raise HangUp(Close.TOO_BIG, f"a message of {len(data)} bytes")
+    return data
+
+
+def _parse(message: str | bytes, code: Close) -> Hello | Stream | Probe | ClockRow | Status | Lost:
+    try:
+        if isinstance(message, bytes):
+            raise HangUp(code, "a text message was expected, and a binary one came")
+        return FromNode.validate_json(heard(message))
+    except LinkError as error:
+        raise HangUp(code, str(error)) from error
+    except ValidationError as error:
+        complaint = error.errors()[0]
+        where = ".".join(str(part) for part in complaint["loc"])
+        raise HangUp(code, f"message not understood: {where}: {complaint['msg']}") from error
+
+
+def _protocol_of(message: str | bytes) -> int | None:
+    """The protocol that a hello names, whatever else is in it; None if it names none."""
+    try:
+        said = json.loads(message) if isinstance(message, str) else None
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(said, dict) or said.get("type") != "hello":
+        return None
+    protocol = said.get("protocol")
+    return protocol if isinstance(protocol, int) else None
+
+
+async def _close(socket: WebSocket, end: HangUp) -> None:
+    log.warning("link closed: %s", end.reason)
+    if socket.application_state is not WebSocketState.DISCONNECTED:
+        with suppress(RuntimeError, WebSocketDisconnect):
+            await socket.close(end.code, close_reason(end.reason))
+
+
+def _leave(server: Server, link: Link) -> None:
+    if server.links.get(link.node.name) is link:
+        del server.links[link.node.name]
+        link.node.detach()
+        server.tell_node(link.node)
+        log.info("node %s has gone", link.node.name)

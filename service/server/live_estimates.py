@@ -1,0 +1,218 @@
+"""Estimates of one node's frames as they come, with a tare that may change at any moment."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.chips.compensation import Compensation
+from devices.errors import FootTileError, TareError
+from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
+from service.estimation.calibration import Calibration
+from service.estimation.contact import UNSEEN_NS
+from service.estimation.models.static import StaticCurves
+from service.estimation.plan import make_plan
+from service.estimation.tare.automatic import Look, first_in_flight, look_in_flight
+from service.estimation.tare.flight import LOOK_BACK_NS, tare_in_flight
+from service.estimation.tare.tare import Tare, take_tare
+from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
+
+LIVE_LAG_MS = 10.0
+_TADC_OVER_NS = 1_000_000_000
+
+Floats = npt.NDArray[np.float64]
+
+
+class LiveEstimates:
+    """One stream's estimates; without calibration or tare, frames pass through without any.
+
+    Args:
+        info: the array.
+        calibration: of its tiles; None if there is none.
+        tare: the one in force, from before.
+    """
+
+    def __init__(self, info: ArrayInfo, calibration: Calibration | None, tare: Tare | None) -> None:
+        self.calibration_problem: str | None = None
+        self._info = info
+        self._compensation = Compensation(info.tiles)
+        self._bears = np.array([not tile.reference for tile in info.tiles])
+        self._calibration: Calibration | None = None
+        self.range_kpa: Floats | None = None
+        """End of each tile's calibrated range, NaN for bare ones; None without a calibration."""
+        self.full_scale_n: Floats | None = None
+        """Force at that end."""
+        self.slope_n_per_kpa: Floats | None = None
+        """Newtons of a kilopascal about zero, per tile; NaN for those that bear no load."""
+        self.free_since_t_ns: int | None = None
+        """Since when every estimate has said that there is no contact; None: not yet."""
+        self._run: EstimateRun | None = None
+        self._recent: deque[FrameBatch] = deque()
+        self._left: list[tuple[FrameBatch, Columns]] = []
+        self._due_t_ns: int | None = None
+        if calibration is not None:
+            try:
+                EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
+                self._calibration = calibration
+                self._know_ranges(calibration)
+            except FootTileError as error:  # does not fit these tiles: said, and done without
+                self.calibration_problem = str(error)
+        self.use(tare)
+
+    def _know_ranges(self, calibration: Calibration) -> None:
+        bearing = np.flatnonzero(self._bears)
+        curves = StaticCurves([calibration.of(self._info.serials[i]) for i in bearing])
+
+        def by_tile(values: Floats) -> Floats:
+            of_all = np.full(len(self._info.tiles), np.nan)
+            of_all[bearing] = values
+            return of_all
+
+        self.range_kpa = by_tile(curves.high_kpa)
+        self.full_scale_n = by_tile(curves.force(curves.high_kpa[None]).force_n[0])
+        self.slope_n_per_kpa = by_tile(curves.slope_at_zero_n_per_kpa)
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """The calibration in use."""
+        return self._calibration
+
+    @property
+    def tare(self) -> Tare | None:
+        """The tare in use."""
+        return self._run.plan.tare if self._run is not None else None
+
+    def use(self, tare: Tare | None) -> None:
+        """Estimate with this tare from the next frame on."""
+        if self._run is not None:  # frames that wait for their look-ahead
+            self._left.extend(self._run.finish())
+        self.free_since_t_ns = None
+        if self._calibration is None or tare is None:
+            self._run = None
+            return
+        plan = make_plan(
+            self._info,
+            self._calibration,
+            tare,
+            models=self._info.models,
+            lag_ms=LIVE_LAG_MS,
+        )
+        self._run = EstimateRun(plan)
+
+    def feed(self, frames: FrameBatch) -> Iterator[tuple[FrameBatch, Columns]]:
+        """Take the next frames; give those that are due, with or without estimates."""
+        self._recent.append(frames)
+        while int(frames.t_ns[-1]) - int(self._recent[0].t_ns[-1]) > LOOK_BACK_NS:
+            self._recent.popleft()
+        left, self._left = self._left, []
+        yield from left
+        if self._run is None:
+            yield frames, {}
+            return
+        for due, columns in self._run.feed(frames, {}):
+            self._note_contact(due, columns)
+            yield due, columns
+
+    @property
+    def newest(self) -> FrameBatch | None:
+        """The last frames that came; None before the first."""
+        return self._recent[-1] if self._recent else None
+
+    @property
+    def newest_t_ns(self) -> int | None:
+        """Instant of the newest frame, in the node's UTC."""
+        return int(self._recent[-1].t_ns[-1]) if self._recent else None
+
+    def recent_tadc(self) -> Floats:
+        """Mean temperature counts of the last second, per tile; NaN where none was read."""
+        if not self._recent:
+            return np.full(len(self._info.tiles), np.nan)
+        since_t_ns = int(self._recent[-1].t_ns[-1]) - _TADC_OVER_NS
+        frames = FrameBatch.concatenate([f for f in self._recent if f.t_ns[-1] >= since_t_ns])
+        known = (frames.tadc != NOT_READ) & ((frames.status & np.uint8(TileStatus.UNUSABLE)) == 0)
+        counts = known.sum(axis=0)
+        total = np.where(known, frames.tadc, 0).sum(axis=0)
+        return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+
+    def newtons(self, shift_kpa: Floats) -> float | None:
+        """What a shift of all baselines makes of the GRF; None where that is not known."""
+        if self.slope_n_per_kpa is None:
+            return None
+        shift_n = (self.slope_n_per_kpa * shift_kpa)[np.isfinite(self.slope_n_per_kpa)]
+        return float(shift_n.sum()) if np.isfinite(shift_n).all() else None
+
+    def tare_from_lead(self, lead: FrameBatch) -> Tare:
+        """The tare of an emulated lead.
+
+        Raises:
+            TareError: its frames are no tare, or there is no calibration.
+        """
+        return take_tare(lead, self._compensation, self._needed(), self._info.serials)
+
+    def look_in_flight(self, anchor: Tare | None) -> Look:
+        """Whether the last seconds give reason to tare unasked.
+
+        Args:
+            anchor: what an automatic tare is held against; None if there has been no tare.
+        """
+        calibration, tare = self._calibration, self.tare
+        if calibration is None or not self._recent:
+            return Look()
+        frames = FrameBatch.concatenate(list(self._recent))
+        serials = self._info.serials
+        if tare is None:
+            return first_in_flight(frames, self._compensation, calibration, serials)
+        if self.free_since_t_ns is None or self._due_t_ns is None:
+            return Look()
+        # Of younger frames it is not yet known whether there was contact.
+        known = int(np.searchsorted(frames.t_ns, self._due_t_ns, side="right"))
+        return look_in_flight(
+            frames.rows(0, known),
+            self._compensation,
+            calibration,
+            serials,
+            present=tare,
+            anchor=anchor,
+            free_since_t_ns=self.free_since_t_ns,
+            bears=self._bears,
+        )
+
+    def tare_from_flight(self) -> Tare:
+        """The tare from the newest unloaded interval of the last seconds.
+
+        Raises:
+            TareError: there was none, no calibration, or no frames.
+        """
+        calibration = self._needed()
+        if not self._recent:
+            raise TareError("no frames have come yet", remedy="Is the node connected?")
+        return tare_in_flight(
+            FrameBatch.concatenate(list(self._recent)),
+            self._compensation,
+            calibration,
+            self._info.serials,
+            present=self.tare,
+            bears=self._bears,
+        )
+
+    def _needed(self) -> Calibration:
+        if self._calibration is None:
+            raise TareError(
+                "without a calibration there is nothing to tare",
+                remedy="Calibrate the tiles and name the calibration in the node's scene",
+            )
+        return self._calibration
+
+    def _note_contact(self, frames: FrameBatch, columns: Columns) -> None:
+        before_t_ns = self._due_t_ns if self._due_t_ns is not None else int(frames.t_ns[0])
+        # In a gap too short for a step, a slot missed here and there, nothing can have happened.
+        gap = np.diff(frames.t_ns, prepend=before_t_ns) > UNSEEN_NS
+        taken = np.flatnonzero((columns["contact"] != 0) | gap)  # or not known
+        self._due_t_ns = int(frames.t_ns[-1])
+        if len(taken):
+            self.free_since_t_ns = int(frames.t_ns[taken[-1]])
+        elif self.free_since_t_ns is None:
+            self.free_since_t_ns = int(frames.t_ns[0])

@@ -1,0 +1,319 @@
+"""One stream of a node as the server keeps it: its journal, and what the node has said of it.
+
+What the node said is in `stream.json` beside the journal, so that a server that was restarted still
+knows why frames are missing and where a stream ended. It is written by whoever calls `sync`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import suppress
+from pathlib import Path
+
+from devices.errors import FileFormatError, StorageError
+from devices.frames import ArrayInfo, FrameBatch
+from service.link import ClockRow, EarlierStream, Hello, PairsByReason
+from storage.clock.log import ClockLog
+from storage.intervals import Intervals
+from storage.journal.journal import Journal
+from storage.journal.stream_notes import StreamNotes
+from storage.losses import CORRUPT, Losses
+from storage.schema import wire_schema
+from storage.sessions.folder import ClockOffset
+from storage.sessions.ledger import NO_END
+
+CLOCK_ROWS = 128
+"""So many measurements of a clock are at hand for a pre-roll; all of them are in the log."""
+_AROUND_MAX = 32
+
+
+class ReceivedStream:
+    """One stream: what is here of it, what may come, what is lost.
+
+    Args:
+        folder: its own; made when there is something to keep.
+        info: description of its array.
+    """
+
+    def __init__(self, folder: Path, info: ArrayInfo) -> None:
+        self.folder = folder
+        self.info = info
+        self.schema = wire_schema(info)
+        self.journal: Journal | None = None
+        self.notes = StreamNotes(array_info=info)
+        self.node_has: Intervals | None = None
+        """What the node may still give; None: it has not said so since the server was started."""
+        self.t_ns_first: int | None = None
+        """Instant of the oldest frame that the node has of an earlier stream, in its UTC."""
+        self.clock_rows: deque[ClockOffset] = deque(maxlen=CLOCK_ROWS)
+        """How the node's clock differs, as measured, oldest first."""
+        self.last_seen_t_ns: int | None = None
+        """When its last frame came, server's UTC."""
+        self.missed_slots = 0
+        self.unsynced = Intervals()
+        """Frames that were appended to the journal since it was synced."""
+        self.owed = Intervals()
+        """Frames to be acknowledged once the journal is synced."""
+        self._first_seq: int | None = None
+        self._forgotten = Intervals()
+        self._guessed = False
+        self._notes_on_disk: StreamNotes | None = None
+        self._around: dict[tuple[int, int], tuple[int, int]] = {}
+        self._clock_log = ClockLog(folder)
+        self._clock_unsynced = False
+
+    @classmethod
+    def open(cls, folder: Path) -> ReceivedStream:
+        """A stream that was kept before.
+
+        Raises:
+            FileFormatError: nothing readable is in its folder.
+            StorageError: it cannot be read.
+        """
+        journal = Journal.open(folder)
+        stream = cls(folder, journal.info)
+        stream.journal = journal
+        with suppress(FileFormatError):  # the node says it again
+            notes = StreamNotes.load(folder)
+            if notes is not None:
+                stream.notes = stream._notes_on_disk = notes
+                stream.missed_slots = notes.missed_slots
+        with suppress(StorageError):
+            stream.clock_rows.extend(stream.all_clock_rows())
+        newest = journal.held.last
+        if newest is not None:
+            stream._first_seq = next(iter(journal.held))[0]
+            # Most likely it was deleted because nothing needed it.
+            stream._guessed = True
+            stream._forgotten = journal.held.missing(0, newest).without(stream.lost.all)
+        return stream
+
+    @property
+    def boot_id(self) -> str:
+        """Its name."""
+        return self.info.boot_id
+
+    @property
+    def clock(self) -> ClockOffset | None:
+        """How the node's clock differs; None before it was measured."""
+        return self.clock_rows[-1] if self.clock_rows else None
+
+    def all_clock_rows(self) -> tuple[ClockOffset, ...]:
+        """Every measurement since the stream began, oldest first.
+
+        Raises:
+            StorageError: the log cannot be read.
+        """
+        return self._clock_log.rows()
+
+    def note_clock(self, row: ClockRow) -> None:
+        """Keep a measurement of the node's clock.
+
+        Raises:
+            StorageError: the log cannot be written; it is known all the same.
+        """
+        offset = ClockOffset(boot_id=self.boot_id, **row.model_dump(exclude={"type"}))
+        self.clock_rows.append(offset)
+        if self.journal is not None:
+            self._log_clock(offset)
+
+    @property
+    def held(self) -> Intervals:
+        """Numbers that are here."""
+        return self.journal.held if self.journal is not None else Intervals()
+
+    @property
+    def may_come(self) -> Intervals:
+        """Numbers that the node may still give, or has given."""
+        known = Intervals([(0, NO_END)]) if self.node_has is None else self.node_has
+        return known.without(Losses(self.notes.lost).all)
+
+    @property
+    def lost(self) -> Losses:
+        """Numbers that will not come, and why. What is held is not lost, whatever is said here."""
+        lost = Losses(self.notes.lost)
+        if self.journal is not None:
+            for reason, numbers in self.journal.lost.by_reason.items():
+                lost.add(numbers.without(self.may_come), reason)
+        return lost
+
+    def around(self, t_ns: int, *, at_least: int, waiting: bool = False) -> tuple[int, int] | None:
+        """Numbers held next to an instant of the node's UTC: the last until it, the first after.
+
+        Asked again and again while frames between them are waited for; the journal's index is read
+        only when such frames have come.
+
+        Args:
+            t_ns: the instant.
+            at_least: earlier numbers do not count; the last is `at_least` - 1 if there is none.
+            waiting: look again only when all of those frames have come, or never will.
+
+        Returns:
+            Both; None while the stream has not passed the instant.
+
+        Raises:
+            DamagedFramesError: the frames that tell are damaged.
+        """
+        if self.journal is None:
+            return None
+        found, held = self._around.get((t_ns, at_least)), self.held
+        if found is not None:
+            last, after = found
+            ends = held.within(after, after) and (last < at_least or held.within(last, last))
+            missing = held.missing(last + 1, after - 1) if after > last + 1 else Intervals()
+            none_came = missing.count == after - last - 1
+            if ends and (none_came or (waiting and common(missing, self.may_come))):
+                return found
+        newest = self.journal.last_seq_until(t_ns, at_least=at_least)
+        if newest is None:
+            return None
+        found = newest, next(iter(held.within(newest + 1, NO_END)))[0]
+        if len(self._around) >= _AROUND_MAX:
+            self._around.clear()
+        self._around[t_ns, at_least] = found
+        return found
+
+    def missing(self, newest: int) -> Intervals:
+        """What should be here and is not, from the first frame known of up to `newest`."""
+        if self._first_seq is None or newest < self._first_seq:
+            return Intervals()
+        return self.held.missing(self._first_seq, newest).without(self._forgotten)
+
+    def lacks(self, needed: Intervals, *, all_of_it: bool) -> Intervals:
+        """What the node has and is missing here.
+
+        Args:
+            needed: by sessions.
+            all_of_it: not only that.
+        """
+        if self.node_has is None:
+            return Intervals()
+        asked = self.may_come.without(self.held)
+        if all_of_it:
+            return asked.without(self._forgotten.without(needed))
+        return common(asked, needed)
+
+    def is_present(self, hello: Hello) -> None:
+        """The node takes this stream now."""
+        self.node_has = Intervals((*hello.held, (hello.next_seq, NO_END)))
+        self._said(hello.lost, next_seq=None)
+        self._see_from(min((first for first, _ in hello.held), default=hello.next_seq))
+
+    def has_ended(self, said: EarlierStream) -> None:
+        """The node has taken it before, and says how it ended."""
+        self.node_has = Intervals(said.held)
+        self.t_ns_first = said.t_ns_first
+        self.missed_slots = said.missed_slots
+        # What a node lost with its power may have come here before.
+        beyond = max(0, (-1 if self.held.last is None else self.held.last) + 1 - said.next_seq)
+        tail = max(0, said.unsynced_tail_max - beyond)
+        self._said(said.lost, next_seq=said.next_seq + beyond, unsynced_tail_max=tail)
+
+    def is_gone(self) -> None:
+        """The node has not mentioned it: nothing more will come of it."""
+        self.node_has = Intervals()
+
+    def note_losses(self, lost: PairsByReason) -> None:
+        """All that the node has lost of it by now."""
+        notes = self.notes
+        self._said(lost, next_seq=notes.next_seq, unsynced_tail_max=notes.unsynced_tail_max)
+
+    def take(self, frames: FrameBatch, payload: bytes, now_t_ns: int) -> None:
+        """Keep frames that came.
+
+        Raises:
+            StorageError: the disk is full or not writable; they are not kept.
+        """
+        if self.journal is None:
+            self.journal = Journal(self.folder, self.info)
+            for row in self.clock_rows:
+                self._log_clock(row)
+        first, last = int(frames.seq[0]), int(frames.seq[-1])
+        self.last_seen_t_ns = now_t_ns
+        self._see_from(first)
+        for interval in self.journal.append(frames, payload):
+            self.unsynced.add(*interval)
+        self.owed.add(first, last)
+
+    def sync(self) -> None:
+        """Have journal and notes on the disk; may run in another thread.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        if self.journal is not None:
+            self.journal.sync()
+        notes = self.notes
+        if notes != self._notes_on_disk and self.folder.is_dir():
+            notes.save(self.folder)
+            self._notes_on_disk = notes
+        if self._clock_unsynced:
+            self._clock_unsynced = False
+            self._clock_log.sync()
+
+    @property
+    def has_news(self) -> bool:
+        """Is there anything to be synced or acknowledged?"""
+        unsaved = self.notes != self._notes_on_disk and self.journal is not None
+        return bool(self.unsynced or self.owed or unsaved or self._clock_unsynced)
+
+    def disown(self, doubtful: Intervals, *, corrupt: bool = False) -> None:
+        """Hold these frames no longer: what is on the disk may not be what was written."""
+        if self.journal is None:
+            return
+        self.journal.disown(doubtful)
+        if corrupt:
+            self.journal.lost.add(doubtful.without(self.held), CORRUPT)
+
+    def prune(self, before_t_ns: int, keep: Intervals) -> None:
+        """Delete what is older and not in `keep`.
+
+        Raises:
+            StorageError: a file cannot be deleted.
+        """
+        if self.journal is not None:
+            for interval in self.journal.prune(before_t_ns, keep):
+                self._forgotten.add(*interval)
+
+    def close(self) -> None:
+        """Sync everything, and close the journal.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        self.sync()
+        if self.journal is not None:
+            self.journal.close()
+
+    def delete(self) -> None:
+        """Delete the journal."""
+        if self.journal is not None:
+            self.journal.delete()
+        self.journal = self._notes_on_disk = None
+        self.unsynced, self.owed = Intervals(), Intervals()
+
+    def _said(
+        self, lost: PairsByReason, *, next_seq: int | None, unsynced_tail_max: int = 0
+    ) -> None:
+        self.notes = StreamNotes(
+            array_info=self.info,
+            next_seq=next_seq,
+            unsynced_tail_max=unsynced_tail_max,
+            missed_slots=self.missed_slots,
+            lost=Losses(lost).as_pairs(),
+        )
+        if self._guessed:
+            self._guessed = False
+            self._forgotten = self._forgotten.without(self.may_come)
+
+    def _log_clock(self, row: ClockOffset) -> None:
+        self._clock_log.append(row)
+        self._clock_unsynced = True
+
+    def _see_from(self, seq: int) -> None:
+        self._first_seq = seq if self._first_seq is None else min(self._first_seq, seq)
+
+
+def common(a: Intervals, b: Intervals) -> Intervals:
+    """Numbers that are in both."""
+    return a.without(a.without(b))

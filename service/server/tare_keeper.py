@@ -1,0 +1,198 @@
+"""Sees to it that a stream is tared: by its lead, in flight, by hand; and says what is wrong.
+
+One for each stream, fed after every message of frames; times are the frames' own.
+"""
+
+from __future__ import annotations
+
+from itertools import takewhile
+from typing import Literal
+
+import numpy as np
+
+from devices.errors import FileFormatError, TareError
+from devices.frames import ArrayInfo, FrameBatch, FrameStatus
+from service.estimation.plan import TARE_OLD_NS
+from service.estimation.tare.automatic import APART_NS, SETTLE_NS, Look
+from service.estimation.tare.drift import expected_shift_kpa, has_warmed, warmer_k
+from service.estimation.tare.flight import WINDOW_NS
+from service.estimation.tare.tare import Tare
+from service.server.live_estimates import LiveEstimates
+from service.sessions.tares import RecordedTare, TareHistory
+from storage.journal.journal import Journal
+
+LOOK_EVERY_NS = 5_000_000_000
+"""A look at the last seconds costs some milliseconds."""
+LEAD_WAIT_NS = 10_000_000_000
+"""Frames of a lead that are still missing so long after it will not come."""
+_BY_HAND = "lift the foot, hold it still, and tare"
+
+AutoTare = Literal["on", "paused", "off"]
+
+
+class TareKeeper:
+    """The tares of one stream.
+
+    Args:
+        info: the stream's array.
+        live: its estimates, which are told what is in force.
+        history: of the node's tares.
+        automatic: whether tares may be taken unasked.
+    """
+
+    def __init__(
+        self, info: ArrayInfo, live: LiveEstimates, history: TareHistory, *, automatic: bool
+    ) -> None:
+        self._info = info
+        self._live = live
+        self._history = history
+        self._automatic = automatic
+        self._lead_is_over = False  # and has been looked at
+        self._lead_over_t_ns: int | None = None
+        self._lead_problem: str | None = None
+        self._is_tared = False  # in this stream, other than by its lead
+        self._doubt: str | None = None
+        self._next_look_t_ns = 0
+
+    @property
+    def auto_tare(self) -> AutoTare:
+        """Does the baseline follow by itself? Not if the scene or an undo says so."""
+        if not self._automatic:
+            return "off"
+        return "paused" if self._history.is_automatic_paused(self._info) else "on"
+
+    @property
+    def problem(self) -> str | None:
+        """Why there is no tare, or why it is not this stream's own."""
+        if self._lead_problem is not None:
+            return f"the lead gave no tare ({self._lead_problem}): {_BY_HAND}"
+        return f"not tared: {_BY_HAND}" if self._history.in_force(self._info) is None else None
+
+    def warnings(self) -> list[str]:
+        """Why the tare in force may no longer fit, in words."""
+        tare, newest_t_ns = self._live.tare, self._live.newest_t_ns
+        if tare is None or newest_t_ns is None:
+            return []
+        said = []
+        age_ns = newest_t_ns - tare.t_ns
+        if age_ns > TARE_OLD_NS:
+            said.append(f"tared {age_ns / 60e9:.0f} min ago: {_BY_HAND}")
+        if "temperature" not in self._info.models and (warmed := self._warmed(tare)) is not None:
+            said.append(warmed)
+        if self._doubt is not None:
+            said.append(self._doubt)
+        return said
+
+    def _warmed(self, tare: Tare) -> str | None:
+        tadc = self._live.recent_tadc()
+        bears = np.array([not tile.reference for tile in self._info.tiles])
+        tiles = np.flatnonzero(has_warmed(tare, tadc) & bears)
+        if not len(tiles):
+            return None
+        warmer = warmer_k(tare, tadc)
+        mean_k = float(warmer[tiles].mean())
+        who = f"tile {self._info.serials[tiles[0]]} is" if len(tiles) == 1 else "the tiles are"
+        shift_n = self._live.newtons(expected_shift_kpa(tare, warmer))
+        about = "" if shift_n is None else f", about {shift_n:+.1f} N on the foot"
+        return (
+            f"{who} {abs(mean_k):.1f} K {'warmer' if mean_k > 0 else 'colder'} than when tared"
+            f"{about}: {_BY_HAND}"
+        )
+
+    def by_hand(self, reason: str = "") -> RecordedTare:
+        """Tare from an unloaded interval of the last seconds, and put it in force.
+
+        Raises:
+            TareError: the foot was loaded, or there is nothing to tare.
+            StorageError: it cannot be kept.
+        """
+        recorded = self._history.add(self._live.tare_from_flight(), self._info, reason)
+        self._put_in_force(recorded)
+        return recorded
+
+    def undo(self, tare_id: str) -> None:
+        """Undo a tare; the one before is in force again.
+
+        Raises:
+            UnknownError, StorageError: as for `TareHistory.undo`.
+        """
+        self._history.undo(tare_id)
+        in_force = self._history.in_force(self._info)
+        self._doubt = None
+        self._live.use(in_force.tare if in_force is not None else None)
+
+    def look(self, journal: Journal | None, node_first_seq: int) -> None:
+        """After more frames: tare from a lead that is over, or in flight.
+
+        Args:
+            journal: of this stream.
+            node_first_seq: the oldest frame that the node can still send.
+
+        Raises:
+            StorageError: a tare cannot be kept; it is not in force then, and tried again.
+        """
+        if self._live.calibration is None:
+            return
+        if not self._lead_is_over and journal is not None:
+            self._look_at_lead(journal, node_first_seq)
+        if self._is_time() and self.auto_tare == "on":
+            self._look_in_flight()
+
+    def _look_at_lead(self, journal: Journal, node_first_seq: int) -> None:
+        newest = self._live.newest
+        if newest is None or newest.frame_status[-1] & FrameStatus.LEAD:
+            return
+        # From the journal, not as frames come: after a break of the link they come in any order.
+        seq, t_ns = int(newest.seq[-1]), int(newest.t_ns[-1])
+        self._lead_over_t_ns = self._lead_over_t_ns or t_ns
+        lacks = journal.held.missing(min(node_first_seq, seq), seq)
+        if lacks and t_ns - self._lead_over_t_ns < LEAD_WAIT_NS:
+            return
+        try:
+            batches = journal.read(0, seq)
+            begin = [*takewhile(lambda batch: batch.frame_status[0] & FrameStatus.LEAD, batches)]
+        except FileFormatError as error:
+            self._lead_is_over, self._lead_problem = True, str(error)
+            return
+        if not begin:
+            self._lead_is_over = True
+            return
+        lead = FrameBatch.concatenate(begin)
+        if self._is_tared:
+            self._lead_is_over = True
+            return
+        try:
+            tare = self._live.tare_from_lead(lead)
+        except TareError as error:
+            self._lead_is_over, self._lead_problem = True, error.what
+            return
+        known = {(t.tare.source, t.tare.t_ns) for t in self._history.all}
+        if ("lead", tare.t_ns) not in known:  # else the server was restarted since
+            self._live.use(self._history.add(tare, self._info).tare)
+        self._lead_is_over = True
+
+    def _is_time(self) -> bool:
+        live = self._live
+        t_ns = live.newest_t_ns
+        if t_ns is None or t_ns < self._next_look_t_ns:
+            return False
+        if live.tare is not None:
+            free_t_ns = live.free_since_t_ns
+            if t_ns - live.tare.t_ns < APART_NS or free_t_ns is None:
+                return False
+            if t_ns - free_t_ns < SETTLE_NS + WINDOW_NS:
+                return False
+        self._next_look_t_ns = t_ns + LOOK_EVERY_NS
+        return True
+
+    def _look_in_flight(self) -> None:
+        anchor = self._history.anchor(self._info)
+        found: Look = self._live.look_in_flight(anchor.tare if anchor is not None else None)
+        self._doubt = found.doubt
+        if found.tare is not None:
+            self._put_in_force(self._history.add(found.tare, self._info, found.reason))
+
+    def _put_in_force(self, recorded: RecordedTare) -> None:
+        self._lead_problem = self._doubt = None
+        self._is_tared = True
+        self._live.use(recorded.tare)

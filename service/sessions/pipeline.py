@@ -1,0 +1,208 @@
+"""Frames to estimates for a recording that comes in pieces: finds the tare, then estimates.
+
+Used by `simulate` while frames are taken, by `estimate` from a file, and by the server live and
+when a session is sealed. Frames wait until a tare is known, and estimates leave together with the
+frames they are about.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.chips.compensation import Compensation
+from devices.errors import TareError, UsageError
+from devices.frames import ArrayInfo, FrameBatch, FrameStatus
+from service.estimation.calibration import Calibration
+from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimates import Estimates
+from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.tare.tare import RECOGNISE_WITHIN_NS, Tare, take_tare
+
+Extra = Mapping[str, npt.NDArray[Any]]
+Columns = dict[str, npt.NDArray[Any]]
+
+CHUNK = 4096
+"""Rows per step: numpy slows down once its temporaries leave the cache (performance.md)."""
+
+
+@dataclass(frozen=True)
+class EstimateOptions:
+    """What an estimate of a recording is asked to be."""
+
+    calibration: Calibration
+    models: tuple[str, ...]
+    lag_ms: float
+    tare_s: tuple[float, float] | None = None
+    tares: tuple[Tare, ...] = ()
+    """Tares that were taken while the stream ran, oldest first; they win over what can be found."""
+
+
+class EstimateRun:
+    """Estimates of consecutive frames with one tare, each leaving with the frames it is about."""
+
+    def __init__(self, plan: EstimationPlan) -> None:
+        self.plan = plan
+        self._state = EstimationState()
+        self._held: deque[tuple[FrameBatch, Extra]] = deque()
+
+    def feed(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
+        """Take the next frames; give those whose estimates are due, in order."""
+        for begin in range(0, len(frames), CHUNK):
+            end = min(begin + CHUNK, len(frames))
+            rows = frames.rows(begin, end)
+            self._held.append((rows, {name: v[begin:end] for name, v in extra.items()}))
+            estimates, self._state = step(self.plan, rows, self._state)
+            yield from _paired(self._held, estimates)
+
+    def finish(self) -> Iterator[tuple[FrameBatch, Columns]]:
+        """Give the frames that still wait for a look-ahead, which will not come."""
+        last = finish(self.plan, self._state)
+        self._state = EstimationState()
+        if last is not None:
+            yield from _paired(self._held, last)
+
+
+class EstimateStream:
+    """Estimates of one stream; `plan` is there once the tare is known."""
+
+    def __init__(self, info: ArrayInfo, options: EstimateOptions) -> None:
+        self.plan: EstimationPlan | None = None
+        self._info = info
+        self._options = options
+        # Refuse now what would fail later: unknown models, tiles without calibration.
+        if options.tare_s is not None and not 0 <= options.tare_s[0] < options.tare_s[1]:
+            raise UsageError(
+                f"--tare-s {options.tare_s[0]:g},{options.tare_s[1]:g} is no interval",
+                expected="BEGIN,END in seconds from the first frame, BEGIN before END",
+            )
+        nothing = np.zeros(len(info.tiles))
+        self._make_plan(Tare(nothing, nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
+
+    def run(
+        self, pieces: Iterable[tuple[FrameBatch, Extra]]
+    ) -> Iterator[tuple[FrameBatch, Columns]]:
+        """Frames with their extra columns and estimates, in order, every frame once.
+
+        Raises:
+            TareError: no tare can be found.
+        """
+        pieces = iter(pieces)
+        changes = deque(self._options.tares[1:])
+        if self._options.tares:
+            self.plan = self._make_plan(self._options.tares[0])
+        else:
+            taken = self._until_tare(pieces)
+            self.plan = self._make_plan(self._find_tare([frames for frames, _ in taken]))
+            pieces = chain(taken, pieces)
+        run = EstimateRun(self.plan)
+        last_t_mono_ns = 0
+        for frames, extra in pieces:
+            rest, rest_of = frames, extra
+            if not len(rest):
+                continue
+            if int(rest.t_mono_ns[0]) < last_t_mono_ns:  # the node was switched on anew
+                yield from run.finish()
+            last_t_mono_ns = int(rest.t_mono_ns[-1])
+            while changes and int(rest.t_ns[-1]) > changes[0].t_ns:
+                tare = changes.popleft()
+                at = int(np.searchsorted(rest.t_ns, tare.t_ns, side="right"))
+                if at:
+                    head = {name: v[:at] for name, v in rest_of.items()}
+                    yield from run.feed(rest.rows(0, at), head)
+                    rest = rest.rows(at, len(rest))
+                    rest_of = {name: v[at:] for name, v in rest_of.items()}
+                yield from run.finish()
+                run = EstimateRun(self._make_plan(tare))
+            if len(rest):
+                yield from run.feed(rest, rest_of)
+        yield from run.finish()
+
+    def _until_tare(
+        self, pieces: Iterator[tuple[FrameBatch, Extra]]
+    ) -> list[tuple[FrameBatch, Extra]]:
+        """Take pieces until the tare's interval has passed."""
+        taken: list[tuple[FrameBatch, Extra]] = []
+        for piece in pieces:
+            taken.append(piece)
+            if self._tare_is_in(taken):
+                break
+        if not taken:
+            raise TareError("the recording has no frames")
+        return taken
+
+    def _find_tare(self, frames: list[FrameBatch]) -> Tare:
+        return take_tare(
+            FrameBatch.concatenate(frames),
+            Compensation(self._info.tiles),
+            self._options.calibration,
+            self._info.serials,
+            interval_s=self._options.tare_s,
+        )
+
+    def _make_plan(self, tare: Tare) -> EstimationPlan:
+        options = self._options
+        return make_plan(
+            self._info, options.calibration, tare, models=options.models, lag_ms=options.lag_ms
+        )
+
+    def _tare_is_in(self, taken: list[tuple[FrameBatch, Extra]]) -> bool:
+        first, newest = taken[0][0], taken[-1][0]
+        since_ns = int(newest.t_ns[-1] - first.t_ns[0])
+        if self._options.tare_s is not None:
+            return since_ns > self._options.tare_s[1] * 1e9
+        if first.frame_status[0] & FrameStatus.LEAD:
+            return any(not (frames.frame_status & FrameStatus.LEAD).all() for frames, _ in taken)
+        return since_ns > RECOGNISE_WITHIN_NS
+
+
+def _paired(
+    held: deque[tuple[FrameBatch, Extra]], estimates: Estimates
+) -> Iterator[tuple[FrameBatch, Columns]]:
+    """Cut the held frames to where the estimates reach."""
+    at = 0
+    while at < len(estimates):
+        frames, extra = held.popleft()
+        n = min(len(frames), len(estimates) - at)
+        if n < len(frames):
+            rest = {name: values[n:] for name, values in extra.items()}
+            held.appendleft((frames.rows(n, len(frames)), rest))
+        columns = {name: values[:n] for name, values in extra.items()}
+        columns |= estimate_columns(estimates.rows(at, at + n))
+        yield frames.rows(0, n), columns
+        at += n
+
+
+def estimate_columns(estimates: Estimates) -> dict[str, npt.NDArray[Any]]:
+    """Columns of a sealed file; `seq` and `t_ns` are the frames' own."""
+    return {
+        f.name: getattr(estimates, f.name)
+        for f in fields(Estimates)
+        if f.name not in ("seq", "t_ns")
+    }
+
+
+def notes_of(plan: EstimationPlan, tares: tuple[Tare, ...] = ()) -> dict[str, object]:
+    """What a file says of how its estimates were made; enough to make them again.
+
+    Args:
+        plan: constants of the estimate.
+        tares: all tares of the recording, if they were taken while it ran.
+    """
+    notes: dict[str, object] = {
+        "calibration_id": plan.calibration.id,
+        "calibration": plan.calibration.model_dump(mode="json"),
+        "absolute_scale": "assumed" if plan.assumed_scale else "measured",
+        "models": list(plan.models),
+        "lag_ms": plan.lag_ns * 1e-6,
+        "tare": plan.tare.as_dict(),
+    }
+    if tares:
+        notes["tares"] = [tare.as_dict() for tare in tares]
+    return notes

@@ -1,0 +1,192 @@
+"""A session's clock table: from every stream's own time to the server's UTC, applied when reading.
+
+Raw instants stay as they are. A stream whose offset nobody measured gets no server's time at all:
+an offset is never invented, nor taken over from another stream, whose anchor is another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from devices.errors import FileFormatError
+from storage.clock.bounds import ClockMap, Int64, Rows, Stretch
+from storage.clock.summary import ClockSummary, State, StepSummary, StreamSummary, StretchSummary
+from storage.schema import NO_INSTANT, Array
+from storage.sessions.folder import ClockOffset
+
+INSTANT_END_NS = 2**62
+"""The year 2116; up to it sums of an instant and an offset can be kept apart from nonsense."""
+UNCERTAINTY_END_NS = 2**60
+"""36 years."""
+
+
+@dataclass(frozen=True)
+class StreamFacts:
+    """What is known of a stream besides its measurements.
+
+    Attributes:
+        boot_id: its name.
+        utc_offset_ns: `t_ns` minus `t_mono_ns` of its frames; None: not known.
+        clock_set: had anything set the node's clock when it started? None: not known.
+    """
+
+    boot_id: str
+    utc_offset_ns: int | None = None
+    clock_set: bool | None = None
+
+
+class ClockTable:
+    """Maps instants of a session's streams to the server's UTC.
+
+    Args:
+        rows: measurements by boot_id, of any streams and in any order.
+        streams: facts of the session's streams, each once.
+        parts: boot_id of each part of the session, by its number.
+        where: for errors: where the rows are from.
+
+    Raises:
+        FileFormatError: a row holds no instant, offset or uncertainty.
+    """
+
+    def __init__(
+        self,
+        rows: Mapping[str, Rows],
+        streams: Sequence[StreamFacts],
+        parts: Sequence[str],
+        *,
+        where: str = "",
+    ) -> None:
+        self._streams = tuple(streams)
+        self._parts = tuple(parts)
+        self._maps: dict[str, ClockMap] = {}
+        for stream in streams:
+            own = rows.get(stream.boot_id)
+            if own is not None and len(own):
+                _check(own, stream.boot_id, where)
+                self._maps[stream.boot_id] = ClockMap(own)
+
+    def columns(self, t_mono_ns: Int64, t_ns: Int64, part: Array | None) -> dict[str, Array]:
+        """Server's time of frames: each by itself, so any split into batches gives the same.
+
+        Args:
+            t_mono_ns: int64[n], of one or several parts, in any order.
+            t_ns: int64[n], the same instants in the node's UTC.
+            part: uint16[n]; None: all are of the first part.
+
+        Returns:
+            `t_server_ns` and `t_server_uncertainty_ns`, int64[n]; `NO_INSTANT` in both where the
+            stream's offset was not measured.
+        """
+        t_server_ns = np.full(len(t_ns), NO_INSTANT, dtype=np.int64)
+        uncertainty_ns = t_server_ns.copy()
+        sane = (np.abs(t_mono_ns >> 1) < INSTANT_END_NS >> 1) & (
+            np.abs(t_ns >> 1) < INSTANT_END_NS >> 1
+        )
+        for number, boot_id in enumerate(self._parts):
+            clock = self._maps.get(boot_id)
+            here = np.flatnonzero(sane if part is None else sane & (part == number))
+            if clock is None or not len(here) or (part is None and number):
+                continue
+            offset, bound = clock.at(t_mono_ns[here])
+            sums = t_ns[here] + offset
+            fits = ((t_ns[here] ^ sums) & (offset ^ sums)) >= 0
+            t_server_ns[here[fits]] = sums[fits]
+            uncertainty_ns[here[fits]] = bound[fits]
+        return {"t_server_ns": t_server_ns, "t_server_uncertainty_ns": uncertainty_ns}
+
+    def summary(self) -> ClockSummary:
+        """Stretches, drifts, steps and flags of every stream, in the order of the session."""
+        return ClockSummary(streams=tuple(self._summary(stream) for stream in self._streams))
+
+    def _summary(self, stream: StreamFacts) -> StreamSummary:
+        clock = self._maps.get(stream.boot_id)
+        state: State = "measured"
+        if clock is None:
+            state = "unsynchronised" if stream.clock_set is False else "unmeasured"
+        stretches = clock.stretches if clock is not None else ()
+        return StreamSummary(
+            boot_id=stream.boot_id,
+            state=state,
+            rows=len(clock.rows) if clock is not None else 0,
+            stretches=tuple(_stretch(stretch, stream) for stretch in stretches),
+            steps=tuple(_step(one, next_one, stream) for one, next_one in pairwise(stretches)),
+        )
+
+
+def rows_by_stream(rows: Iterable[ClockOffset], *, where: str = "") -> dict[str, Rows]:
+    """The measurements of a session as columns by boot_id.
+
+    Raises:
+        FileFormatError: a number is too large for a column.
+    """
+    found: dict[str, list[tuple[int, int, int]]] = {}
+    for row in rows:
+        numbers = (row.t_mono_ns, row.server_minus_node_ns, row.uncertainty_ns)
+        found.setdefault(row.boot_id, []).append(numbers)
+    try:
+        return {
+            boot_id: Rows(*np.array(numbers, dtype=np.int64).T.copy())
+            for boot_id, numbers in found.items()
+        }
+    except OverflowError as error:
+        raise FileFormatError(f"a clock row is out of range: {error}", where=where) from error
+
+
+def _check(rows: Rows, boot_id: str, where: str) -> None:
+    sane = {
+        "t_mono_ns": (rows.t_mono_ns >= 0) & (rows.t_mono_ns < INSTANT_END_NS),
+        "server_minus_node_ns": (rows.offset_ns > -INSTANT_END_NS)
+        & (rows.offset_ns < INSTANT_END_NS),
+        "uncertainty_ns": (rows.uncertainty_ns >= 0) & (rows.uncertainty_ns < UNCERTAINTY_END_NS),
+    }
+    for (name, good), values in zip(
+        sane.items(), (rows.t_mono_ns, rows.offset_ns, rows.uncertainty_ns), strict=True
+    ):
+        if not good.all():
+            raise FileFormatError(
+                f"a clock row of stream {boot_id} has {name} = {values[~good][0]}",
+                where=where,
+                expected="instants from 0 to 2^62 ns, offsets within that, uncertainties from 0 to "
+                "2^60 ns",
+            )
+
+
+def _stretch(stretch: Stretch, stream: StreamFacts) -> StretchSummary:
+    middle_ns = (stretch.begin_ns + stretch.end_ns) // 2
+    low, high = _bounds(stretch, middle_ns)
+    drift = stretch.drift_bounds
+    return StretchSummary(
+        begin_t_ns=_utc(stretch.begin_ns, stream),
+        end_t_ns=_utc(stretch.end_ns, stream),
+        rows=len(stretch.rows),
+        offset_ns=(low + high) // 2,
+        uncertainty_ns=(high - low + 1) // 2,
+        drift_ppm=None if drift is None else (drift[0] + drift[1]) / 2 * 1e6,
+        drift_uncertainty_ppm=None if drift is None else (drift[1] - drift[0]) / 2 * 1e6,
+    )
+
+
+def _step(one: Stretch, next_one: Stretch, stream: StreamFacts) -> StepSummary:
+    middle_ns = (one.end_ns + next_one.begin_ns) // 2
+    low, high = _bounds(one, middle_ns)
+    later_low, later_high = _bounds(next_one, middle_ns)
+    least, most = later_low - high, later_high - low
+    return StepSummary(
+        after_t_ns=_utc(one.end_ns, stream),
+        before_t_ns=_utc(next_one.begin_ns, stream),
+        jump_ns=(least + most) // 2,
+        jump_uncertainty_ns=(most - least + 1) // 2,
+    )
+
+
+def _bounds(stretch: Stretch, t_mono_ns: int) -> tuple[int, int]:
+    low, high = stretch.bounds(np.array([t_mono_ns], dtype=np.int64))
+    return int(low[0]), int(high[0])
+
+
+def _utc(t_mono_ns: int, stream: StreamFacts) -> int | None:
+    return None if stream.utc_offset_ns is None else t_mono_ns + stream.utc_offset_ns

@@ -1,0 +1,132 @@
+"""What sessions need of a node's frames, as each server said last; it outlives the node's process.
+
+Until a server says otherwise its word holds: a laptop that went away with an open recording will
+ask for these frames when it is back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from devices.errors import FileFormatError
+from storage.durable import write_whole
+from storage.intervals import Intervals
+from storage.sessions.ledger import NO_END
+
+OpenPairs = tuple[tuple[int, int | None], ...]
+
+
+class ServerWants(BaseModel):
+    """What one server needs.
+
+    Attributes:
+        streams: numbers by boot_id; one without an end goes on with every frame to come.
+        recording: a stream that it has not heard of yet is recorded from its first frame on.
+        known: streams that it had heard of when it said this.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    streams: dict[str, OpenPairs] = Field(default_factory=dict)
+    recording: bool = False
+    known: tuple[str, ...] = ()
+
+    def numbers(self, boot_id: str) -> Intervals:
+        """What it needs of a stream."""
+        if boot_id in self.streams:
+            return closed(self.streams[boot_id])
+        if self.recording and boot_id not in self.known:
+            return Intervals([(0, NO_END)])
+        return Intervals()
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    servers: dict[str, ServerWants] = Field(default_factory=dict)
+
+
+class Wanted:
+    """All that is wanted of one node.
+
+    Args:
+        path: where it is kept.
+
+    Raises:
+        FileFormatError: the file is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._local: dict[str, Intervals] = {}
+        try:
+            self._servers = _File.model_validate_json(path.read_bytes()).servers
+        except FileNotFoundError:
+            self._servers = {}
+        except (OSError, ValidationError) as error:
+            raise FileFormatError(
+                f"what sessions need cannot be read: {error}",
+                where=str(path),
+                remedy="Move it away; servers say it again when they are connected",
+            ) from error
+
+    def numbers(self, boot_id: str) -> Intervals:
+        """What anybody needs of a stream."""
+        wanted = Intervals(self._local.get(boot_id, ()))
+        for server in list(self._servers.values()):
+            for interval in server.numbers(boot_id):
+                wanted.add(*interval)
+        return wanted
+
+    def unmet(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
+        """What somebody needs and has not got: each server by its own acknowledgements.
+
+        What the node's own session needs is here only, whoever has it besides.
+        """
+        unmet = Intervals(self._local.get(boot_id, ()))
+        for server_id, server in list(self._servers.items()):
+            has = acked_by.get(server_id, Intervals())
+            for interval in server.numbers(boot_id).without(has):
+                unmet.add(*interval)
+        return unmet
+
+    def local(self, boot_id: str) -> Intervals:
+        """What the node's own session needs of a stream."""
+        return Intervals(self._local.get(boot_id, ()))
+
+    def undelivered(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
+        """What servers need and have not got."""
+        return Intervals(
+            interval
+            for server_id, server in list(self._servers.items())
+            for interval in server.numbers(boot_id).without(acked_by.get(server_id, Intervals()))
+        )
+
+    def say(self, server_id: str, wants: ServerWants) -> bool:
+        """A server has said what it needs; has that changed anything?"""
+        if self._servers.get(server_id, ServerWants()) == wants:
+            return False
+        self._servers = {**self._servers, server_id: wants}
+        if not wants.streams and not wants.recording:
+            del self._servers[server_id]
+        return True
+
+    def say_local(self, needed: Mapping[str, Intervals]) -> None:
+        """What a session that is recorded on the node itself needs; kept by that session."""
+        self._local = dict(needed)
+
+    def save(self) -> None:
+        """Write it down.
+
+        Raises:
+            StorageError: the disk is full or not writable.
+        """
+        write_whole(self._path, _File(servers=self._servers).model_dump_json().encode())
+
+
+def closed(pairs: Iterable[tuple[int, int | None]]) -> Intervals:
+    """Intervals of which some have no end."""
+    return Intervals((first, NO_END if last is None else last) for first, last in pairs)

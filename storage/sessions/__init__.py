@@ -1,0 +1,1 @@
+"""Recorded sessions on disk: folder, description, sealed file, and the ledger of their frames."""

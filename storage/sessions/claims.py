@@ -1,0 +1,89 @@
+"""What `session.json` says of a session: the server's own, or the one that `foottile pull` left."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from storage.checked_json import CHECK, is_unchanged, without_check
+from storage.sessions.folder import Ledger, Part, Session
+
+SESSION_NAME = "session.json"
+
+
+@dataclass(frozen=True)
+class Claims:
+    """What a folder's `session.json` says, the server's own or one that was pulled."""
+
+    content: dict[str, Any]
+    parts: tuple[Part, ...]
+    ledger: Ledger | None
+    whole: Session | None
+    """None of a pulled one, which says less."""
+
+
+def claims_in(
+    folder: Path, text: bytes | None, problems: list[str], unproven: list[str]
+) -> Claims | None:
+    """What a session's folder says of itself.
+
+    Args:
+        folder: the session's.
+        text: of its `session.json`; None if that is missing.
+        problems: what is wrong is added here.
+        unproven: and here what the text cannot show.
+
+    Returns:
+        None if it is not readable.
+    """
+    if text is None:
+        problems.append(f"{SESSION_NAME} is missing")
+        return None
+    unchanged = is_unchanged(text)
+    if unchanged is False:
+        problems.append(f"{SESSION_NAME} was changed: its text is not what its hash is of")
+    try:
+        if unchanged is None and CHECK in json.loads(text):
+            problems.append(f"{SESSION_NAME} was changed: its hash is not readable")
+        if unchanged is None:
+            unproven.append(
+                f"name, subject, notes and tags in {SESSION_NAME}: it states no hash of itself"
+            )
+        body = without_check(text)
+        try:
+            return claims_of(Session.model_validate_json(body))
+        except ValidationError:
+            return _pulled(folder, json.loads(body))
+    except (ValueError, KeyError, TypeError) as error:
+        problems.append(f"{SESSION_NAME} is not readable: {first_line(error)}")
+        return None
+
+
+def claims_of(session: Session) -> Claims:
+    """What a session says."""
+    return Claims(session.model_dump(mode="json"), session.parts, session.ledger, session)
+
+
+def _pulled(folder: Path, content: dict[str, Any]) -> Claims:
+    """What `foottile pull` left: the API's view of the session, and its ledger in a file."""
+    text = bytes_of(folder / "ledger.json")
+    parts = tuple(Part.model_validate(part) for part in content["parts"])
+    ledger = Ledger.model_validate_json(text) if text is not None else None
+    return Claims({**content, "id": content["id"]}, parts, ledger, None)
+
+
+def bytes_of(path: Path) -> bytes | None:
+    """A file's content; None if there is none, or it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError:
+        return None
+
+
+def first_line(error: Exception) -> str:
+    """An error in one line of bounded length."""
+    return " ".join(str(error).split())[:300]

@@ -1,0 +1,1 @@
+"""What files prove of themselves, without any server and without writing anything."""

@@ -1,0 +1,283 @@
+"""Proves a sealed file from itself alone: its bytes, its content, its frames' order and counts.
+
+What only `session.json` beside it could prove is said as well, in `unproven`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+from pydantic import TypeAdapter, ValidationError
+
+from devices.errors import FileFormatError
+from storage.intervals import Intervals
+from storage.losses import AsPairs, Losses
+from storage.sessions.content_hash import ContentDigest, file_hashes
+from storage.sessions.file import FORMAT_WITHOUT_HASH, SessionReader
+from storage.sessions.folder import Ledger, Part, PartLedger
+from storage.sessions.frame_order import PartFrames
+
+_LOST = TypeAdapter(dict[str, AsPairs])
+_PARTS = TypeAdapter(tuple[Part, ...])
+_ONE_MORE = 2
+
+
+@dataclass
+class FileReport:
+    """What a sealed file proves.
+
+    Attributes:
+        path: the file.
+        problems: what is wrong with it; none: it is whole.
+        unproven: what it cannot show by itself.
+        notes: what it says of its session; empty if that cannot be read.
+        ledger: of its session, as it says; of one that says none, as its frames say.
+        parts: its frames, by part.
+        frames: how many there are.
+        content_sha256: hash of what it says; None of an older or rewritten file.
+    """
+
+    path: Path
+    problems: list[str] = field(default_factory=list)
+    unproven: list[str] = field(default_factory=list)
+    notes: dict[str, Any] = field(default_factory=dict)
+    ledger: Ledger | None = None
+    parts: list[PartFrames] = field(default_factory=list)
+    frames: int = 0
+    content_sha256: str | None = None
+
+    @property
+    def session(self) -> dict[str, Any]:
+        """What it says of the session it is of."""
+        said = self.notes.get("session")
+        return said if isinstance(said, dict) else {}
+
+
+def verify_file(path: Path) -> FileReport:
+    """Read all of a sealed file, and hold it against what it says of itself.
+
+    Args:
+        path: the file; it is read, never written.
+
+    Raises:
+        FileFormatError: there is no such file, or it is no sealed session.
+    """
+    report = FileReport(path)
+    hashes = _file_hashes(path)
+    if hashes is not None and hashes[0] != hashes[1]:
+        report.problems.append(
+            "its bytes are not those that were sealed, by the hash in its footer"
+        )
+    try:
+        with SessionReader(path) as reader:
+            _read_through(reader, report, has_file_hash=hashes is not None)
+    except FileFormatError as error:
+        if not report.problems and not _is_ours(path):
+            raise
+        report.problems.append(error.what)
+    except Exception as error:  # of bytes that are known to be damaged anything may come
+        if not report.problems:
+            raise
+        report.problems.append(f"it cannot be read: {error}")
+    else:
+        _check_ledger(report)
+    return report
+
+
+def part_problems(parts: list[PartFrames], ledger: Ledger, lost: dict[str, Losses]) -> list[str]:
+    """What speaks against a ledger's being that of these frames.
+
+    Args:
+        parts: the frames.
+        ledger: what is said of them.
+        lost: by boot_id the numbers that are said to be lost; a stream that is not in it names
+            none, and then only their count is held against the gaps.
+    """
+    problems = ledger_problems(ledger)
+    by_number = {part.part: part for part in parts}
+    for strange in sorted(set(by_number) - set(range(len(ledger.parts)))):
+        problems.append(f"there are frames of part {strange}, of which the ledger says nothing")
+    for number, said in enumerate(ledger.parts):
+        found = by_number.get(number)
+        frames = found.frames if found is not None else 0
+        name = f"part {number}"
+        if frames != said.recorded:
+            problems.append(f"{name}: {frames} frames, and the ledger has {said.recorded}")
+        held = found.held if found is not None else Intervals()
+        beyond = held.without(Intervals([(said.seq_first, said.seq_last)] if _length(said) else []))
+        if beyond:
+            first, last = next(iter(beyond))
+            problems.append(
+                f"{name}: frames {first} to {last} are outside of {said.seq_first} to "
+                f"{said.seq_last}, which it consists of"
+            )
+        gaps = held.missing(said.seq_first, said.seq_last) if _length(said) else Intervals()
+        accounted = sum(said.lost.values()) + said.pending
+        if gaps.count != accounted:
+            problems.append(
+                f"{name}: {gaps.count} frames are missing ({_named(gaps)}), and the ledger "
+                f"accounts for {accounted}"
+            )
+        if said.boot_id in lost:
+            unnamed = gaps.without(lost[said.boot_id].all)
+            if unnamed and not said.pending:
+                problems.append(f"{name}: frames {_named(unnamed)} are missing and not named lost")
+    return problems
+
+
+def ledger_problems(ledger: Ledger) -> list[str]:
+    """What is wrong with a ledger in itself."""
+    problems = []
+    for number, part in enumerate(ledger.parts):
+        counted = part.recorded + sum(part.lost.values()) + part.pending
+        if counted != _length(part) or min(part.recorded, part.pending, *part.lost.values(), 0) < 0:
+            problems.append(
+                f"part {number}: the ledger counts {counted} frames, and {part.seq_first} to "
+                f"{part.seq_last} are {_length(part)}"
+            )
+    lossy = any(any(part.lost.values()) or part.unsynced_tail_max for part in ledger.parts)
+    if lossy != ledger.lossy:
+        problems.append(f"the ledger says lossy: {ledger.lossy}, and its parts say {lossy}")
+    if ledger.complete and (lossy or any(part.pending for part in ledger.parts)):
+        problems.append("the ledger says that it is complete, and its parts say that it is not")
+    return problems
+
+
+def named_losses(notes: dict[str, Any]) -> dict[str, Losses]:
+    """The numbers that a file's notes name as lost, by boot_id; of older files none.
+
+    Raises:
+        FileFormatError: they are not readable.
+    """
+    try:
+        return {
+            b: Losses(pairs) for b, pairs in _LOST.validate_python(notes.get("lost", {})).items()
+        }
+    except (ValidationError, ValueError) as error:
+        raise FileFormatError(f"the numbers that are lost are not readable: {error}") from error
+
+
+def _file_hashes(path: Path) -> tuple[str, str] | None:
+    try:
+        return file_hashes(path)
+    except OSError as error:
+        raise FileFormatError(
+            f"cannot be read: {error.strerror}", where=str(path), expected="a sealed session"
+        ) from error
+
+
+def _read_through(reader: SessionReader, report: FileReport, *, has_file_hash: bool) -> None:
+    report.notes, report.content_sha256 = reader.notes, reader.content_sha256
+    digest = ContentDigest()
+    try:
+        for table in reader.tables():
+            digest.feed(table)
+    except (KeyError, ValueError, TypeError) as error:
+        if isinstance(error, FileFormatError):
+            raise
+        raise FileFormatError(f"its columns cannot be read: {error}") from error
+    report.parts = digest.order.parts
+    report.frames = sum(part.frames for part in report.parts)
+    report.problems += digest.order.problems
+    if reader.content is not None:
+        report.problems += _content_problems(reader.content, digest.content())
+    if reader.content is None or not has_file_hash:
+        if reader.format == FORMAT_WITHOUT_HASH and reader.content is None:
+            report.unproven.append(
+                "that nothing in it was edited: an older foottile wrote it, without hashes"
+            )
+        else:
+            report.problems.append("it has no hashes: another program has written it anew")
+    _check_offset(report, reader.info.utc_offset_ns)
+
+
+def _is_ours(path: Path) -> bool:
+    """Was it a sealed session once? A damaged one is to be called damaged, not foreign."""
+    try:
+        with pq.ParquetFile(path) as file:
+            metadata = file.schema_arrow.metadata or {}
+    except Exception:  # whatever is wrong with it, it is not known as ours
+        return path.name == "frames.parquet"
+    return any(key.startswith(b"foottile.") for key in metadata)
+
+
+def _content_problems(stated: dict[str, Any], found: dict[str, Any]) -> list[str]:
+    problems = []
+    if stated.get("frames") != found["frames"]:
+        problems.append(f"{found['frames']} frames, where {stated.get('frames')} were sealed")
+    if stated.get("parts") != found["parts"]:
+        problems.append("its parts do not begin and end where they did when it was sealed")
+    said, has = stated.get("columns", {}), found["columns"]
+    if list(said) != list(has):
+        added, gone = sorted(set(has) - set(said)), sorted(set(said) - set(has))
+        changes = [f"added: {', '.join(added)}"] * bool(added) + [
+            f"gone: {', '.join(gone)}"
+        ] * bool(gone)
+        problems.append(f"its columns are not those that were sealed ({'; '.join(changes)})")
+    changed = [name for name in has if name in said and has[name] != said[name]]
+    if changed:
+        shown = ", ".join(changed[:6]) + (" ..." if len(changed) > 6 else "")
+        problems.append(f"the values of {shown} are not those that were sealed")
+    return problems
+
+
+def _check_offset(report: FileReport, utc_offset_ns: int) -> None:
+    """Part 0 is of the stream that the file describes; later ones have anchors of their own."""
+    first = next((part for part in report.parts if part.part == 0), None)
+    if first is not None and first.offset_ns != utc_offset_ns:
+        report.problems.append(
+            f"part 0: t_ns - t_mono_ns is {first.offset_ns}, and the array's anchor {utc_offset_ns}"
+        )
+
+
+def _check_ledger(report: FileReport) -> None:
+    """Hold the frames against the ledger in the notes, or make one from the frames."""
+    said = report.notes.get("ledger")
+    if said is None:
+        gaps = Intervals(pair for part in report.parts for pair in part.gaps)
+        if gaps:
+            report.problems.append(
+                f"frames {_named(gaps)} are missing, and nothing says why: it has no ledger"
+            )
+        report.ledger = Ledger(
+            complete=not gaps,
+            lossy=bool(gaps),
+            parts=tuple(
+                PartLedger(
+                    boot_id="",
+                    seq_first=part.seq_first,
+                    seq_last=part.seq_last,
+                    recorded=part.frames,
+                    lost={"unknown": part.gaps.count} if part.gaps else {},
+                    pending=0,
+                )
+                for part in report.parts
+            ),
+            missed_slots=0,
+        )
+        report.unproven.append("where its recording began and ended: it is of no recorded session")
+        return
+    try:
+        report.ledger = Ledger.model_validate(said)
+        lost = named_losses(report.notes)
+        parts = _PARTS.validate_python(report.session.get("parts", ()))
+    except (ValidationError, FileFormatError) as error:
+        report.problems.append(f"its ledger is not readable: {error}")
+        return
+    report.problems += part_problems(report.parts, report.ledger, lost)
+    intervals = [(p.boot_id, p.seq_first, p.seq_last) for p in parts]
+    if parts and intervals != [(p.boot_id, p.seq_first, p.seq_last) for p in report.ledger.parts]:
+        report.problems.append("its ledger is of other parts than its session")
+
+
+def _length(part: PartLedger) -> int:
+    return max(0, part.seq_last - part.seq_first + 1)
+
+
+def _named(numbers: Intervals) -> str:
+    pairs = list(numbers)
+    shown = ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in pairs[:_ONE_MORE])
+    return shown + (f" and {len(pairs) - _ONE_MORE} more gaps" if len(pairs) > _ONE_MORE else "")

@@ -1,0 +1,164 @@
+"""Proves a stream's journal as it lies on the disk: its segments, their order, and its notes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from devices.errors import FileFormatError
+from devices.frames import ArrayInfo
+from storage.intervals import Intervals
+from storage.journal.segment import INDEX_SUFFIX, RECORD, SUFFIX, UNREAD_SUFFIX
+from storage.journal.stream_notes import NOTES_FILE, StreamNotes
+from storage.losses import CORRUPT, Losses
+from storage.sessions.claims import bytes_of
+from storage.verify.segment import SegmentReport, verify_segment
+
+
+@dataclass
+class StreamReport:
+    """What one stream's journal proves.
+
+    Attributes:
+        node: whose stream it is, by its folder's name.
+        boot_id: which stream it is, by its folder's name.
+        held: numbers of frames that are whole.
+        lost: numbers that are known to be lost, by reason; damaged ones among them.
+        unsynced: see `SegmentReport`.
+        notes: its `stream.json`; None if there is none.
+        info: the array.
+        segments: how many there are.
+        problems: what is wrong.
+        remarks: what a person should know, and is no damage.
+    """
+
+    node: str
+    boot_id: str
+    held: Intervals = field(default_factory=Intervals)
+    lost: Losses = field(default_factory=Losses)
+    unsynced: Intervals = field(default_factory=Intervals)
+    notes: StreamNotes | None = None
+    info: ArrayInfo | None = None
+    segments: int = 0
+    problems: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+    @property
+    def missing(self) -> Intervals:
+        """Numbers up to the stream's end that are neither here nor known to be lost.
+
+        They were deleted when nobody needed them any more, or are still to come.
+        """
+        last = self.held.last
+        if self.notes is not None and self.notes.next_seq is not None:
+            last = max(self.notes.next_seq - 1, -1 if last is None else last)
+        first = next(iter(self.held), (0, 0))[0]
+        if last is None or last < first:
+            return Intervals()
+        return self.held.missing(first, last).without(self.lost.all)
+
+
+def verify_stream(folder: Path) -> StreamReport:
+    """Check a stream's journal: every segment, and what its notes say of them.
+
+    Args:
+        folder: `DIR/journal/<node>/<boot_id>`.
+
+    Raises:
+        FileFormatError: the folder cannot be read.
+    """
+    report = StreamReport(folder.parent.name, folder.name)
+    try:
+        report.notes = StreamNotes.load(folder)
+    except FileFormatError as error:
+        report.problems.append(f"{NOTES_FILE}: {error.what}")
+    if report.notes is not None:
+        report.info, report.lost = report.notes.array_info, Losses(report.notes.lost)
+    else:
+        report.remarks.append(f"no {NOTES_FILE}: nothing says where the stream ended")
+    segments = _segments(folder)
+    for path in _names(folder, INDEX_SUFFIX):
+        if not path.with_suffix(SUFFIX).exists() and bytes_of(path):
+            report.problems.append(f"{path.name}: the segment of this index is missing")
+    for path in _names(folder, UNREAD_SUFFIX):
+        report.remarks.append(f"{path.name}: bytes that were no whole batch after a crash")
+    report.segments = len(segments)
+    for segment in segments:
+        name = segment.path.name
+        report.problems += [f"{name}: {problem}" for problem in segment.problems]
+        report.remarks += [f"{name}: {remark}" for remark in segment.remarks]
+        if segment.info is not None:
+            report.info = report.info or segment.info
+            if segment.info != report.info:
+                report.problems.append(f"{name}: it is of another stream or array")
+                continue
+        for pair in segment.held:
+            report.held.add(*pair)
+        for pair in segment.unsynced:
+            report.unsynced.add(*pair)
+    report.unsynced = report.unsynced.without(report.held)
+    for segment in segments:
+        report.lost.add(segment.damaged.without(report.held), CORRUPT)
+    _check_stream(report, segments, is_servers=(folder.parents[2] / "nodes").is_dir())
+    return report
+
+
+def _check_stream(report: StreamReport, segments: list[SegmentReport], *, is_servers: bool) -> None:
+    info, notes = report.info, report.notes
+    if info is not None and (info.node, info.boot_id) != (report.node, report.boot_id):
+        report.problems.append(
+            f"its frames are of node {info.node}, stream {info.boot_id}: wrongly placed"
+        )
+    index = np.concatenate([np.zeros(0, RECORD), *(segment.index for segment in segments)])
+    index = index[np.argsort(index["seq_first"], kind="stable")]
+    # What a disk refused once was written again: a second copy is neither damage nor out of order.
+    ends = np.maximum.accumulate(index["seq_first"] + index["count"])
+    index = index[np.concatenate([[True] * min(1, len(index)), ends[1:] > ends[:-1]]).astype(bool)]
+    back = np.flatnonzero(index["t_ns_first"][1:] < index["t_ns_last"][:-1])
+    if len(back):
+        report.problems.append(f"time runs back before frame {index['seq_first'][back[0] + 1]}")
+    if notes is None or notes.next_seq is None:
+        return
+    last = report.held.last
+    if last is not None and last >= notes.next_seq:
+        report.problems.append(
+            f"it holds frame {last}, and {NOTES_FILE} says that it ended with {notes.next_seq - 1}"
+        )
+    open_ones = [segment for segment in segments if not segment.is_closed]
+    if not is_servers and open_ones:
+        # Its node closes a stream's segments before it writes down where the stream ended.
+        report.problems += [
+            f"{segment.path.name}: it was cut behind frame {segment.held.last}: the stream has "
+            "ended, and it was not closed"
+            for segment in open_ones
+        ]
+
+
+def _segments(folder: Path) -> list[SegmentReport]:
+    """Every segment's report; what looks damaged is looked at again, as it may just be deleted."""
+    first_look = [_if_there(path) for path in _names(folder, SUFFIX)]
+    looked = [
+        _if_there(report.path) if report is not None and report.problems else report
+        for report in first_look
+    ]
+    return [report for report in looked if report is not None]
+
+
+def _if_there(path: Path) -> SegmentReport | None:
+    """The segment's report; None if it was deleted meanwhile, as those are that nobody needs."""
+    try:
+        report = verify_segment(path)
+    except FileFormatError:
+        if path.exists():
+            raise
+        return None
+    return report if not report.problems or path.exists() else None
+
+
+def _names(folder: Path, suffix: str) -> list[Path]:
+    try:
+        return sorted(folder.glob("*" + suffix))
+    except OSError as error:
+        raise FileFormatError(f"cannot be read: {error.strerror}", where=str(folder)) from error

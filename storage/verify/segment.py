@@ -1,0 +1,227 @@
+"""Proves one segment of a journal as it lies on the disk; nothing is mended.
+
+It may be written meanwhile, or have been until the power failed: behind the last batch of a segment
+that was not closed there may be half a batch, and its index may name some that never came to the
+disk. Nobody was promised those. Everything else has to agree with its checksum.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from devices.errors import FileFormatError
+from devices.frames import ArrayInfo
+from storage.intervals import Intervals
+from storage.journal.segment import (
+    INDEX_SUFFIX,
+    RECORD,
+    Records,
+    is_whole,
+    numbers,
+    payload_of,
+    read_index,
+)
+from storage.schema import array_info, wire_schema
+from storage.wire import decode
+
+
+@dataclass
+class SegmentReport:
+    """What one segment proves.
+
+    Attributes:
+        path: the segment.
+        held: numbers of frames whose bytes agree with their checksum.
+        damaged: numbers of frames whose bytes do not.
+        unsynced: numbers that the index names at the end of a segment that was not closed, and that
+            are not on the disk: nobody was promised them.
+        is_closed: was it closed in order?
+        info: the array it is of; None if that cannot be read.
+        index: records of the batches that are held.
+        problems: what is wrong with it.
+        remarks: what a person should know, and is no damage.
+    """
+
+    path: Path
+    held: Intervals = field(default_factory=Intervals)
+    damaged: Intervals = field(default_factory=Intervals)
+    unsynced: Intervals = field(default_factory=Intervals)
+    is_closed: bool = False
+    info: ArrayInfo | None = None
+    index: Records = field(default_factory=lambda: np.zeros(0, RECORD))
+    problems: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+
+def verify_segment(path: Path) -> SegmentReport:
+    """Check every batch of a segment.
+
+    Raises:
+        FileFormatError: there is no such file.
+    """
+    report = SegmentReport(path)
+    try:
+        _verify(path, report)
+    except OSError as error:  # not there, or deleted meanwhile
+        raise FileFormatError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    return report
+
+
+def _verify(path: Path, report: SegmentReport) -> None:
+    try:
+        # In this order, for whoever writes appends to the segment first: what was there before the
+        # index was read, and is not in the index, is one batch at most.
+        size = path.stat().st_size
+        index: Records | None = read_index(path)
+    except FileNotFoundError:
+        if not path.exists():
+            raise
+        index = None
+    report.is_closed = index is not None and _is_closed(index)
+    schema, header_bytes = _schema_of(path, report)
+    if schema is None:
+        # One that was just begun when the power failed may be empty; one with frames may not.
+        if report.is_closed or (index is not None and _holds_any(path, index)):
+            report.problems.append("it does not begin with the description of an array")
+        return
+    if index is None:
+        if size > header_bytes:
+            report.problems.append(
+                f"its index {path.with_suffix(INDEX_SUFFIX).name} is missing: nothing proves its "
+                "frames; it is made anew when the journal is next opened"
+            )
+        return
+    _check_batches(report, index, schema, header_bytes)
+    end = _end_of(index, header_bytes)
+    behind = _whole_messages(path, end, size, schema)
+    if report.is_closed and size > end:
+        report.problems.append(f"{size - end} bytes behind its last batch are in no index")
+    elif behind > 1:
+        report.problems.append(f"{behind} batches behind its last one are in no index: it was cut")
+    elif behind:
+        report.remarks.append("a batch behind its last one is in no index")
+
+
+def _check_batches(
+    report: SegmentReport, index: Records, schema: pa.Schema, header_bytes: int
+) -> None:
+    doubtful: list[tuple[Intervals, str]] = []
+    good = []
+    end, offset_ns = header_bytes, array_info(schema, where="").utc_offset_ns
+    descriptor = os.open(report.path, os.O_RDONLY)
+    try:
+        for at, record in enumerate(index):
+            if not is_whole(record):
+                doubtful.append((Intervals(), f"record {at} of its index is damaged"))
+                continue
+            if not record["count"]:
+                continue
+            first, last = numbers(record)
+            payload = payload_of(descriptor, record)
+            if payload is None:
+                said = f"frames {first} to {last} do not agree with their checksum"
+                doubtful.append((Intervals([(first, last)]), said))
+                continue
+            # What is damaged before something whole was whole once.
+            _take_for_damaged(report, doubtful)
+            doubtful = []
+            wrong = _wrong_in(payload, record, schema, offset_ns)
+            if int(record["offset"]) < end:
+                wrong = "they stand where other frames stand as well"
+            end = int(record["offset"]) + int(record["length"])
+            if not wrong and report.held.within(first, last):
+                wrong = "they are in it twice"
+            if wrong:
+                report.problems.append(f"frames {first} to {last}: {wrong}")
+                continue
+            report.held.add(first, last)
+            good.append(at)
+    finally:
+        os.close(descriptor)
+    report.index = index[good]
+    if report.is_closed:
+        _take_for_damaged(report, doubtful)
+    elif doubtful:
+        report.unsynced = Intervals(pair for numbers_, _ in doubtful for pair in numbers_)
+        report.remarks.append(
+            f"{len(doubtful)} batches at its end were not yet on the disk: nobody was promised them"
+        )
+
+
+def _take_for_damaged(report: SegmentReport, doubtful: list[tuple[Intervals, str]]) -> None:
+    report.damaged = Intervals(
+        (*report.damaged, *(pair for these, _ in doubtful for pair in these))
+    )
+    report.problems += [said for _, said in doubtful]
+
+
+def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, offset_ns: int) -> str:
+    """What speaks against the bytes' being what the index says of them; empty: nothing."""
+    try:
+        batch = decode(payload, schema)
+    except FileFormatError as error:
+        return error.what
+    if (int(batch.seq[0]), len(batch)) != (int(record["seq_first"]), int(record["count"])):
+        return f"the batch holds {len(batch)} frames from {int(batch.seq[0])} on"
+    if (int(batch.t_ns[0]), int(batch.t_ns[-1])) != (record["t_ns_first"], record["t_ns_last"]):
+        return "the index says other instants than the batch"
+    if (batch.t_ns - batch.t_mono_ns != offset_ns).any():
+        return "t_ns is not t_mono_ns plus the stream's anchor"
+    return ""
+
+
+def _is_closed(index: Records) -> bool:
+    return bool(len(index)) and is_whole(index[-1]) and not index[-1]["count"]
+
+
+def _holds_any(path: Path, index: Records) -> bool:
+    """Are any bytes in the segment those that the index says?"""
+    with path.open("rb") as file:
+        return any(
+            is_whole(record) and record["count"] and payload_of(file.fileno(), record) is not None
+            for record in index
+        )
+
+
+def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int]:
+    """Schema at a segment's beginning, and how many bytes it takes."""
+    try:
+        with pa.OSFile(str(path), "r") as file:
+            schema = pa.ipc.read_schema(pa.ipc.read_message(file))
+            length = file.tell()
+        report.info = array_info(schema, where=str(path))
+        if not schema.equals(wire_schema(report.info), check_metadata=True):
+            report.problems.append("its columns are not those of a stream of frames")
+    except (pa.ArrowException, EOFError, OSError, ValueError):
+        return None, 0
+    return schema, length
+
+
+def _end_of(index: Records, header_bytes: int) -> int:
+    whole = index[[is_whole(record) and bool(record["count"]) for record in index]]
+    ends: list[int] = (whole["offset"] + whole["length"]).tolist()
+    return max([header_bytes, *ends])
+
+
+def _whole_messages(path: Path, begin: int, end: int, schema: pa.Schema) -> int:
+    """How many whole batches stand between two places of a segment."""
+    found = 0
+    with pa.OSFile(str(path), "r") as file:
+        try:
+            while begin < end:
+                file.seek(begin)
+                pa.ipc.read_message(file)
+                after = file.tell()
+                file.seek(begin)
+                if after > end:
+                    break
+                decode(file.read(after - begin), schema)
+                found, begin = found + 1, after
+        except (pa.ArrowException, EOFError, OSError, FileFormatError):
+            pass
+    return found

@@ -1,0 +1,299 @@
+"""Proves a session's folder from its files alone: description, frames, events, clock and ledger.
+
+Nothing is written and no lock is needed: a server may run beside it. What looks wrong while the
+session changes is looked at again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import TypeAdapter, ValidationError
+
+from devices.errors import FileFormatError
+from storage.intervals import Intervals
+from storage.losses import Losses
+from storage.sessions.claims import SESSION_NAME, Claims, bytes_of, claims_in, claims_of, first_line
+from storage.sessions.content_hash import file_hashes, sha256_of
+from storage.sessions.folder import FRAMES_NAME, Event, Ledger, Session
+from storage.sessions.ledger import NO_END, StreamState, ledger_of
+from storage.verify.file import FileReport, ledger_problems, verify_file
+from storage.verify.journal import StreamReport, verify_stream
+
+EVENTS_NAME, CLOCK_NAME = "events.parquet", "clock.parquet"
+_TRIES = 3
+_SAME_S = 1e-6
+_CLOCK_COLUMNS = ("boot_id", "t_mono_ns", "server_minus_node_ns", "uncertainty_ns")
+
+Streams = Callable[[Path], StreamReport]
+
+
+@dataclass
+class SessionReport:
+    """What a session's folder, or a sealed file, proves.
+
+    Attributes:
+        path: the folder or file.
+        id: of the session; None if that cannot be read, or of a file that is of none.
+        name: as people call it.
+        node: whose frames they are.
+        state: as it says; `file` of a lone one.
+        ledger: what became of every frame; None if that cannot be read.
+        sha256: hash of the sealed file as it is; None before.
+        problems: what is wrong; none: it is whole.
+        unproven: what these files cannot show.
+        in_trash: was it deleted?
+    """
+
+    path: Path
+    id: str | None = None
+    name: str = ""
+    node: str = ""
+    state: str = ""
+    ledger: Ledger | None = None
+    sha256: str | None = None
+    problems: list[str] = field(default_factory=list)
+    unproven: list[str] = field(default_factory=list)
+    in_trash: bool = False
+
+    @property
+    def frames(self) -> int:
+        """How many frames are recorded."""
+        return sum(part.recorded for part in self.ledger.parts) if self.ledger else 0
+
+    @property
+    def is_complete(self) -> bool:
+        """Is it whole, and every frame of it there?"""
+        return not self.problems and self.ledger is not None and self.ledger.complete
+
+    def as_dict(self) -> dict[str, Any]:
+        """The ledger, and what was found (design.md 6)."""
+        empty = Ledger(complete=False, lossy=False, parts=(), missed_slots=0)
+        ledger = self.ledger or empty
+        if self.problems:
+            ledger = ledger.model_copy(update={"complete": False})
+        content = ledger.model_dump(mode="json")
+        return {**content, "id": self.id, "problems": self.problems, "sha256": self.sha256}
+
+
+def verify_lone_file(path: Path) -> SessionReport:
+    """Prove a sealed file without `session.json` beside it.
+
+    Raises:
+        FileFormatError: there is no such file, or it is no sealed session.
+    """
+    file = verify_file(path)
+    report = SessionReport(path, state="file", ledger=file.ledger, sha256=sha256_of(path))
+    report.id, report.node = file.session.get("id"), str(file.session.get("node", ""))
+    report.name = str(file.session.get("name", ""))
+    report.problems, report.unproven = file.problems, file.unproven
+    if report.id is not None:
+        report.unproven.append(
+            f"that it is the file that {SESSION_NAME} of its session names, nor events and clock"
+        )
+    return report
+
+
+def verify_session(
+    folder: Path,
+    *,
+    data: Path | None = None,
+    session: Session | None = None,
+    streams: Streams = verify_stream,
+) -> SessionReport:
+    """Prove a session's folder.
+
+    Args:
+        folder: with `session.json`, and `frames.parquet` if it is sealed.
+        data: where its journals are if it is not sealed; default: where a server has them.
+        session: what to hold the files against, in place of `session.json`.
+        streams: checks a stream's journal.
+
+    Raises:
+        FileFormatError: there is no such folder.
+    """
+    if not folder.is_dir():
+        raise FileFormatError("no such folder", where=str(folder))
+    data = data if data is not None else folder.absolute().parent.parent
+    for _ in range(_TRIES):
+        before = bytes_of(folder / SESSION_NAME)
+        report = _once(folder, data, session, before, streams)
+        if not report.problems or before == bytes_of(folder / SESSION_NAME):
+            break
+    return report
+
+
+def _once(
+    folder: Path, data: Path, session: Session | None, text: bytes | None, streams: Streams
+) -> SessionReport:
+    report = SessionReport(folder, in_trash=folder.absolute().parent.name == "trash")
+    said = (
+        claims_of(session)
+        if session is not None
+        else claims_in(folder, text, report.problems, report.unproven)
+    )
+    if said is None:
+        if (folder / FRAMES_NAME).is_file():
+            _add_file(report, folder)
+        return report
+    report.id, report.name = str(said.content["id"]), str(said.content.get("name", ""))
+    report.node, report.state = str(said.content.get("node", "")), str(said.content.get("state"))
+    report.ledger = said.ledger
+    if report.state == "sealed":
+        _check_sealed(report, folder, said)
+    elif said.whole is not None:
+        _count(report, data, said.whole, streams)
+    return report
+
+
+def _check_sealed(report: SessionReport, folder: Path, said: Claims) -> None:
+    problems, content = report.problems, said.content
+    if said.ledger is None:
+        problems.append("it is sealed, and its ledger is missing")
+    elif any(part.pending for part in said.ledger.parts):
+        problems.append("it is sealed, and frames of it are still to come")
+    path = folder / FRAMES_NAME
+    if said.ledger is not None and not any(part.recorded for part in said.ledger.parts):
+        if path.is_file():
+            problems.append(f"{FRAMES_NAME} is there, and the ledger has no frame recorded")
+        problems += ledger_problems(said.ledger)
+        return
+    if not path.is_file():
+        problems.append(f"{FRAMES_NAME} is missing")
+        return
+    file = _add_file(report, folder)
+    if report.sha256 != content.get("sha256"):
+        problems.append(
+            f"{FRAMES_NAME} is not the file that {SESSION_NAME} names: its SHA-256 is "
+            f"{report.sha256}, not {content.get('sha256')}"
+        )
+    _compare(problems, content, file, path.stat().st_size)
+    if said.ledger is not None:
+        report.ledger = said.ledger
+        if file.ledger is not None and file.ledger != said.ledger:
+            problems.append(f"the ledgers of {SESSION_NAME} and {FRAMES_NAME} are not the same")
+    if file.session and file.session.get("parts") != [p.model_dump() for p in said.parts]:
+        problems.append(f"{SESSION_NAME} and {FRAMES_NAME} are not of the same parts")
+    if said.whole is not None:
+        _check_events(problems, folder / EVENTS_NAME, said.whole.events)
+        _check_clock(problems, folder / CLOCK_NAME, said.whole)
+
+
+def _compare(problems: list[str], content: dict[str, Any], file: FileReport, size: int) -> None:
+    """What `session.json` says of the file against what the file says."""
+    first_last = [(part.t_mono_ns_first, part.t_mono_ns_last) for part in file.parts]
+    duration_s = sum(last - first for first, last in first_last) * 1e-9
+    found: dict[str, Any] = {"frames": file.frames, "bytes": size}
+    found |= {
+        name: file.session.get(name)
+        for name in ("id", "node", "started_t_ns", "stopped_t_ns", "scene")
+        if name in file.session
+    }
+    found |= {name: file.notes.get(name) for name in ("calibration_id", "absolute_scale")}
+    for name, value in found.items():
+        if name in content and content[name] != value:
+            problems.append(
+                f"{SESSION_NAME} says {name} {content[name]!r}, and {FRAMES_NAME} {value!r}"
+            )
+    if not file.session:
+        problems.append(f"{FRAMES_NAME} is of no recorded session")
+    if abs(float(content.get("duration_s", duration_s)) - duration_s) > _SAME_S:
+        problems.append(
+            f"{SESSION_NAME} says that it lasted {content['duration_s']} s, and {FRAMES_NAME} "
+            f"{duration_s} s"
+        )
+
+
+def _add_file(report: SessionReport, folder: Path) -> FileReport:
+    """Prove the frames, and take over what was found."""
+    path = folder / FRAMES_NAME
+    try:
+        file = verify_file(path)
+        report.sha256 = sha256_of(path)
+    except (FileFormatError, OSError) as error:
+        what = error.what if isinstance(error, FileFormatError) else str(error)
+        report.problems.append(f"{FRAMES_NAME}: {what}")
+        return FileReport(path)
+    report.problems += [f"{FRAMES_NAME}: {problem}" for problem in file.problems]
+    report.unproven += file.unproven
+    report.id = report.id if report.id is not None else file.session.get("id")
+    report.ledger = report.ledger or file.ledger
+    return file
+
+
+def _check_events(problems: list[str], path: Path, events: tuple[Event, ...]) -> None:
+    table = _small_table(problems, path)
+    if table is None:
+        return
+    try:
+        found = TypeAdapter(tuple[Event, ...]).validate_python(table.to_pylist())
+    except ValidationError as error:
+        problems.append(f"{path.name} is not readable: {first_line(error)}")
+        return
+    if found != events:
+        problems.append(f"{path.name} has other events than {SESSION_NAME}")
+
+
+def _check_clock(problems: list[str], path: Path, session: Session) -> None:
+    table = _small_table(problems, path)
+    if table is None:
+        return
+    if missing := set(_CLOCK_COLUMNS) - set(table.column_names):
+        problems.append(f"{path.name} lacks {', '.join(sorted(missing))}")
+        return
+    said = [row.model_dump(include=set(_CLOCK_COLUMNS)) for row in session.clock]
+    if said and table.select(list(_CLOCK_COLUMNS)).to_pylist() != said:
+        problems.append(f"{path.name} has other rows than {SESSION_NAME}")
+
+
+def _small_table(problems: list[str], path: Path) -> pa.Table | None:
+    try:
+        hashes = file_hashes(path)
+        if hashes is not None and hashes[0] != hashes[1]:
+            problems.append(f"{path.name}: its bytes are not those that were written")
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            return file.read()
+    except FileNotFoundError:
+        problems.append(f"{path.name} is missing")
+    except (OSError, ValueError, pa.ArrowException) as error:
+        problems.append(f"{path.name} is not readable: {first_line(error)}")
+    return None
+
+
+def _count(report: SessionReport, data: Path, session: Session, streams: Streams) -> None:
+    """The ledger of a session that is not sealed, from the journals."""
+    if not (data / "journal").is_dir():
+        report.unproven.append("what of it is there: its journals are not here")
+        return
+    states: dict[str, StreamState] = {}
+    may_come = (data / "nodes").is_dir()  # a server's folder; a node has what there is
+    for part in session.parts:
+        folder = data / "journal" / session.node / part.boot_id
+        found = StreamReport(session.node, part.boot_id)
+        if part.boot_id not in states and folder.is_dir():
+            found = streams(folder)
+            report.problems += [f"journal {part.boot_id}: {problem}" for problem in found.problems]
+        tail, missed_slots = session.unsynced_tail_max.get(part.boot_id, 0), 0
+        if found.notes is not None:
+            tail = max(tail, found.notes.unsynced_tail_max)
+            missed_slots = found.notes.missed_slots
+        if part.boot_id == session.parts[0].boot_id:
+            missed_slots = max(0, missed_slots - session.missed_slots_at_start)
+        states.setdefault(
+            part.boot_id,
+            StreamState(
+                held=found.held,
+                lost=Losses(found.lost.as_pairs()),
+                may_come=Intervals([(0, NO_END)]) if may_come else Intervals(),
+                unsynced_tail_max=tail,
+                missed_slots=missed_slots,
+            ),
+        )
+    finished = session.stopped_t_ns is not None
+    report.ledger = ledger_of(session.parts, states, finished=finished)
+    report.ledger = report.ledger.model_copy(update={"complete": False})

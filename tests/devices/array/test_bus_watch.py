@@ -1,0 +1,188 @@
+"""Does the bus move at all? Told by a mux that keeps, or does not keep, what is written to it."""
+
+from __future__ import annotations
+
+import pytest
+
+from devices.array.bus_watch import BusWatch
+from devices.array.scan import Scan
+from devices.chips.tca9548a import MuxRouter
+from devices.errors import BusSetupError
+from tests.devices.rigs import TWO_MUXES, Wires
+
+MS = 1_000_000
+
+
+class Helper:
+    """A recovery that notes when it is asked, may fail itself, and may free SDA."""
+
+    def __init__(self, wires: Wires) -> None:
+        self.wires = wires
+        self.asked_ns: list[int] = []
+        self.resets = 0
+        self.fails = False
+        self.lets_go = True
+        self.clocks_free = False
+        self.reset_frees = False
+        self.reset_is_wired = True
+
+    def clock_out(self) -> bool:
+        self.asked_ns.append(self.wires.clock.now_ns())
+        if self.fails:
+            raise BusSetupError("the lines are somebody else's", where="gpio", errno=16)
+        if self.clocks_free:
+            self.free()
+        return self.lets_go
+
+    def reset_muxes(self) -> bool:
+        self.resets += 1
+        if self.reset_frees:
+            self.free()
+        return self.reset_is_wired
+
+    def free(self) -> None:
+        self.wires.adapter.line.sda_low.clear(self.wires.clock.now_ns())
+
+
+def watch_on(wires: Wires, helper: Helper | None = None) -> BusWatch:
+    return BusWatch(MuxRouter(wires.bus, (mux for mux, _ in TWO_MUXES)), wires.clock, helper)
+
+
+def scan_on(wires: Wires) -> Scan:
+    return Scan.blank(4, wires.clock.now_ns(), 0)
+
+
+def test_a_bus_that_moves_is_no_reason_to_give_a_frame_up() -> None:
+    wires = Wires(TWO_MUXES)
+    watch_on(wires).look(scan := scan_on(wires))
+    assert not scan.bus_fault
+    assert not scan.given_up
+
+
+def test_one_mux_that_answers_is_enough() -> None:
+    wires = Wires(TWO_MUXES)
+    with wires.fault("brown_out", "0x70"):
+        watch_on(wires).look(scan := scan_on(wires))
+    assert not scan.bus_fault
+
+
+def test_a_bus_that_does_not_move_gives_the_frame_up_at_once() -> None:
+    wires = Wires(TWO_MUXES)
+    for kind in ("sda_low", "sda_high", "scl_low"):
+        with wires.fault(kind):
+            watch_on(wires).look(scan := scan_on(wires))
+        assert scan.bus_fault
+        assert scan.given_up
+
+
+def test_a_bus_that_fell_is_down_until_it_moves_again() -> None:
+    wires = Wires(TWO_MUXES)
+    watch = watch_on(wires)
+    assert not watch.is_down
+    with wires.fault("sda_high"):
+        watch.fall()
+        assert watch.is_down
+        assert not watch.comes_back()
+        assert watch.is_down
+    assert watch.comes_back()
+    assert not watch.is_down
+    assert watch.recoveries == 0, "there was nobody to help"
+
+
+def test_a_stuck_bus_is_helped_at_once_and_then_ever_more_rarely() -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    watch = watch_on(wires, helper)
+    with wires.fault("sda_low"):
+        watch.fall()
+        begin_ns = wires.clock.now_ns()
+        while wires.clock.now_ns() < begin_ns + 5_000 * MS:
+            assert not watch.comes_back()
+            wires.clock.sleep_until_ns(wires.clock.now_ns() + MS)
+    waits_ms = [
+        round((after - before) / MS)
+        for before, after in zip(helper.asked_ns, helper.asked_ns[1:], strict=False)
+    ]
+    assert helper.asked_ns[0] - begin_ns < MS
+    assert all(
+        abs(found - due) <= 3
+        for found, due in zip(waits_ms, [10, 20, 40, 80, 160, 320, 640, 1000, 1000], strict=False)
+    )
+    assert len(waits_ms) >= 9
+    assert watch.recoveries == len(helper.asked_ns)
+    assert helper.resets == len(helper.asked_ns), "neither of them was enough"
+
+
+def test_clocks_that_free_the_bus_are_all_that_is_done() -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    helper.clocks_free = True
+    watch = watch_on(wires, helper)
+    with wires.fault("sda_low"):
+        watch.fall()
+        assert watch.comes_back()
+    assert (len(helper.asked_ns), helper.resets) == (1, 0)
+
+
+@pytest.mark.parametrize("lets_go", [False, True])
+@pytest.mark.parametrize("fails", [False, True])
+def test_reset_is_for_a_bus_that_does_not_move_after_nine_clocks(
+    fails: bool, lets_go: bool
+) -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    helper.fails, helper.lets_go, helper.reset_frees = fails, lets_go, True
+    watch = watch_on(wires, helper)
+    with wires.fault("sda_low"):
+        watch.fall()
+        assert watch.comes_back()
+    assert len(helper.asked_ns) == helper.resets == 1
+
+
+def test_what_kept_the_bus_from_being_helped_is_told_until_it_is_back() -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    helper.fails, helper.reset_is_wired = True, False
+    watch = watch_on(wires, helper)
+    with wires.fault("sda_low"):
+        watch.fall()
+        assert watch.problem == ""
+        assert not watch.comes_back()
+        assert watch.problem == "gpio: the lines are somebody else's"
+    watch.fall()
+    assert watch.comes_back()
+    assert watch.problem == ""
+
+
+def test_after_it_was_well_a_stuck_bus_is_helped_at_once_again() -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    watch = watch_on(wires, helper)
+    for _ in range(3):
+        with wires.fault("sda_low"):
+            watch.fall()
+            asked = len(helper.asked_ns)
+            assert not watch.comes_back()
+            assert len(helper.asked_ns) == asked + 1
+        assert watch.comes_back()
+
+
+def test_a_line_that_cannot_be_had_now_does_not_end_the_stream() -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    helper.fails = True
+    watch = watch_on(wires, helper)
+    with wires.fault("sda_low"):
+        watch.fall()
+        assert not watch.comes_back()
+    assert helper.asked_ns
+    assert watch.comes_back()
+
+
+def test_a_bus_that_moves_needs_no_help() -> None:
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    watch = watch_on(wires, helper)
+    watch.fall()
+    assert watch.comes_back()
+    assert helper.asked_ns == []

@@ -1,0 +1,91 @@
+"""Opening an SPI device: what is set, and what is said when it cannot be had."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from types import ModuleType
+
+import pytest
+
+from devices.buses.spi import open_spi
+from devices.errors import SpiSetupError, UsageError
+
+
+class FakeSpiDev:
+    """`spidev.SpiDev` without a device: attributes, and `open_path`."""
+
+    mode = 3
+    max_speed_hz = 125_000_000
+    failure: OSError | None = None
+
+    def __init__(self) -> None:
+        self.path = ""
+        self.closed = False
+
+    def open_path(self, path: str) -> None:
+        if self.failure is not None:
+            raise self.failure
+        self.path = path
+
+    def xfer2(self, data: list[int], /) -> list[int]:
+        return data
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def devices(monkeypatch: pytest.MonkeyPatch) -> list[FakeSpiDev]:
+    """Every device that was made, by a fake library."""
+    made: list[FakeSpiDev] = []
+
+    def make() -> FakeSpiDev:
+        made.append(FakeSpiDev())
+        return made[-1]
+
+    library = ModuleType("spidev")
+    library.SpiDev = make  # type: ignore[attr-defined]  # a module of our own
+    monkeypatch.setitem(sys.modules, "spidev", library)
+    return made
+
+
+def test_a_device_is_opened_in_mode_0_at_1_mhz(devices: list[FakeSpiDev]) -> None:
+    opened = open_spi("/dev/spidev0.1")
+    assert opened is devices[0]
+    assert devices[0].path == "/dev/spidev0.1"
+    # hardware.md 6: SPI mode 0,0; at 3.3 V stay at or below 1 MHz
+    assert (devices[0].mode, devices[0].max_speed_hz) == (0, 1_000_000)
+    assert not devices[0].closed
+
+
+@pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES])
+def test_a_device_that_cannot_be_opened_is_closed_and_said(
+    devices: list[FakeSpiDev], monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    monkeypatch.setattr(FakeSpiDev, "failure", OSError(number, os.strerror(number)))
+    with pytest.raises(SpiSetupError, match=os.strerror(number)) as caught:
+        open_spi("/dev/spidev0.0")
+    assert caught.value.where == "/dev/spidev0.0"
+    assert "dtparam=spi=on" in caught.value.remedy
+    assert devices[0].closed
+
+
+def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "spidev", None)
+    with pytest.raises(SpiSetupError, match=r"'\.\[rig\]'"):
+        open_spi("/dev/spidev0.0")
+
+
+def test_an_emulated_device_needs_a_world() -> None:
+    with pytest.raises(UsageError, match="emulated") as caught:
+        open_spi("emulated")
+    assert caught.value.exit_code == 2
+
+
+def test_an_emulated_device_is_the_one_it_is_given(devices: list[FakeSpiDev]) -> None:
+    given = FakeSpiDev()
+    assert open_spi("emulated", given) is given
+    assert open_spi("/dev/spidev0.0", given) is not given
+    assert len(devices) == 1

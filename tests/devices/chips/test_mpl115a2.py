@@ -1,0 +1,344 @@
+"""The MPL115A2: arithmetic against the data sheet, transfers against an emulated part.
+
+Golden vectors: hardware.md 1.2 (the data sheet's worked example, recomputed with exact
+coefficients; a real part from a forum; the coefficient of the MPL115A1's data sheet) and 1.3.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from smbus2 import i2c_msg
+
+from devices.buses.i2c import I2cBus, open_bus
+from devices.chips.mpl115a2 import Coefficients, Mpl115a2, compensate_kpa, kpa_per_padc, padc_of_kpa
+from devices.clock import VirtualClock
+from devices.emulation.buses.i2c import EmulatedI2cAdapter
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
+from devices.emulation.chips.tca9548a import EmulatedTca9548a
+from devices.errors import NoAcknowledgeError, TileSetupError
+
+DATA_SHEET = bytes.fromhex("3ECE B3F9 C517 33C8")
+FORUM = bytes.fromhex("3591 C0A2 C625 2C18")
+
+Words = tuple[int, int, int, int]
+
+
+def words_of(registers: bytes) -> Words:
+    a0, b1, b2, c12 = struct.unpack(">4H", registers)
+    return a0, b1, b2, c12
+
+
+def part_of(registers: bytes) -> Coefficients:
+    return Coefficients.from_words(words_of(registers))
+
+
+def kpa_of(part: Coefficients, padc: int, tadc: int) -> float:
+    return float(compensate_kpa(padc, tadc, part.a0, part.b1, part.b2, part.c12))
+
+
+# Through driver, bus and an emulated part
+
+
+def connected(registers: bytes, padc: int, tadc: int) -> tuple[Mpl115a2, VirtualClock]:
+    """The driver of one emulated part that always measures the same."""
+    clock = VirtualClock()
+    chip = EmulatedMpl115a2(Silicon(words_of(registers), 1_600_000, lambda _: (padc, tadc)))
+    mux = EmulatedTca9548a(0x70, {2: chip})
+    bus = open_bus("emulated", EmulatedI2cAdapter([mux], clock, 400_000))
+    bus.transfer(i2c_msg.write(0x70, [0b100]))
+    return Mpl115a2(bus), clock
+
+
+@pytest.mark.parametrize(
+    ("registers", "padc", "tadc", "kpa"),
+    [(DATA_SHEET, 410, 507, 96.5873), (FORUM, 272, 521, 100.8227)],
+    ids=["data sheet", "forum"],
+)
+def test_a_published_part_gives_its_pressure_through_driver_bus_and_chip(
+    registers: bytes, padc: int, tadc: int, kpa: float
+) -> None:
+    driver, clock = connected(registers, padc, tadc)
+    part = Coefficients.from_words(driver.read_coefficient_words(where="test"))
+    driver.convert()
+    clock.sleep_until_ns(clock.now_ns() + 1_600_000)
+    assert driver.read_counts() == (padc, tadc)
+    assert kpa_of(part, *driver.read_counts()) == pytest.approx(kpa, abs=1e-3)
+    # 1e-4 would already tell 4194304 from a rounded c12
+    assert kpa_of(part, *driver.read_counts()) == pytest.approx(kpa, abs=1e-4)
+
+
+@pytest.mark.parametrize(("padc", "tadc"), [(512, 512), (1023, 1023), (600, 900), (0, 1023)])
+def test_counts_above_511_are_unsigned(padc: int, tadc: int) -> None:
+    driver, clock = connected(DATA_SHEET, padc, tadc)
+    driver.convert()
+    clock.sleep_until_ns(clock.now_ns() + 1_600_000)
+    assert driver.read_counts() == (padc, tadc)
+
+
+def test_before_the_first_conversion_the_counts_are_zero() -> None:
+    driver, _ = connected(DATA_SHEET, 410, 507)
+    assert driver.read_counts() == (0, 0)
+
+
+def test_a_part_that_is_not_there_does_not_acknowledge() -> None:
+    bus = open_bus("emulated", EmulatedI2cAdapter([], VirtualClock(), 400_000))
+    with pytest.raises(NoAcknowledgeError):
+        Mpl115a2(bus).convert()
+    with pytest.raises(NoAcknowledgeError):
+        Mpl115a2(bus).read_counts()
+    with pytest.raises(NoAcknowledgeError):
+        Mpl115a2(bus).read_coefficient_words(where="test")
+
+
+# The bytes of the transfers
+
+
+class Script:
+    """An adapter that expects exactly these transactions and gives these answers."""
+
+    def __init__(self, *transactions: tuple[str, str]) -> None:
+        self.left = list(transactions)
+
+    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
+        assert self.left, f"unexpected: {i2c_msgs}"
+        expected, answer = self.left.pop(0)
+        said = [
+            f"R{message.addr:02x} {message.len}"
+            if message.flags & 1
+            else f"W{message.addr:02x} {bytes(message).hex(' ')}"
+            for message in i2c_msgs
+        ]
+        assert ", ".join(said) == expected
+        if answer:
+            for i, value in enumerate(bytes.fromhex(answer)):
+                i2c_msgs[-1].buf[i] = value
+
+    def set_timeout(self, units_10ms: int) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def scripted(*transactions: tuple[str, str]) -> tuple[Mpl115a2, Script]:
+    script = Script(*transactions)
+    return Mpl115a2(I2cBus(script, "script")), script
+
+
+def test_convert_is_paired_with_a_zero() -> None:
+    driver, script = scripted(("W60 12 00", ""))
+    driver.convert()
+    assert not script.left
+
+
+def test_counts_are_read_in_one_transaction_of_four_bytes() -> None:
+    # data sheet: 6680h is 410, 7EC0h is 507
+    driver, script = scripted(("W60 00, R60 4", "66 80 7E C0"))
+    assert driver.read_counts() == (410, 507)
+    assert not script.left
+
+
+def test_the_six_bits_below_the_counts_are_ignored() -> None:
+    driver, _ = scripted(("W60 00, R60 4", "66 BF 7E FF"))
+    assert driver.read_counts() == (410, 507)
+
+
+def test_a_second_reading_does_not_show_the_first_one() -> None:
+    driver, _ = scripted(("W60 00, R60 4", "66 80 7E C0"), ("W60 00, R60 4", "44 00 82 40"))
+    assert [driver.read_counts(), driver.read_counts()] == [(410, 507), (272, 521)]
+
+
+COEFFICIENTS = "W60 04, R60 8"
+
+
+def test_coefficients_are_read_three_times() -> None:
+    driver, script = scripted(*[(COEFFICIENTS, DATA_SHEET.hex())] * 3)
+    assert driver.read_coefficient_words(where="tile T01") == (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
+    assert not script.left
+
+
+@pytest.mark.parametrize("odd_one", [0, 1, 2])
+def test_readings_of_the_coefficients_that_differ_are_refused(odd_one: int) -> None:
+    readings = [DATA_SHEET.hex()] * 3
+    readings[odd_one] = "3ece b3f9 c517 33c0"  # one bit
+    driver, _ = scripted(*[(COEFFICIENTS, reading) for reading in readings])
+    with pytest.raises(TileSetupError, match="differ") as caught:
+        driver.read_coefficient_words(where="tile T01")
+    assert caught.value.where == "tile T01"
+    assert "3e ce b3 f9 c5 17 33 c8" in str(caught.value)
+    assert "3e ce b3 f9 c5 17 33 c0" in str(caught.value)
+    assert "pull-ups" in caught.value.remedy
+
+
+@pytest.mark.parametrize("registers", ["00" * 8, "ff" * 8], ids=["SDA stuck low", "nobody there"])
+def test_coefficients_of_a_dead_bus_are_refused(registers: str) -> None:
+    driver, _ = scripted(*[(COEFFICIENTS, registers)] * 3)
+    with pytest.raises(TileSetupError, match="no MPL115A2's") as caught:
+        driver.read_coefficient_words(where="tile T01")
+    assert caught.value.where == "tile T01"
+    assert "stuck" in caught.value.remedy
+
+
+# Coefficients
+
+
+def test_the_coefficients_of_the_data_sheet_are_decoded_exactly() -> None:
+    part = part_of(DATA_SHEET)
+    assert part.a0 == 2009.75
+    assert part.b1 == -2.3758544921875
+    assert part.b2 == -0.92047119140625
+    assert part.c12 == pytest.approx(0.00079011917, abs=5e-12)
+
+
+@pytest.mark.parametrize(
+    ("register", "c12"),
+    [(0x33C8, 0.000790), (0x38CC, 0.00086665), (0x2C18, 0x0B06 / 2**22), (0xFFFC, -1 / 2**22)],
+)
+def test_c12_is_14_bits_wide_and_left_justified(register: int, c12: float) -> None:
+    decoded = Coefficients.from_words((0, 0, 0, register)).c12
+    assert decoded == pytest.approx(c12, rel=2e-4)
+
+
+@pytest.mark.parametrize("noise", [0, 1, 2, 3])
+def test_the_two_bits_below_c12_do_not_count(noise: int) -> None:
+    part = Coefficients.from_words((0, 0, 0, 0x33C8 | noise))
+    assert part == Coefficients.from_words((0, 0, 0, 0x33C8))
+
+
+word = st.integers(0, 0xFFFF)
+
+
+@given(words=st.tuples(word, word, word, word.map(lambda w: w & 0xFFFC)))
+def test_registers_survive_decoding_and_encoding(words: Words) -> None:
+    assert Coefficients.from_words(words).to_words() == words
+
+
+@given(
+    a0=st.floats(1700, 2200),
+    b1=st.floats(-2.5, -1.9),
+    b2=st.floats(-1.0, -0.85),
+    c12=st.floats(0.00065, 0.00088),
+)
+def test_coefficients_are_encoded_to_the_nearest_step(
+    a0: float, b1: float, b2: float, c12: float
+) -> None:
+    part = Coefficients(a0, b1, b2, c12)
+    again = Coefficients.from_words(part.to_words())
+    assert abs(again.a0 - a0) <= 0.5 / 8
+    assert abs(again.b1 - b1) <= 0.5 / 8192
+    assert abs(again.b2 - b2) <= 0.5 / 16384
+    assert abs(again.c12 - c12) <= 0.5 / 2**22
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"a0": 4096.0}, {"b1": -4.001}, {"b2": 2.0}, {"c12": 0.001953125}]
+)
+def test_a_coefficient_that_no_register_holds_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(struct.error):
+        replace(part_of(DATA_SHEET), **wrong).to_words()
+
+
+@pytest.mark.parametrize("registers", [DATA_SHEET, FORUM], ids=["data sheet", "forum"])
+def test_the_coefficients_of_published_parts_are_plausible(registers: bytes) -> None:
+    assert part_of(registers).implausibility() == ""
+
+
+@pytest.mark.parametrize("name", ["a0", "b1", "b2", "c12"])
+def test_a_coefficient_of_the_wrong_sign_is_implausible_and_named(name: str) -> None:
+    part = part_of(DATA_SHEET)
+    assert name in replace(part, **{name: -getattr(part, name)}).implausibility()
+    assert name in replace(part, **{name: 0.0}).implausibility()
+
+
+# Compensation
+
+
+def test_the_worked_example_of_the_data_sheet() -> None:
+    assert kpa_of(part_of(DATA_SHEET), 410, 507) == pytest.approx(96.587326, abs=5e-7)
+
+
+@pytest.mark.parametrize(
+    ("registers", "padc", "tadc", "kpa"),
+    [
+        (DATA_SHEET, 0, 0, 177.7),  # a part that never converted
+        (DATA_SHEET, 0, 507, 148.0),
+        (DATA_SHEET, 1023, 507, 19.7),
+        (FORUM, 0, 521, 129.0),
+        (FORUM, 1023, 521, 23.1),
+    ],
+)
+def test_nothing_is_clipped_to_the_specified_range(
+    registers: bytes, padc: int, tadc: int, kpa: float
+) -> None:
+    assert kpa_of(part_of(registers), padc, tadc) == pytest.approx(kpa, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("registers", "tadc", "kpa"), [(DATA_SHEET, 507, -0.1255), (FORUM, 521, -0.1035)]
+)
+def test_pressure_falls_with_every_count(registers: bytes, tadc: int, kpa: float) -> None:
+    part = part_of(registers)
+    assert float(kpa_per_padc(tadc, part.b1, part.c12)) == pytest.approx(kpa, abs=5e-5)
+    step = kpa_of(part, 301, tadc) - kpa_of(part, 300, tadc)
+    assert step == pytest.approx(kpa, abs=5e-5)
+
+
+def test_one_count_of_temperature_is_worth_what_hardware_md_says() -> None:
+    # -0.0379 kPa per count at the example's pressure
+    step = kpa_of(part_of(DATA_SHEET), 410, 508) - kpa_of(part_of(DATA_SHEET), 410, 507)
+    assert step == pytest.approx(-0.0379, abs=5e-5)
+
+
+def test_the_inverse_finds_the_counts_of_the_data_sheet() -> None:
+    assert float(padc_of_kpa(96.587326, 507, part_of(DATA_SHEET))) == pytest.approx(410, abs=1e-4)
+
+
+@pytest.mark.parametrize(("registers", "tadc", "padc"), [(DATA_SHEET, 507, 263), (FORUM, 521, 135)])
+def test_115_kpa_is_the_end_of_the_range_and_no_end_of_the_counts(
+    registers: bytes, tadc: int, padc: int
+) -> None:
+    assert float(padc_of_kpa(115.0, tadc, part_of(registers))) == pytest.approx(padc, abs=0.5)
+
+
+parts = st.builds(
+    Coefficients,
+    a0=st.floats(1500, 2500),
+    b1=st.floats(-3.0, -1.5),
+    b2=st.floats(-1.2, -0.7),
+    c12=st.floats(0.0005, 0.001),
+)
+
+
+@given(part=parts, kpa=st.floats(0, 300), tadc=st.integers(0, 1023))
+def test_compensation_undoes_its_inverse(part: Coefficients, kpa: float, tadc: int) -> None:
+    padc = padc_of_kpa(kpa, tadc, part)
+    again = compensate_kpa(padc, tadc, part.a0, part.b1, part.b2, part.c12)
+    assert float(again) == pytest.approx(kpa, abs=1e-9)
+
+
+@given(part=parts, padc=st.integers(0, 1023), tadc=st.integers(0, 1023))
+def test_the_inverse_undoes_compensation(part: Coefficients, padc: int, tadc: int) -> None:
+    # A part whose b1 is all but cancelled by the temperature measures nothing.
+    assume(part.b1 + part.c12 * tadc < -0.1)
+    assert float(padc_of_kpa(kpa_of(part, padc, tadc), tadc, part)) == pytest.approx(padc, abs=1e-8)
+
+
+def test_columns_of_frames_meet_one_coefficient_per_tile() -> None:
+    tiles = [part_of(DATA_SHEET), part_of(FORUM)]
+    padc = np.array([[410, 272], [0, 1023], [65535, 0]], dtype=np.uint16)
+    tadc = np.array([[507, 521], [507, 521], [65535, 521]], dtype=np.uint16)
+    a0, b1, b2, c12 = (
+        np.array([getattr(tile, name) for tile in tiles]) for name in ("a0", "b1", "b2", "c12")
+    )
+    kpa = compensate_kpa(padc, tadc, a0, b1, b2, c12)
+    assert kpa.dtype == np.float64
+    for row in range(3):
+        for i, tile in enumerate(tiles):
+            assert kpa[row, i] == kpa_of(tile, int(padc[row, i]), int(tadc[row, i]))
+    assert kpa[0] == pytest.approx([96.5873, 100.8227], abs=1e-4)

@@ -1,0 +1,291 @@
+"""The REST API as a whole: errors, pages, its own description, and that reading changes nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.api.app import make_app
+from service.api.guard import BODY_BYTES_MAX
+from service.server.server import Server
+from storage.sessions.folder import Part, Session, new_session_id
+
+Running = Any
+FakeNode = Any
+Until = Callable[..., Any]
+
+UNKNOWN_ID = "20200101T000000Z-000000"
+
+
+def assert_problem(answer: httpx.Response, status: int, path: str) -> None:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    content = answer.json()
+    assert set(content) == {"type", "title", "status", "detail", "instance"}
+    assert content["type"] == "about:blank"
+    assert content["status"] == status
+    assert content["title"]
+    assert content["detail"]
+    assert content["instance"] == path
+
+
+WRONG: tuple[tuple[str, str, bytes | None, int], ...] = (
+    ("GET", "/nothing", None, 404),
+    ("GET", f"/sessions/{UNKNOWN_ID}", None, 404),
+    ("GET", f"/sessions/{UNKNOWN_ID}/nothing", None, 404),
+    ("POST", "/nothing", b"{}", 404),
+    ("PUT", "/sessions", b"{}", 405),
+    ("DELETE", "/sessions", None, 405),
+    ("POST", "/health", b"{}", 405),
+    ("GET", f"/sessions/{UNKNOWN_ID}/stop", None, 405),
+    ("POST", "/sessions", b"", 422),
+    ("POST", "/sessions", b"{", 422),
+    ("POST", "/sessions", b"[]", 422),
+    ("POST", "/sessions", b"{}", 422),
+    ("POST", "/sessions", b'{"node":"a","name":""}', 422),
+    ("POST", "/sessions", b'{"node":"a","name":"   "}', 422),
+    ("POST", "/sessions", b'{"node":"a","name":5}', 422),
+    ("POST", "/sessions", b'{"node":"a","name":"x","surprise":1}', 422),
+    ("POST", "/sessions", b'{"node":"a","name":"x","pre_roll_s":-1}', 422),
+    ("POST", "/sessions", b'{"node":"a","name":"x","pre_roll_s":NaN}', 422),
+    ("POST", "/sessions", b'{"node":"a","name":"x","pre_roll_s":1e400}', 422),
+    ("POST", "/sessions", b'{"node":"a","name":"' + b"x" * 300 + b'"}', 422),
+    ("POST", "/sessions", b'{"node":"a","name":"\xff"}', 400),
+    ("POST", "/sessions", b'{"node":"a","name":"\\ud800"}', 422),
+    ("POST", "/sessions", b"[" * 60_000, 400),
+    ("PATCH", f"/sessions/{UNKNOWN_ID}", b'{"name":""}', 422),
+    ("PATCH", f"/sessions/{UNKNOWN_ID}", b'{"sha256":"x"}', 422),
+    ("PATCH", f"/sessions/{UNKNOWN_ID}", b'{"name":"x"}', 404),
+    (
+        "POST",
+        f"/sessions/{UNKNOWN_ID}/events",
+        b'{"label":"x","t_ns":9223372036854775808}',
+        422,
+    ),
+    ("POST", f"/sessions/{UNKNOWN_ID}/events", b'{"label":"x","t_ns":1.5}', 422),
+    ("GET", "/sessions?limit=0", None, 422),
+    ("GET", "/sessions?limit=501", None, 422),
+    ("GET", "/sessions?limit=many", None, 422),
+    ("GET", "/sessions?q=" + "x" * 201, None, 422),
+)
+
+
+def test_every_error_is_a_problem(running: Running) -> None:
+    for method, path, body, status in WRONG:
+        answer = running.http.request(
+            method, path, content=body, headers={"Content-Type": "application/json"}
+        )
+        assert_problem(answer, status, "/api/v1" + path.split("?")[0])
+
+
+def test_a_body_of_another_type_is_a_problem(running: Running) -> None:
+    for kind in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""):
+        answer = running.http.post(
+            "/sessions", content=b'{"node":"bench","name":"x"}', headers={"Content-Type": kind}
+        )
+        assert answer.status_code in (415, 422), kind
+        assert_problem(answer, answer.status_code, "/api/v1/sessions")
+
+
+def test_a_path_outside_the_api_is_a_problem_too(running: Running) -> None:
+    for path in ("/nothing", "/static/nothing.js", "/static/%2e%2e/pyproject.toml", "/api"):
+        answer = running.http.get(running.url + path)
+        assert answer.status_code == 404, path
+        assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_body_that_is_too_long_is_a_problem(running: Running) -> None:
+    long = b'{"node":"a","name":"' + b"x" * BODY_BYTES_MAX + b'"}'
+    assert_problem(running.http.post("/sessions", content=long), 413, "/api/v1/sessions")
+
+
+def test_a_body_in_chunks_that_is_too_long_is_a_problem(running: Running) -> None:
+    def chunks() -> Iterator[bytes]:
+        for _ in range(BODY_BYTES_MAX // 1000 + 5):
+            yield b"x" * 1000
+
+    answer = running.http.post(
+        "/sessions", content=chunks(), headers={"Content-Type": "application/json"}
+    )
+    assert_problem(answer, 413, "/api/v1/sessions")
+    assert running.http.get("/health").status_code == 200
+
+
+def test_a_mistake_of_the_server_is_a_problem_without_its_inside(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken() -> None:
+        raise ZeroDivisionError("secret")
+
+    monkeypatch.setattr(running.server, "check_storage", broken)
+    answer = running.http.get("/ready")
+    assert_problem(answer, 500, "/api/v1/ready")
+    assert "secret" not in answer.text
+
+
+def test_a_full_disk_is_a_problem_that_says_so(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from devices.errors import StorageError
+
+    def full() -> None:
+        raise StorageError("No space left on device", remedy="Free space")
+
+    monkeypatch.setattr(running.server, "check_storage", full)
+    assert_problem(running.http.get("/ready"), 507, "/api/v1/ready")
+
+
+@pytest.fixture
+def many(running: Running, node: FakeNode, until: Until) -> list[str]:
+    """Ids of 23 sessions, newest first; several began at the same instant."""
+    node.connect()
+    node.send(10)
+    until(lambda: running.node()["last_seq"] == 9)
+    begin_ns = time.time_ns()
+    sessions = [
+        Session(
+            id=new_session_id(datetime(2026, 1, 1, tzinfo=UTC)),
+            name=f"{'mud' if i % 3 else 'Sand'} {i}",
+            node="bench",
+            state="recording",
+            started_t_ns=begin_ns + i // 4,
+            parts=(Part(boot_id=node.boot_id, seq_first=0, seq_last=0),),
+            scene="test",
+        )
+        for i in range(23)
+    ]
+    for session in sessions:
+        running.call(lambda session=session: running.server.recorder._keep(session))
+    sessions.sort(key=lambda s: (s.started_t_ns, s.id), reverse=True)
+    return [session.id for session in sessions]
+
+
+def pages(running: Running, limit: int, q: str | None) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = []
+    query: dict[str, Any] = {"limit": limit} | ({} if q is None else {"q": q})
+    for _ in range(30):
+        page = running.http.get("/sessions", params=query).json()
+        assert len(page["items"]) <= limit
+        found += page["items"]
+        if page["next_cursor"] is None:
+            return found
+        query["cursor"] = page["next_cursor"]
+    pytest.fail("the pages do not end")
+
+
+def test_pages_lose_and_repeat_nothing(running: Running, many: list[str]) -> None:
+    for limit in (1, 2, 5, 22, 23, 24, 500):
+        assert [session["id"] for session in pages(running, limit, None)] == many
+        for q, count in (("sand", 8), ("MUD", 15), ("nothing", 0)):
+            found = pages(running, limit, q)
+            ids = [session["id"] for session in found]
+            assert ids == [one for one in many if one in ids]
+            assert len(ids) == count
+            assert all(q.casefold() in session["name"].casefold() for session in found)
+
+
+def test_a_cursor_that_is_none_harms_nothing(running: Running, many: list[str]) -> None:
+    for cursor in ("", "x", "1", "1.", ".x", "-5.a", "9" * 30 + ".a", "\N{SUPERSCRIPT TWO}.a"):
+        answer = running.http.get("/sessions", params={"cursor": cursor})
+        assert answer.status_code in (200, 422), cursor
+
+
+def test_every_operation_is_described(tmp_path: Path) -> None:
+    server = Server(tmp_path)
+    try:
+        schema = make_app(server).openapi()
+    finally:
+        server._lock.close()
+    ids = []
+    for path, operations in schema["paths"].items():
+        for method, operation in operations.items():
+            where = f"{method} {path}"
+            ids.append(operation["operationId"])
+            assert operation["summary"], where
+            assert operation["description"], where
+            if "{" in path:
+                problem = operation["responses"]["404"]
+                assert "application/problem+json" in problem["content"], where
+            for status, answer in operation["responses"].items():
+                assert answer["description"], where
+                if int(status) >= 400:
+                    assert set(answer["content"]) == {"application/problem+json"}, (where, status)
+    assert len(set(ids)) == len(ids)
+    assert len(ids) >= 18
+
+
+def test_the_history_of_tares_says_why_and_where_the_baselines_are_going(
+    running: Running, node: FakeNode, until: Until
+) -> None:
+    node.connect()
+    node.tared()
+    node.next_t_mono_ns += 900_000_000_000  # a quarter of an hour later, one count more
+    node.send(300, 1.0, alive=True)
+    until(lambda: running.node()["last_seq"] == node.seq - 1)
+    answer = running.http.post("/nodes/bench/tare", json={"reason": "  new shoe "})
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["reason"] == "new shoe"
+    assert answer.json()["tadc_counts"] == [480.0, 480.0]
+    page = running.http.get("/nodes/bench/tares").json()
+    said = [(tare["source"], tare["reason"]) for tare in page["items"]]
+    assert said == [("unloaded", "new shoe"), ("lead", "unloaded lead of the emulation")]
+    per_hour = [4 * 130 / 1023] * 2
+    assert page["drift"]["kpa_per_hour"] == pytest.approx(per_hour, rel=0.01)
+    assert page["drift"]["n_per_hour"] == pytest.approx([4.0, 4.0], rel=0.01)
+    assert page["drift"]["grf_n_per_hour"] == pytest.approx(8.0, rel=0.01)
+    assert page["drift"]["kelvin_since_tare"] == [0.0, 0.0]
+    shown = running.node()
+    assert shown["drift"] == page["drift"]
+    assert shown["auto_tare"] == "on"
+    assert shown["tare_warnings"] == []
+    assert running.http.post("/nodes/bench/tare", json={"why": "?"}).status_code == 422
+    assert running.http.post("/nodes/bench/tare").status_code in (201, 409)
+
+
+def test_a_node_without_a_tare_has_no_drift(running: Running, node: FakeNode) -> None:
+    node.connect()
+    shown = running.node()
+    assert shown["tare"] is None
+    assert shown["tare_problem"] == "not tared: lift the foot, hold it still, and tare"
+    assert shown["drift"]["kpa_per_hour"] == [None, None]
+    assert shown["drift"]["grf_n_per_hour"] is None
+    assert shown["drift"]["kelvin_since_tare"] == [None, None]
+
+
+def test_no_get_changes_anything(running: Running, node: FakeNode, until: Until) -> None:
+    node.connect()
+    node.tared()
+    until(lambda: running.node()["last_seq"] == node.seq - 1)
+    node.acknowledged(node.seq - 1)
+    session = running.http.post("/sessions", json={"node": "bench", "name": "x"}).json()
+    schema = make_app(running.server).openapi_schema  # made without asking for it
+    assert schema is None
+    paths = [
+        *("/health", "/ready", "/version", "/nodes", "/nodes/bench", "/nodes/bench/scene"),
+        *("/nodes/bench/tares", "/nodes/bench/tare", "/sessions", f"/sessions/{session['id']}"),
+        *(f"/sessions/{session['id']}/{rest}" for rest in ("events", "ledger", "data?format=csv")),
+        *(f"/sessions/{session['id']}/{rest}" for rest in ("stop", "data")),
+    ]
+
+    def state() -> object:
+        files = {
+            str(path): path.read_bytes()
+            for path in sorted(running.data.rglob("*"))
+            # What a server writes by itself while frames and clocks come in is not asked for.
+            if path.is_file()
+            and path.suffix not in (".arrows", ".idx", ".tmp")
+            and path.name not in ("stream.json", "clock.jsonl")
+        }
+        return files, running.node(), running.session(session["id"])
+
+    before = state()
+    for path in paths:
+        for method in ("GET", "HEAD", "OPTIONS"):
+            assert running.http.request(method, path).status_code < 500, path
+    assert state() == before

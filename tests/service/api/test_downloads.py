@@ -1,0 +1,398 @@
+"""Downloads: the stored file by ranges, other formats as streams, and a client that resumes."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from base64 import b64encode
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+import pytest
+import service.routes.sessions
+
+from devices.errors import LinkError, StateError
+from service.offline.client import Client
+
+Running = Any
+FakeNode = Any
+Until = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """A sealed session of 300 frames at 20 and 60 N, and one that is still recorded."""
+
+    running: Running
+    id: str
+    content: bytes
+    recording: str
+
+    @property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.content).hexdigest()
+
+    def get(self, method: str = "GET", **headers: str) -> httpx.Response:
+        answer: httpx.Response = self.running.http.request(
+            method, f"/sessions/{self.id}/data", headers={"Accept-Encoding": "identity"} | headers
+        )
+        return answer
+
+    def made(self, session_id: str | None = None, **query: object) -> httpx.Response:
+        answer: httpx.Response = self.running.http.get(
+            f"/sessions/{session_id or self.id}/data", params=query
+        )
+        return answer
+
+
+@pytest.fixture
+def sealed(
+    running: Running, node: FakeNode, until: Until, monkeypatch: pytest.MonkeyPatch
+) -> Sealed:
+    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.02)
+    node.connect()
+    node.tared()
+    until(lambda: running.node()["last_seq"] == node.seq - 1)
+    body = {"node": "bench", "name": "x"}
+    session_id = running.http.post("/sessions", json=body).json()["id"]
+    node.send(300, [20.0, 60.0])
+    until(lambda: running.node()["last_seq"] == node.seq - 1)
+    running.http.post(f"/sessions/{session_id}/stop")
+    node.send(10, now=True)
+    running.sealed(session_id)
+    recording = running.http.post("/sessions", json=body).json()["id"]
+    node.send(50, [5.0, 0.0])
+    until(lambda: running.session(recording)["frames"] == 50)
+    content = (running.data / "sessions" / session_id / "frames.parquet").read_bytes()
+    return Sealed(running, session_id, content, recording)
+
+
+def table_of(answer: httpx.Response, to: str) -> pa.Table:
+    assert answer.status_code == 200, answer.text
+    match to:
+        case "parquet":
+            return pq.read_table(io.BytesIO(answer.content))
+        case "arrow":
+            return pa.ipc.open_stream(answer.content).read_all()
+        case _:
+            return pacsv.read_csv(io.BytesIO(answer.content))
+
+
+def test_the_whole_file_comes_as_it_is_stored(sealed: Sealed) -> None:
+    answer = sealed.get()
+    assert answer.status_code == 200
+    assert answer.content == sealed.content
+    assert answer.headers["etag"] == f'"{sealed.sha256}"'
+    digest = b64encode(hashlib.sha256(answer.content).digest()).decode()
+    assert answer.headers["repr-digest"] == f"sha-256=:{digest}:"
+    assert answer.headers["content-length"] == str(len(sealed.content))
+    assert answer.headers["accept-ranges"] == "bytes"
+    assert answer.headers["foottile-complete"] == "true"
+    assert answer.headers["content-type"] == "application/vnd.apache.parquet"
+    assert f'filename="{sealed.id}.parquet"' in answer.headers["content-disposition"]
+    assert "immutable" in answer.headers["cache-control"]
+    assert sealed.running.session(sealed.id)["sha256"] == sealed.sha256
+
+
+def test_one_range_is_that_part_of_the_file(sealed: Sealed) -> None:
+    size = len(sealed.content)
+    for asked, begin, end in (
+        ("bytes=0-0", 0, 1),
+        ("bytes=0-99", 0, 100),
+        ("bytes=100-199", 100, 200),
+        (f"bytes={size - 1}-", size - 1, size),
+        ("bytes=1000-", 1000, size),
+        ("bytes=0-", 0, size),
+        ("bytes=-1", size - 1, size),
+        ("bytes=-100", size - 100, size),
+        (f"bytes=-{size * 2}", 0, size),
+        (f"bytes=10-{size * 2}", 10, size),
+    ):
+        answer = sealed.get(Range=asked)
+        assert answer.status_code == 206, asked
+        assert answer.content == sealed.content[begin:end], asked
+        assert answer.headers["content-range"] == f"bytes {begin}-{end - 1}/{size}", asked
+        assert answer.headers["content-length"] == str(end - begin), asked
+        assert answer.headers["etag"] == f'"{sealed.sha256}"', asked
+
+
+def test_a_range_outside_the_file_is_a_problem_that_says_its_size(sealed: Sealed) -> None:
+    size = len(sealed.content)
+    for asked in (f"bytes={size}-", f"bytes={size + 5}-{size + 9}", "bytes=-0"):
+        answer = sealed.get(Range=asked)
+        assert answer.status_code == 416, asked
+        assert answer.headers["content-range"] == f"bytes */{size}"
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert str(size) in answer.json()["detail"]
+
+
+def test_a_range_that_is_not_understood_or_several_is_ignored(sealed: Sealed) -> None:
+    for asked in (
+        "bytes=0-1,5-6",
+        "bytes=9-2",
+        "bytes=a-b",
+        "bytes=-",
+        "bytes",
+        "bytes=",
+        "lines=0-5",
+        "bytes=0-5-9",
+        "bytes=--5",
+        "bytes=\xb2-",
+        "bytes=" + "9" * 300 + "-",
+        "",
+    ):
+        answer = sealed.get(Range=asked.encode("latin-1"))  # type: ignore[arg-type]  # no text
+        assert answer.status_code == 200, asked
+        assert answer.content == sealed.content, asked
+
+
+def test_a_range_holds_only_for_the_file_that_if_range_names(sealed: Sealed) -> None:
+    right = f'"{sealed.sha256}"'
+    for given, status in (
+        (right, 206),
+        ('"' + "0" * 64 + '"', 200),
+        ("W/" + right, 200),
+        ("Wed, 21 Oct 2015 07:28:00 GMT", 200),
+    ):
+        answer = sealed.get(Range="bytes=0-9", **{"If-Range": given})
+        assert answer.status_code == status, given
+        assert answer.content == (sealed.content[:10] if status == 206 else sealed.content), given
+
+
+def test_what_one_has_already_is_not_sent(sealed: Sealed) -> None:
+    right = f'"{sealed.sha256}"'
+    for given, status in (
+        (right, 304),
+        (f"W/{right}", 304),
+        (f'"a", {right}', 304),
+        (f'"a",W/{right} , "b"', 304),
+        ("*", 304),
+        ('"a"', 200),
+        (sealed.sha256, 200),
+        ('"a", "b"', 200),
+    ):
+        answer = sealed.get(**{"If-None-Match": given})
+        assert answer.status_code == status, given
+        assert answer.headers["etag"] == right
+        assert answer.content == (b"" if status == 304 else sealed.content)
+
+
+def test_head_says_what_get_would_and_sends_nothing(sealed: Sealed) -> None:
+    got, head = sealed.get(), sealed.get("HEAD")
+    assert head.status_code == 200
+    assert head.content == b""
+    ignored = {"date"}
+    assert {k: v for k, v in head.headers.items() if k not in ignored} == {
+        k: v for k, v in got.headers.items() if k not in ignored
+    }
+
+
+def test_head_of_what_is_made_says_what_get_would(sealed: Sealed) -> None:
+    url = f"/sessions/{sealed.id}/data?format=csv"
+    got, head = sealed.running.http.get(url), sealed.running.http.head(url)
+    assert head.status_code == 200
+    assert head.content == b""
+    for name in ("etag", "content-type", "content-disposition", "foottile-complete"):
+        assert head.headers[name] == got.headers[name]
+
+
+@pytest.mark.parametrize("to", ["parquet", "arrow", "csv"])
+def test_a_slice_has_the_rows_and_columns_asked_for(sealed: Sealed, to: str) -> None:
+    whole = pq.read_table(io.BytesIO(sealed.content))
+    answer = sealed.made(format=to, start_s=0.1, end_s=0.2, columns="seq,force_n, padc_1")
+    found = table_of(answer, to)
+    assert found.column_names == ["seq", "force_n_0", "force_n_1", "padc_1"]
+    assert found["seq"].to_pylist() == list(range(70 + 50, 70 + 100))
+    for name in found.column_names:
+        np.testing.assert_allclose(
+            found[name].to_numpy(), whole[name].to_numpy()[50:100], rtol=1e-6, err_msg=name
+        )
+    assert answer.headers["etag"].startswith('"')
+    assert answer.headers["accept-ranges"] == "none"
+
+
+@pytest.mark.parametrize("to", ["arrow", "csv"])
+def test_another_format_of_the_whole_has_the_same_values(sealed: Sealed, to: str) -> None:
+    whole = pq.read_table(io.BytesIO(sealed.content))
+    found = table_of(sealed.made(format=to), to)
+    assert sorted(found.column_names) == sorted(whole.column_names)
+    for name in ("seq", "t_ns", "padc_0", "part", "force_n_1", "grf_n"):
+        np.testing.assert_allclose(
+            found[name].to_numpy(), whole[name].to_numpy(), rtol=1e-6, err_msg=name
+        )
+
+
+def test_an_empty_slice_has_a_header_and_no_rows(sealed: Sealed) -> None:
+    for to in ("parquet", "arrow", "csv"):
+        found = table_of(sealed.made(format=to, start_s=100, columns="seq,t_ns"), to)
+        assert found.column_names == ["seq", "t_ns"]
+        assert found.num_rows == 0
+
+
+def test_queries_that_ask_for_different_data_have_different_tags(sealed: Sealed) -> None:
+    queries: tuple[dict[str, Any], ...] = (
+        {"format": "csv"},
+        {"format": "arrow"},
+        {"format": "csv", "columns": "seq"},
+        {"format": "csv", "end_s": 0.1},
+        {"format": "csv", "start_s": 0.1},
+    )
+    tags = [sealed.made(**query).headers["etag"] for query in queries]
+    assert len(set(tags)) == len(queries)
+    assert sealed.made(**queries[0]).headers["etag"] == tags[0]
+    answer = sealed.running.http.get(
+        f"/sessions/{sealed.id}/data", params=queries[0], headers={"If-None-Match": tags[0]}
+    )
+    assert answer.status_code == 304
+
+
+def test_parquet_of_a_recording_session_is_not_there_yet(sealed: Sealed) -> None:
+    for query in ({}, {"format": "parquet"}, {"columns": "seq"}):
+        answer = sealed.made(sealed.recording, **query)
+        assert answer.status_code == 409
+        assert "csv" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("to", ["arrow", "csv"])
+def test_a_recording_session_gives_what_there_is(sealed: Sealed, to: str) -> None:
+    answer = sealed.made(sealed.recording, format=to)
+    assert answer.headers["foottile-complete"] == "false"
+    assert answer.headers["etag"].startswith('W/"')
+    found = table_of(answer, to)
+    assert found["seq"].to_pylist() == list(range(380, 430))
+    assert found["force_n_0"].to_numpy()[20:40] == pytest.approx(np.full(20, 5.0), abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        {"formats": "csv"},
+        {"format": "xlsx"},
+        {"format": "csv", "columns": "nonsense"},
+        {"format": "csv", "columns": "force_n_2"},
+        {"start_s": "-1"},
+        {"start_s": "nan"},
+        {"end_s": "inf"},
+        {"end_s": "0"},
+        {"start_s": "soon"},
+        {"start_s": "1e300"},
+    ],
+    ids=str,
+)
+def test_a_query_that_is_none_is_refused(sealed: Sealed, query: dict[str, str]) -> None:
+    answer = sealed.made(**query)
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_an_odd_id_is_not_found(sealed: Sealed) -> None:
+    for odd in (
+        "..",
+        "%2e%2e",
+        "%2e%2e%2f%2e%2e%2fetc%2fpasswd",
+        "..%5c..",
+        "20200101T000000Z-000000",
+        "20200101T000000Z-000000%00",
+        f"{sealed.id}%0a",
+        "x" * 5000,
+        "%ff",
+    ):
+        for rest in ("", "/data", "/events", "/ledger"):
+            answer = sealed.running.http.get(f"/sessions/{odd}{rest}")
+            assert answer.status_code in (400, 404), odd
+            assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_file_that_was_taken_away_is_said_to_be(sealed: Sealed) -> None:
+    path = sealed.running.data / "sessions" / sealed.id / "frames.parquet"
+    path.unlink()
+    answer = sealed.get()
+    assert answer.status_code == 404
+    assert "taken away" in answer.json()["detail"]
+    assert sealed.made(format="csv").status_code in (404, 500)
+    assert sealed.running.http.get("/health").status_code == 200
+
+
+def test_the_client_pulls_a_session_whole(sealed: Sealed, tmp_path: Path) -> None:
+    with Client(sealed.running.url) as client:
+        assert {s["id"] for s in client.sessions()} == {sealed.id, sealed.recording}
+        pulled = client.pull(sealed.id, tmp_path / "out")
+        assert Path(pulled["path"]).read_bytes() == sealed.content
+        assert pulled["resumed_bytes"] == 0
+        folder = tmp_path / "out" / sealed.id
+        assert {path.name for path in folder.iterdir()} == {
+            "frames.parquet",
+            "session.json",
+            "events.json",
+            "ledger.json",
+            "clock.parquet",
+        }
+        again = client.pull(sealed.id, tmp_path / "out")
+        assert again["path"] == pulled["path"]
+
+
+@pytest.mark.parametrize("have", [1, 1000, None])
+def test_the_client_resumes_a_partial_file(
+    sealed: Sealed, tmp_path: Path, have: int | None
+) -> None:
+    folder = tmp_path / "out" / sealed.id
+    folder.mkdir(parents=True)
+    (folder / ".frames.parquet.part").write_bytes(sealed.content[:have])
+    with Client(sealed.running.url) as client:
+        pulled = client.pull(sealed.id, tmp_path / "out")
+    assert Path(pulled["path"]).read_bytes() == sealed.content
+    assert pulled["resumed_bytes"] == (have or len(sealed.content))
+    assert not list(folder.glob("*.part"))
+
+
+@pytest.mark.parametrize(
+    "partial", [b"x" * 1000, b"x" * 10_000_000], ids=["shorter", "longer than the file"]
+)
+def test_the_client_repairs_a_partial_file_that_is_wrong(
+    sealed: Sealed, tmp_path: Path, partial: bytes
+) -> None:
+    folder = tmp_path / "out" / sealed.id
+    folder.mkdir(parents=True)
+    (folder / ".frames.parquet.part").write_bytes(partial)
+    with Client(sealed.running.url) as client:
+        with suppress(LinkError):  # it may say so, once
+            client.pull(sealed.id, tmp_path / "out")
+        client.pull(sealed.id, tmp_path / "out")
+    assert (folder / "frames.parquet").read_bytes() == sealed.content
+
+
+def test_the_client_replaces_a_file_that_is_wrong(sealed: Sealed, tmp_path: Path) -> None:
+    folder = tmp_path / "out" / sealed.id
+    folder.mkdir(parents=True)
+    (folder / "frames.parquet").write_bytes(b"something else")
+    with Client(sealed.running.url) as client:
+        client.pull(sealed.id, tmp_path / "out")
+    assert (folder / "frames.parquet").read_bytes() == sealed.content
+
+
+def test_the_client_says_that_a_session_is_not_sealed(sealed: Sealed, tmp_path: Path) -> None:
+    with (
+        Client(sealed.running.url) as client,
+        pytest.raises(StateError, match=r"is recording.*Stop it"),
+    ):
+        client.pull(sealed.recording, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_client_says_that_there_is_no_such_session(sealed: Sealed, tmp_path: Path) -> None:
+    with Client(sealed.running.url) as client, pytest.raises(LinkError, match="no session"):
+        client.pull("20200101T000000Z-000000", tmp_path)
+
+
+def test_the_client_says_that_no_server_answers(running: Running, tmp_path: Path) -> None:
+    running.stop()
+    with Client(running.url) as client, pytest.raises(LinkError, match="foottile serve"):
+        client.sessions()

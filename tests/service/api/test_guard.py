@@ -1,0 +1,215 @@
+"""Who may ask: names, origins and the token."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import InvalidStatus
+
+from service.api.guard import is_loopback
+from service.api.serve import token_for
+from service.link import INGEST_PATH
+
+LIVE = "/api/v1/live"
+TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
+
+Running = Any
+FakeNode = Any
+
+
+def test_a_host_of_another_name_is_refused(running: Running) -> None:
+    for host in ("evil.example", "evil.example:80", "127.0.0.1.evil.example", "", "[", "a b", "."):
+        for path in ("/health", "/sessions", "/nothing"):
+            answer = running.http.get(path, headers={"Host": host})
+            assert answer.status_code == 403, host
+            assert answer.headers["content-type"] == "application/problem+json"
+            assert "--allow-host" in answer.json()["detail"]
+
+
+def test_localhost_and_addresses_pass(running: Running) -> None:
+    for host in (
+        "localhost",
+        "localhost:1",
+        "LOCALHOST",
+        "192.168.4.1:8000",
+        "[::1]",
+        "[fe80::1]:8",
+    ):
+        answer = running.http.get("/health", headers={"Host": host})
+        assert answer.status_code == 200, host
+
+
+def test_a_name_that_was_allowed_passes(serve_with: Callable[..., Running]) -> None:
+    running = serve_with(hosts=["Robot.local"])
+    for host, status in (("robot.local:8000", 200), ("ROBOT.LOCAL", 200), ("robot", 403)):
+        assert running.http.get("/health", headers={"Host": host}).status_code == status, host
+
+
+@pytest.mark.parametrize("path", [LIVE, INGEST_PATH])
+def test_a_websocket_of_another_host_is_refused(running: Running, path: str) -> None:
+    headers = {
+        "Host": "evil.example",
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec-WebSocket-Version": "13",
+    }
+    assert running.http.get(running.url + path, headers=headers).status_code == 403
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "", "//["])
+def test_a_change_from_another_site_is_refused(running: Running, origin: str) -> None:
+    for method in ("POST", "PATCH", "DELETE", "PUT"):
+        answer = running.http.request(
+            method, "/sessions", json={"node": "x", "name": "x"}, headers={"Origin": origin}
+        )
+        assert answer.status_code == 403, method
+        assert "another site" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize("path", [LIVE, INGEST_PATH])
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1"])
+def test_a_websocket_from_another_site_is_refused(running: Running, path: str, origin: str) -> None:
+    with pytest.raises(InvalidStatus) as refused, running.socket(path, origin=origin):
+        pass
+    assert refused.value.response.status_code == 403
+
+
+def test_the_servers_own_page_passes(running: Running) -> None:
+    answer = running.http.post(
+        "/sessions", json={"node": "nobody", "name": "x"}, headers={"Origin": running.url}
+    )
+    assert answer.status_code == 404  # it came through to where there is no such node
+    for path in (LIVE, INGEST_PATH):
+        with running.socket(path, origin=running.url):
+            pass
+
+
+def test_reading_from_another_site_is_let_to_the_browser(running: Running) -> None:
+    answer = running.http.get("/sessions", headers={"Origin": "http://evil.example"})
+    assert answer.status_code == 200
+    assert "access-control-allow-origin" not in answer.headers
+
+
+def test_a_page_of_ours_is_hardened(running: Running) -> None:
+    answer = running.http.get(running.url + "/")
+    assert answer.status_code == 200
+    assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
+    assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+CHANGES = (
+    ("POST", "/sessions"),
+    ("POST", "/sessions/20200101T000000Z-000000/stop"),
+    ("PATCH", "/sessions/20200101T000000Z-000000"),
+    ("POST", "/sessions/20200101T000000Z-000000/events"),
+    ("POST", "/nodes/bench/tare"),
+    ("DELETE", "/nodes/bench/tares/1"),
+)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [None, "", "Bearer", f"Bearer {TOKEN}x", f"Bearer {TOKEN[:-1]}", "Basic eDp5", "\xe9"],
+)
+def test_a_change_without_the_token_is_refused(
+    serve_with: Callable[..., Running], given: str | None
+) -> None:
+    running = serve_with(token=TOKEN)
+    headers: Any = {} if given is None else {"Authorization": given.encode("latin-1")}
+    for method, path in CHANGES:
+        answer = running.http.request(method, path, json={}, headers=headers)
+        assert answer.status_code == 401, path
+        assert answer.headers["www-authenticate"] == "Bearer"
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert TOKEN not in answer.text
+    with (
+        pytest.raises(InvalidStatus) as refused,
+        running.socket(INGEST_PATH, additional_headers=given and {"Authorization": given}),
+    ):
+        pass
+    assert refused.value.response.status_code == 401
+    assert refused.value.response.headers["www-authenticate"] == "Bearer"
+
+
+def test_a_change_with_the_token_passes(
+    serve_with: Callable[..., Running], node_of: Callable[..., FakeNode]
+) -> None:
+    running = serve_with(token=TOKEN)
+    for method, path in CHANGES:
+        answer = running.http.request(
+            method, path, json={}, headers={"Authorization": f"Bearer {TOKEN}"}
+        )
+        assert answer.status_code in (404, 422), path
+    node = node_of(running, token=TOKEN)
+    node.connect()
+    node.send(10)
+    node.acknowledged(9)
+
+
+def test_reading_and_watching_need_no_token(serve_with: Callable[..., Running]) -> None:
+    running = serve_with(token=TOKEN)
+    for path in ("/health", "/ready", "/version", "/nodes", "/sessions", "/openapi.json"):
+        assert running.http.get(path).status_code == 200, path
+    with running.socket(LIVE) as live:
+        assert "hello" in live.recv(timeout=5.0)
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        ("localhost", True),
+        ("127.0.0.1", True),
+        ("127.9.9.9", True),
+        ("::1", True),
+        ("0.0.0.0", False),  # noqa: S104  # compared only
+        ("::", False),
+        ("192.168.4.1", False),
+        ("robot.local", False),
+        ("localhost.evil.example", False),
+        ("", False),
+    ],
+)
+def test_loopback_is_only_this_machine(host: str, expected: bool) -> None:
+    assert is_loopback(host) is expected
+
+
+def test_a_token_is_made_once_and_only_its_owner_may_read_it(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    token = token_for("0.0.0.0", None, data)  # noqa: S104  # nothing listens
+    assert token is not None
+    assert len(token) >= 20
+    assert stat.S_IMODE((data / "token").stat().st_mode) == 0o600
+    assert token_for("192.168.4.1", None, data) == token
+    assert token_for("0.0.0.0", "given", data) == "given"  # noqa: S104  # nothing listens
+
+
+def test_on_loopback_no_token_is_made(tmp_path: Path) -> None:
+    assert token_for("127.0.0.1", None, tmp_path / "data") is None
+    assert not (tmp_path / "data").exists()
+    assert token_for("localhost", "given", tmp_path / "data") == "given"
+
+
+def test_an_empty_token_is_none(tmp_path: Path) -> None:
+    # FOOTTILE_TOKEN= in the environment must not open the server to everybody.
+    assert token_for("0.0.0.0", "", tmp_path)  # noqa: S104  # nothing listens
+
+
+def test_a_token_file_that_is_empty_is_no_token(tmp_path: Path) -> None:
+    # As after a cut of power between its creation and its writing.
+    (tmp_path / "token").touch(mode=0o600)
+    assert token_for("0.0.0.0", None, tmp_path)  # noqa: S104  # nothing listens
+
+
+@pytest.mark.parametrize("path", ["/api/v1/ingest%0A", "/api/v1/ingest/", "/api/v1//ingest", "/x"])
+def test_no_other_way_of_writing_the_path_gets_past_the_token(
+    serve_with: Callable[..., Running], path: str
+) -> None:
+    running = serve_with(token=TOKEN)
+    with pytest.raises(InvalidStatus) as refused, running.socket(path):
+        pytest.fail("it was let in")
+    assert refused.value.response.status_code in (400, 401)

@@ -1,0 +1,282 @@
+"""Everything wrong that a user can say: a clear line, the right exit code, nothing half-written."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+STANDING = (resources.files("devices.scene") / "builtin" / "standing.toml").read_text("utf-8")
+GOOD_TRACE = "time_s,fz_n,cop_x_m,cop_y_m\n" + "".join(
+    f"{0.01 * i:.2f},{10 + i},0.0,0.0\n" for i in range(50)
+)
+
+
+def left(folder: Path, *given: str) -> list[str]:
+    """What lies in the folder beside what the test put there."""
+    return sorted(path.name for path in folder.iterdir() if path.name not in given)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("conversion_ms =", "conversoin_ms ="), ["array.conversoin_ms", "spelling"]),
+        (('serial = "T01"', "serial = 1"), ["tile.0.serial"]),
+        (("conversion_ms = 1.6", 'conversion_ms = "1.6"'), ["array.conversion_ms", "'1.6'"]),
+        (("channel = 1", "channel = 0"), ["0x70", "channel 0", "two tiles"]),
+        (('serial = "T02"', 'serial = "T01"'), ["T01", "twice"]),
+        (("x_m = -0.021", "x_m = -21.0"), ["tile.0.x_m", "-21"]),
+        (('kind = "plate"', 'kind = "plates"'), ["ground", "plate"]),
+        (("[array]", "[array"), ["not TOML"]),
+        (('models = ["unwrap", "static"]', 'models = ["unwrap"]'), ["static"]),
+        (('models = ["unwrap", "static"]', 'models = ["static", "magic"]'), ["magic", "unwrap"]),
+        (('name = "standing"', 'name = "standing"\ncalibration = "gone.json"'), ["gone.json"]),
+    ],
+)
+def test_a_wrong_scene_names_the_key(run, tmp_path, change, says):
+    assert change[0] in STANDING
+    (tmp_path / "scene.toml").write_text(STANDING.replace(*change, 1))
+    outcome = run("simulate", "--scene", "scene.toml", "--seconds", 2, "--out", "s.parquet")
+    assert outcome.code in (1, 2)
+    assert outcome.err.startswith("foottile: ")
+    assert "Traceback" not in outcome.err
+    for word in says:
+        assert word in outcome.err
+    assert left(tmp_path, "scene.toml") == []
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (GOOD_TRACE.replace("time_s", "time_ms"), ["time_s", "time_ms"]),
+        (GOOD_TRACE.replace("fz_n", "fz_kn"), ["fz_n", "fz_kn"]),
+        (GOOD_TRACE.replace("0.20,", "0.10,"), ["row 21", "rise"]),
+        (GOOD_TRACE.replace("0.20,", "0.19,"), ["row 21", "rise"]),
+        (GOOD_TRACE.replace("0.20,30,", "0.20,nan,"), ["fz_n", "row 21"]),
+        (GOOD_TRACE.replace("0.20,30,", "0.20,,"), ["fz_n", "row 21"]),
+        (GOOD_TRACE.replace("0.20,30,0.0,0.0", "0.20,30,,"), ["row 21", "centre of pressure"]),
+        (GOOD_TRACE.replace("0.20,30,", "0.20,much,"), ["fz_n"]),
+        ("time_s,cell1_n,cell2_n\n0,1,1\n1,1,1\n", ["2 cell columns", "4 tiles"]),
+        ("", ["cannot be read"]),
+        ("\x00\xff\x00", ["cannot be read", "expected"]),
+    ],
+)
+def test_a_wrong_load_trace_names_the_place(run, tmp_path, text, says):
+    (tmp_path / "load.csv").write_bytes(text.encode("latin-1"))
+    outcome = run("simulate", "--scene", "standing", "--load", "load.csv", "--out", "s.parquet")
+    assert outcome.code == 1
+    assert "load.csv" in outcome.err
+    for word in says:
+        assert word in outcome.err
+    assert left(tmp_path, "load.csv") == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["--scene", "nowhere"], 2, ["nowhere", "standing"]),
+        (["--scene", "insole"], 2, ["--load"]),
+        (["--scene", "standing"], 2, ["--seconds"]),
+        (["--scene", "standing", "--seconds", "-1"], 2, ["--seconds"]),
+        (["--scene", "standing", "--seconds", "nan"], 2, ["--seconds"]),
+        (["--scene", "standing", "--seconds", "2", "--schedule", "fast"], 2, ["simultaneous"]),
+        (["--scene", "standing", "--seconds", "2", "--tiles", "T01"], 2, ["--tiles"]),
+        (["--scene", "standing", "--load", "gone.csv"], 1, ["gone.csv"]),
+        (["--scene", "standing", "--seconds", "2", "--out", "gone/s.parquet"], 2, ["gone"]),
+        (["--scene", "standing", "--seconds", "2", "--cop-offset-m", "1"], 2, ["--cop-offset-m"]),
+        (["--scene", "standing", "--seconds", "0.02"], 1, ["T01", "20"]),
+    ],
+)
+def test_simulate_refuses(run, tmp_path, arguments, code, says):
+    outcome = run("simulate", *arguments)
+    assert outcome.code == code, outcome.err
+    for word in says:
+        assert word in outcome.err
+    assert left(tmp_path) == []
+
+
+def test_an_axis_name_that_is_none_is_refused(run, tmp_path):
+    (tmp_path / "load.csv").write_text(GOOD_TRACE)
+    outcome = run("simulate", "--scene", "standing", "--load", "load.csv", "--cop-axes", "xx")
+    assert outcome.code == 2
+    assert "--cop-axes" in outcome.err
+
+
+def made_once(run, folder: Path, name: str, *arguments: object) -> bytes:
+    """What `foottile simulate` writes; the same command always gives the same bytes."""
+    kept = folder / name
+    if not kept.exists():
+        assert run("simulate", *arguments, "--out", kept).code == 0
+    return kept.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("kept")
+
+
+@pytest.fixture
+def session(run, tmp_path, kept) -> Path:
+    arguments = ("--scene", "standing", "--seconds", 2, "--no-estimates")
+    path = tmp_path / "s.parquet"
+    path.write_bytes(made_once(run, kept, "s.parquet", *arguments))
+    return path
+
+
+@pytest.fixture
+def bench(run, kept) -> bytes:
+    """A recording of tile T01 under the mill."""
+    return made_once(run, kept, "bench.parquet", "--scene", "indentation", "--tiles", "T01")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        ([], 1, ["--calibration"]),
+        (["--calibration", "gone.json"], 1, ["gone.json", "paper-eq2-shape"]),
+        (["--calibration", "other.json"], 1, ["T01", "T09", "foottile calibrate"]),
+        (["--calibration", "broken.json"], 1, ["broken.json"]),
+        (["--calibration", "paper-eq2-shape", "--models", "magic"], 2, ["magic"]),
+        (["--calibration", "paper-eq2-shape", "--lag-ms", "-1"], 2, ["look-ahead"]),
+        (["--calibration", "paper-eq2-shape", "--tare-s", "1"], 2, ["--tare-s"]),
+        (["--calibration", "paper-eq2-shape", "--tare-s", "5,6"], 1, ["T01", "--tare-s"]),
+        (["--calibration", "paper-eq2-shape", "--tare-s", "1,0"], 2, ["--tare-s"]),
+        (
+            ["--scene", "rolling", "--calibration", "paper-eq2-shape", "--scene", "insole"],
+            2,
+            ["T08"],
+        ),
+    ],
+)
+def test_estimate_refuses(run, tmp_path, session, arguments, code, says):
+    from service.estimation.calibration import Calibration, paper_eq2_shape
+
+    preset = paper_eq2_shape()
+    other = Calibration(
+        name="other",
+        reference="none",
+        date=preset.date,
+        tiles=(preset.tiles[0].model_copy(update={"serial": "T09"}),),
+    )
+    (tmp_path / "other.json").write_text(other.to_json())
+    (tmp_path / "broken.json").write_text(other.to_json().replace("15.0", "16.0"))
+    outcome = run("estimate", session, "--out", "e.parquet", *arguments)
+    assert outcome.code == code, outcome.err
+    for word in says:
+        assert word in outcome.err
+    assert left(tmp_path, "s.parquet", "other.json", "broken.json") == []
+
+
+def test_estimate_refuses_what_is_no_session(run, tmp_path):
+    (tmp_path / "x.parquet").write_bytes(b"PAR1 not really PAR1")
+    for name in ("x.parquet", "gone.parquet"):
+        outcome = run("estimate", name, "--out", "e.parquet")
+        assert outcome.code == 1
+        assert name in outcome.err
+    assert left(tmp_path, "x.parquet") == []
+
+
+def test_calibrate_refuses_a_session_that_is_no_indentation(run, tmp_path, session):
+    outcome = run("calibrate", session, "--out", "cal.json")
+    assert outcome.code == 1
+    assert "not an indentation" in outcome.err
+    assert left(tmp_path, "s.parquet") == []
+
+
+def test_calibrate_refuses_an_indentation_that_never_loads_the_tile(run, tmp_path):
+    text = (resources.files("devices.scene") / "builtin" / "indentation.toml").read_text("utf-8")
+    text = text.replace('kind = "indentation"', 'kind = "indentation"\nload_n = 0.2')
+    (tmp_path / "scene.toml").write_text(text)
+    run("simulate", "--scene", "scene.toml", "--tiles", "T01", "--out", "bench.parquet")
+    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--plot", "cal.png")
+    assert outcome.code == 1
+    assert "never loads the tile" in outcome.err
+    assert "T01" in outcome.err
+    assert left(tmp_path, "scene.toml", "bench.parquet") == []
+
+
+def test_calibrate_refuses_one_tile_from_two_files(run, tmp_path, bench):
+    for name in ("a.parquet", "b.parquet"):
+        (tmp_path / name).write_bytes(bench)
+    outcome = run("calibrate", "a.parquet", "b.parquet", "--out", "cal.json")
+    assert outcome.code == 1
+    assert "T01" in outcome.err
+    assert "a.parquet" in outcome.err
+    assert "b.parquet" in outcome.err
+
+
+def test_a_full_disk_is_an_error_and_leaves_nothing(run, tmp_path, monkeypatch):
+    import os
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    outcome = run(
+        *("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
+    )
+    assert outcome.code == 1
+    assert "No space left" in outcome.err
+    assert left(tmp_path) == []
+
+
+def test_a_tare_under_load_is_refused(run, tmp_path):
+    run("simulate", "--scene", "standing", "--seconds", 4, "--out", "s.parquet")
+    outcome = run("estimate", "s.parquet", "--tare-s", "2,3", "--out", "e.parquet")
+    assert outcome.code == 1
+    assert "seems to be loaded" in outcome.err
+    assert left(tmp_path, "s.parquet") == []
+
+
+def test_no_output_takes_the_place_of_an_input_or_a_device(run, tmp_path):
+    (tmp_path / "foot.toml").write_text(STANDING)
+    (tmp_path / "load.csv").write_text(GOOD_TRACE)
+    (tmp_path / "folder").mkdir()
+    simulate = ("simulate", "--scene", "foot.toml", "--load", "load.csv", "--out")
+    for target in ("foot.toml", "load.csv", "folder"):
+        outcome = run(*simulate, target)
+        assert outcome.code == 2, target
+    import os
+
+    os.mkfifo(tmp_path / "pipe")
+    assert run(*simulate, "pipe").code == 2
+    assert (tmp_path / "foot.toml").read_text() == STANDING
+    assert (tmp_path / "load.csv").read_text() == GOOD_TRACE
+
+
+def test_an_output_through_a_link_lands_where_the_link_points(run, tmp_path):
+    (tmp_path / "real.parquet").write_bytes(b"")
+    (tmp_path / "link.parquet").symlink_to("real.parquet")
+    simulate = ("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out")
+    assert run(*simulate, "link.parquet").code == 0
+    assert (tmp_path / "link.parquet").is_symlink()
+    assert (tmp_path / "real.parquet").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("tiles", ["", "T01,T01", "../x"])
+def test_a_wrong_list_of_tiles_is_refused(run, tmp_path, tiles):
+    outcome = run("simulate", "--scene", "indentation", "--tiles", tiles)
+    assert outcome.code == 2
+    assert outcome.err.startswith("foottile: ")
+    assert left(tmp_path) == []
+
+
+def test_a_reference_with_brackets_is_printed_as_it_is(run, tmp_path, bench):
+    (tmp_path / "bench.parquet").write_bytes(bench)
+    reference = "load cell [/dev/ttyUSB0]"
+    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--reference", reference)
+    assert outcome.code == 0, outcome.err
+    assert reference in outcome.out
+
+
+def test_a_calibration_of_another_part_with_the_same_serial_is_refused(run, tmp_path, bench):
+    (tmp_path / "bench.parquet").write_bytes(bench)
+    assert run("calibrate", "bench.parquet", "--out", "cal.json").code == 0
+    other = ("--tiles", "T01", "--parts-seed", 3, "--seconds", 2, "--out", "other.parquet")
+    assert run("simulate", "--scene", "indentation", *other).code == 0
+    arguments = ("--calibration", "cal.json", "--out", "e.parquet")
+    outcome = run("estimate", "other.parquet", *arguments)
+    assert outcome.code == 1
+    assert "T01 is not the part that was calibrated" in outcome.err
+    assert run("estimate", "bench.parquet", *arguments).code == 0

@@ -1,0 +1,115 @@
+"""`foottile bench` as a user meets it, with a preset instead of the emulated bench."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+from service.offline.benchmark import draws
+
+QUICK = ("--quick", "--frames", 2000, "--seconds", 2, "--jobs", 1)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """`rolling` with the paper's curve, and the models that go with it."""
+    text = (resources.files("devices.scene") / "builtin" / "rolling.toml").read_text("utf-8")
+    path = tmp_path / "rolling.toml"
+    text = re.sub(r"(?m)^models = .*$", 'models = ["unwrap", "static"]', text)
+    path.write_text('calibration = "paper-eq2-shape"\n' + text)
+    return path
+
+
+def test_bench_writes_json_tables_and_plot(run, scene, tmp_path):
+    outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "new/folder", "--json")
+    assert outcome.code == 0, outcome.err
+    assert "rolling: 2 of 2 draws" in outcome.err
+    folder = tmp_path / "new" / "folder"
+    content = json.loads((folder / "bench.json").read_text())
+    assert json.loads(outcome.out) == content
+    (rolling,) = content["scenes"]
+    assert (rolling["draws"], rolling["failures"]) == (2, [])
+    assert not all(goal["met"] for goal in rolling["goals"]), "said, and no failure unless asked"
+    assert rolling["absolute_scale"] == "assumed"
+    for rung in rolling["rungs"]:
+        for mode, lag_ms in (("live", 10.0), ("offline", 100.0)):
+            assert rung[mode]["lag_ms"] == lag_ms
+            assert rung[mode]["ns_per_frame"]["n"] == 3
+            assert rung[mode]["figures"]["grf_mae_n"]["n"] == 2
+            assert rung[mode]["coverage"]["all"]["frames"] > 1000
+    assert sum(rung["default"] for rung in rolling["rungs"]) == 1
+    text = (folder / "bench.md").read_text()
+    assert "an emulated foot" in text
+    assert "newtons are not to be trusted" in text
+    assert (folder / "bench.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_goals_that_are_not_met_are_named_and_code_3_if_asked_for(run, scene):
+    outcome = run("bench", "--scene", scene, "--draws", 1, *QUICK, "--out", "o", "--check-goals")
+    assert outcome.code == 3
+    assert outcome.out.startswith("# Speed against error")
+    # The paper's curve has another scale than the emulated domes.
+    assert "goal not met: rolling, live: GRF mean absolute error, N" in outcome.err
+    assert "| NO |" in outcome.out
+
+
+def test_a_draw_that_fails_is_reported_and_the_others_count(run, scene, tmp_path, monkeypatch):
+    real = draws.find_calibration
+
+    def refuses(name, serials, *, parts_seed, **others):
+        if parts_seed == 1:
+            raise draws.FootTileError("tile T03 does not rise")
+        return real(name, serials, parts_seed=parts_seed, **others)
+
+    monkeypatch.setattr(draws, "find_calibration", refuses)
+    outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
+    assert outcome.code == 3
+    assert "rolling, draw 1: tile T03 does not rise" in outcome.err
+    assert "- draw 1: tile T03 does not rise" in (tmp_path / "o" / "bench.md").read_text()
+    (rolling,) = json.loads((tmp_path / "o" / "bench.json").read_text())["scenes"]
+    assert rolling["draws"] == 1
+    assert len(rolling["failures"]) == 1
+
+
+def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(run, scene, tmp_path):
+    scene.write_text(scene.read_text().replace("paper-eq2-shape", "nowhere.json"))
+    outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
+    assert outcome.code == 1
+    assert "none of 2 draws gave a figure" in outcome.err
+    assert "nowhere.json" in outcome.err
+    assert not list((tmp_path / "o").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--scene", "nowhere"), "nowhere"),
+        (("--scene", "rolling", "--scene", "rolling"), "each scene once"),
+        (("--scene", "rolling", "--seconds", "0"), "--seconds 0"),
+        (("--scene", "rolling", "--draws", "0"), "draws"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_before_anything_takes_time(run, arguments, says):
+    outcome = run("bench", *arguments, "--out", "o")
+    assert outcome.code == 2
+    assert says in outcome.err
+
+
+def test_a_scene_of_real_hardware_is_refused(run, scene):
+    scene.write_text(scene.read_text() + '\n[array]\nbus = "/dev/i2c-1"\n')
+    outcome = run("bench", "--scene", scene, "--out", "o")
+    assert outcome.code == 2
+    assert "only emulates" in outcome.err
+
+
+def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(run, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    outcome = run("bench", "--scene", "rolling", "--out", "o")
+    assert outcome.code == 2
+    assert "pip install '.[plot]'" in outcome.err

@@ -1,0 +1,198 @@
+"""`foottile doctor`: what it finds on an emulated bus, what it advises, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib import resources
+
+import pytest
+
+from devices.scene.file import load_scene
+
+
+def scene_text(name: str) -> str:
+    return (resources.files("devices.scene") / "builtin" / f"{name}.toml").read_text("utf-8")
+
+
+def faulty(kind: str, **keys: object) -> str:
+    lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items())
+    return f'\n[[fault]]\nkind = "{kind}"\nt_s = 0.0\nduration_s = 1000.0\n{lines}'
+
+
+@pytest.fixture
+def doctor(run, tmp_path):
+    """Run the doctor with --json on a scene of this text."""
+
+    def examine(text: str, *arguments: object):
+        (tmp_path / "scene.toml").write_text(text)
+        outcome = run("doctor", "--scene", "scene.toml", "--json", *arguments)
+        return outcome, json.loads(outcome.out) if outcome.out else None
+
+    return examine
+
+
+def test_a_healthy_bus_is_said_to_be_well_and_how_fast_it_is(run):
+    outcome = run("doctor", "--bus", "emulated", "--json")
+    assert outcome.code == 0, outcome.err
+    found = json.loads(outcome.out)
+    assert [tile["serial"] for tile in found["tiles"]] == ["T01", "T02", "T03", "T04"]
+    assert all(tile["problem"] == "" for tile in found["tiles"])
+    # The scene's parts take 1.6 ms; hardware.md 4 has the rates.
+    assert all(1.6 <= tile["conversion_ms"] < 1.62 for tile in found["tiles"])
+    assert found["scl_hz"] == pytest.approx(400_000, rel=1e-3)
+    limits = {"sequential": 132.45, "simultaneous": 394.87, "pipelined": 544.22}
+    for schedule, limit_hz in limits.items():
+        assert 0.99 * limit_hz < found["rates_hz"][schedule] <= limit_hz
+    assert found["schedule"] == "pipelined"
+    assert "pipelined gives 541 frames/s" in found["verdict"]
+    assert "repeated" not in found["verdict"], "channels without a tile are no disturbance"
+
+
+def test_what_people_read_says_the_same(run):
+    outcome = run("doctor", "--bus", "emulated")
+    assert outcome.code == 0
+    for word in ("T03", "0x70", "1.609 ms", "400.0 kHz", "541.5", "best", "pipelined gives"):
+        assert word in outcome.out
+
+
+def test_a_rate_that_will_not_hold_is_said_with_what_would(run):
+    outcome = run("doctor", "--scene", "standing", "--rate-hz", 700, "--json")
+    assert outcome.code == 3
+    found = json.loads(outcome.out)
+    assert found["holds"] is False
+    assert "700 frames/s asked for will not hold: ask for 531 or less" in found["verdict"]
+
+
+def test_a_rate_that_another_schedule_would_hold_is_said_with_its_name(doctor):
+    text = scene_text("standing").replace("[array]", '[array]\nschedule = "sequential"')
+    outcome, found = doctor(text, "--rate-hz", 300)
+    assert outcome.code == 3
+    assert "will not hold: use schedule simultaneous" in found["verdict"]
+
+
+def test_the_raspberry_pi_that_runs_at_five_eighths_is_recognised(doctor):
+    outcome, found = doctor(scene_text("standing") + "\n[emulation]\nscl_part = 0.625\n")
+    assert outcome.code == 0
+    assert found["scl_hz"] == pytest.approx(250_000, rel=1e-3)
+    assert "runs at 250 kHz where 400 are asked for" in found["verdict"]
+    assert "core_freq" in found["verdict"]
+
+
+def test_a_slow_part_is_named_with_what_it_costs(run):
+    outcome = run("doctor", "--scene", "rolling", "--servo", "none", "--json")
+    assert outcome.code == 0
+    slowest = max(json.loads(outcome.out)["tiles"], key=lambda tile: tile["conversion_ms"])
+    assert f"{slowest['serial']} converts slowest" in json.loads(outcome.out)["verdict"]
+
+
+@pytest.mark.parametrize("kind", ["no_answer", "unplugged"])
+def test_a_tile_that_is_not_there_needs_attention(doctor, kind):
+    outcome, found = doctor(scene_text("standing") + faulty(kind, tile="T02"))
+    assert outcome.code == 3
+    assert [tile["serial"] for tile in found["tiles"] if tile["problem"]] == ["T02"]
+    assert "T02 needs attention first" in found["verdict"]
+    assert found["rates_hz"]["pipelined"] is not None, "the others are measured all the same"
+
+
+def test_a_part_that_does_not_convert_needs_attention(doctor):
+    outcome, found = doctor(scene_text("standing") + faulty("stale", tile="T03"))
+    assert outcome.code == 3
+    (tile,) = [tile for tile in found["tiles"] if tile["problem"]]
+    assert tile["serial"] == "T03"
+    assert tile["conversion_ms"] is None
+    assert "never change" in tile["problem"]
+
+
+def test_a_part_that_does_not_convert_is_not_said_to_set_the_pace(doctor):
+    _, found = doctor(scene_text("standing") + faulty("stale", tile="T03"))
+    assert "converts slowest" not in found["verdict"]
+
+
+def test_a_bus_on_which_nobody_answers_is_a_failure_with_advice(doctor):
+    outcome, found = doctor(scene_text("standing") + faulty("sda_high"))
+    assert outcome.code == 1
+    assert found["scl_hz"] is None
+    assert "Nothing answers at 0x70 to 0x77" in found["verdict"]
+
+
+@pytest.mark.parametrize(("kind", "word"), [("sda_low", "SDA is stuck low"), ("scl_low", "bus")])
+def test_a_stuck_bus_is_a_failure_in_one_line(doctor, kind, word):
+    outcome, _ = doctor(scene_text("standing") + faulty(kind))
+    assert outcome.code == 1
+    assert outcome.out == ""
+    assert outcome.err.startswith("foottile: ")
+    assert word in outcome.err
+    assert "Traceback" not in outcome.err
+
+
+def test_more_channels_than_allowed_at_once_is_no_schedule(run):
+    found = json.loads(run("doctor", "--scene", "grid", "--json").out)
+    assert found["rates_hz"]["simultaneous"] is None
+    assert found["schedule"] == "per_mux"
+    assert len(found["tiles"]) == len(load_scene("grid").tile) == 64
+
+
+def test_which_bus_has_to_be_said(run):
+    outcome = run("doctor")
+    assert outcome.code == 2
+    assert "--bus" in outcome.err
+
+
+def test_a_bus_that_does_not_exist_is_a_failure_in_one_line(run):
+    outcome = run("doctor", "--bus", "/dev/i2c-99")
+    assert outcome.code == 1
+    assert outcome.err.count("\n") == 1
+
+
+@pytest.mark.real_time
+def test_the_servo_of_the_scene_is_found_and_named(run):
+    found = json.loads(run("doctor", "--scene", "rolling", "--json").out)["servo"]
+    assert found["is_well"] is True
+    assert found["verdict"].startswith("MX-28, protocol 2, 1000000 baud, id 1.")
+
+
+@pytest.mark.real_time
+def test_a_servo_that_is_not_what_the_scene_says_is_said(run, tmp_path, monkeypatch):
+    from devices.clock import SystemClock
+    from devices.emulation.chips.dynamixel import EmulatedServo
+
+    with EmulatedServo(lambda _: 0, SystemClock(), protocol=1, model="MX-64") as servo:
+        outcome = run("doctor", "--scene", "rolling", "--servo", servo.port, "--json")
+    assert outcome.code == 3
+    found = json.loads(outcome.out)["servo"]
+    assert "MX-64, protocol 1" in found["verdict"]
+    assert "The scene says MX-28, protocol 2" in found["verdict"]
+
+
+def test_a_wait_that_the_scene_fixes_is_the_one_that_counts(doctor):
+    text = scene_text("standing").replace("[array]", "[array]\nwait_ms = 3.0")
+    _, found = doctor(text)
+    assert found["rates_hz"]["pipelined"] == pytest.approx(309.0, rel=0.005)  # hardware.md 4
+
+
+def test_beside_a_reference_sensor_tiles_are_asked_at_once(run):
+    verdict = json.loads(run("doctor", "--scene", "indentation", "--json").out)["verdict"]
+    assert "simultaneous gives" in verdict
+
+
+def test_single_lost_acknowledges_do_not_make_tiles_look_ill(doctor):
+    outcome, found = doctor(scene_text("standing") + faulty("nack_storm", rate=0.002))
+    assert outcome.code == 0, found
+    assert not any(tile["problem"] for tile in found["tiles"])
+    assert re.search(r"\d+ transfers were acknowledged only when repeated", found["verdict"])
+
+
+def test_a_bus_that_hangs_since_the_last_run_is_freed_before_the_start(run, tmp_path):
+    text = scene_text("standing") + faulty("sda_low") + "\n[recovery]\nreset_line = 17\n"
+    (tmp_path / "scene.toml").write_text(text)
+    outcome = run("simulate", "--scene", "scene.toml", "--seconds", 1, "--no-estimates")
+    assert outcome.code == 0, outcome.err
+
+
+def test_without_help_a_bus_that_hangs_is_named_and_no_tile_is_blamed(run, tmp_path):
+    (tmp_path / "scene.toml").write_text(scene_text("standing") + faulty("sda_low"))
+    outcome = run("simulate", "--scene", "scene.toml", "--seconds", 1, "--no-estimates")
+    assert outcome.code == 1
+    assert "SDA is stuck low" in outcome.err
+    assert "T01" not in outcome.err

@@ -1,0 +1,271 @@
+"""The main path: bench, session, estimate; and that it closes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from service.offline.simulate import START_NS
+from storage.schema import ESTIMATES, FRAMES, TRUTH
+
+Run = Callable[..., object]
+
+QUIET = """
+[emulation]
+noise_kpa = 0.0
+gas = false
+rubber = false
+hysteresis = false
+"""
+
+
+def scene_text(name: str, *, without: str = "") -> str:
+    from importlib import resources
+
+    text = (resources.files("devices.scene") / "builtin" / f"{name}.toml").read_text("utf-8")
+    return text.split(without)[0] if without else text
+
+
+def test_the_same_command_gives_the_same_bytes(run, tmp_path):
+    for name in ("a.parquet", "b.parquet"):
+        outcome = run(
+            "simulate", "--scene", "rolling", "--seconds", 3, "--truth", "--seed", 5, "--out", name
+        )
+        assert outcome.code == 0, outcome.err
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+    run(
+        "simulate",
+        "--scene",
+        "rolling",
+        "--seconds",
+        3,
+        "--truth",
+        "--seed",
+        6,
+        "--out",
+        "c.parquet",
+    )
+    assert (tmp_path / "a.parquet").read_bytes() != (tmp_path / "c.parquet").read_bytes()
+
+
+def test_a_fresh_bench_and_a_kept_one_give_the_same_bytes(run, tmp_path, monkeypatch):
+    arguments = ("simulate", "--scene", "standing", "--seconds", 2, "--out")
+    assert run(*arguments, "kept.parquet").code == 0
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "empty"))
+    assert run(*arguments, "fresh.parquet").code == 0
+    assert (tmp_path / "kept.parquet").read_bytes() == (tmp_path / "fresh.parquet").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("schedule", "limit_hz"),
+    [("sequential", 132.45), ("simultaneous", 394.87), ("pipelined", 544.2)],
+)
+def test_frames_come_at_the_limit_of_the_bus(run, tmp_path, schedule, limit_hz):
+    outcome = run(
+        *("simulate", "--scene", "standing", "--seconds", 4, "--schedule", schedule, "--json"),
+        *("--out", "s.parquet"),
+    )
+    assert outcome.code == 0, outcome.err
+    # hardware.md 4; measured conversion times are a little longer than true ones, and every second
+    # one of them is tried anew.
+    assert 0.98 * limit_hz < json.loads(outcome.out)["rate_hz"] <= limit_hz
+    t_ns = pq.read_table(tmp_path / "s.parquet")["t_ns"].to_numpy()
+    assert np.median(np.diff(t_ns)) == pytest.approx(1e9 / limit_hz, rel=0.01)
+
+
+def test_a_session_has_raw_columns_then_estimates_then_truth(run, tmp_path):
+    run("simulate", "--scene", "standing", "--seconds", 2, "--truth", "--out", "s.parquet")
+    names = pq.read_schema(tmp_path / "s.parquet").names
+    expected = [flat for c in (*FRAMES, *ESTIMATES, *TRUTH) for flat in c.flat_names(4)]
+    assert sorted(names) == sorted(expected)
+    assert names[0] == "seq"
+    assert names.index("padc_0") < names.index("gauge_kpa_0")
+
+
+def test_no_estimates_leaves_raw_frames_only(run, tmp_path):
+    run("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
+    names = pq.read_schema(tmp_path / "s.parquet").names
+    assert sorted(names) == sorted(flat for c in FRAMES for flat in c.flat_names(4))
+
+
+def test_bench_to_session_to_estimate_closes_on_a_quiet_dome(run, tmp_path):
+    # Static effects only: what is left is the cubic's misfit and rounding to counts.
+    bench = scene_text("indentation", without="[emulation]") + QUIET
+    (tmp_path / "bench.toml").write_text(bench)
+    assert run("simulate", "--scene", "bench.toml", "--out", "bench.parquet").code == 0
+    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--json")
+    assert outcome.code == 0, outcome.err
+    assert min(tile["r2"] for tile in json.loads(outcome.out)["tiles"]) > 0.9999
+    (tmp_path / "foot.toml").write_text(scene_text("standing") + QUIET)
+    run(
+        "simulate",
+        "--scene",
+        "foot.toml",
+        "--seconds",
+        5,
+        "--truth",
+        "--no-estimates",
+        "--out",
+        "s.parquet",
+    )
+    outcome = run(
+        "estimate", "s.parquet", "--out", "e.parquet", "--calibration", "cal.json", "--json"
+    )
+    assert outcome.code == 0, outcome.err
+    accuracy = json.loads(outcome.out)["accuracy"]
+    assert accuracy["grf_mae_n"] < 0.15
+    assert abs(accuracy["flight_mean_n"]) < 0.02
+    assert accuracy["cop_p95_m"] < 0.0005
+
+
+def test_measured_jumps_through_all_effects_stay_within_the_papers_errors(run, recording):
+    outcome = run(
+        *("simulate", "--scene", "standing", "--truth", "--json"),
+        *("--load", recording("squat_jump_plate1.csv"), "--load-scale", 0.03, "--cop-scale", 0.2),
+    )
+    assert outcome.code == 0, outcome.err
+    accuracy = json.loads(outcome.out)["accuracy"]
+    assert accuracy["grf_mae_n"] < 1.0
+    assert accuracy["cop_p95_m"] < 0.004
+    assert accuracy["stances"] >= 3
+
+
+def test_measured_walking_is_pressed_cell_by_cell(run, recording, tmp_path):
+    outcome = run(
+        *("simulate", "--scene", "insole", "--load", recording("insole_walk_left.csv")),
+        *("--load-scale", 0.05, "--truth", "--seconds", 6, "--json", "--out", "walk.parquet"),
+    )
+    assert outcome.code == 0, outcome.err
+    table = pq.read_table(tmp_path / "walk.parquet")
+    t_ns = table["t_ns"].to_numpy() - START_NS
+    t_s = t_ns * 1e-9 - 1.01  # lead, and the touch-down before row 1
+    trace = np.genfromtxt(recording("insole_walk_left.csv"), delimiter=",", names=True)
+    inside = (t_s > 0) & (t_s < trace["time_s"][-1])
+    for cell in range(8):
+        wanted = 0.05 * np.interp(t_s[inside], trace["time_s"], trace[f"cell{cell + 1}_N"])
+        pressed = table[f"true_force_n_{cell}"].to_numpy()[inside]
+        np.testing.assert_allclose(pressed, wanted, atol=1e-6)
+
+
+def test_estimating_anew_gives_the_bits_of_the_simulation(run, tmp_path):
+    run("simulate", "--scene", "rolling", "--seconds", 4, "--out", "s.parquet")
+    assert run("estimate", "s.parquet", "--out", "e.parquet").code == 0
+    before, after = (pq.read_table(tmp_path / name) for name in ("s.parquet", "e.parquet"))
+    for name in before.column_names:
+        assert before[name].equals(after[name]), name
+
+
+def test_an_assumed_scale_is_said_on_the_terminal_and_in_the_file(run, tmp_path):
+    run("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
+    outcome = run("estimate", "s.parquet", "--out", "e.parquet", "--calibration", "paper-eq2-shape")
+    assert outcome.code == 0, outcome.err
+    assert "assumed" in outcome.out
+    table = pq.read_table(tmp_path / "e.parquet")
+    assert (table["estimate_status"].to_numpy() & 64 == 64).all()
+    assert json.loads(table.schema.metadata[b"foottile.notes"])["absolute_scale"] == "assumed"
+
+
+def test_a_fault_of_the_scene_is_null_and_flagged_while_the_others_go_on(run, tmp_path):
+    (tmp_path / "faulty.toml").write_text(
+        scene_text("standing")
+        + '[[fault]]\nkind = "no_answer"\ntile = "T02"\nt_s = 1.5\nduration_s = 0.5\n'
+    )
+    outcome = run("simulate", "--scene", "faulty.toml", "--seconds", 3, "--out", "s.parquet")
+    assert outcome.code == 0, outcome.err
+    table = pq.read_table(tmp_path / "s.parquet")
+    silent = table["status_1"].to_numpy() & 1 == 1
+    assert 0.4 < silent.mean() * 3 < 0.6
+    assert table["padc_1"].null_count == silent.sum()
+    assert table["grf_n"].null_count == silent.sum()
+    assert table["padc_0"].null_count == table["force_n_0"].null_count == 0
+    assert (table["estimate_status"].to_numpy()[silent] & 32 == 32).all()
+
+
+def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touch(run, tmp_path):
+    # T09 is a part whose padc falls through zero at 95 N; face value would be about 23 kPa.
+    (tmp_path / "foot.toml").write_text(scene_text("standing").replace("T01", "T09"))
+    rows = "".join(f"{0.01 * i:.2f},110,5,5,5\n" for i in range(100))
+    (tmp_path / "load.csv").write_text("time_s,cell1_n,cell2_n,cell3_n,cell4_n\n" + rows)
+    simulate = ("simulate", "--scene", "foot.toml", "--load", "load.csv", "--out", "s.parquet")
+    assert run(*simulate, "--truth").code == 0
+    table = pq.read_table(tmp_path / "s.parquet")
+    pressed = table["true_force_n_0"].to_numpy() == 110.0
+    wrapped = pressed & (table["padc_0"].to_numpy() > 900)
+    assert wrapped.sum() > 100
+    assert (table["status_0"].to_numpy()[wrapped] & 16 == 16).all()
+    assert (table["estimate_status"].to_numpy()[pressed] & 1 == 1).all()
+    assert (table["force_n_0"].to_numpy()[pressed] > 25.0).all()
+    assert np.isnan(table["force_sigma_n_0"].to_numpy()[pressed]).all()
+    # Without the model it is no force at all.
+    outcome = run("estimate", "s.parquet", "--models", "static", "--out", "e.parquet")
+    assert outcome.code == 0, outcome.err
+    assert np.isnan(pq.read_table(tmp_path / "e.parquet")["force_n_0"].to_numpy()[wrapped]).all()
+
+
+def test_a_rate_that_the_bus_cannot_keep_is_said_and_gives_exit_code_3(run, tmp_path):
+    text = scene_text("standing").replace('name = "standing"', 'name = "fast"\nrate_hz = 1000')
+    (tmp_path / "fast.toml").write_text(text)
+    outcome = run("simulate", "--scene", "fast.toml", "--seconds", 3, "--out", "s.parquet")
+    assert outcome.code == 3
+    assert "slots were missed" in outcome.out
+    table = pq.read_table(tmp_path / "s.parquet")
+    overrun = table["frame_status"].to_numpy() & 1 == 1
+    assert overrun.mean() > 0.5
+    # What is lost is lost at the sensor: no frame is taken to be missing, and contact is seen.
+    assert (table["estimate_status"].to_numpy() & 8 == 0).mean() > 0.99
+    assert table["contact"].to_numpy().max() == 1
+
+
+def test_json_is_on_stdout_alone(run):
+    outcome = run("simulate", "--scene", "standing", "--seconds", 2, "--json")
+    assert json.loads(outcome.out)["frames"] > 700
+
+
+def test_calibrate_prints_the_contract_and_draws(run, tmp_path):
+    run("simulate", "--scene", "indentation", "--tiles", "T01,T02", "--out", "bench.parquet")
+    outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--plot", "cal.png", "--json")
+    assert outcome.code == 0, outcome.err
+    printed = json.loads(outcome.out)
+    assert [tile["serial"] for tile in printed["tiles"]] == ["T01", "T02"]
+    tile = printed["tiles"][0]
+    assert set(tile) >= {
+        *("serial", "r2", "rmse_n", "cv_rmse_n", "hysteresis_n", "range_kpa"),
+        *("monotonic", "coefficients"),
+    }
+    assert tile["bench"]["ended_by"] == "load"
+    assert tile["absolute_scale"] == "measured"
+    low_ms, high_ms = tile["effects"]["gas_tau_ms"]["interval_95"]
+    assert low_ms < tile["effects"]["gas_tau_ms"]["value"] < high_ms
+    assert printed["refused"] == {}
+    assert json.loads((tmp_path / "cal.json").read_text())["id"] == printed["id"]
+    assert (tmp_path / "cal.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_befell_a_tile_is_said_on_the_terminal(run, tmp_path):
+    (tmp_path / "faulty.toml").write_text(
+        scene_text("standing")
+        + '[[fault]]\nkind = "unplugged"\ntile = "T02"\nt_s = 0.5\nduration_s = 0.5\n'
+    )
+    arguments = ("simulate", "--scene", "faulty.toml", "--seconds", 2, "--no-estimates")
+    assert "tile T02: of " in run(*arguments).out
+    flags = json.loads(run(*arguments, "--json").out)["flags"]
+    assert list(flags) == ["T02"]
+    # Half a second at 540 frames a second, and until it is found again.
+    assert 250 < flags["T02"]["no_answer"] < 500
+
+
+def test_a_part_that_could_not_be_measured_is_said_on_the_terminal(run, tmp_path):
+    (tmp_path / "faulty.toml").write_text(
+        scene_text("standing")
+        + '[[fault]]\nkind = "stale"\ntile = "T03"\nt_s = 0.0\nduration_s = 0.5\n'
+    )
+    arguments = ("simulate", "--scene", "faulty.toml", "--seconds", 1, "--no-estimates")
+    said = "tile T03: its conversion time could not be measured, so it was given 3 ms"
+    assert said in run(*arguments).out
+    assert json.loads(run(*arguments, "--json").out)["unmeasured"] == ["T03"]
+    healthy = run("simulate", "--scene", "standing", "--seconds", 1, "--no-estimates", "--json")
+    assert json.loads(healthy.out)["unmeasured"] == []

@@ -1,0 +1,49 @@
+"""Loadings of a tile on the bench, as they go into the fit of fast effects."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.estimation.bench.indentation import Indentation, Unloaded
+from service.estimation.bench.press import joined, presses
+
+ZERO = Unloaded(baseline_kpa=100.0, noise_kpa=0.1, reference_zero_n=0.0)
+
+
+def taps(n: int = 3, *, outlier_at: int | None = None) -> Indentation:
+    """Taps of 15 N and 6 kPa whose top is a single reading, and rest."""
+    one_n = np.concatenate([np.zeros(40), [5.0, 10.0, 15.0, 10.0, 5.0]])
+    force_n = np.tile(one_n, n)
+    kpa = 100.0 + 0.4 * force_n
+    if outlier_at is not None:
+        kpa[outlier_at] -= 3.0
+    return Indentation(
+        serial="T01",
+        where="bench.parquet",
+        t_ns=np.arange(len(force_n), dtype=np.int64) * 3_000_000,
+        kpa=kpa,
+        reference_n=force_n,
+        phase=np.where(force_n > 0.0, "tap", "rest"),
+        under_spindle=np.ones(len(force_n), dtype=bool),
+        tadc=np.full(len(force_n), 500.0),
+    )
+
+
+def test_the_top_of_a_tap_stays_in_although_it_is_a_single_reading() -> None:
+    points = presses(taps(), ZERO)
+    assert np.isfinite(points.kpa[points.force_n == 15.0]).all()
+
+
+def test_a_spike_that_no_force_explains_is_left_out() -> None:
+    points = presses(taps(outlier_at=60), ZERO)  # at rest between the first two taps
+    assert np.flatnonzero(np.isnan(points.kpa)).tolist() == [60]
+
+
+def test_joined_recordings_keep_their_loadings_apart_and_far_apart() -> None:
+    one, other = presses(taps(3), ZERO), presses(taps(2), ZERO)
+    both = joined([one, other])
+    assert both.loadings == one.loadings + other.loadings == 5
+    assert (np.diff(both.t_s) > 0.0).all()
+    assert np.diff(both.t_s).max() >= 600.0
+    assert both.loading[len(one.t_s)] == one.loadings
+    np.testing.assert_array_equal(both.kpa, np.concatenate([one.kpa, other.kpa]))

@@ -1,0 +1,72 @@
+"""`unwrap`: what reads below 50 kPa has fallen through zero."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devices.chips.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
+from service.estimation.models.unwrap import unwrap
+
+DATA_SHEET_PART = Coefficients.from_words((0x3ECE, 0xB3F9, 0xC517, 0x33C8))
+FORUM_PART = Coefficients.from_words((0x3591, 0xC0A2, 0xC625, 0x2C18))
+
+
+def kpa(counts: float, tadc: int, c: Coefficients) -> float:
+    """Data sheet eq. 1 and 2, written out once more; takes counts below zero too."""
+    return (c.a0 + (c.b1 + c.c12 * tadc) * counts + c.b2 * tadc) * 65 / 1023 + 50
+
+
+def unwrapped(padc: int, tadc: int, c: Coefficients) -> float:
+    at_face_value = compensate_kpa([padc], tadc, c.a0, c.b1, c.b2, c.c12)
+    return float(unwrap(at_face_value, kpa_per_padc(tadc, c.b1, c.c12))[0])
+
+
+@given(
+    past_zero=st.integers(1, 200),
+    tadc=st.integers(440, 560),
+    part=st.sampled_from([DATA_SHEET_PART, FORUM_PART]),
+)
+def test_a_count_that_fell_through_zero_is_taken_back_below_zero(
+    past_zero: int, tadc: int, part: Coefficients
+) -> None:
+    pressure = unwrapped(1024 - past_zero, tadc, part)
+    assert abs(pressure - kpa(-past_zero, tadc, part)) < 1e-9
+    assert pressure > 120.0
+
+
+@given(
+    padc=st.integers(0, 740),
+    tadc=st.integers(440, 560),
+    part=st.sampled_from([DATA_SHEET_PART, FORUM_PART]),
+)
+def test_a_count_of_the_chips_range_is_left_as_it_is(
+    padc: int, tadc: int, part: Coefficients
+) -> None:
+    assert unwrapped(padc, tadc, part) == float(
+        compensate_kpa(padc, tadc, part.a0, part.b1, part.b2, part.c12)
+    )
+
+
+def test_full_load_of_a_real_part_reads_as_23_kpa_and_is_recognised() -> None:
+    # hardware.md 1.3: cells pressed past their range came back 18 to 37 counts past zero
+    assert kpa(1024 - 18, 500, DATA_SHEET_PART) < 24
+    assert unwrapped(1024 - 18, 500, DATA_SHEET_PART) > 148.0 + 18 * 0.12
+
+
+def test_one_count_past_zero_is_wrapped_already() -> None:
+    # -1 comes back as 1023; a bus that nobody drives reads that in both words, and is flagged
+    assert unwrapped(1023, 500, DATA_SHEET_PART) == pytest.approx(kpa(-1, 500, DATA_SHEET_PART))
+    assert unwrapped(0, 500, DATA_SHEET_PART) == pytest.approx(kpa(0, 500, DATA_SHEET_PART))
+
+
+def test_exactly_50_kpa_is_a_pressure_and_a_hair_less_is_none() -> None:
+    out = unwrap(np.array([50.0, np.nextafter(50.0, 0.0)]), np.full(2, -0.125))
+    assert out[0] == 50.0
+    assert out[1] == np.nextafter(50.0, 0.0) + 128.0
+
+
+def test_nan_stays_nan() -> None:
+    assert np.isnan(unwrap(np.array([np.nan]), -0.1)).all()

@@ -1,0 +1,60 @@
+"""The backlog: what is most urgent first, nothing twice, nothing forgotten."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.node.backlog import Backlog
+from storage.intervals import Intervals
+
+pairs = st.lists(
+    st.tuples(st.integers(0, 60), st.integers(0, 20)).map(lambda p: (p[0], p[0] + p[1])), max_size=4
+)
+
+
+def sent(backlog: Backlog, frames_max: int) -> list[tuple[str, int, int]]:
+    """Everything it gives, in order, until there is no more."""
+    found = []
+    while (wanted := backlog.next(frames_max)) is not None:
+        found.append(wanted)
+        backlog.done(*wanted)
+    return found
+
+
+@given(
+    lacks=st.lists(st.tuples(st.sampled_from("ab"), pairs), max_size=4),
+    frames_max=st.integers(1, 30),
+)
+def test_everything_that_lacks_is_given_once_in_pieces(
+    lacks: list[tuple[str, list[tuple[int, int]]]], frames_max: int
+) -> None:
+    backlog = Backlog((boot_id, Intervals(numbers)) for boot_id, numbers in lacks)
+    expected = {
+        boot_id: Intervals(pair for b, numbers in lacks if b == boot_id for pair in numbers)
+        for boot_id in "ab"
+    }
+    assert backlog.count == sum(numbers.count for numbers in expected.values())
+    given_ = {"a": Intervals(), "b": Intervals()}
+    total = 0
+    for boot_id, first, last in sent(backlog, frames_max):
+        assert 0 < last - first + 1 <= frames_max
+        given_[boot_id].add(first, last)
+        total += last - first + 1
+    assert given_ == expected
+    assert total == sum(numbers.count for numbers in expected.values())
+    assert backlog.count == 0
+
+
+def test_what_comes_first_in_the_list_goes_first() -> None:
+    """A server names what sessions need before what is only for pre-roll."""
+    backlog = Backlog([("a", Intervals([(50, 59)])), ("b", Intervals([(0, 4)]))])
+    backlog.add("a", 0, 9)
+    assert sent(backlog, 100) == [("a", 0, 9), ("a", 50, 59), ("b", 0, 4)]
+
+
+def test_a_stream_that_nobody_lacked_anything_of_can_fall_behind() -> None:
+    backlog = Backlog()
+    assert backlog.next(10) is None
+    backlog.add("a", 5, 9)
+    assert backlog.next(3) == ("a", 5, 7)

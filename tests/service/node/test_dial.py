@@ -1,0 +1,82 @@
+"""Dialling: at once where somebody listens, and soon where a link returns."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+
+import pytest
+
+from service.node import dial as dial_module
+from service.node.dial import dial
+
+
+def listening() -> socket.socket:
+    server = socket.socket()
+    server.bind(("127.0.0.1", 0))
+    server.listen(4)
+    return server
+
+
+def test_where_somebody_listens_it_connects() -> None:
+    with listening() as server:
+        port = server.getsockname()[1]
+        found = asyncio.run(dial("127.0.0.1", port))
+        assert found.getpeername() == ("127.0.0.1", port)
+        assert found.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        found.close()
+
+
+def test_where_nobody_listens_it_says_so_at_once() -> None:
+    with listening() as server:
+        port = server.getsockname()[1]
+    with pytest.raises(ConnectionRefusedError):
+        asyncio.run(dial("127.0.0.1", port))
+
+
+def test_a_name_that_is_none_is_an_error() -> None:
+    with pytest.raises(OSError, match=r"."):
+        asyncio.run(dial("no-such-host.invalid", 1))
+
+
+def test_a_link_that_returns_is_noticed_by_a_fresh_attempt_beside_those_that_wait(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The kernel repeats its first packet after 1, 3, 7 s only."""
+    monkeypatch.setattr(dial_module, "EVERY_S", 0.02)
+    begun: list[int] = []
+
+    async def scenario() -> None:
+        loop = asyncio.get_running_loop()
+        real = loop.sock_connect
+
+        async def connect(sock: socket.socket, address: tuple[str, int]) -> None:
+            begun.append(len(begun))
+            if begun[-1] < 3:
+                await asyncio.sleep(60.0)
+            await real(sock, address)
+
+        monkeypatch.setattr(loop, "sock_connect", connect)
+        with listening() as server:
+            (await dial("127.0.0.1", server.getsockname()[1])).close()
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    asyncio.run(scenario())
+    assert len(begun) == 4
+
+
+def test_nobody_who_answers_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dial_module, "EVERY_S", 0.01)
+    monkeypatch.setattr(dial_module, "GIVE_UP_S", 0.05)
+
+    async def scenario() -> None:
+        loop = asyncio.get_running_loop()
+
+        async def connect(sock: socket.socket, address: tuple[str, int]) -> None:
+            await asyncio.sleep(60.0)
+
+        monkeypatch.setattr(loop, "sock_connect", connect)
+        with pytest.raises(TimeoutError, match="nobody answered"):
+            await dial("127.0.0.1", 9)
+
+    asyncio.run(scenario())

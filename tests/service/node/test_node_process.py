@@ -1,0 +1,297 @@
+"""`foottile node` as a process, with emulated tiles, against a real server."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import tty
+from collections.abc import Callable
+from contextlib import closing
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus, TileStatus
+from storage.intervals import Intervals
+from storage.journal.journal import Journal
+from storage.journal.stream_notes import StreamNotes
+from storage.sessions.file import SessionReader
+
+pytestmark = pytest.mark.real_time
+
+Running = Any
+Until = Callable[..., Any]
+Foottile = Callable[..., Any]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """The built-in scene with a calibration that need not be pressed on the bench first."""
+    text = (resources.files("devices.scene") / "builtin" / "standing.toml").read_text("utf-8")
+    path = tmp_path / "standing.toml"
+    path.write_text('calibration = "paper-eq2-shape"\n' + text)
+    return path
+
+
+def children(pid: int) -> list[int]:
+    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(word) for word in text.split()]
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"
+
+
+def test_an_emulated_node_streams_tares_and_ends_without_loss(
+    running: Running, foottile: Foottile, scene: Path, until: Until
+) -> None:
+    process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
+    process.said("connected to")
+    until(lambda: (running.node("demo")["last_seq"] or 0) > 600, 30.0)
+    until(lambda: running.node("demo")["tare"], 30.0)
+    node = running.node("demo")
+    assert node["emulated"] is True
+    assert node["tare"]["source"] == "lead"
+    assert node["calibration"]["name"] == "paper-eq2-shape"
+    assert node["calibration"]["absolute_scale"] == "assumed"
+    assert node["rate_hz"] > 100.0
+    assert node["lost_frames"] == 0
+    assert node["clock"] is not None
+    process.process.send_signal(signal.SIGTERM)
+    assert process.ended(8.0) == 0, process.err
+    assert not any("wait on this disk" in line for line in process.err)
+    until(lambda: not running.node("demo")["connected"])
+    node = running.node("demo")
+    seqs = np.concatenate([b.seq for b in running.journal(node["boot_id"], "demo").read(0, 2**61)])
+    np.testing.assert_array_equal(seqs, np.arange(node["last_seq"] + 1))
+
+
+def test_a_servo_that_is_silent_from_the_start_is_said_and_the_tiles_stream(
+    running: Running, foottile: Foottile, scene: Path, until: Until
+) -> None:
+    master, slave = pty.openpty()
+    try:
+        tty.setraw(slave)
+        servo = f'\n[servo]\nport = "{os.ttyname(slave)}"\nprotocol = 1\nmodel = "MX-28"\n'
+        scene.write_text(scene.read_text() + servo)
+        process = foottile("node", "--scene", scene, "--server", running.url, "--name", "mute")
+        process.said("servo 1 at 1000000 baud, protocol 1: no answer within 100 ms")
+        process.said("connected to")
+        until(lambda: (running.node("mute")["last_seq"] or 0) > 100, 15.0)
+        process.process.send_signal(signal.SIGTERM)
+        assert process.ended(8.0) == 0, process.err
+    finally:
+        os.close(master)
+        os.close(slave)
+    boot_id = running.node("mute")["boot_id"]
+    batches = list(running.journal(boot_id, "mute").read(0, 2**61))
+    assert all((b.frame_status & FrameStatus.SERVO_STALE).all() for b in batches)
+    assert all((b.servo_counts == NO_SERVO_COUNTS).all() for b in batches)
+
+
+def test_a_tile_that_does_not_answer_is_named(
+    running: Running, foottile: Foottile, scene: Path
+) -> None:
+    fault = '\n[[fault]]\ntile = "T03"\nkind = "no_answer"\nt_s = 0.0\nduration_s = 1000.0\n'
+    scene.write_text(scene.read_text() + fault)
+    process = foottile("node", "--scene", scene, "--server", running.url)
+    assert process.ended(20.0) == 1
+    assert any("T03" in line for line in process.err), process.err
+    assert not any("Traceback" in line for line in process.err)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--scene", "nothing"),
+        ("--scene", "standing", "--server", "nowhere"),
+        ("--scene", "standing", "--name", "../x"),
+    ],
+    ids=str,
+)
+def test_a_node_that_cannot_be_started_says_so(
+    foottile: Foottile, arguments: tuple[str, ...]
+) -> None:
+    process = foottile("node", *arguments)
+    assert process.ended(20.0) == 2
+    assert process.err
+    assert not any("Traceback" in line for line in process.err)
+
+
+def test_acquisition_ends_when_its_node_is_killed(
+    running: Running, foottile: Foottile, scene: Path, until: Until
+) -> None:
+    process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
+    process.said("connected to")
+    begun = children(process.pid)
+    assert begun
+    os.kill(process.pid, signal.SIGKILL)
+    # Its pipes stay open as long as a child has them: that they end is what is waited for.
+    until(lambda: not any(is_alive(pid) for pid in begun), 8.0)
+    assert process.ended(5.0) == -signal.SIGKILL
+    until(lambda: not running.node("demo")["connected"], 8.0)
+
+
+def test_a_node_without_a_server_keeps_its_frames(
+    running: Running, foottile: Foottile, scene: Path, tmp_path: Path, until: Until
+) -> None:
+    running.stop()
+    process = foottile(
+        *("node", "--scene", scene, "--server", running.url, "--name", "leg"),
+        *("--journal", tmp_path / "node"),
+    )
+    assert "trying again" in process.said("not connected to")
+    until(lambda: list((tmp_path / "node").glob("journal/leg/*/*.arrows")), 30.0)
+    process.process.send_signal(signal.SIGINT)
+    assert process.ended(20.0) == 0  # no session needs them
+    (folder,) = (tmp_path / "node" / "journal" / "leg").glob("?" * 32)
+    notes = StreamNotes.load(folder)
+    assert notes is not None
+    with closing(Journal.open(folder)) as journal:
+        assert journal.held == Intervals([(0, (notes.next_seq or 0) - 1)])
+
+
+@pytest.fixture
+def leg(running: Running, foottile: Foottile, scene: Path, tmp_path: Path) -> Callable[..., Any]:
+    """A node with a journal that outlives it."""
+
+    def start(*arguments: object) -> Any:
+        return foottile(
+            *("node", "--scene", scene, "--name", "leg", "--journal", tmp_path / "node"),
+            *(arguments or ("--server", running.url)),
+        )
+
+    return start
+
+
+def streaming(running: Running, until: Until, more: int = 100) -> dict[str, Any]:
+    """Wait until the server has seen this many frames of the node's present stream."""
+    until(lambda: running.http.get("/nodes/leg").status_code == 200, 30.0)
+    until(lambda: running.node("leg")["connected"], 30.0)
+    until(lambda: (running.node("leg")["last_seq"] or 0) > more, 30.0)
+    node: dict[str, Any] = running.node("leg")
+    return node
+
+
+def test_a_killed_node_has_lost_nothing_and_its_session_goes_on(
+    running: Running, leg: Callable[..., Any], until: Until
+) -> None:
+    process = leg()
+    before = streaming(running, until)
+    session = running.http.post("/sessions", json={"node": "leg", "name": "killed"}).json()
+    until(lambda: running.node("leg")["last_seq"] > before["last_seq"] + 200, 30.0)
+    seen = running.node("leg")["last_seq"]
+    process.process.kill()
+    until(lambda: not running.node("leg")["connected"], 15.0)
+    again = leg()
+    until(lambda: running.node("leg")["boot_id"] != before["boot_id"], 30.0)
+    streaming(running, until)
+    running.http.post(f"/sessions/{session['id']}/stop")
+    until(lambda: running.session(session["id"])["state"] == "sealed", 40.0)
+    found = running.session(session["id"])
+    assert (found["complete"], len(found["parts"])) == (True, 2)
+    assert found["parts"][0]["seq_last"] >= seen
+    again.process.send_signal(signal.SIGTERM)
+    assert again.ended(12.0) == 0, again.err
+
+
+def test_what_a_session_needs_waits_on_the_nodes_disk_until_both_are_back(
+    running: Running, leg: Callable[..., Any], until: Until
+) -> None:
+    process = leg()
+    streaming(running, until)
+    session = running.http.post("/sessions", json={"node": "leg", "name": "apart"}).json()
+    running.stop()
+    process.said("not connected to")
+    process.process.send_signal(signal.SIGINT)
+    assert process.ended(20.0) == 3
+    assert any("wait on this disk" in line for line in process.err)
+    running.start()
+    running.http.post(f"/sessions/{session['id']}/stop")
+    assert running.session(session["id"])["state"] == "pending"
+    again = leg()
+    until(lambda: running.session(session["id"])["state"] == "sealed", 40.0)
+    assert running.session(session["id"])["complete"] is True
+    again.process.send_signal(signal.SIGTERM)
+    assert again.ended(20.0) == 0, again.err
+
+
+def test_a_node_alone_leaves_a_complete_session_that_proves_itself(
+    leg: Callable[..., Any], foottile: Foottile, tmp_path: Path, until: Until
+) -> None:
+    process = leg("--record", "third trial")
+    until(lambda: list((tmp_path / "node").glob("journal/leg/*/*.arrows")), 30.0)
+    process.process.kill()  # the battery held, the process did not
+    process.ended(5.0)
+    again = leg("--record", "third trial")
+    again.said("goes on")
+    until(lambda: len(list((tmp_path / "node").glob("journal/leg/*/*.arrows"))) > 1, 30.0)
+    again.process.send_signal(signal.SIGINT)
+    assert again.ended(30.0) == 0, again.err
+    assert "is complete" in again.said("session")
+    proof = foottile("verify", tmp_path / "node", "--json")
+    assert proof.ended(20.0) == 0, proof.out
+    (session,) = json.loads("".join(proof.out))["sessions"]
+    assert (session["complete"], len(session["parts"])) == (True, 2)
+
+
+def frames_of(running: Running, session_id: str) -> FrameBatch:
+    path = running.data / "sessions" / session_id / "frames.parquet"
+    with SessionReader(path) as file:
+        return file.frames()
+
+
+def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old_one(
+    running: Running, foottile: Foottile, scene: Path, until: Until
+) -> None:
+    swap = '\n[[fault]]\nkind = "replaced"\ntile = "T02"\nt_s = 6.0\nduration_s = 0.5\n'
+    scene.write_text(scene.read_text() + swap)
+    process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
+    process.said("connected to")
+    until(lambda: running.node("demo")["tare"], 40.0)
+    answer = running.http.post("/sessions", json={"node": "demo", "name": "swap"})
+    assert answer.status_code == 201, answer.text
+    process.said("a new stream begins", 40.0)
+    sealed = running.sealed(answer.json()["id"])
+    assert sealed["complete"] is True
+    assert "other tiles" in sealed["problem"]
+    first = frames_of(running, sealed["id"])
+    tile = first.status[-20:, 1]
+    assert (tile & TileStatus.UNUSABLE != 0).all(), "of the other part nothing was believed"
+    assert (first.status[:, 0] & TileStatus.UNUSABLE == 0).all()
+    until(lambda: (running.node("demo")["last_seq"] or 0) > 200, 30.0)
+    (second,) = running.http.get("/sessions").json()["items"][:1]
+    assert (second["name"], second["state"]) == ("swap (2)", "recording")
+    running.http.post(f"/sessions/{second['id']}/stop")
+    running.sealed(second["id"])
+    again = frames_of(running, second["id"])
+    assert again.frame_status[0] & FrameStatus.NEW_ARRAY_INFO
+    assert not (again.frame_status[1:] & FrameStatus.NEW_ARRAY_INFO).any()
+    assert (again.status[20:, 1] & TileStatus.UNUSABLE == 0).mean() > 0.99
+
+
+def test_a_tile_that_dies_is_named_on_the_terminal_and_by_the_server_and_so_is_its_return(
+    running: Running, foottile: Foottile, scene: Path, until: Until
+) -> None:
+    death = '\n[[fault]]\nkind = "unplugged"\ntile = "T03"\nt_s = 1.0\nduration_s = 2.5\n'
+    scene.write_text(scene.read_text() + death)
+    process = foottile("node", "--scene", scene, "--server", running.url)
+    process.said("tile T03 (mux 0x70 channel 2) does not answer", 25.0)
+    (name,) = [node["node"] for node in running.http.get("/nodes").json()["items"]]
+    until(lambda: running.node(name)["troubles"])
+    assert running.node(name)["troubles"] == ["tile T03 (mux 0x70 channel 2) does not answer"]
+    process.said("no longer: tile T03", 15.0)
+    until(lambda: not running.node(name)["troubles"])
+    counts = running.node(name)["fault_counts"]
+    assert counts["T03"]["no_answer"] > 100
+    process.process.send_signal(signal.SIGTERM)
+    assert process.ended(10.0) == 0

@@ -1,0 +1,100 @@
+"""Medians, ranges, pooled coverage and the front, on numbers small enough to check by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.offline.accuracy import Accuracy, judge
+from service.offline.benchmark.draws import Drawn
+from service.offline.benchmark.figures import Spread, coverage_of, figures_of, measured_of, pareto
+from service.offline.benchmark.rungs import rungs
+
+
+def accuracy(error_n: float, frames: int = 20) -> Accuracy:
+    """Of a standing foot of 10 N that is estimated off by that much; sigma is 0.1 N."""
+    columns = {
+        "t_ns": 10_000_000 * np.arange(frames, dtype=np.int64),
+        "true_grf_n": np.full(frames, 10.0),
+        "grf_n": np.full(frames, 10.0 + error_n),
+        "grf_sigma_n": np.full(frames, 0.1),
+        "true_cop_x_m": np.zeros(frames),
+        "true_cop_y_m": np.zeros(frames),
+        "cop_x_m": np.full(frames, error_n * 1e-3),
+        "cop_y_m": np.zeros(frames),
+        "cop_sigma_x_m": np.full(frames, 1e-4),
+        "estimate_status": np.zeros(frames, dtype=np.uint16),
+    }
+    return judge(columns)
+
+
+def test_a_spread_is_median_and_5_to_95_percent() -> None:
+    spread = Spread.of([float(n) for n in range(101)])
+    assert (spread.low, spread.median, spread.high, spread.n) == (5.0, 50.0, 95.0, 101)
+
+
+def test_what_is_not_known_is_left_out_of_a_spread_and_counted() -> None:
+    assert Spread.of([1.0, math.nan, 3.0]).n == 2
+    assert Spread.of([1.0, math.nan, 3.0]).median == 2.0
+    assert Spread.of([]).as_dict() == {"median": None, "p5": None, "p95": None, "n": 0}
+
+
+def test_figures_with_a_sign_do_not_cancel_over_draws() -> None:
+    figures = figures_of([accuracy(-0.3), accuracy(0.3)])
+    assert figures["grf_bias_n"].median == pytest.approx(0.3)
+    assert figures["grf_mae_n"].median == pytest.approx(0.3)
+    assert math.isnan(figures["flight_mean_n"].median)
+
+
+def test_coverage_is_pooled_over_frames_and_not_over_draws() -> None:
+    coverage = coverage_of([accuracy(0.1, frames=30), accuracy(0.5, frames=10)])
+    assert coverage["all"].share == pytest.approx(0.75)
+    assert coverage["mid_stance"] == coverage["all"]
+    assert coverage["flight"].frames == 0
+    assert coverage["cop_x"].share == pytest.approx(0.75)
+
+
+def test_a_rung_that_failed_in_one_draw_has_the_figures_of_the_others() -> None:
+    ladder = rungs(("unwrap", "static"), existing=("unwrap", "static"))
+    label = ladder[0].label
+    both = Drawn(0, 20, {("live", label): accuracy(0.1), ("offline", label): accuracy(0.2)}, ())
+    one = replace(both, draw=1, accuracy={("live", label): accuracy(0.3)})
+    measured = measured_of(ladder, [both, one], {("live", label): [5.0, 7.0, 6.0]})
+    assert measured["live", label].figures["grf_mae_n"].median == pytest.approx(0.2)
+    assert measured["live", label].ns_per_frame.median == 6.0
+    assert measured["offline", label].figures["grf_mae_n"].n == 1
+    assert measured["offline", label].ns_per_frame.n == 0
+    assert measured["live", ladder[1].label].figures["grf_mae_n"].n == 0
+
+
+def test_a_model_left_out_is_compared_draw_by_draw() -> None:
+    ladder = rungs(("unwrap", "static"), existing=("unwrap", "static"))
+    whole, less = (("live", rung.label) for rung in ladder)
+    draws = [
+        Drawn(0, 20, {whole: accuracy(0.1), less: accuracy(0.3)}, ()),
+        Drawn(1, 20, {whole: accuracy(0.5), less: accuracy(0.8)}, ()),
+        Drawn(2, 20, {less: accuracy(9.0)}, ()),
+    ]
+    measured = measured_of(ladder, draws, {})
+    more = measured[less].beyond_whole["grf_mae_n"]
+    assert (more.n, more.median) == (2, pytest.approx(0.25))
+    assert measured[whole].beyond_whole["cop_p95_m"].median == 0.0
+
+
+def test_figures_are_json() -> None:
+    figures = {n: s.as_dict() for n, s in figures_of([accuracy(0.1)]).items()}
+    assert json.loads(json.dumps(figures, allow_nan=False))["grf_mae_n"]["n"] == 1
+
+
+def test_the_front_has_the_points_that_no_other_beats() -> None:
+    points = [(3.0, 1.0), (1.0, 5.0), (2.0, 5.0), (2.0, 2.0), (4.0, 1.0), (5.0, 0.5)]
+    assert pareto(points) == [1, 3, 0, 5]
+
+
+def test_what_was_not_measured_is_on_no_front() -> None:
+    assert pareto([(math.nan, 0.0), (1.0, math.nan), (2.0, 2.0)]) == [2]
+    assert pareto([]) == []

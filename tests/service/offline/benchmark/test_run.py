@@ -1,0 +1,26 @@
+"""Draws in processes of their own are the same draws."""
+
+from __future__ import annotations
+
+from devices.scene.file import load_scene
+from service.offline.benchmark.draws import Task, run_draw
+from service.offline.benchmark.run import drawn
+from service.offline.benchmark.rungs import rungs
+
+
+def test_draws_in_processes_of_their_own_give_the_same() -> None:
+    scene = load_scene("rolling").model_copy(
+        update={"calibration": "paper-eq2-shape", "models": ("unwrap", "static")}
+    )
+    tasks = [Task(scene, 1.5, draw, rungs(scene.models)) for draw in (0, 1)]
+    there = sorted(drawn(tasks, jobs=2), key=lambda d: d.draw)
+    assert there == [run_draw(task) for task in tasks]
+    assert not any(d.failures for d in there)
+
+
+def test_a_draw_that_cannot_be_made_is_a_failure_and_no_end() -> None:
+    scene = load_scene("rolling").model_copy(update={"calibration": "nowhere.json"})
+    (result,) = drawn([Task(scene, 1.5, 7, rungs(scene.models))], jobs=1)
+    assert not result.accuracy
+    assert [f.what for f in result.failures] == ["draw 7"]
+    assert "nowhere.json" in result.failures[0].why

@@ -1,0 +1,97 @@
+"""The picture of a calibration, and the fast loads that are replayed in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from devices.scene.file import build_scene, load_scene
+from service.estimation.bench.effects_fit import fit_effects
+from service.estimation.bench.indentation import Indentation
+from service.estimation.bench.replay import replays
+from service.estimation.calibration import Calibration
+from service.offline.calibrate import calibrate_recordings, read_recordings
+from service.offline.calibrations import with_tiles
+from service.offline.simulate import SimulateOptions, simulate
+
+Bench = tuple[Calibration, dict[str, list[Indentation]]]
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """One tile of the emulated bench."""
+    path = Path(tmp_path_factory.mktemp("bench")) / "bench.parquet"
+    scene = with_tiles(load_scene("indentation"), ["T01"])
+    quick = scene.model_dump() | {"ground": scene.ground.model_dump() | {"stroke_s": 2.0}}
+    simulate(SimulateOptions(build_scene(quick, where="quick")), path, None)
+    pressed = read_recordings([path])
+    calibration = calibrate_recordings(pressed, name="bench", reference="mill")
+    return calibration, {"T01": [one.indentation for one in pressed["T01"]]}
+
+
+def test_a_release_and_a_tap_are_replayed_better_with_effects_than_without(bench: Bench) -> None:
+    calibration, recordings = bench
+    found = replays(recordings["T01"], calibration.of("T01"))
+    assert set(found) == {"release", "tap"}
+    for replay in found.values():
+        known = np.isfinite(replay.measured_kpa)
+        with_effects, without = (
+            np.sqrt(np.mean((modelled[known] - replay.measured_kpa[known]) ** 2))
+            for modelled in (replay.modelled_kpa, replay.static_kpa)
+        )
+        assert with_effects < 0.25  # the noise of a reading is 0.165 kPa
+        assert with_effects < without
+
+
+def test_a_recording_without_fast_loads_has_nothing_to_replay(bench: Bench) -> None:
+    calibration, recordings = bench
+    (recording,) = recordings["T01"]
+    slow = np.isin(recording.phase, ("rest", "load", "unload"))
+    last = int(np.flatnonzero(~slow)[0])
+    only_slow = Indentation(
+        **{
+            name: value[:last] if isinstance(value, np.ndarray) else value
+            for name, value in vars(recording).items()
+        }
+    )
+    assert replays([only_slow], calibration.of("T01")) == {}
+
+
+def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> None:
+    calibration, (recording,) = bench[0], bench[1]["T01"]
+    soaks = recording.phase == "soak"
+
+    def part(rows: np.ndarray) -> Indentation:
+        return Indentation(
+            **{
+                name: value[rows] if isinstance(value, np.ndarray) else value
+                for name, value in vars(recording).items()
+            }
+        )
+
+    tile = calibration.of("T01")
+    without = fit_effects([part(~soaks)], tile)
+    assert without.temperature is None
+    apart = fit_effects([part(~soaks), part(soaks)], tile)
+    assert apart.temperature is not None
+    assert tile.effects.temperature is not None
+    assert apart.temperature.kpa_per_k.value == pytest.approx(
+        tile.effects.temperature.kpa_per_k.value, rel=1e-3
+    )
+
+
+@pytest.mark.parametrize("tiles", [1, 5])
+def test_a_picture_holds_any_number_of_tiles(bench: Bench, tiles: int) -> None:
+    pytest.importorskip("matplotlib")
+    from service.offline.calibration_plot import plot_calibration
+
+    calibration, recordings = bench
+    entry = calibration.of("T01")
+    serials = [f"T{i:02}" for i in range(tiles)]
+    many = calibration.model_copy(
+        update={"tiles": tuple(entry.model_copy(update={"serial": s}) for s in serials)}
+    )
+    png = plot_calibration(many, dict.fromkeys(serials, recordings["T01"]))
+    assert png.startswith(b"\x89PNG")

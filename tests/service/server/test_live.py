@@ -1,0 +1,388 @@
+"""What screens are told: the newest frame, the peaks of all that were skipped, and what was not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from itertools import accumulate, pairwise
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.frames import NO_SERVO_AGE, FrameBatch
+from service.estimation.contact import UNKNOWN
+from service.server.live import SUMMARY_NS, Encoder, Hub, Piece, Subscriber, min_of, sum_up
+from service.server.nodes import Node
+
+PERIOD_NS = 2_000_000
+TILES = 2
+RANGE_KPA = np.array([15.0, 15.0])
+
+Columns = dict[str, np.ndarray]
+
+
+def fake_node(name: str = "bench", boot_id: str = "0" * 32) -> Node:
+    node = SimpleNamespace(
+        name=name,
+        boot_id=boot_id,
+        info=SimpleNamespace(tiles=("T01", "T02"), nominal_rate_hz=1e9 / PERIOD_NS),
+        live=SimpleNamespace(range_kpa=RANGE_KPA),
+        shown_t_ns=None,
+    )
+    return cast(Node, node)
+
+
+def frames(first: int, rows: int, *, period_ns: int = PERIOD_NS) -> FrameBatch:
+    seq = np.arange(first, first + rows)
+    return FrameBatch(
+        seq=seq.astype(np.uint64),
+        t_mono_ns=seq * period_ns,
+        t_ns=10**18 + seq * period_ns,
+        padc=np.full((rows, TILES), 500, dtype=np.uint16),
+        tadc=np.full((rows, TILES), 480, dtype=np.uint16),
+        sample_offset_us=np.zeros((rows, TILES), dtype=np.int32),
+        servo_counts=np.zeros(rows, dtype=np.int32),
+        servo_age_us=np.full(rows, NO_SERVO_AGE, dtype=np.int32),
+        status=(seq[:, None] % 64 * [1, 0]).astype(np.uint8),
+        frame_status=(seq % 32).astype(np.uint8),
+        reference_force_n=np.full(rows, np.nan, dtype=np.float32),
+    )
+
+
+def estimates(first: int, rows: int, *, silent: float = 0.2) -> Columns:
+    """Estimates that belong to the numbers of the frames, some of them not known."""
+    made = []
+    for seq in range(first, first + rows):
+        rng = np.random.default_rng(seq)
+        force_n = rng.normal(0.0, 20.0, TILES)
+        force_n[rng.random(TILES) < silent] = np.nan
+        made.append((force_n, force_n / 7, force_n.sum()))
+    force, gauge, grf = (np.array(column) for column in zip(*made, strict=True))
+    return {
+        "force_n": force,
+        "gauge_kpa": gauge,
+        "grf_n": grf,
+        "contact": np.where(np.isnan(grf), UNKNOWN, grf > 0).astype(np.uint8),
+        "estimate_status": np.arange(first, first + rows, dtype=np.uint16),
+    }
+
+
+def piece(first: int, rows: int, *, period_ns: int = PERIOD_NS) -> Piece:
+    return sum_up(RANGE_KPA, frames(first, rows, period_ns=period_ns), estimates(first, rows))
+
+
+def taken(
+    subscriber: Subscriber, ages_ms: Mapping[str, float] | None = None
+) -> list[dict[str, Any]]:
+    def refuse(constant: str) -> None:
+        pytest.fail(f"{constant} is no JSON")
+
+    texts = subscriber.take(ages_ms or {}, Encoder())
+    return [json.loads(text, parse_constant=refuse) for text in texts]
+
+
+def of_type(messages: Sequence[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
+    return [message for message in messages if message["type"] == kind]
+
+
+def extremes(values: np.ndarray, digits: int) -> tuple[list[float | None], list[float | None]]:
+    """Least and greatest by tile over what is known."""
+    low, high = [], []
+    for column in values.T:
+        known = column[~np.isnan(column)].tolist()
+        low.append(round(min(known), digits) if known else None)
+        high.append(round(max(known), digits) if known else None)
+    return low, high
+
+
+# --- peaks ----------------------------------------------------------------------------------------
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(1, 12), min_size=1, max_size=12), st.sampled_from([0.0, 0.3, 1.0]))
+def test_minimum_and_maximum_of_all_that_was_skipped_go_with_the_newest(
+    sizes: list[int], silent: float
+) -> None:
+    node, subscriber = fake_node(), Subscriber()
+    for a, b in pairwise(accumulate(sizes, initial=0)):
+        subscriber.add(
+            node, sum_up(RANGE_KPA, frames(a, b - a), estimates(a, b - a, silent=silent))
+        )
+    total = sum(sizes)
+    columns = estimates(0, total, silent=silent)
+    (message,) = taken(subscriber)
+    assert (message["type"], message["node"]) == ("frame", "bench")
+    assert (message["seq"], message["n"]) == (total - 1, total)
+    assert message["t_ns"] == 10**18 + (total - 1) * PERIOD_NS
+    gauge, force = extremes(columns["gauge_kpa"], 4), extremes(columns["force_n"], 4)
+    assert (message["gauge_min_kpa"], message["gauge_max_kpa"]) == gauge
+    assert (message["force_min_n"], message["force_max_n"]) == force
+    assert ([message["grf_min_n"]], [message["grf_max_n"]]) == extremes(
+        columns["grf_n"][:, None], 4
+    )
+    newest = [None if np.isnan(v) else round(v, 4) for v in columns["force_n"][-1].tolist()]
+    assert message["force_n"] == newest
+    assert message["estimate_status"] == total - 1
+    assert taken(subscriber) == []
+
+
+@given(st.lists(st.integers(1, 9), min_size=3, max_size=3))
+def test_joining_pieces_is_summing_up_their_frames_and_in_any_grouping(sizes: list[int]) -> None:
+    a, b, c, end = accumulate(sizes, initial=0)
+    one, two, three = piece(a, b - a), piece(b, c - b), piece(c, end - c)
+    whole = piece(0, end)
+    for joined in (one.joined(two).joined(three), one.joined(two.joined(three))):
+        for name in ("seq_first", "seq_last", "n", "t_ns", "newest"):
+            assert getattr(joined, name) == getattr(whole, name), name
+        for name in ("gauge_min_kpa", "gauge_max_kpa", "force_min_n", "force_max_n"):
+            np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
+        np.testing.assert_array_equal(
+            [joined.grf_min_n, joined.grf_max_n], [whole.grf_min_n, whole.grf_max_n]
+        )
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "smaller"), [(1.0, 2.0, 1.0), (np.nan, 2.0, 2.0), (1.0, np.nan, 1.0)]
+)
+def test_not_a_number_is_no_smaller_number(a: float, b: float, smaller: float) -> None:
+    assert min_of(a, b) == min_of(b, a) == smaller
+    assert np.isnan(min_of(np.nan, np.nan))
+
+
+# --- what is not told -----------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    runs=st.lists(st.tuples(st.integers(0, 3), st.integers(1, 30)), min_size=1, max_size=25),
+    takes=st.sets(st.integers(0, 24)),
+    period_ns=st.sampled_from([PERIOD_NS, SUMMARY_NS // 40]),
+)
+def test_every_number_is_in_a_message_or_reported_as_dropped(
+    runs: list[tuple[int, int]], takes: set[int], period_ns: int
+) -> None:
+    """Runs of lost frames and frames; a client that takes now and then."""
+    node, subscriber, seq = fake_node(), Subscriber(), 0
+    begin: int | None = None
+    messages: list[dict[str, Any]] = []
+    sent, lost = set[int](), set[int]()
+    for at, (gap, rows) in enumerate(runs):
+        lost |= set(range(seq, seq + gap)) if begin is not None else set()
+        seq += gap
+        begin = seq if begin is None else begin
+        subscriber.add(node, piece(seq, rows, period_ns=period_ns))
+        sent |= set(range(seq, seq + rows))
+        seq += rows
+        if at in takes:
+            messages += taken(subscriber)
+    messages += taken(subscriber)
+    told = sum(message["n"] for message in of_type(messages, "frame"))
+    dropped = [
+        n for m in of_type(messages, "dropped") for n in range(m["from_seq"], m["to_seq"] + 1)
+    ]
+    assert len(dropped) == len(set(dropped))
+    assert lost <= set(dropped) <= lost | sent
+    assert told == len(sent - set(dropped))
+    assert len(of_type(messages, "frame") + of_type(messages, "dropped")) == len(messages)
+    if period_ns == PERIOD_NS and sum(rows + gap for gap, rows in runs) < SUMMARY_NS // PERIOD_NS:
+        assert set(dropped) == lost  # within a second nothing is dropped
+    assert not {m["seq"] for m in of_type(messages, "frame")} & set(dropped)
+
+
+def test_the_first_piece_says_nothing_of_what_was_before() -> None:
+    subscriber = Subscriber()
+    subscriber.add(fake_node(), piece(1000, 10))
+    assert [m["type"] for m in taken(subscriber)] == ["frame"]
+
+
+def test_a_summary_is_of_a_second_at_most_and_older_frames_are_dropped() -> None:
+    node, subscriber = fake_node(), Subscriber()
+    for first in range(0, 2000, 10):  # 4 s
+        subscriber.add(node, piece(first, 10))
+    messages = taken(subscriber)
+    (frame,), (dropped,) = of_type(messages, "frame"), of_type(messages, "dropped")
+    assert frame["n"] <= SUMMARY_NS // PERIOD_NS + 10
+    assert (dropped["node"], dropped["from_seq"]) == ("bench", 0)
+    assert dropped["to_seq"] == frame["seq"] - frame["n"]
+    assert messages.index(dropped) < messages.index(frame)
+
+
+def test_a_summary_is_of_a_second_at_most_although_frames_come_slower_than_they_should() -> None:
+    node, subscriber, period_ns = fake_node(), Subscriber(), 10 * PERIOD_NS
+    for first in range(0, 400, 5):  # 8 s
+        subscriber.add(node, piece(first, 5, period_ns=period_ns))
+    (frame,) = of_type(taken(subscriber), "frame")
+    assert (frame["n"] - 1) * period_ns <= SUMMARY_NS + 5 * period_ns
+
+
+@pytest.mark.parametrize("frames_sent", [1000, 20_000])
+def test_a_client_that_never_takes_stays_bounded(frames_sent: int) -> None:
+    """Of three frames two are lost, and there are notices: what is kept does not grow with time."""
+    node, subscriber, period_ns = fake_node(), Subscriber(), 10_000_000
+    one = vars(piece(0, 1))
+    for at in range(0, 3 * frames_sent, 3):
+        t_ns = at * period_ns
+        subscriber.add(node, Piece(**one | {"seq_first": at, "seq_last": at, "t_ns": t_ns}))
+        subscriber.notice('{"type":"node"}')
+    messages = taken(subscriber)
+    assert len(of_type(messages, "node")) == 256
+    assert len(of_type(messages, "frame")) == 1
+    # One interval for what was dropped, and the gaps of the present summary.
+    assert len(of_type(messages, "dropped")) <= 1 + SUMMARY_NS // PERIOD_NS
+
+
+def test_a_node_that_begins_anew_has_lost_nothing_by_that() -> None:
+    subscriber = Subscriber()
+    subscriber.add(fake_node(), piece(100, 10))
+    taken(subscriber)
+    again = fake_node(boot_id="1" * 32)
+    subscriber.add(again, piece(0, 5))
+    subscriber.add(again, piece(7, 5))
+    messages = taken(subscriber)
+    assert [(m["from_seq"], m["to_seq"]) for m in of_type(messages, "dropped")] == [(5, 6)]
+    assert [(m["seq"], m["n"]) for m in of_type(messages, "frame")] == [(11, 10)]
+
+
+def test_frames_of_before_a_restart_that_were_not_told_are_dropped() -> None:
+    subscriber = Subscriber()
+    subscriber.add(fake_node(), piece(100, 10))
+    subscriber.add(fake_node(boot_id="1" * 32), piece(0, 5))
+    messages = taken(subscriber)
+    assert [(m["seq"], m["n"]) for m in of_type(messages, "frame")] == [(4, 5)]
+    assert [(m["from_seq"], m["to_seq"]) for m in of_type(messages, "dropped")] == [(100, 109)]
+
+
+# --- who is told what -----------------------------------------------------------------------------
+
+
+def test_nodes_do_not_mix_and_a_client_may_look_at_one_only() -> None:
+    everything, only = Subscriber(), Subscriber("right")
+    for name, first in (("left", 0), ("right", 50), ("left", 10), ("right", 60)):
+        node = fake_node(name)
+        for subscriber in (everything, only):
+            subscriber.add(node, piece(first, 10))
+    assert [(m["node"], m["seq"], m["n"]) for m in taken(everything)] == [
+        ("left", 19, 20),
+        ("right", 69, 20),
+    ]
+    assert [(m["node"], m["seq"]) for m in taken(only)] == [("right", 69)]
+
+
+def test_there_is_news_until_it_is_taken() -> None:
+    subscriber = Subscriber("left")
+    assert not subscriber.news.is_set()
+    subscriber.add(fake_node("right"), piece(0, 1))
+    assert not subscriber.news.is_set()
+    subscriber.add(fake_node("left"), piece(0, 1))
+    assert subscriber.news.is_set()
+    taken(subscriber)
+    assert not subscriber.news.is_set()
+    subscriber.answer({"type": "answer"})
+    assert subscriber.news.is_set()
+    assert taken(subscriber) == [{"type": "answer"}]
+
+
+def test_notices_come_first_in_their_order_and_the_oldest_are_forgotten() -> None:
+    subscriber = Subscriber()
+    subscriber.add(fake_node(), piece(0, 1))
+    for n in range(1000):
+        subscriber.answer({"type": "notice", "n": n})
+    messages = taken(subscriber)
+    assert messages[-1]["type"] == "frame"
+    assert [m["n"] for m in messages[:-1]] == list(range(1000 - len(messages) + 1, 1000))
+    assert len(messages) > 100
+
+
+def test_clients_that_are_told_the_same_share_one_text() -> None:
+    hub, node = Hub(), fake_node()
+    one, two = hub.join(), hub.join()
+    hub.publish(node, [(frames(0, 10), estimates(0, 10)), (frames(10, 5), estimates(10, 5))])
+    (first,), (second,) = (s.take({"bench": 3.2}, hub.encoder) for s in (one, two))
+    assert first is second
+    assert json.loads(first)["n"] == 15
+    assert node.shown_t_ns == 10**18 + 14 * PERIOD_NS
+
+
+def test_clients_that_are_told_different_things_have_texts_of_their_own() -> None:
+    hub, node = Hub(), fake_node()
+    slow, quick = hub.join(), hub.join()
+    hub.publish(node, [(frames(0, 10), estimates(0, 10))])
+    quick.take({}, hub.encoder)
+    hub.publish(node, [(frames(10, 10), estimates(10, 10))])
+    ((behind,), (level,)) = (s.take({}, hub.encoder) for s in (slow, quick))
+    assert [json.loads(text)["n"] for text in (behind, level)] == [20, 10]
+    assert json.loads(behind)["seq"] == json.loads(level)["seq"] == 19
+
+
+def test_a_text_of_before_a_restart_is_not_given_again() -> None:
+    encoder = Encoder()
+    before = sum_up(RANGE_KPA, frames(0, 5), estimates(0, 5))
+    after = sum_up(RANGE_KPA, frames(0, 5, period_ns=2 * PERIOD_NS), estimates(100, 5))
+    told = [json.loads(encoder.encode("bench", one, None)) for one in (before, after)]
+    assert told[0]["t_ns"] == before.t_ns
+    assert told[1]["t_ns"] == after.t_ns
+    assert told[0]["force_n"] != told[1]["force_n"]
+
+
+@pytest.mark.parametrize(("age_ms", "told"), [(None, None), (0.0, 0.0), (12.34, 12.3)])
+@pytest.mark.parametrize("before", [None, 0.0, 500.0])
+def test_the_age_goes_with_it_if_it_is_known(
+    age_ms: float | None, told: float | None, before: float | None
+) -> None:
+    encoder, one = Encoder(), piece(0, 5)
+    encoder.encode("bench", one, before)
+    assert json.loads(encoder.encode("bench", one, age_ms))["age_ms"] == told
+
+
+def test_only_who_has_joined_is_told_and_nobody_after_leaving() -> None:
+    hub, node = Hub(), fake_node()
+    hub.notice({"type": "early"})
+    one, two = hub.join(), hub.join(only="other")
+    assert hub.subscribers == 2
+    hub.publish(node, [(frames(0, 5), {})])
+    hub.notice({"type": "late"})
+    hub.leave(one)
+    hub.leave(one)
+    hub.publish(node, [(frames(5, 5), {})])
+    assert hub.subscribers == 1
+    assert [(m["type"], m.get("n")) for m in taken(one)] == [("late", None), ("frame", 5)]
+    assert [m["type"] for m in taken(two)] == ["late"]
+
+
+# --- what is not known ----------------------------------------------------------------------------
+
+
+def test_without_estimates_everything_estimated_is_null() -> None:
+    subscriber = Subscriber()
+    subscriber.add(fake_node(), sum_up(RANGE_KPA, frames(0, 5), {}))
+    (message,) = taken(subscriber)
+    for name in ("gauge_kpa", "force_n", "force_sigma_n", "gauge_min_kpa", "force_max_n"):
+        assert message[name] == [None, None], name
+    for name in ("grf_n", "grf_min_n", "grf_max_n", "cop_x_m", "angle_rad", "contact", "age_ms"):
+        assert message[name] is None, name
+    assert message["saturated"] == [False, False]
+    assert message["estimate_status"] == 0
+    assert message["status"] == [4, 0]
+    assert message["frame_status"] == 4
+    assert message["servo_age_us"] is None
+
+
+def test_contact_and_saturation_are_those_of_the_newest_frame() -> None:
+    high_kpa = np.array([10.0, 10.0])
+    columns = {
+        "gauge_kpa": np.array([[50.0, 50.0], [10.0, 10.1]]),
+        "contact": np.array([UNKNOWN, 1], dtype=np.uint8),
+    }
+    newest = sum_up(high_kpa, frames(0, 2), columns).newest
+    assert newest["saturated"] == [False, True]
+    assert newest["contact"] is True
+    assert sum_up(None, frames(0, 2), columns).newest["saturated"] == [False, False]
+    for value, told in ((0, False), (UNKNOWN, None)):
+        columns["contact"][-1] = value
+        assert sum_up(high_kpa, frames(0, 2), columns).newest["contact"] is told
+    columns["gauge_kpa"][-1] = np.nan
+    assert sum_up(high_kpa, frames(0, 2), columns).newest["saturated"] == [False, False]

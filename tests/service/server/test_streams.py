@@ -1,0 +1,352 @@
+"""What a server makes of a node's streams, in whatever order their frames come, and how often."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.frames import (
+    FRAME_COLUMNS,
+    NO_SERVO_AGE,
+    NO_SERVO_COUNTS,
+    ArrayInfo,
+    FrameBatch,
+)
+from service.link import PROTOCOL, EarlierStream, Hello
+from service.server.nodes import Node
+from storage.intervals import Intervals
+from storage.schema import wire_schema
+from storage.sessions.ledger import NO_END
+from storage.wire import encode
+
+PERIOD_NS = 2_000_000
+UTC_NS = 10**18
+PER_MESSAGE = 5
+OLD, NEW = "a" * 32, "b" * 32
+
+Array = Callable[..., ArrayInfo]
+
+
+def frames(first: int, last: int, boot: str) -> FrameBatch:
+    seq = np.arange(first, last + 1)
+    n = len(seq)
+    t_mono_ns = seq * PERIOD_NS + (0 if boot == OLD else 10**12)
+    return FrameBatch(
+        seq=seq.astype(np.uint64),
+        t_mono_ns=t_mono_ns,
+        t_ns=t_mono_ns + UTC_NS,
+        padc=(300 + np.stack([seq % 97, seq % 89], axis=1)).astype(np.uint16),
+        tadc=np.full((n, 2), 480, dtype=np.uint16),
+        sample_offset_us=np.zeros((n, 2), dtype=np.int32),
+        servo_counts=np.full(n, NO_SERVO_COUNTS, dtype=np.int32),
+        servo_age_us=np.full(n, NO_SERVO_AGE, dtype=np.int32),
+        status=np.zeros((n, 2), dtype=np.uint8),
+        frame_status=np.zeros(n, dtype=np.uint8),
+        reference_force_n=np.full(n, np.nan, dtype=np.float32),
+    )
+
+
+class Told:
+    """A node as the server knows it, told what a test wants without a socket."""
+
+    def __init__(self, folder: Path, array: Array) -> None:
+        self.folder = folder
+        self.info = {boot: array("bench", boot, UTC_NS) for boot in (OLD, NEW)}
+        self.node: Node
+        self.restart()
+
+    def restart(self) -> None:
+        if hasattr(self, "node"):
+            self.close()
+        self.node = Node(self.folder / "node", self.folder / "journal", self.hello())
+
+    def hello(self, **changes: Any) -> Hello:
+        content: dict[str, Any] = {
+            "protocol": PROTOCOL,
+            "array_info": self.info[NEW],
+            "held": (),
+            "next_seq": 0,
+            "scene": {},
+            "emulated": False,
+            "calibration": None,
+            "calibration_problem": "for this test",
+        }
+        return Hello(**(content | changes))
+
+    def earlier(self, **changes: Any) -> EarlierStream:
+        content: dict[str, Any] = {"array_info": self.info[OLD], "held": (), "next_seq": 0}
+        return EarlierStream(**(content | changes))
+
+    def connect(self, **changes: Any) -> None:
+        self.node.attach(self.hello(**changes), UTC_NS)
+
+    def take(self, first: int, last: int, boot: str = NEW) -> list[int]:
+        """Numbers whose estimates are due then."""
+        payload = encode(frames(first, last, boot), wire_schema(self.info[boot]))
+        *_, due = self.node.take(self.node.streams[boot], payload, UTC_NS)
+        return [int(seq) for batch, _ in due for seq in batch.seq]
+
+    def synced(self) -> dict[str, Intervals]:
+        """Sync as the server does; what it would acknowledge then."""
+        acks = {}
+        for boot, stream in self.node.streams.items():
+            stream.sync()
+            acks[boot], stream.owed, stream.unsynced = stream.owed, Intervals(), Intervals()
+        return acks
+
+    def lacks(self, **needed: list[tuple[int, int]]) -> dict[str, list[tuple[int, int | None]]]:
+        named = {{"old": OLD, "new": NEW}[name]: Intervals(n) for name, n in needed.items()}
+        return {each.boot_id: [*each.numbers] for each in self.node.lacks(named)}
+
+    def close(self) -> None:
+        for journal in self.node.journals.values():
+            journal.close()
+
+
+@pytest.fixture
+def told(tmp_path: Path, array_of: Array) -> Iterator[Told]:
+    one = Told(tmp_path, array_of)
+    yield one
+    one.close()
+
+
+messages = st.tuples(st.sampled_from([OLD, NEW]), st.integers(0, 7))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    order=st.permutations([(boot, n) for boot in (OLD, NEW) for n in range(8)]),
+    again=st.lists(messages, max_size=8),
+    breaks=st.sets(st.integers(0, 23), max_size=4),
+    restarts=st.sets(st.integers(0, 23), max_size=2),
+)
+def test_frames_of_two_streams_in_any_order_and_any_number_of_times_are_each_held_once(
+    order: list[tuple[str, int]],
+    again: list[tuple[str, int]],
+    breaks: set[int],
+    restarts: set[int],
+    array_of: Array,
+) -> None:
+    with TemporaryDirectory() as folder:
+        told = Told(Path(folder), array_of)
+        total = 8 * PER_MESSAGE
+        whole = ((0, total - 1),)
+        shown: list[int] = []
+        sent = {OLD: Intervals(), NEW: Intervals()}
+        acked = {OLD: Intervals(), NEW: Intervals()}
+
+        def connect() -> None:
+            told.connect(
+                held=whole,
+                next_seq=total,
+                earlier=(told.earlier(held=whole, next_seq=total),),
+            )
+            lacks = told.lacks(old=[(0, NO_END)])
+            for boot in (OLD, NEW):
+                missing = [*Intervals(whole).without(sent[boot])]
+                if boot == NEW:  # nothing beyond what the node has taken is here yet
+                    joined = [*Intervals([*missing, (total, NO_END)])]
+                    missing = [(a, None if b == NO_END else b) for a, b in joined]
+                assert lacks.get(boot, []) == missing
+
+        def note_acks() -> None:
+            for boot, numbers in told.synced().items():
+                for interval in numbers:
+                    acked[boot].add(*interval)
+
+        connect()
+        for step, (boot, n) in enumerate([*order, *again]):
+            if step in restarts:
+                told.restart()
+                shown = []
+            if step in restarts or step in breaks:
+                connect()
+            first, last = n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1
+            shown += told.take(first, last, boot)
+            sent[boot].add(first, last)
+            assert shown == sorted(set(shown)), "the live picture never goes back"
+            if step % 3 == 0:
+                note_acks()
+        note_acks()
+        for boot in (OLD, NEW):
+            journal = told.node.journals[boot]
+            assert journal.held == Intervals(whole)
+            assert acked[boot] == Intervals(whole)
+            found = FrameBatch.concatenate(list(journal.read(0, total)))
+            for name in FRAME_COLUMNS:
+                np.testing.assert_array_equal(
+                    getattr(found, name), getattr(frames(0, total - 1, boot), name)
+                )
+        assert told.node.lost == {}
+        assert told.node.backlog_frames == 0
+        told.close()
+
+
+def test_what_is_missing_and_still_with_the_node_is_backlog_and_not_lost(told: Told) -> None:
+    told.connect(held=((0, 99),), next_seq=100)
+    told.take(100, 104)
+    assert told.node.backlog_frames == 100
+    assert told.node.lost == {}
+    told.take(50, 54)
+    assert told.node.backlog_frames == 95
+
+
+def test_what_the_node_has_lost_is_counted_by_its_reason_and_no_backlog(told: Told) -> None:
+    told.connect(held=((0, 99),), next_seq=100)
+    told.take(100, 104)
+    told.node.present.note_losses({"evicted": ((0, 9),), "disk_full": ((20, 24),)})
+    assert told.node.lost == {"evicted": 10, "disk_full": 5}
+    assert told.node.backlog_frames == 85
+
+
+def test_a_loss_that_came_all_the_same_is_none(told: Told) -> None:
+    told.connect(held=((0, 9),), next_seq=10)
+    told.take(0, 9)
+    told.node.present.note_losses({"disk_full": ((5, 6),)})
+    assert told.node.lost == {}
+
+
+def test_frames_from_before_the_server_knew_the_node_are_not_lost(told: Told) -> None:
+    told.connect(held=((500, 599),), next_seq=600)
+    told.take(500, 599)
+    told.take(600, 609)
+    assert told.node.lost == {}
+
+
+def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_restart(
+    told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.server.nodes.RING_NS", 20 * PERIOD_NS)
+    monkeypatch.setattr("storage.journal.journal.SEGMENT_NS", 10 * PERIOD_NS)
+    told.connect()
+    for n in range(0, 100, 5):
+        told.take(n, n + 4)
+    told.synced()
+    told.node.prune({NEW: Intervals([(10, 12)])})
+    held = told.node.present.held
+    assert held.missing(10, 12).count == 0
+    assert held.missing(0, 99).count > 50
+    assert told.node.lost == {}
+    # It is not asked for again either, but what a session needs is.
+    told.connect(held=((0, 99),), next_seq=100)
+    assert told.lacks() == {NEW: [(100, None)]}
+    assert told.lacks(new=[(30, 39)]) == {NEW: [(30, 39), (100, None)]}
+    told.restart()
+    told.connect(held=((100, 104),), next_seq=105)
+    told.take(105, 109)
+    assert told.node.lost == {}
+
+
+def test_of_the_present_stream_all_is_asked_for_and_what_sessions_need_first(told: Told) -> None:
+    told.connect(held=((0, 99),), next_seq=100)
+    assert told.lacks() == {NEW: [(0, None)]}
+    assert told.lacks(new=[(40, 49)]) == {NEW: [(40, 49), (0, 39), (50, None)]}
+    assert told.lacks(new=[(40, NO_END)]) == {NEW: [(40, 99), (0, 39), (100, None)]}
+    told.take(0, 59)
+    assert told.lacks(new=[(40, NO_END)]) == {NEW: [(60, None)]}
+
+
+def test_of_earlier_streams_only_what_sessions_need_and_the_node_has_is_asked_for(
+    told: Told,
+) -> None:
+    told.connect(earlier=(told.earlier(held=((0, 49), (60, 99)), next_seq=100),))
+    assert told.lacks() == {NEW: [(0, None)]}
+    told.take(70, 74, OLD)
+    asked = told.lacks(old=[(40, NO_END)])
+    assert asked == {OLD: [(40, 49), (60, 69), (75, 99)], NEW: [(0, None)]}
+
+
+def test_frames_of_an_earlier_stream_are_kept_and_never_shown(told: Told) -> None:
+    told.connect(earlier=(told.earlier(held=((0, 9),), next_seq=10),))
+    assert told.take(0, 4) == [0, 1, 2, 3, 4]
+    assert told.take(5, 9, OLD) == []
+    assert told.node.last_seq == 4
+    assert told.node.journals[OLD].held == Intervals([(5, 9)])
+
+
+def test_a_stream_that_the_node_does_not_mention_cannot_come(told: Told) -> None:
+    told.connect(earlier=(told.earlier(held=((0, 9),), next_seq=10),))
+    told.take(0, 4, OLD)
+    assert told.node.streams[OLD].may_come == Intervals([(0, 9)])
+    told.connect()
+    assert not told.node.streams[OLD].may_come
+
+
+def test_before_the_node_has_said_anything_everything_may_come(told: Told) -> None:
+    told.connect(earlier=(told.earlier(held=((0, 9),), next_seq=10),))
+    told.take(0, 4, OLD)
+    told.synced()
+    told.restart()
+    assert told.node.streams[OLD].may_come == Intervals([(0, NO_END)])
+
+
+def test_what_the_node_said_of_a_stream_outlives_the_server(told: Told) -> None:
+    said = told.earlier(
+        held=((0, 9),),
+        next_seq=12,
+        lost={"disk_full": ((10, 11),)},
+        unsynced_tail_max=280,
+        missed_slots=3,
+    )
+    told.connect(earlier=(said,), lost={"evicted": ((0, 4),)}, next_seq=20, held=((5, 19),))
+    told.take(0, 4, OLD)
+    told.take(5, 9)
+    told.synced()
+    told.restart()
+    notes = told.node.streams[OLD].notes
+    assert (notes.next_seq, notes.unsynced_tail_max, notes.missed_slots) == (12, 280, 3)
+    assert notes.lost == {"disk_full": ((10, 11),)}
+    present = told.node.present.notes
+    assert (present.next_seq, present.lost) == (None, {"evicted": ((0, 4),)})
+
+
+def test_frames_that_are_damaged_here_may_come_again_while_the_node_has_them(told: Told) -> None:
+    told.connect(held=((0, 9),), next_seq=10)
+    told.take(0, 4)
+    told.take(5, 9)
+    stream = told.node.present
+    stream.disown(Intervals([(0, 4)]), corrupt=True)
+    assert not stream.lost
+    told.connect(held=((5, 9),), next_seq=10)
+    assert stream.lost.as_pairs() == {"corrupt": ((0, 4),)}
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    order=st.permutations(range(8)),
+    at=st.integers(-3, 8 * PER_MESSAGE + 3),
+    at_least=st.integers(0, 8 * PER_MESSAGE),
+    lost=st.integers(0, 7),
+)
+def test_what_is_held_next_to_an_instant_is_the_same_whether_it_was_asked_before_or_not(
+    order: list[int], at: int, at_least: int, lost: int, array_of: Array
+) -> None:
+    with TemporaryDirectory() as folder:
+        told = Told(Path(folder), array_of)
+        told.connect(held=((0, 8 * PER_MESSAGE - 1),), next_seq=8 * PER_MESSAGE)
+        t_ns = UTC_NS + 10**12 + at * PERIOD_NS
+        sent = Intervals()
+        for n in order:
+            if n == lost:
+                continue
+            told.take(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
+            sent.add(n * PER_MESSAGE, (n + 1) * PER_MESSAGE - 1)
+            stream = told.node.present
+            found = stream.around(t_ns, at_least=at_least)
+            held = [seq for a, b in sent for seq in range(a, b + 1) if seq >= at_least]
+            until = max((seq for seq in held if seq <= at), default=at_least - 1)
+            after = min((seq for seq in held if seq > at), default=None)
+            assert found == (None if after is None else (until, after))
+            # While frames in between may come, it may answer as before, but says that they lack.
+            lazy = stream.around(t_ns, at_least=at_least, waiting=True)
+            assert (lazy is None) == (found is None)
+            if lazy is not None and lazy != found:
+                assert stream.may_come.within(lazy[0] + 1, lazy[1] - 1)
+        told.close()

@@ -1,0 +1,408 @@
+"""Deleting, having back, giving up; and frames that are damaged before they were sealed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import service.recorder
+import service.routes.sessions
+
+import service.server
+from storage.intervals import Intervals
+from storage.sessions.folder import DOOMED_PREFIX, SessionFolder
+
+Running = Any
+FakeNode = Any
+Until = Callable[..., Any]
+Closing = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture(autouse=True)
+def quick_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stop answers soon: the scripted node sends what passes it only afterwards."""
+    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.02)
+
+
+@pytest.fixture
+def tared(running: Running, node: FakeNode) -> FakeNode:
+    """A connected node with a tare, all of whose 70 frames have come and are acknowledged."""
+    node.connect()
+    node.tared()
+    node.acknowledged(69)
+    return node
+
+
+def start(running: Running, **body: object) -> dict[str, Any]:
+    answer = running.http.post("/sessions", json={"node": "bench", "name": "trial"} | body)
+    assert answer.status_code == 201, answer.text
+    session: dict[str, Any] = answer.json()
+    return session
+
+
+def stop(running: Running, session: dict[str, Any]) -> None:
+    answer = running.http.post(f"/sessions/{session['id']}/stop")
+    assert answer.status_code == 200, answer.text
+
+
+def sealed(running: Running, node: FakeNode) -> dict[str, Any]:
+    session = start(running)
+    node.send(20)
+    node.acknowledged(node.seq - 1)
+    stop(running, session)
+    node.send(10, now=True)
+    done: dict[str, Any] = running.sealed(session["id"])
+    return done
+
+
+def pending(running: Running, node: FakeNode) -> dict[str, Any]:
+    """A session whose node has gone with its last thirty frames."""
+    session = start(running)
+    node.send(50)
+    node.acknowledged(node.seq - 1)
+    node.leave()
+    node.frames(30)
+    stop(running, session)
+    return session
+
+
+def ids(running: Running, path: str) -> list[str]:
+    return [each["id"] for each in running.http.get(path).json()["items"]]
+
+
+# --- the trash ------------------------------------------------------------------------------------
+
+
+def test_a_deleted_session_is_in_the_trash_and_can_be_had_back_as_it_was(
+    running: Running, tared: FakeNode
+) -> None:
+    session = sealed(running, tared)
+    answer = running.http.delete(f"/sessions/{session['id']}")
+    assert (answer.status_code, answer.content) == (204, b"")
+    assert ids(running, "/sessions") == []
+    assert running.http.get("/trash").json()["items"] == [session]
+    gone = running.http.get(f"/sessions/{session['id']}")
+    assert gone.status_code == 404
+    assert "trash" in gone.json()["detail"]
+    assert running.http.get(f"/sessions/{session['id']}/data").status_code == 404
+    answer = running.http.post(f"/trash/{session['id']}/restore")
+    assert answer.status_code == 200
+    assert answer.json() == session
+    assert ids(running, "/trash") == []
+    assert running.http.get(f"/sessions/{session['id']}/data").status_code == 200
+
+
+def test_what_is_in_the_trash_is_so_after_a_restart(running: Running, tared: FakeNode) -> None:
+    kept, deleted = sealed(running, tared), sealed(running, tared)
+    running.http.delete(f"/sessions/{deleted['id']}")
+    running.restart()
+    assert ids(running, "/sessions") == [kept["id"]]
+    assert ids(running, "/trash") == [deleted["id"]]
+
+
+def test_emptying_the_trash_deletes_for_good_and_says_how_much(
+    running: Running, tared: FakeNode
+) -> None:
+    kept = sealed(running, tared)
+    size = 0
+    for _ in range(2):
+        session = sealed(running, tared)
+        folder = running.data / "sessions" / session["id"]
+        size += sum(path.stat().st_size for path in folder.iterdir())
+        running.http.delete(f"/sessions/{session['id']}")
+    assert running.http.delete("/trash").json() == {"sessions": 2, "bytes": size}
+    assert running.http.delete("/trash").json() == {"sessions": 0, "bytes": 0}
+    assert ids(running, "/trash") == []
+    assert list((running.data / "trash").iterdir()) == []
+    assert ids(running, "/sessions") == [kept["id"]]
+
+
+def test_a_session_that_is_recorded_is_not_deleted(running: Running, tared: FakeNode) -> None:
+    session = start(running)
+    answer = running.http.delete(f"/sessions/{session['id']}")
+    assert answer.status_code == 409
+    assert "Stop it first" in answer.json()["detail"]
+    assert running.session(session["id"])["state"] == "recording"
+
+
+def test_a_session_that_is_being_sealed_is_not_deleted(
+    running: Running, tared: FakeNode, until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seal = service.recorder.seal
+    may_seal = threading.Event()
+
+    def slow(*arguments: Any) -> Any:
+        assert may_seal.wait(20.0)
+        return seal(*arguments)
+
+    monkeypatch.setattr(service.server.recorder, "seal", slow)
+    try:
+        session = start(running)
+        tared.send(20)
+        tared.acknowledged(89)
+        stop(running, session)
+        tared.send(10, now=True)
+        until(lambda: running.session(session["id"])["state"] == "sealing")
+        answer = running.http.delete(f"/sessions/{session['id']}")
+        assert answer.status_code == 409
+        assert "sealed" in answer.json()["detail"]
+    finally:
+        may_seal.set()
+    running.sealed(session["id"])
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("DELETE", "/sessions/20200101T000000Z-000000"),
+        ("POST", "/sessions/20200101T000000Z-000000/seal"),
+        ("POST", "/trash/20200101T000000Z-000000/restore"),
+        ("POST", "/trash/..%2fx/restore"),
+        ("POST", "/trash/x/restore"),
+    ],
+)
+def test_what_is_not_there_is_not_found(running: Running, method: str, path: str) -> None:
+    assert running.http.request(method, path).status_code == 404
+
+
+def test_a_pending_session_in_the_trash_keeps_its_frames_until_the_trash_is_emptied(
+    running: Running, tared: FakeNode
+) -> None:
+    session = pending(running, tared)
+    running.http.delete(f"/sessions/{session['id']}")
+    running.restart()
+    tared.connect()
+    [wanted] = tared.wanted.streams
+    assert (wanted.boot_id, [*wanted.numbers]) == (tared.boot_id, [(70, None)])
+    tared.send_again(tared.sent[-1])
+    tared.send(10, now=True)
+    tared.acknowledged(tared.seq - 1, first=120)
+    assert running.http.get("/trash").json()["items"][0]["state"] == "pending"
+    running.http.post(f"/trash/{session['id']}/restore")
+    assert running.sealed(session["id"])["complete"] is True
+    again = pending(running, tared)
+    running.http.delete(f"/sessions/{again['id']}")
+    tared.connect()
+    assert tared.wanted.streams
+    running.http.delete("/trash")
+    tared.receive("wanted")
+    assert tared.wanted.streams == ()
+
+
+def test_a_session_is_in_one_place_however_a_delete_was_cut_off(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from devices.errors import StorageError
+
+    session = sealed(running, tared)
+
+    def cut_off(*_: object) -> None:
+        raise StorageError("No space left on device")
+
+    move = SessionFolder.move
+    monkeypatch.setattr(SessionFolder, "move", cut_off)
+    assert running.http.delete(f"/sessions/{session['id']}").status_code == 507
+    assert ids(running, "/sessions") == [session["id"]]
+    assert ids(running, "/trash") == []
+    monkeypatch.setattr(SessionFolder, "move", move)
+
+    def then_killed(folder: SessionFolder, session_id: str, to: SessionFolder) -> None:
+        move(folder, session_id, to)
+        cut_off()  # the folder was renamed, and the process ends before it knows
+
+    monkeypatch.setattr(SessionFolder, "move", then_killed)
+    assert running.http.delete(f"/sessions/{session['id']}").status_code == 507
+    monkeypatch.setattr(SessionFolder, "move", move)
+    running.restart()
+    assert ids(running, "/sessions") == []
+    assert ids(running, "/trash") == [session["id"]]
+
+
+def test_what_was_half_deleted_is_no_session_and_gone_at_the_next_start(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = sealed(running, tared)
+    running.http.delete(f"/sessions/{session['id']}")
+    monkeypatch.setattr(service.server.server, "destroy", lambda folders: 0)  # killed before
+    running.http.delete("/trash")
+    assert [path.name for path in (running.data / "trash").iterdir()] == [
+        DOOMED_PREFIX + session["id"]
+    ]
+    running.restart()
+    assert ids(running, "/trash") == []
+    assert list((running.data / "trash").iterdir()) == []
+
+
+def test_screens_are_told_of_a_deletion(running: Running, tared: FakeNode) -> None:
+    import json
+
+    session = sealed(running, tared)
+    with running.socket("/api/v1/live") as live:
+        assert json.loads(live.recv(timeout=5.0))["type"] == "hello"
+        running.http.delete(f"/sessions/{session['id']}")
+        while (message := json.loads(live.recv(timeout=5.0)))["type"] != "deleted":
+            pass
+    assert message["session_id"] == session["id"]
+
+
+# --- giving up ------------------------------------------------------------------------------------
+
+
+def test_a_session_whose_node_never_comes_back_can_be_sealed_without_it(
+    running: Running, tared: FakeNode
+) -> None:
+    session = pending(running, tared)
+    answer = running.http.post(f"/sessions/{session['id']}/seal")
+    assert answer.status_code == 200, answer.text
+    done = running.sealed(session["id"])
+    assert (done["complete"], done["frames"]) == ("lossy", 50)
+    assert done["parts"] == [{"boot_id": tared.boot_id, "seq_first": 70, "seq_last": 119}]
+    # Nobody knows how many there were: at most as many as fit between the last one and the stop.
+    assert done["tail_frames_max"] >= 30
+    assert done["pending_frames"] == 0
+
+
+def test_what_is_given_up_within_a_session_is_lost_for_that_reason(
+    running: Running, tared: FakeNode, until: Until
+) -> None:
+    session = start(running)
+    tared.send(50)
+    tared.frames(30)
+    tared.send(20)
+    until(lambda: running.node()["last_seq"] == 169)
+    stop(running, session)
+    tared.send(10, now=True)
+    until(lambda: running.session(session["id"])["parts"][0]["seq_last"] == 169)
+    assert running.session(session["id"])["pending_frames"] == 30
+    running.http.post(f"/sessions/{session['id']}/seal")
+    done = running.sealed(session["id"])
+    assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 70, {"given_up": 30})
+    ledger = running.http.get(f"/sessions/{session['id']}/ledger").json()
+    assert ledger["parts"][0]["unsynced_tail_max"] == 0
+
+
+def test_only_a_pending_session_can_be_given_up(running: Running, tared: FakeNode) -> None:
+    recording = start(running)
+    answer = running.http.post(f"/sessions/{recording['id']}/seal")
+    assert answer.status_code == 409
+    assert "Stop it first" in answer.json()["detail"]
+    stop(running, recording)
+    tared.send(10, now=True)
+    running.sealed(recording["id"])
+    assert running.http.post(f"/sessions/{recording['id']}/seal").status_code == 409
+
+
+# --- damage ---------------------------------------------------------------------------------------
+
+
+def damage(running: Running, node: FakeNode, at: float = 0.5) -> None:
+    """Flip a bit in the middle of the node's journal."""
+    [path] = (running.data / "journal" / "bench" / node.boot_id).glob("*.arrows")
+    content = bytearray(path.read_bytes())
+    content[int(len(content) * at)] ^= 0x10
+    with path.open("r+b") as file:
+        file.write(content)
+
+
+def test_frames_that_are_found_damaged_are_asked_for_again_and_the_session_is_complete(
+    running: Running, tared: FakeNode, closing: Closing
+) -> None:
+    session = start(running)
+    tared.send(200)
+    tared.acknowledged(269)
+    damage(running, tared)
+    stop(running, session)
+    tared.send(10, now=True)
+    code, reason = closing(tared.socket)
+    assert (code, "damaged" in reason) == (1012, True)
+    lacks = tared.connect()
+    first, last = lacks[0]
+    assert last is not None
+    assert 70 <= first <= last <= 269
+    tared.send_again(tared.all_sent().rows(first, last + 1))
+    done = running.sealed(session["id"])
+    assert (done["complete"], done["frames"], done["lost"]) == (True, 200, {})
+
+
+def test_frames_that_are_found_damaged_and_nobody_has_are_lost_and_said_to_be(
+    running: Running, tared: FakeNode, closing: Closing
+) -> None:
+    session = start(running)
+    tared.send(200)
+    tared.acknowledged(269)
+    damage(running, tared)
+    stop(running, session)
+    tared.send(10, now=True)
+    closing(tared.socket)
+    tared.connect(held=((270, 279),))  # the rest it has forgotten, as it may
+    done = running.sealed(session["id"])
+    assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 190, {"corrupt": 10})
+
+
+# --- starting -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("state", ["sealing", "pending"])
+def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_the_next(
+    running: Running, tared: FakeNode, until: Until, state: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from devices.errors import StorageError
+
+    def refusing(*_: object) -> None:
+        raise StorageError("No space left on device")
+
+    seal = service.recorder.seal
+    monkeypatch.setattr(service.server.recorder, "seal", refusing)
+    session = start(running)
+    tared.send(20)
+    tared.acknowledged(89)
+    stop(running, session)
+    if state == "sealing":
+        tared.send(10, now=True)
+        until(lambda: "No space" in (running.session(session["id"])["problem"] or ""))
+    assert running.session(session["id"])["state"] == state
+    monkeypatch.setattr(service.server.recorder, "seal", seal)
+    running.restart()
+    if state == "pending":
+        tared.connect()
+        tared.send(10, now=True)
+    assert running.sealed(session["id"])["frames"] == 20
+
+
+def test_what_killed_processes_left_half_written_is_removed_at_the_start(
+    running: Running, tared: FakeNode
+) -> None:
+    session = sealed(running, tared)
+    folder = running.data / "sessions" / session["id"]
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait(20)
+    stale = [
+        folder / f".frames.parquet.{ended.pid}.tmp",
+        folder / f".session.json.{ended.pid}-0a1b2c3d.tmp",
+        running.data / "nodes" / "bench" / f".hello.json.{ended.pid}.7.0a1b2c3d.tmp",
+    ]
+    kept = [
+        folder / f".frames.parquet.{os.getppid()}.tmp",  # somebody is at it
+        folder / ".mine.tmp",
+        folder / f"frames.{ended.pid}.tmp",
+    ]
+    for path in (*stale, *kept):
+        path.write_bytes(b"half")
+    running.restart()
+    assert not any(path.exists() for path in stale)
+    assert all(path.exists() for path in kept)
+
+
+def test_frames_of_an_unsealed_session_are_never_pruned(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.server.nodes.RING_NS", 0)
+    pending(running, tared)
+    node = running.server.nodes.get("bench")
+    running.call(lambda: node.prune(running.server.recorder.needed("bench")))
+    assert not Intervals([(70, 119)]).without(node.present.held)

@@ -1,0 +1,563 @@
+"""A recording that comes in pieces: which tare it gets, and that every frame comes out once.
+
+Chips are such that a count is 130/1023 kPa and a newton; unloaded they read 500 counts.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import CalibrationError, TareError, UsageError
+from devices.frames import ArrayInfo, FrameBatch, FrameStatus, TileInfo, TileStatus
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimates import Estimates
+from service.estimation.plan import make_plan
+from service.estimation.tare.tare import Tare
+from service.sessions import pipeline
+from service.sessions.pipeline import EstimateOptions, EstimateStream, estimate_columns, notes_of
+from storage.schema import ESTIMATES
+
+COUNT_KPA = 130 / 1023
+UNLOADED_KPA = 787 * 65 / 1023 + 50
+
+Piece = tuple[FrameBatch, dict[str, np.ndarray]]
+
+
+def array(rate_hz: float = 500.0) -> ArrayInfo:
+    return ArrayInfo(
+        node="bench",
+        boot_id="0" * 32,
+        tiles=tuple(
+            TileInfo(
+                serial=f"T{i + 1:02}",
+                mux=0x70,
+                channel=i,
+                coefficient_words=(1787 * 8, 0xC000, 0, 0),
+                x_m=0.014 * i,
+                y_m=0.0,
+                z_m=-0.15,
+                reference=False,
+                conversion_ms=1.6,
+            )
+            for i in range(2)
+        ),
+        servo=None,
+        schedule="simultaneous",
+        nominal_rate_hz=rate_hz,
+        utc_offset_ns=10**18,
+        clock_set=True,
+        software="test",
+        scene="test",
+        models=("unwrap", "static"),
+    )
+
+
+def calibration(*serials: str, **changes: Any) -> Calibration:
+    entry: dict[str, Any] = {
+        "p_input": "gauge_kpa",
+        "p_offset_kpa": 0.0,
+        "p_scale_kpa": COUNT_KPA,
+        "f_offset_n": 0.0,
+        "f_scale_n": 1.0,
+        "zero_mode": "subtract_f0",
+        "coefficients": (0.0, 1.0, 0.001, 0.0),
+        "range_kpa": (0.0, 150 * COUNT_KPA),
+        "monotonic": True,
+        "absolute_scale": "measured",
+        "covariance": ((1e-4, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-9)),
+        "relative_misfit": 0.01,
+        "loop_misfit_n": 0.0,
+        "r2": 0.999,
+        "rmse_n": 0.1,
+        "cv_rmse_n": 0.1,
+        "hysteresis_n": 0.5,
+        "repeats": 4,
+        "baseline_kpa": UNLOADED_KPA,
+        "noise_kpa": COUNT_KPA,
+    }
+    return Calibration(
+        name="by hand",
+        reference="none",
+        date="2020-01-01",
+        tiles=tuple(
+            TileCalibration.model_validate(entry | {"serial": serial} | changes)
+            for serial in serials or ("T01", "T02")
+        ),
+    )
+
+
+def options(**changes: Any) -> EstimateOptions:
+    chosen: dict[str, Any] = {
+        "calibration": calibration(),
+        "models": ("unwrap", "static"),
+        "lag_ms": 10.0,
+    }
+    return EstimateOptions(**chosen | changes)
+
+
+def frames(forces_n: np.ndarray, *, lead: int = 0, period_ns: int = 2_000_000) -> FrameBatch:
+    n, tiles = forces_n.shape
+    t_mono_ns = period_ns * np.arange(n, dtype=np.int64)
+    return FrameBatch(
+        seq=np.arange(n, dtype=np.uint64),
+        t_mono_ns=t_mono_ns,
+        t_ns=t_mono_ns + 10**18,
+        padc=(500 - np.rint(forces_n)).astype(np.uint16),
+        tadc=np.full((n, tiles), 480, dtype=np.uint16),
+        sample_offset_us=np.zeros((n, tiles), dtype=np.int32),
+        servo_counts=np.zeros(n, dtype=np.int32),
+        servo_age_us=np.zeros(n, dtype=np.int32),
+        status=np.zeros((n, tiles), dtype=np.uint8),
+        frame_status=np.where(np.arange(n) < lead, FrameStatus.LEAD, 0).astype(np.uint8),
+        reference_force_n=np.full(n, np.nan, dtype=np.float32),
+    )
+
+
+def hopping(n: int, *, loaded_from: int, seed: int = 0) -> np.ndarray:
+    """Noise, and from frame `loaded_from` on hops of 30 ms, for two tiles."""
+    rng = np.random.default_rng(seed)
+    at = np.arange(n)
+    load = np.where((at >= loaded_from) & (at // 15 % 2 == 1), 20.0, 0.0)
+    return load[:, None] + rng.normal(0.0, 1.0, (n, 2))
+
+
+def cut(batch: FrameBatch, cuts: Sequence[int]) -> list[Piece]:
+    """The batch in pieces, each with an extra column that tells its frames apart."""
+    edges = [0, *sorted(set(cuts) & set(range(1, len(batch)))), len(batch)]
+    return [
+        (batch.rows(a, b), {"true_grf_n": 1000.0 + np.arange(a, b)}) for a, b in pairwise(edges)
+    ]
+
+
+def run(
+    pieces: Sequence[Piece], info: ArrayInfo | None = None, **changes: Any
+) -> tuple[EstimateStream, FrameBatch, dict[str, np.ndarray]]:
+    stream = EstimateStream(info or array(), options(**changes))
+    out = list(stream.run(pieces))
+    for batch, columns in out:
+        assert {len(values) for values in columns.values()} == {len(batch)}
+    columns = {name: np.concatenate([c[name] for _, c in out]) for name in out[0][1]}
+    return stream, FrameBatch.concatenate([batch for batch, _ in out]), columns
+
+
+def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+    assert list(one) == list(other)
+    for name, values in one.items():
+        assert values.tobytes() == other[name].tobytes(), name
+
+
+# --- every frame once -----------------------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    cuts=st.one_of(st.just(range(1, 120)), st.sets(st.integers(1, 119))),
+    lead=st.integers(20, 120),
+    lag_ms=st.sampled_from([0.0, 5.0, 10.0, 100.0, 5000.0]),
+    chunk=st.sampled_from([1, 7, 64, 4096]),
+)
+def test_every_frame_comes_out_once_with_its_own_estimate_whatever_the_pieces(
+    cuts: Sequence[int], lead: int, lag_ms: float, chunk: int
+) -> None:
+    batch = frames(hopping(120, loaded_from=lead), lead=lead)
+    _, _, whole = run(cut(batch, []), lag_ms=lag_ms)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "CHUNK", chunk)
+        _, out, columns = run(cut(batch, cuts), lag_ms=lag_ms)
+    for f in fields(FrameBatch):
+        assert getattr(out, f.name).tobytes() == getattr(batch, f.name).tobytes(), f.name
+    assert columns["true_grf_n"].tolist() == [1000.0 + i for i in range(120)]
+    same(columns, whole)
+
+
+def test_the_estimate_beside_a_frame_is_about_that_frame() -> None:
+    # With a look-ahead of 50 frames a pairing that is off by one would show in every loaded frame.
+    batch = frames(hopping(300, loaded_from=50), lead=50)
+    stream, out, columns = run(cut(batch, [13, 77, 78, 200]), lag_ms=100.0)
+    assert stream.plan is not None
+    counts = 500 - out.padc.astype(np.float64)
+    offset = (stream.plan.tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA
+    np.testing.assert_allclose(columns["gauge_kpa"] / COUNT_KPA, counts - offset, atol=1e-9)
+
+
+def test_frames_leave_before_the_recording_ends() -> None:
+    # A live stream must not wait for its end: after the lead, a frame waits for its look-ahead.
+    batch = frames(hopping(300, loaded_from=50), lead=50)
+    asked = 0
+
+    def pieces() -> Iterator[Piece]:
+        nonlocal asked
+        for piece in cut(batch, range(1, 300)):
+            asked += 1
+            yield piece
+
+    stream = EstimateStream(array(), options(lag_ms=10.0))
+    for out, _ in stream.run(pieces()):
+        assert int(out.seq[-1]) >= asked - 51
+    assert asked == 300
+
+
+def test_all_columns_of_the_schema_are_there_in_its_order_and_double_precision() -> None:
+    batch = frames(hopping(100, loaded_from=50), lead=50)
+    _, _, columns = run([(batch, {})])
+    assert list(columns) == [column.name for column in ESTIMATES]
+    assert {columns[c.name].dtype for c in ESTIMATES[:-2]} == {np.dtype(np.float64)}
+    assert columns["contact"].dtype == np.uint8
+    assert columns["estimate_status"].dtype == np.uint16
+
+
+# --- the tare -------------------------------------------------------------------------------------
+
+
+def test_the_lead_is_taken_to_its_end_even_over_many_pieces() -> None:
+    batch = frames(hopping(300, loaded_from=120), lead=120)
+    stream, _, _ = run(cut(batch, range(1, 300)))
+    assert stream.plan is not None
+    assert (stream.plan.tare.source, stream.plan.tare.frames) == ("lead", 120)
+
+
+def test_a_recording_that_is_all_lead_is_estimated_too() -> None:
+    stream, out, _ = run(cut(frames(hopping(100, loaded_from=100), lead=100), [30, 60]))
+    assert stream.plan is not None
+    assert stream.plan.tare.frames == 100
+    assert len(out) == 100
+
+
+def test_a_named_interval_is_waited_for_and_reaches_back() -> None:
+    # unloaded from 0.4 to 0.5 s only; frames before it are estimated with that tare as well
+    forces_n = hopping(300, loaded_from=0)
+    forces_n[200:251] = np.random.default_rng(1).normal(0.0, 1.0, (51, 2))
+    stream, out, _ = run(cut(frames(forces_n), range(1, 300)), tare_s=(0.4, 0.5))
+    assert stream.plan is not None
+    assert (stream.plan.tare.source, stream.plan.tare.frames) == ("interval", 51)
+    assert len(out) == 300
+
+
+def test_a_named_interval_wins_over_the_lead() -> None:
+    batch = frames(hopping(300, loaded_from=300), lead=100)
+    stream, _, _ = run(cut(batch, [10, 20]), tare_s=(0.3, 0.5))
+    assert stream.plan is not None
+    assert (stream.plan.tare.source, stream.plan.tare.frames) == ("interval", 101)
+
+
+def a_minute_under_load(unloaded_from_s: float, seconds: float) -> FrameBatch:
+    """100 frames/s under a load, then flight; no lead, so the tare has to be recognised."""
+    n = round(seconds * 100)
+    forces_n = np.random.default_rng(2).normal(0.0, 1.0, (n, 2))
+    forces_n[: round(unloaded_from_s * 100)] += 40.0
+    return frames(forces_n, period_ns=10_000_000)
+
+
+@pytest.mark.parametrize("cuts", [[], [6001], [6002, 6003], [5990, 6020], [1000, 6049], [6300]])
+def test_a_recognised_tare_does_not_depend_on_the_pieces(cuts: list[int]) -> None:
+    # Unloaded from 58.9 s on: windows of half a second begin at 59.0 s.
+    batch = a_minute_under_load(58.9, 64.0)
+    whole, _, expected = run(cut(batch, []), array(100.0))
+    stream, _, columns = run(cut(batch, cuts), array(100.0))
+    assert whole.plan is not None
+    assert stream.plan is not None
+    assert whole.plan.tare.begin_s == stream.plan.tare.begin_s == pytest.approx(59.0)
+    same(columns, expected)
+
+
+@pytest.mark.parametrize("unloaded_from_s", [59.7, 60.3])
+@pytest.mark.parametrize("cuts", [[6002], [6030], [6200], [6390]])
+def test_at_the_end_of_the_minute_too_it_does_not_depend_on_the_pieces(
+    unloaded_from_s: float, cuts: list[int]
+) -> None:
+    # A tare is looked for in the first minute; where that ends is not for the pieces to say.
+    def outcome(pieces: list[Piece]) -> tuple[float, ...] | str:
+        try:
+            stream, _, _ = run(pieces, array(100.0))
+        except TareError:
+            return "refused"
+        assert stream.plan is not None
+        return (stream.plan.tare.begin_s, stream.plan.tare.end_s)
+
+    batch = a_minute_under_load(unloaded_from_s, 64.0)
+    assert outcome(cut(batch, cuts)) == outcome(cut(batch, []))
+
+
+def test_a_recording_that_is_never_unloaded_is_refused() -> None:
+    with pytest.raises(TareError, match="no interval can be recognised"):
+        run([(frames(np.full((400, 2), 40.0)), {})])
+
+
+def test_a_recording_without_frames_is_refused() -> None:
+    with pytest.raises(TareError, match="no frames"):
+        list(EstimateStream(array(), options()).run([]))
+
+
+def test_an_interval_after_the_end_is_refused() -> None:
+    with pytest.raises(TareError):
+        run([(frames(np.zeros((100, 2))), {})], tare_s=(10.0, 11.0))
+
+
+# --- refused before the first frame ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"models": ("static", "magic")},
+        {"models": ("unwrap",)},
+        {"lag_ms": -1.0},
+        {"tare_s": (1.0, 1.0)},
+        {"tare_s": (2.0, 1.0)},
+        {"tare_s": (-1.0, 1.0)},
+        {"tare_s": (float("nan"), 1.0)},
+        {"tare_s": (0.0, float("nan"))},
+    ],
+)
+def test_options_that_cannot_work_are_refused_before_the_first_frame(
+    changes: dict[str, Any],
+) -> None:
+    with pytest.raises(UsageError):
+        EstimateStream(array(), options(**changes))
+
+
+def test_a_tile_without_calibration_is_refused_before_the_first_frame() -> None:
+    with pytest.raises(CalibrationError, match="T02"):
+        EstimateStream(array(), options(calibration=calibration("T01", "T03")))
+
+
+def test_the_plan_is_there_with_the_first_estimates() -> None:
+    stream = EstimateStream(array(), options())
+    assert stream.plan is None
+    next(stream.run([(frames(hopping(100, loaded_from=50), lead=50), {})]))
+    assert stream.plan is not None
+
+
+# --- notes ----------------------------------------------------------------------------------------
+
+
+def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
+    batch = frames(hopping(300, loaded_from=100), lead=100)
+    stream, _, columns = run([(batch, {})], lag_ms=9.2, models=("static",))
+    assert stream.plan is not None
+    notes = json.loads(json.dumps(notes_of(stream.plan), allow_nan=False))
+    kept = notes["tare"]
+    tare = Tare(
+        baseline_kpa=np.array(kept["baseline_kpa"]),
+        baseline_sigma_kpa=np.array(kept["baseline_sigma_kpa"]),
+        noise_kpa=np.array(kept["noise_kpa"]),
+        tadc_counts=np.array(kept["tadc_counts"]),
+        t_ns=kept["t_ns"],
+        begin_s=kept["begin_s"],
+        end_s=kept["end_s"],
+        frames=kept["frames"],
+        source=kept["source"],
+    )
+    plan = make_plan(
+        array(),
+        Calibration.model_validate(notes["calibration"]),
+        tare,
+        models=notes["models"],
+        lag_ms=notes["lag_ms"],
+    )
+    first, state = step(plan, batch, EstimationState())
+    last = finish(plan, state)
+    assert last is not None
+    again = {
+        f.name: np.concatenate([getattr(first, f.name), getattr(last, f.name)])
+        for f in fields(Estimates)
+        if f.name not in ("seq", "t_ns")
+    }
+    same(again, columns)
+
+
+def test_the_notes_say_what_was_used() -> None:
+    stream, _, _ = run([(frames(hopping(300, loaded_from=100), lead=100), {})], lag_ms=100.0)
+    assert stream.plan is not None
+    notes = notes_of(stream.plan)
+    assert notes["calibration_id"] == calibration().id
+    assert notes["absolute_scale"] == "measured"
+    assert notes["models"] == ["unwrap", "static"]
+    assert notes["lag_ms"] == 100.0
+    tare = notes["tare"]
+    assert isinstance(tare, dict)
+    assert (tare["source"], tare["frames"], tare["t_ns"]) == ("lead", 100, 10**18 + 198_000_000)
+
+
+def test_an_assumed_scale_is_said_in_the_notes() -> None:
+    assumed = calibration(absolute_scale="assumed")
+    stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=assumed)
+    assert stream.plan is not None
+    assert notes_of(stream.plan)["absolute_scale"] == "assumed"
+
+
+def test_the_calibration_in_the_notes_is_the_one_that_they_name() -> None:
+    # A bench of eight tiles, a foot of two of them: what is kept must be found by the id stated.
+    many = calibration("T07", "T02", "T01", "T05")
+    stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=many)
+    assert stream.plan is not None
+    notes = notes_of(stream.plan)
+    assert Calibration.model_validate(notes["calibration"]).id == notes["calibration_id"]
+
+
+def test_estimate_columns_are_those_of_the_estimates_without_number_and_time() -> None:
+    plan = make_plan(
+        array(),
+        calibration(),
+        Tare(np.zeros(2), np.zeros(2), np.ones(2), np.zeros(2), 0, 0.0, 0.0, 0, "interval"),
+        models=("static",),
+    )
+    estimates, _ = step(plan, frames(np.zeros((3, 2))), EstimationState())
+    columns = estimate_columns(estimates)
+    assert set(columns) == {f.name for f in fields(Estimates)} - {"seq", "t_ns"}
+    assert columns["grf_n"] is estimates.grf_n
+
+
+def test_faults_in_the_lead_leave_the_rest_of_it_as_tare() -> None:
+    batch = frames(hopping(200, loaded_from=100), lead=100)
+    status = batch.status.copy()
+    status[:30, 1] = TileStatus.NO_ANSWER
+    stream, _, columns = run(cut(replace(batch, status=status), [50]))
+    assert stream.plan is not None
+    assert stream.plan.tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=0.1)
+    assert np.isnan(columns["grf_n"]).sum() == 30
+
+
+# --- tares that were taken while it ran -----------------------------------------------------------
+
+
+def taken_at(t_ns: int, counts: float) -> Tare:
+    """A tare that was taken at `t_ns`, with the baseline so many counts above 500."""
+    return Tare(
+        baseline_kpa=np.full(2, UNLOADED_KPA + counts * COUNT_KPA),
+        baseline_sigma_kpa=np.full(2, 0.001),
+        noise_kpa=np.full(2, COUNT_KPA),
+        tadc_counts=np.full(2, 480.0),
+        t_ns=10**18 + t_ns,
+        begin_s=0.0,
+        end_s=0.25,
+        frames=125,
+        source="unloaded",
+    )
+
+
+def baselines(batch: FrameBatch, columns: dict[str, np.ndarray]) -> list[int]:
+    """Counts above 500 of the baseline with which each frame was estimated."""
+    counts = 500 - batch.padc.astype(np.float64)
+    return [round(c) for c in (counts - columns["gauge_kpa"] / COUNT_KPA)[:, 0].tolist()]
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    instants=st.lists(st.integers(-10, 130), min_size=1, max_size=4).map(sorted),
+    between=st.integers(0, 1),
+    cuts=st.sets(st.integers(1, 119), max_size=12),
+    lag_ms=st.sampled_from([0.0, 10.0, 5000.0]),
+)
+def test_a_tare_is_in_force_from_the_frame_after_its_instant_whatever_the_pieces(
+    instants: list[int], between: int, cuts: Sequence[int], lag_ms: float
+) -> None:
+    # Instants in frames of 2 ms, exactly at one or a nanosecond before.
+    batch = frames(hopping(120, loaded_from=30))
+    tares = tuple(
+        taken_at(2_000_000 * at - between, 3.0 * number) for number, at in enumerate(instants)
+    )
+    stream, out, columns = run(cut(batch, cuts), lag_ms=lag_ms, tares=tares)
+    assert out.seq.tolist() == list(range(120))
+    assert columns["true_grf_n"].tolist() == [1000.0 + i for i in range(120)]
+    expected = []
+    for t_ns in batch.t_ns:
+        in_force = [number for number, tare in enumerate(tares) if tare.t_ns < t_ns]
+        expected.append(3 * (in_force[-1] if in_force else 0))  # before all of them, the first
+    assert baselines(out, columns) == expected
+    assert stream.plan is not None
+    assert stream.plan.tare is tares[0]
+    _, _, whole = run(cut(batch, []), lag_ms=lag_ms, tares=tares)
+    same(columns, whole)
+
+
+def test_tares_that_were_taken_win_over_a_lead_and_need_no_wait() -> None:
+    batch = frames(hopping(300, loaded_from=100), lead=100)
+    stream = EstimateStream(array(), options(lag_ms=0.0, tares=(taken_at(0, 7.0),)))
+    first, columns = next(stream.run(cut(batch, range(1, 300))))
+    assert len(first) == 1
+    assert baselines(first, columns) == [7]
+
+
+def test_a_tare_after_the_last_frame_changes_nothing() -> None:
+    batch = frames(hopping(120, loaded_from=30))
+    one, later = taken_at(0, 0.0), taken_at(2_000_000 * 119, 5.0)
+    _, _, columns = run(cut(batch, [50]), tares=(one,))
+    _, _, again = run(cut(batch, [50]), tares=(one, later))
+    same(columns, again)
+
+
+def test_all_tares_are_in_the_notes_and_none_if_none_were_taken() -> None:
+    tares = (taken_at(0, 0.0), taken_at(10**8, 5.0))
+    stream, _, _ = run([(frames(hopping(99, loaded_from=50)), {})], tares=tares)
+    assert stream.plan is not None
+    notes = json.loads(json.dumps(notes_of(stream.plan, tares), allow_nan=False))
+    assert [kept["t_ns"] for kept in notes["tares"]] == [tare.t_ns for tare in tares]
+    assert notes["tare"] == notes["tares"][0]
+    assert "tares" not in notes_of(stream.plan)
+
+
+# --- parts ----------------------------------------------------------------------------------------
+
+
+def later_part(batch: FrameBatch, after_ns: int) -> FrameBatch:
+    """The node was switched on anew: its clock and numbers begin again, UTC goes on."""
+    return replace(batch, t_ns=batch.t_ns + after_ns)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    cuts=st.tuples(
+        st.sets(st.integers(1, 59), max_size=8), st.sets(st.integers(1, 89), max_size=8)
+    ),
+    tared=st.booleans(),
+    second_at=st.integers(-10, 200),
+    lag_ms=st.sampled_from([0.0, 10.0, 100.0]),
+)
+def test_a_recording_that_goes_on_after_a_restart_has_one_estimate_a_frame(
+    cuts: tuple[set[int], set[int]], tared: bool, second_at: int, lag_ms: float
+) -> None:
+    first = frames(hopping(60, loaded_from=30), lead=25)
+    second = later_part(frames(hopping(90, loaded_from=5, seed=1)), 10**9)
+    tares = (taken_at(0, 1.0), taken_at(2_000_000 * second_at + 800_000_000, 4.0)) if tared else ()
+
+    def parts(*where: set[int]) -> list[Piece]:
+        return [
+            piece
+            for part, at in zip((first, second), where, strict=True)
+            for piece in cut(part, [*at])
+        ]
+
+    stream, out, columns = run(parts(*cuts), lag_ms=lag_ms, tares=tares)
+    assert out.seq.tolist() == [*range(60), *range(90)]
+    assert out.t_ns.tolist() == [*first.t_ns.tolist(), *second.t_ns.tolist()]
+    assert {len(values) for values in columns.values()} == {150}
+    assert columns["true_grf_n"].tolist() == [*range(1000, 1060), *range(1000, 1090)]
+    _, _, whole = run(parts(set(), set()), lag_ms=lag_ms, tares=tares)
+    same(columns, whole)
+    assert stream.plan is not None
+    if not tared:
+        counts = 500 - out.padc.astype(np.float64)
+        gauge = counts - (stream.plan.tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA
+        np.testing.assert_allclose(columns["gauge_kpa"] / COUNT_KPA, gauge, atol=1e-9)
+
+
+def test_what_comes_after_a_restart_knows_nothing_of_what_was_before() -> None:
+    # The first part ends in contact; the second is estimated as if it were all there is.
+    first = frames(np.full((60, 2), 30.0))
+    second = later_part(frames(hopping(90, loaded_from=200)), 10**9)
+    tares = (taken_at(0, 0.0),)
+    _, _, both = run([*cut(first, []), *cut(second, [40])], tares=tares)
+    _, _, alone = run(cut(second, []), tares=tares)
+    assert both["contact"][59] == 1
+    same({name: values[60:] for name, values in both.items()}, alone)

@@ -1,0 +1,506 @@
+"""After a crash everything that is on the disk becomes a session that proves itself."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from devices.errors import StorageError
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, FrameStatus
+from service.sessions import recover as recover_module
+from service.sessions.recover import Recovery, recover
+from storage.folder_lock import locked
+from storage.journal.in_flight import InFlight
+from storage.journal.journal import Journal
+from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
+from storage.losses import Losses
+from storage.sessions.file import SessionReader
+from storage.sessions.folder import ClockOffset, Event, Part, Session, SessionFolder
+from storage.verify.data import as_dict, verdict_of, verify
+
+ID = "20200101T000000Z-00000a"
+BOOT = "a" * 32
+OTHER_BOOT = "b" * 32
+UTC_NS = 10**18
+PERIOD_NS = 2_000_000
+LEAD = 400
+TAIL = unsynced_tail_max(500.0)
+
+Frames = Callable[..., FrameBatch]
+
+
+@pytest.fixture
+def info_of(array_of: Callable[..., ArrayInfo]) -> Callable[[str], ArrayInfo]:
+    def make(boot_id: str = BOOT) -> ArrayInfo:
+        return array_of("bench", boot_id, UTC_NS)
+
+    return make
+
+
+def frames(first: int, last: int) -> FrameBatch:
+    """Unloaded for the lead, then ten counts, which are ten newtons; the last digit is noise."""
+    seq = np.arange(first, last + 1, dtype=np.uint64)
+    t_mono_ns = PERIOD_NS * seq.astype(np.int64)
+    shape = (len(seq), 2)
+    lead = seq < LEAD
+    return FrameBatch(
+        seq=seq,
+        t_mono_ns=t_mono_ns,
+        t_ns=t_mono_ns + UTC_NS,
+        padc=(np.where(lead, 500, 490) + seq % 2)[:, None].repeat(2, axis=1).astype(np.uint16),
+        tadc=np.full(shape, 480, np.uint16),
+        sample_offset_us=np.zeros(shape, np.int32),
+        servo_counts=np.full(len(seq), NO_SERVO_COUNTS, np.int32),
+        servo_age_us=np.full(len(seq), NO_SERVO_AGE, np.int32),
+        status=np.zeros(shape, np.uint8),
+        frame_status=np.where(lead, int(FrameStatus.LEAD), 0).astype(np.uint8),
+        reference_force_n=np.full(len(seq), np.nan, np.float32),
+    )
+
+
+def t_ns(seq: int) -> int:
+    return UTC_NS + PERIOD_NS * seq
+
+
+def stream(
+    data: Path, info: ArrayInfo, *runs: tuple[int, int], closed: bool = True, **notes: Any
+) -> Path:
+    folder = data / "journal" / info.node / info.boot_id
+    journal = Journal(folder, info)
+    for first, last in runs:
+        for begin in range(first, last + 1, 10):
+            journal.append(frames(begin, min(begin + 9, last)))
+    StreamNotes(array_info=info, **notes).save(folder)
+    journal.close()
+    if not closed:  # as a killed process leaves it
+        for path in folder.glob("*.idx"):
+            path.write_bytes(path.read_bytes()[:-48])
+    return folder
+
+
+def session(data: Path, session_id: str = ID, **changes: Any) -> Session:
+    content: dict[str, Any] = {
+        "id": session_id,
+        "name": "walk",
+        "node": "bench",
+        "state": "recording",
+        "started_t_ns": t_ns(0),
+        "parts": (Part(boot_id=BOOT, seq_first=0),),
+        "scene": "test",
+        "scene_content": {"name": "test"},
+        "subject": "leg 2",
+        "notes": "in mud",
+        "tags": ("wet",),
+        "events": (Event(id="e1", label="slip", t_ns=t_ns(500)),),
+    }
+    kept = Session(**content | changes)
+    SessionFolder(data / "sessions").save(kept)
+    return kept
+
+
+def loaded(data: Path, session_id: str = ID) -> Session:
+    return SessionFolder(data / "sessions").load(session_id)
+
+
+def state_of(data: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(data)): path.read_bytes()
+        for path in sorted(data.rglob("*"))
+        if path.is_file()
+    }
+
+
+def servers(data: Path) -> Path:
+    (data / "nodes" / "bench").mkdir(parents=True)
+    return data
+
+
+def outcomes(recovery: Recovery) -> list[str]:
+    return [one.outcome for one in recovery.sessions]
+
+
+# --- a node alone ---------------------------------------------------------------------------------
+
+
+def test_a_node_that_died_while_recording_leaves_a_sealed_session(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo], newtons_of: Callable[..., Any]
+) -> None:
+    folder = stream(tmp_path, info_of(), (0, 999), closed=False)
+    (segment,) = folder.glob("*.arrows")
+    segment.write_bytes(segment.read_bytes() + b"half a batch")
+    session(tmp_path, calibration=newtons_of(("T01", "T02")).model_dump(mode="json"))
+    recovery = recover(tmp_path)
+    assert (outcomes(recovery), recovery.problems) == (["sealed"], [])
+    assert recovery.sessions[0].problem == ""
+    assert recovery.cut == {f"bench/{BOOT}": len(b"half a batch")}
+    done = loaded(tmp_path)
+    assert (done.state, done.frames, done.stopped_t_ns) == ("sealed", 1000, t_ns(999))
+    assert done.ledger is not None
+    assert done.ledger.parts[0].unsynced_tail_max == TAIL == 267
+    assert (done.ledger.lossy, done.ledger.complete) == (True, False)
+    for name in ("name", "subject", "notes", "tags", "events", "scene"):
+        assert getattr(done, name) == getattr(session(tmp_path / "other"), name)
+    report = verify(tmp_path / "sessions" / ID)
+    assert (report.problems, verdict_of(report)) == ([], "lossy")
+    with SessionReader(tmp_path / "sessions" / ID / "frames.parquet") as reader:
+        ((batch, columns),) = reader.batches("grf_n")
+        assert reader.notes["scene"] == {"name": "test"}
+        assert "emulated" not in reader.notes
+    assert columns["grf_n"][batch.seq >= 500].mean() == pytest.approx(20.0, abs=0.1)
+
+
+def test_a_second_run_finds_nothing_and_changes_nothing(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(tmp_path, info_of(), (0, 99), closed=False)
+    session(tmp_path)
+    assert not recover(tmp_path, streams=True).is_nothing
+    before = state_of(tmp_path)
+    again = recover(tmp_path, streams=True)
+    assert again.is_nothing
+    assert again.sessions == []
+    assert state_of(tmp_path) == before
+
+
+def test_without_tare_or_calibration_raw_frames_are_kept_and_it_says_so(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(tmp_path, info_of(), (0, 99))
+    session(tmp_path)
+    (one,) = recover(tmp_path).sessions
+    assert "no calibration" in one.problem
+    assert loaded(tmp_path).frames == 100
+
+
+def test_a_process_that_was_killed_on_a_machine_that_stayed_up_lost_nothing(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    folder = stream(tmp_path, info_of(), (0, 99), closed=False)
+    InFlight(folder, info_of()).close()
+    session(tmp_path)
+    assert recover(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
+    ledger = loaded(tmp_path).ledger
+    assert ledger is not None
+    assert ledger.complete
+    assert verdict_of(verify(tmp_path)) == "complete"
+
+
+def test_after_another_start_of_the_machine_what_was_in_flight_is_gone(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = stream(tmp_path, info_of(), (0, 99), closed=False)
+    InFlight(folder, info_of()).close()
+    monkeypatch.setattr("storage.journal.in_flight.kernel_boot_id", lambda: "another")
+    session(tmp_path)
+    assert recover(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
+    ledger = loaded(tmp_path).ledger
+    assert ledger is not None
+    assert ledger.parts[0].unsynced_tail_max == TAIL
+
+
+def test_a_stream_whose_end_is_known_is_counted_to_it(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    lost = {"disk_full": ((100, 119),)}
+    stream(tmp_path, info_of(), (0, 99), next_seq=120, lost=lost, missed_slots=3)
+    session(tmp_path, missed_slots_at_start=1)
+    (one,) = recover(tmp_path).sessions
+    assert one.ledger is not None
+    assert one.ledger.parts[0].lost == {"disk_full": 20}
+    assert (one.ledger.parts[0].unsynced_tail_max, one.ledger.missed_slots) == (0, 2)
+    with SessionReader(tmp_path / "sessions" / ID / "frames.parquet") as reader:
+        assert reader.notes["lost"] == {BOOT: {"disk_full": [[100, 119]]}}
+
+
+def test_a_session_that_was_stopped_ends_where_it_was_stopped(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(tmp_path, info_of(), (0, 199), closed=False)
+    session(tmp_path, state="pending", stopped_t_ns=t_ns(150) + 1)
+    (one,) = recover(tmp_path).sessions
+    assert one.session.parts[0].seq_last == 150
+    assert one.ledger is not None
+    assert one.ledger.complete
+
+
+def test_several_parts_become_one_file(tmp_path: Path, info_of: Callable[..., ArrayInfo]) -> None:
+    stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    stream(tmp_path, info_of(OTHER_BOOT), (0, 49), closed=False)
+    parts = (
+        Part(boot_id=BOOT, seq_first=5, seq_last=99),
+        Part(boot_id=OTHER_BOOT, seq_first=0),
+    )
+    session(tmp_path, parts=parts)
+    assert outcomes(recover(tmp_path)) == ["sealed"]
+    assert loaded(tmp_path).frames == 145
+    assert as_dict(verify(tmp_path))["problems"] == []
+
+
+def test_frames_that_are_damaged_are_lost_and_the_others_kept(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    folder = stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    (segment,) = folder.glob("*.arrows")
+    content = bytearray(segment.read_bytes())
+    content[len(content) // 2] ^= 1
+    segment.write_bytes(content)
+    session(tmp_path)
+    (one,) = recover(tmp_path).sessions
+    assert one.ledger is not None
+    assert one.ledger.parts[0].lost == {"corrupt": 10}
+    assert loaded(tmp_path).frames == 90
+    notes = StreamNotes.load(folder)
+    assert notes is not None
+    assert Losses(notes.lost).by_reason["corrupt"].count == 10
+    assert verdict_of(verify(tmp_path / "sessions" / ID)) == "lossy"
+
+
+def test_a_session_of_which_nothing_reached_the_disk_is_sealed_as_that(tmp_path: Path) -> None:
+    session(tmp_path)
+    (one,) = recover(tmp_path).sessions
+    assert one.outcome == "sealed"
+    assert one.ledger is not None
+    assert one.ledger.parts[0].unsynced_tail_max == unsynced_tail_max(1000.0)
+    assert (loaded(tmp_path).frames, loaded(tmp_path).problem) == (0, "not one frame was recorded")
+    assert recover(tmp_path).is_nothing
+
+
+# --- a server -------------------------------------------------------------------------------------
+
+
+def test_what_a_node_may_still_bring_is_waited_for(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
+    session(tmp_path)
+    parts = (Part(boot_id=BOOT, seq_first=50, seq_last=150),)
+    session(tmp_path, ID[:-1] + "b", state="pending", stopped_t_ns=t_ns(150), parts=parts)
+    parts = (Part(boot_id=BOOT, seq_first=130, seq_last=150),)
+    session(tmp_path, ID[:-1] + "c", state="pending", stopped_t_ns=t_ns(150), parts=parts)
+    before = (tmp_path / "sessions" / ID / "session.json").read_bytes()
+    recovery = recover(tmp_path)
+    assert outcomes(recovery) == ["waiting", "waiting", "sealed"]
+    assert "20 frames may still come" in recovery.sessions[1].problem
+    assert (tmp_path / "sessions" / ID / "session.json").read_bytes() == before
+    assert recover(tmp_path).is_nothing
+
+
+def test_what_is_given_up_is_lost_and_says_so(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
+    session(tmp_path)
+    (one,) = recover(tmp_path, give_up=True).sessions
+    assert one.ledger is not None
+    assert one.ledger.parts[0].lost == {"given_up": 20}
+    assert one.ledger.parts[0].unsynced_tail_max == TAIL
+    assert loaded(tmp_path).frames == 180
+
+
+def test_a_stop_that_was_never_reached_bounds_what_is_given_up(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(servers(tmp_path), info_of(), (0, 99))
+    clock = ClockOffset(boot_id=BOOT, t_mono_ns=0, server_minus_node_ns=10**9, uncertainty_ns=1)
+    stopped_t_ns = t_ns(99) + 10**9 + 4 * 10**9
+    session(tmp_path, state="pending", stopped_t_ns=stopped_t_ns, clock=(clock,))
+    assert outcomes(recover(tmp_path)) == ["waiting"]
+    (one,) = recover(tmp_path, give_up=True).sessions
+    assert one.session.unsynced_tail_max == {BOOT: 2000}
+
+
+def test_a_session_that_was_stopped_is_ended_by_its_clock(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(servers(tmp_path), info_of(), (0, 99))
+    clock = ClockOffset(boot_id=BOOT, t_mono_ns=0, server_minus_node_ns=10**9, uncertainty_ns=1)
+    session(tmp_path, state="pending", stopped_t_ns=t_ns(50) + 10**9, clock=(clock,))
+    (one,) = recover(tmp_path).sessions
+    assert (one.outcome, one.session.parts[0].seq_last) == ("sealed", 50)
+
+
+# --- streams of no session ------------------------------------------------------------------------
+
+
+def test_frames_of_no_session_become_one_if_asked(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(tmp_path, info_of(), (0, 199), next_seq=200)
+    session(
+        tmp_path,
+        state="pending",
+        stopped_t_ns=t_ns(149),
+        parts=(Part(boot_id=BOOT, seq_first=50, seq_last=149),),
+    )
+    assert outcomes(recover(tmp_path)) == ["sealed"]
+    at = datetime(2020, 1, 2, tzinfo=UTC)
+    recovery = recover(tmp_path, streams=True, now=lambda: at)
+    assert outcomes(recovery) == ["sealed", "sealed"]
+    found = [one.session for one in recovery.sessions]
+    assert [s.parts[0].seq_first for s in found] == [0, 150]
+    assert [s.frames for s in found] == [50, 50]
+    assert {s.name for s in found} == {f"recovered bench {BOOT}"}
+    assert [s.started_t_ns for s in found] == [t_ns(0), t_ns(150)]
+    assert all(s.id.startswith("20200102T000000Z-") for s in found)
+    assert recover(tmp_path, streams=True).is_nothing
+    assert verdict_of(verify(tmp_path)) == "complete"
+
+
+def test_what_was_deleted_is_not_brought_back(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    session(tmp_path, state="sealed")
+    (tmp_path / "trash").mkdir()
+    (tmp_path / "sessions" / ID).rename(tmp_path / "trash" / ID)
+    assert recover(tmp_path, streams=True).sessions == []
+
+
+# --- what else a crash leaves ---------------------------------------------------------------------
+
+
+def test_what_dead_processes_left_half_written_is_removed(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    session(tmp_path)
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], stdout=-1)
+    stale = tmp_path / "sessions" / ID / f".frames.parquet.{int(dead.stdout)}.7.0123abcd.tmp"
+    stale.write_bytes(b"PAR1")
+    assert recover(tmp_path).removed == [stale]
+    assert not stale.exists()
+
+
+def test_events_that_were_not_written_in_time_are_written_anew(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    session(tmp_path)
+    recover(tmp_path)
+    done = loaded(tmp_path)
+    marked = done.model_copy(
+        update={"events": (*done.events, Event(id="e2", label="fall", t_ns=1))}
+    )
+    SessionFolder(tmp_path / "sessions").save(marked)
+    assert as_dict(verify(tmp_path))["problems"]
+    assert recover(tmp_path).mended == [ID]
+    assert as_dict(verify(tmp_path))["problems"] == []
+    assert recover(tmp_path).is_nothing
+
+
+def test_what_cannot_be_read_is_named_and_holds_up_nothing_else(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo]
+) -> None:
+    stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    session(tmp_path)
+    bad = tmp_path / "sessions" / (ID[:-1] + "b")
+    bad.mkdir()
+    (bad / "session.json").write_bytes(b"{")
+    hopeless = tmp_path / "journal" / "bench" / OTHER_BOOT
+    hopeless.mkdir()
+    (hopeless / f"{0:020d}.arrows").write_bytes(b"nothing of ours")
+    recovery = recover(tmp_path)
+    assert outcomes(recovery) == ["sealed"]
+    text = "; ".join(recovery.problems)
+    assert bad.name in text
+    assert OTHER_BOOT in text
+
+
+def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    session(tmp_path)
+    real = recover_module.seal
+
+    def careless(*arguments: Any) -> Session:
+        done = real(*arguments)
+        path = tmp_path / "sessions" / ID / "frames.parquet"
+        content = bytearray(path.read_bytes())
+        content[100] ^= 1
+        path.write_bytes(content)
+        return done
+
+    monkeypatch.setattr(recover_module, "seal", careless)
+    (one,) = recover(tmp_path).sessions
+    assert one.outcome == "failed"
+    assert "not those that were sealed" in one.problem
+    assert loaded(tmp_path).state == "sealing"
+    monkeypatch.undo()
+    assert outcomes(recover(tmp_path)) == ["sealed"]
+
+
+def test_a_full_disk_leaves_the_session_for_the_next_run(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    session(tmp_path)
+
+    def full(*_: Any) -> Session:
+        raise StorageError("cannot be written: no space left")
+
+    monkeypatch.setattr(recover_module, "seal", full)
+    (one,) = recover(tmp_path).sessions
+    assert (one.outcome, loaded(tmp_path).state) == ("failed", "sealing")
+    monkeypatch.undo()
+    assert outcomes(recover(tmp_path)) == ["sealed"]
+
+
+class Killed(BaseException):
+    """As good as SIGKILL for what is on the disk: nothing after it is done."""
+
+
+def test_killed_at_any_write_the_next_run_comes_to_the_same(
+    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = tmp_path / "begun"
+    stream(begun, info_of(), (0, 99), closed=False)
+    session(begun)
+    once = tmp_path / "once"
+    shutil.copytree(begun, once)
+    recover(once)
+    wanted = state_of(once)
+    real, rounds, left = os.fsync, 0, 1
+    while left:
+        rounds += 1
+        again = tmp_path / f"round-{rounds}"
+        shutil.copytree(begun, again)
+        allowed = rounds
+
+        def counted(descriptor: int) -> None:
+            nonlocal allowed
+            allowed -= 1
+            if allowed < 0:
+                raise Killed
+            real(descriptor)
+
+        monkeypatch.setattr(os, "fsync", counted)
+        try:
+            recover(again)
+            left = 0
+        except Killed:
+            pass
+        monkeypatch.setattr(os, "fsync", real)
+        recover(again)
+        assert state_of(again) == wanted, rounds
+    assert rounds > 5
+
+
+def test_a_folder_in_use_is_left_alone(tmp_path: Path) -> None:
+    with (
+        locked(tmp_path),
+        pytest.raises(StorageError, match="server or node uses"),
+        locked(tmp_path),
+    ):
+        pass
+    with locked(tmp_path):
+        pass

@@ -1,0 +1,409 @@
+"""Tares of a node: the newest that was not undone is in force, also after a restart."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError, StorageError, UnknownError
+from devices.frames import ArrayInfo, TileInfo
+from service.estimation.tare.tare import Source, Tare
+from service.sessions.tares import KEPT_MAX, RecordedTare, TareHistory
+
+
+def array(*serials: str) -> ArrayInfo:
+    return ArrayInfo(
+        node="bench",
+        boot_id="0" * 32,
+        tiles=tuple(
+            TileInfo(
+                serial=serial,
+                mux=0x70,
+                channel=i,
+                coefficient_words=(1787 * 8, 0xC000, 0, 0),
+                x_m=0.014 * i,
+                y_m=0.0,
+                z_m=-0.15,
+                reference=False,
+                conversion_ms=1.6,
+            )
+            for i, serial in enumerate(serials)
+        ),
+        servo=None,
+        schedule="simultaneous",
+        nominal_rate_hz=500.0,
+        utc_offset_ns=10**18,
+        clock_set=True,
+        software="test",
+        scene="test",
+        models=("unwrap", "static"),
+    )
+
+
+INFO = array("T01", "T02")
+OTHERS = (array("T01", "T03"), array("T02", "T01"), array("T01"), array("T01", "T02", "T03"))
+
+
+def tare(t_ns: int = 0, *, tiles: int = 2, source: Source = "unloaded") -> Tare:
+    return Tare(
+        baseline_kpa=100.0 + np.arange(tiles) / 3,
+        baseline_sigma_kpa=np.full(tiles, 0.01),
+        noise_kpa=np.full(tiles, 1 / 7),
+        tadc_counts=480.0 + np.arange(tiles) / 7,
+        t_ns=t_ns,
+        begin_s=0.1,
+        end_s=0.35,
+        frames=125,
+        source=source,
+    )
+
+
+def same(one: RecordedTare, other: RecordedTare) -> None:
+    assert (one.id, one.serials, one.undone) == (other.id, other.serials, other.undone)
+    assert (one.reason, one.chips) == (other.reason, other.chips)
+    for f in fields(Tare):
+        a, b = getattr(one.tare, f.name), getattr(other.tare, f.name)
+        if isinstance(a, np.ndarray):
+            assert (a.dtype, a.tobytes()) == (b.dtype, b.tobytes()), f.name
+        else:
+            assert (type(a), a) == (type(b), b), f.name
+
+
+def history(tmp_path: Path, *t_ns: int) -> TareHistory:
+    made = TareHistory(tmp_path / "node" / "tares.json")
+    for t in t_ns:
+        made.add(tare(t), INFO)
+    return made
+
+
+def instants(tares: Sequence[Tare]) -> list[int]:
+    return [one.t_ns for one in tares]
+
+
+# --- in force -------------------------------------------------------------------------------------
+
+
+def test_a_node_that_was_never_tared_has_none(tmp_path: Path) -> None:
+    tares = history(tmp_path)
+    assert tares.in_force(INFO) is None
+    assert tares.all == []
+    assert tares.during(INFO, 0, 100) == ()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_newest_is_in_force_and_undone_the_one_before(tmp_path: Path) -> None:
+    tares = history(tmp_path)
+    one, two, three = (tares.add(tare(t), INFO) for t in (1, 2, 3))
+    assert tares.in_force(INFO) is three
+    tares.undo(three.id)
+    same_as_two = tares.in_force(INFO)
+    assert same_as_two is not None
+    same(same_as_two, two)
+    tares.undo(one.id)  # one that is not in force, too
+    assert [recorded.undone for recorded in tares.all] == [True, False, True]
+    tares.undo(two.id)
+    assert tares.in_force(INFO) is None
+    again = tares.add(tare(4), INFO)
+    assert tares.in_force(INFO) is again
+
+
+def test_only_what_is_there_and_in_force_can_be_undone(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1)
+    recorded = tares.all[0]
+    tares.undo(recorded.id)
+    for tare_id in (recorded.id, "", "nothing", recorded.id[:-1]):
+        with pytest.raises(UnknownError, match="could be undone"):
+            tares.undo(tare_id)
+    assert len(tares.all) == 1
+
+
+def test_tares_of_other_tiles_do_not_count(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1)
+    mine = tares.all[0]
+    for number, info in enumerate(OTHERS):
+        tares.add(tare(10 + number, tiles=len(info.tiles)), info)
+    assert tares.in_force(INFO) is mine
+    assert instants(tares.during(INFO, 0, 100)) == [1]
+    for number, info in enumerate(OTHERS):
+        assert instants(tares.during(info, 0, 100)) == [10 + number]
+
+
+def test_a_tare_does_not_count_for_a_part_that_was_swapped(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1)
+    other = INFO.tiles[1].model_copy(update={"coefficient_words": (1790 * 8, 0xC000, 0, 0)})
+    swapped = INFO.model_copy(update={"tiles": (INFO.tiles[0], other)})
+    assert tares.in_force(swapped) is None
+    assert tares.during(swapped, 0, 100) == ()
+    tares.add(tare(2), swapped)
+    assert instants(history(tmp_path).during(INFO, 0, 100)) == [1]
+    path = tmp_path / "node" / "tares.json"
+    content = json.loads(path.read_bytes())
+    del content[0]["chips"]  # an older version's knows only serials
+    path.write_text(json.dumps(content))
+    assert instants(history(tmp_path).during(swapped, 0, 100)) == [1, 2]
+
+
+def test_ids_are_all_different(tmp_path: Path) -> None:
+    tares = history(tmp_path, *range(30))
+    assert len({recorded.id for recorded in tares.all}) == 30
+
+
+def test_what_is_given_out_is_no_handle_on_the_history(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1)
+    tares.all.clear()
+    assert len(tares.all) == 1
+
+
+# --- during an interval ---------------------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    taken=st.lists(st.tuples(st.integers(0, 20), st.booleans()), max_size=6).map(sorted),
+    begin=st.integers(-1, 21),
+    length=st.integers(0, 22),
+)
+def test_during_an_interval_are_those_that_were_in_force_at_some_time_of_it(
+    tmp_path_factory: pytest.TempPathFactory,
+    taken: list[tuple[int, bool]],
+    begin: int,
+    length: int,
+) -> None:
+    tares = history(tmp_path_factory.mktemp("during"), *(t for t, _ in taken))
+    for recorded, (_, undone) in zip(tares.all, taken, strict=True):
+        if undone:
+            tares.undo(recorded.id)
+    valid = [t for t, undone in taken if not undone]
+    in_force = set[int]()
+    for instant in range(begin, begin + length + 1):
+        before = [t for t in valid if t <= instant]
+        in_force |= {before[-1]} if before else set()
+    found = instants(tares.during(INFO, begin, begin + length))
+    assert sorted(set(found)) == sorted(in_force)
+    assert found == sorted(found)
+
+
+# --- why, and automatic ones ----------------------------------------------------------------------
+
+
+def test_every_tare_has_a_reason_in_words(tmp_path: Path) -> None:
+    tares = history(tmp_path)
+    tares.add(tare(1, source="lead"), INFO)
+    tares.add(tare(2), INFO)
+    tares.add(tare(3), INFO, "new shoe")
+    tares.add(tare(4), INFO, "x" * 500)
+    path = tmp_path / "node" / "tares.json"
+    content = json.loads(path.read_bytes())
+    del content[1]["reason"]  # an older version's
+    path.write_text(json.dumps(content))
+    assert [recorded.reason for recorded in history(tmp_path).all] == [
+        "unloaded lead of the emulation",
+        "by hand",
+        "new shoe",
+        "x" * 200,
+    ]
+
+
+def test_an_undone_automatic_tare_pauses_them_until_somebody_tares(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1)
+    assert not tares.is_automatic_paused(INFO)
+    one = tares.add(tare(2, source="flight"), INFO)
+    two = tares.add(tare(3, source="flight"), INFO)
+    assert not tares.is_automatic_paused(INFO)
+    tares.undo(two.id)
+    in_force = tares.in_force(INFO)
+    assert in_force is not None
+    assert in_force.id == one.id
+    assert tares.is_automatic_paused(INFO)
+    assert history(tmp_path).is_automatic_paused(INFO), "also after a restart"
+    assert not tares.is_automatic_paused(OTHERS[0]), "not for other tiles"
+    by_hand = tares.add(tare(4), INFO)
+    assert not tares.is_automatic_paused(INFO)
+    tares.undo(by_hand.id)  # it did not change anybody's mind
+    assert tares.is_automatic_paused(INFO)
+
+
+def test_a_tare_by_hand_that_is_undone_pauses_nothing(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1, 2)
+    tares.undo(tares.all[-1].id)
+    assert not tares.is_automatic_paused(INFO)
+
+
+def test_automatic_tares_are_held_against_the_last_one_by_hand_or_the_oldest(
+    tmp_path: Path,
+) -> None:
+    tares = history(tmp_path)
+    assert tares.anchor(INFO) is None
+    first = tares.add(tare(1, source="flight"), INFO)
+    tares.add(tare(2, source="flight"), INFO)
+    assert tares.anchor(INFO) is first
+    by_hand = tares.add(tare(3), INFO)
+    tares.add(tare(4, source="flight"), INFO)
+    assert tares.anchor(INFO) is by_hand
+    tares.undo(by_hand.id)
+    anchor = tares.anchor(INFO)
+    assert anchor is not None
+    assert anchor.id == first.id
+
+
+def test_automatic_tares_never_push_out_one_that_was_taken_by_hand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.sessions.tares.AUTOMATIC_KEPT_MAX", 20)
+    tares = history(tmp_path, 0)
+    for t in range(1, 301):
+        tares.add(tare(t, source="unloaded" if t % 100 == 0 else "flight"), INFO)
+        assert sum(recorded.is_automatic for recorded in tares.all) <= 20
+    assert instants([t.tare for t in tares.all if not t.is_automatic]) == [0, 100, 200, 300]
+    kept = instants([t.tare for t in tares.all if t.is_automatic])
+    assert kept == sorted(kept)
+    assert kept[0] == 1, "the first of them"
+    assert set(range(290, 300)) <= set(kept), "the newest without a gap"
+    assert max(np.diff(kept)) < 120, "and of what was before some"
+
+
+# --- kept -----------------------------------------------------------------------------------------
+
+
+def test_the_history_survives_a_restart_bit_by_bit(tmp_path: Path) -> None:
+    tares = history(tmp_path, 1, 2**62)
+    tares.add(tare(5, tiles=1), array("Ü\n\u2028"))
+    tares.undo(tares.all[1].id)
+    again = history(tmp_path)
+    assert len(again.all) == 3
+    for one, other in zip(tares.all, again.all, strict=True):
+        same(one, other)
+    in_force = again.in_force(INFO)
+    assert in_force is not None
+    assert in_force.tare.t_ns == 1
+    again.undo(in_force.id)
+    assert history(tmp_path).in_force(INFO) is None
+
+
+def test_only_the_newest_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.sessions.tares.KEPT_MAX", 5)
+    tares = history(tmp_path, *range(8))
+    assert instants([recorded.tare for recorded in tares.all]) == [3, 4, 5, 6, 7]
+    assert instants([recorded.tare for recorded in history(tmp_path).all]) == [3, 4, 5, 6, 7]
+    assert KEPT_MAX >= 100
+
+
+def test_a_disk_that_cannot_be_written_leaves_the_history_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    tares = history(tmp_path, 1, 2)
+    before = tares.all
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", full)
+        with pytest.raises(StorageError, match="No space left"):
+            tares.add(tare(3), INFO)
+        with pytest.raises(StorageError, match="No space left"):
+            tares.undo(before[0].id)
+    assert tares.all == before
+    assert tares.in_force(INFO) is before[1]
+    assert instants([recorded.tare for recorded in history(tmp_path).all]) == [1, 2]
+    assert not any(recorded.undone for recorded in history(tmp_path).all)
+    tares.add(tare(4), INFO)
+    assert instants([recorded.tare for recorded in history(tmp_path).all]) == [1, 2, 4]
+
+
+def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
+    (tmp_path / "node").write_bytes(b"")
+    tares = TareHistory(tmp_path / "node" / "more" / "tares.json")
+    with pytest.raises(StorageError):
+        tares.add(tare(), INFO)
+    assert tares.all == []
+
+
+# --- damaged --------------------------------------------------------------------------------------
+
+
+def assert_damaged(path: Path) -> None:
+    with pytest.raises(FileFormatError, match="not readable") as caught:
+        TareHistory(path)
+    assert caught.value.where == str(path)
+    assert "tared anew" in caught.value.remedy
+
+
+def test_a_file_that_is_cut_off_anywhere_is_damaged(tmp_path: Path) -> None:
+    history(tmp_path, 1)
+    path = tmp_path / "node" / "tares.json"
+    content = path.read_bytes()
+    for length in range(len(content)):
+        path.write_bytes(content[:length])
+        assert_damaged(path)
+
+
+DAMAGES: dict[str, dict[str, Any]] = {
+    "a baseline less": {"tare": {"baseline_kpa": [100.0]}},
+    "a baseline that is not known": {"tare": {"baseline_kpa": [100.0, None]}},
+    "words for baselines": {"tare": {"baseline_kpa": "none"}},
+    "no baselines": {"tare": {"baseline_kpa": None}},
+    "noise that is no number": {"tare": {"noise_kpa": [1.0, float("nan")]}},
+    "one noise for all": {"tare": {"noise_kpa": 1.0}},
+    "a temperature too many": {"tare": {"tadc_counts": [1.0, 2.0, 3.0]}},
+    "words for temperatures": {"tare": {"tadc_counts": ["warm", "cold"]}},
+    "another shape": {"tare": {"baseline_sigma_kpa": [[1.0, 1.0]]}},
+    "words for an instant": {"tare": {"t_ns": "yesterday"}},
+    "no instant": {"tare": {"t_ns": None}},
+    "other tiles": {"serials": ["T01", "T02", "T03"]},
+    "words for chips": {"chips": [["a"], ["b"]]},
+    "a number for chips": {"chips": 7},
+    "a number for serials": {"serials": 7},
+}
+
+
+@pytest.mark.parametrize("change", DAMAGES.values(), ids=DAMAGES.keys())
+def test_an_entry_that_is_no_tare_of_its_tiles_is_damaged(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    history(tmp_path, 1)
+    path = tmp_path / "node" / "tares.json"
+    content = json.loads(path.read_bytes())
+    for name, value in change.items():
+        content[0][name] = content[0][name] | value if name == "tare" else value
+    path.write_text(json.dumps(content))
+    assert_damaged(path)
+
+
+@pytest.mark.parametrize(
+    "missing", ["id", "serials", "undone", "tare", "baseline_kpa", "t_ns", "source", "frames"]
+)
+def test_an_entry_that_lacks_something_is_damaged(tmp_path: Path, missing: str) -> None:
+    history(tmp_path, 1)
+    path = tmp_path / "node" / "tares.json"
+    content = json.loads(path.read_bytes())
+    del (content[0] if missing in content[0] else content[0]["tare"])[missing]
+    path.write_text(json.dumps(content))
+    assert_damaged(path)
+
+
+def test_tares_of_an_older_version_have_no_temperature_and_are_readable(tmp_path: Path) -> None:
+    history(tmp_path, 1)
+    path = tmp_path / "node" / "tares.json"
+    content = json.loads(path.read_bytes())
+    del content[0]["tare"]["tadc_counts"]
+    path.write_text(json.dumps(content))
+    (old,) = history(tmp_path).all
+    assert np.isnan(old.tare.tadc_counts).tolist() == [True, True]
+    history(tmp_path).add(tare(2), INFO)  # and can be written again, as JSON that has no NaN
+    json.loads(path.read_bytes(), parse_constant=pytest.fail)
+    assert np.isnan(history(tmp_path).all[0].tare.tadc_counts).all()
+
+
+@pytest.mark.parametrize("content", [b"null", b"7", b'"tares"', b"{}", b"[7]", b"[null]", b"\xff"])
+def test_what_is_no_list_of_tares_is_damaged(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "tares.json"
+    path.write_bytes(content)
+    assert_damaged(path)

@@ -1,0 +1,193 @@
+"""`clock.parquet` beside a session: rows, facts of streams, and what is no clock table."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from devices.errors import FileFormatError, UsageError
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, TileInfo
+from storage.clock.file import clock_beside, read_clock, write_clock
+from storage.clock.table import StreamFacts
+from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.folder import ClockOffset
+
+SECOND = 1_000_000_000
+
+
+def measured(boot_id: str, n: int) -> list[ClockOffset]:
+    return [
+        ClockOffset(
+            boot_id=boot_id,
+            t_mono_ns=i * 10 * SECOND,
+            server_minus_node_ns=1000 + i,
+            uncertainty_ns=50,
+        )
+        for i in range(n)
+    ]
+
+
+def test_the_file_gives_back_rows_and_facts(tmp_path: Path) -> None:
+    rows = [*measured("one", 3), *measured("two", 2)]
+    facts = [StreamFacts("one", 5, True), StreamFacts("two"), StreamFacts("three", -7, False)]
+    write_clock(tmp_path / "clock.parquet", rows, facts)
+    read, said = read_clock(tmp_path / "clock.parquet")
+    assert {name: len(own) for name, own in read.items()} == {"one": 3, "two": 2}
+    assert read["one"].offset_ns.tolist() == [row.server_minus_node_ns for row in rows[:3]]
+    assert list(said.values()) == facts
+
+
+def test_a_table_without_rows_is_one(tmp_path: Path) -> None:
+    write_clock(tmp_path / "clock.parquet", [], [StreamFacts("one", 5, False)])
+    rows, facts = read_clock(tmp_path / "clock.parquet")
+    assert rows == {}
+    assert facts["one"].clock_set is False
+
+
+def numbers(**changed: pa.Array) -> dict[str, pa.Array]:
+    one = pa.array([1], pa.int64())
+    return {
+        "boot_id": pa.array(["b"]),
+        "t_mono_ns": one,
+        "server_minus_node_ns": one,
+        "uncertainty_ns": one,
+    } | changed
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"boot_id": pa.array(["b"])},
+        numbers(t_mono_ns=pa.array([None], pa.int64())),
+        numbers(boot_id=pa.array([None], pa.string())),
+        numbers(uncertainty_ns=pa.array(["much"])),
+        numbers(uncertainty_ns=pa.array([0.5])),
+    ],
+    ids=["columns missing", "empty instant", "empty stream", "text", "fraction"],
+)
+def test_a_file_that_is_no_clock_table_is_refused(
+    tmp_path: Path, columns: dict[str, pa.Array]
+) -> None:
+    path = tmp_path / "clock.parquet"
+    pq.write_table(pa.table(columns), path)
+    with pytest.raises(FileFormatError, match=r"clock\.parquet"):
+        read_clock(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1", b"x" * 1000])
+def test_a_file_that_is_no_parquet_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "clock.parquet"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError):
+        read_clock(path)
+
+
+def test_facts_that_are_not_understood_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "clock.parquet"
+    table = pa.table(numbers()).replace_schema_metadata({"foottile.streams": json.dumps([1])})
+    pq.write_table(table, path)
+    with pytest.raises(FileFormatError, match="clock table"):
+        read_clock(path)
+
+
+# --- beside a session -----------------------------------------------------------------------------
+
+
+def sealed(folder: Path, notes: dict[str, object]) -> Path:
+    info = ArrayInfo(
+        node="bench",
+        boot_id="one",
+        tiles=(
+            TileInfo(
+                serial="T01",
+                mux=0x70,
+                channel=0,
+                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
+                x_m=0.0,
+                y_m=0.0,
+                z_m=-0.15,
+                reference=False,
+                conversion_ms=1.6,
+            ),
+        ),
+        servo=None,
+        schedule="simultaneous",
+        nominal_rate_hz=1.0,
+        utc_offset_ns=7,
+        clock_set=False,
+        software="test",
+        scene="test",
+        models=("static",),
+    )
+    t_mono_ns = np.arange(4, dtype=np.int64) * SECOND
+    frames = FrameBatch(
+        seq=np.arange(4, dtype=np.uint64),
+        t_mono_ns=t_mono_ns,
+        t_ns=t_mono_ns + 7,
+        padc=np.full((4, 1), 400, dtype=np.uint16),
+        tadc=np.full((4, 1), 480, dtype=np.uint16),
+        sample_offset_us=np.zeros((4, 1), dtype=np.int32),
+        servo_counts=np.full(4, NO_SERVO_COUNTS, dtype=np.int32),
+        servo_age_us=np.full(4, NO_SERVO_AGE, dtype=np.int32),
+        status=np.zeros((4, 1), dtype=np.uint8),
+        frame_status=np.zeros(4, dtype=np.uint8),
+        reference_force_n=np.full(4, np.nan, dtype=np.float32),
+    )
+    path = folder / "frames.parquet"
+    with SessionWriter(path, info, notes) as writer:
+        writer.append(frames, {"part": np.array([0, 0, 1, 1], dtype=np.uint16)})
+    return path
+
+
+def parts(*boot_ids: str) -> dict[str, object]:
+    return {"session": {"parts": [{"boot_id": boot_id} for boot_id in boot_ids]}}
+
+
+def test_each_part_of_a_session_has_the_clock_of_its_stream(tmp_path: Path) -> None:
+    path = sealed(tmp_path, parts("one", "two"))
+    write_clock(tmp_path / "clock.parquet", measured("two", 3), [StreamFacts("two", 9, True)])
+    with SessionReader(path) as reader:
+        table = clock_beside(reader)
+    one, two = table.summary().streams
+    assert (one.boot_id, one.state, one.rows) == ("one", "unsynchronised", 0)
+    assert (two.boot_id, two.state, two.rows) == ("two", "measured", 3)
+    assert two.stretches[0].begin_t_ns == 9
+
+
+def test_a_table_of_an_older_version_says_nothing_of_streams_and_is_read(tmp_path: Path) -> None:
+    path = sealed(tmp_path, parts("one", "two"))
+    pq.write_table(pa.table(numbers(boot_id=pa.array(["two"]))), tmp_path / "clock.parquet")
+    with SessionReader(path) as reader:
+        one, two = clock_beside(reader).summary().streams
+    assert (one.state, two.state) == ("unsynchronised", "measured")
+    assert two.stretches[0].begin_t_ns is None
+
+
+def test_a_file_that_was_never_recorded_is_of_one_stream(tmp_path: Path) -> None:
+    path = sealed(tmp_path, {})
+    write_clock(tmp_path / "clock.parquet", measured("one", 3), [])
+    with SessionReader(path) as reader:
+        (stream,) = clock_beside(reader).summary().streams
+    assert (stream.boot_id, stream.state) == ("one", "measured")
+    assert stream.stretches[0].begin_t_ns == 7
+
+
+def test_a_lone_file_has_no_servers_time_and_says_what_is_missing(tmp_path: Path) -> None:
+    with (
+        SessionReader(sealed(tmp_path, {})) as reader,
+        pytest.raises(UsageError, match=r"no clock\.parquet beside frames\.parquet"),
+    ):
+        clock_beside(reader)
+
+
+@pytest.mark.parametrize("session", [1, {"parts": 5}, {"parts": [{}]}, {}])
+def test_notes_that_name_no_streams_are_refused(tmp_path: Path, session: object) -> None:
+    path = sealed(tmp_path, {"session": session})
+    write_clock(tmp_path / "clock.parquet", measured("one", 3), [])
+    with SessionReader(path) as reader, pytest.raises(FileFormatError, match="which streams"):
+        clock_beside(reader)

@@ -1,0 +1,182 @@
+"""Clock rows on disk: appended, read back, and never misread."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devices.errors import StorageError
+from storage.clock.log import ClockLog
+from storage.sessions.folder import ClockOffset
+
+INT64 = st.integers(-(2**63), 2**63 - 1)
+
+
+def row(number: int) -> ClockOffset:
+    return ClockOffset(
+        boot_id="a" * 32,
+        t_mono_ns=10**10 * number,
+        server_minus_node_ns=-(10**18) - number,
+        uncertainty_ns=1_000_000 + number,
+    )
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> ClockLog:
+    return ClockLog(tmp_path / "stream")
+
+
+def filled(log: ClockLog, n: int) -> list[ClockOffset]:
+    rows = [row(i) for i in range(n)]
+    for one in rows:
+        log.append(one)
+    return rows
+
+
+def test_rows_come_back_in_the_order_they_came(log: ClockLog) -> None:
+    rows = filled(log, 20)
+    log.sync()
+    assert list(ClockLog(log.path.parent).rows()) == rows
+
+
+def test_a_log_without_rows_is_empty_and_makes_no_file(log: ClockLog) -> None:
+    log.sync()
+    assert log.rows() == ()
+    assert not log.path.parent.exists()
+
+
+@given(boot_id=st.text(), t_mono_ns=INT64, offset=INT64, uncertainty=INT64)
+def test_any_row_comes_back_as_it_was(
+    tmp_path_factory: pytest.TempPathFactory,
+    boot_id: str,
+    t_mono_ns: int,
+    offset: int,
+    uncertainty: int,
+) -> None:
+    log = ClockLog(tmp_path_factory.mktemp("log"))
+    given_row = ClockOffset(
+        boot_id=boot_id,
+        t_mono_ns=t_mono_ns,
+        server_minus_node_ns=offset,
+        uncertainty_ns=uncertainty,
+    )
+    log.append(given_row)
+    log.append(given_row)
+    assert log.rows() == (given_row, given_row)
+
+
+def test_a_torn_last_line_costs_that_row_only(log: ClockLog) -> None:
+    rows = filled(log, 3)
+    whole = log.path.read_bytes()
+    begin = whole.rindex(b"\n", 0, -1) + 1
+    for end in range(begin, len(whole)):
+        log.path.write_bytes(whole[:end])
+        assert list(log.rows())[:2] == rows[:2]
+        assert len(log.rows()) in ({2, 3} if end == len(whole) - 1 else {2})
+        log.append(row(9))
+        assert log.rows()[-1] == row(9)
+        assert set(log.rows()) <= {*rows, row(9)}
+
+
+def test_a_flipped_bit_anywhere_never_makes_another_row(log: ClockLog) -> None:
+    rows = filled(log, 3)
+    whole = log.path.read_bytes()
+    for at in range(len(whole)):
+        for bit in range(8):
+            damaged = bytearray(whole)
+            damaged[at] ^= 1 << bit
+            log.path.write_bytes(damaged)
+            read = log.rows()
+            assert set(read) <= set(rows)
+            assert len(read) >= (1 if whole[at] == 10 else 2)
+
+
+@pytest.mark.parametrize(
+    "rubbish",
+    [b"\0" * 5000, b"[" * 100_000, b"{}", b"null", b'{"crc32":1}', b"\xff\xfe", b"1e999"],
+    ids=["zeros", "deep", "object", "null", "crc", "bytes", "infinity"],
+)
+def test_rubbish_is_skipped(log: ClockLog, rubbish: bytes) -> None:
+    filled(log, 2)
+    with log.path.open("ab") as file:
+        file.write(rubbish)
+    log.append(row(7))
+    assert list(log.rows()) == [row(0), row(1), row(7)]
+
+
+def test_a_full_disk_is_said_and_earlier_rows_stay(
+    log: ClockLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = filled(log, 3)
+    before = log.path.read_bytes()
+    write = os.write
+    calls = 0
+
+    def full(descriptor: int, data: memoryview) -> int:
+        nonlocal calls
+        calls += 1
+        if calls == 1:
+            return write(descriptor, data[:11])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "write", full)
+        with pytest.raises(StorageError, match="No space left") as caught:
+            log.append(row(8))
+    assert "clock.jsonl" in caught.value.where
+    assert log.path.read_bytes() == before
+    log.append(row(9))
+    assert list(log.rows()) == [*rows, row(9)]
+
+
+def test_a_disk_so_full_that_nothing_can_be_taken_back_keeps_the_rows(
+    log: ClockLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = filled(log, 3)
+    write = os.write
+
+    def full(descriptor: int, data: memoryview) -> int:
+        if len(data) > 50:
+            return write(descriptor, data[:50])
+        raise OSError(errno.EIO, "Input/output error")
+
+    def refused(descriptor: int, length: int) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "write", full)
+        patched.setattr(os, "ftruncate", refused)
+        with pytest.raises(StorageError):
+            log.append(row(8))
+    log.append(row(9))
+    assert [r for r in log.rows() if r != row(8)] == [*rows, row(9)]
+
+
+def test_a_folder_that_cannot_be_written_is_an_error_of_storage(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError):
+        ClockLog(tmp_path / "file").append(row(0))
+
+
+def test_appending_costs_the_same_however_long_the_log_is(
+    log: ClockLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    filled(log, 1000)
+    read = 0
+    pread = os.pread
+
+    def counted(descriptor: int, length: int, offset: int) -> bytes:
+        nonlocal read
+        read += length
+        return pread(descriptor, length, offset)
+
+    monkeypatch.setattr(os, "pread", counted)
+    size = log.path.stat().st_size
+    log.append(row(1000))
+    assert read == 1
+    assert log.path.stat().st_size - size < 300

@@ -1,0 +1,416 @@
+"""Sessions in other formats: the same values in each, in pieces, and only what was asked for."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import UsageError
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, ArrayInfo, FrameBatch, TileInfo
+from storage.clock.bounds import Rows
+from storage.clock.table import ClockTable, StreamFacts
+from storage.formats.export import FORMATS, MEDIA_TYPES, Format, Slice, export
+from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, FRAMES, Array
+from storage.sessions.file import NOTES_KEY
+
+PERIOD_NS = 2_000_000
+BEGIN_NS = 10**18 + 123
+ROWS = 50
+NOTES: dict[str, object] = {"seed": 7, "scene": {"name": "mud"}}
+
+Piece = tuple[FrameBatch, dict[str, Array]]
+
+
+def array(tiles: int = 2) -> ArrayInfo:
+    return ArrayInfo(
+        node="bench",
+        boot_id="0" * 32,
+        tiles=tuple(
+            TileInfo(
+                serial=f"T{i + 1:02}",
+                mux=0x70,
+                channel=i,
+                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
+                x_m=0.014 * i,
+                y_m=0.0,
+                z_m=-0.15,
+                reference=False,
+                conversion_ms=1.6,
+            )
+            for i in range(tiles)
+        ),
+        servo=None,
+        schedule="simultaneous",
+        nominal_rate_hz=1e9 / PERIOD_NS,
+        utc_offset_ns=10**18,
+        clock_set=True,
+        software="test",
+        scene="test",
+        models=("unwrap", "static"),
+    )
+
+
+def frames(rows: int = ROWS, tiles: int = 2) -> FrameBatch:
+    """Frames of which some values are not known."""
+    rng = np.random.default_rng(5)
+    t_mono_ns = 123 + PERIOD_NS * np.arange(rows, dtype=np.int64)
+    padc = rng.integers(250, 420, (rows, tiles)).astype(np.uint16)
+    padc[rng.random((rows, tiles)) < 0.2] = NOT_READ
+    servo_counts = rng.integers(-5000, 5000, rows).astype(np.int32)
+    servo_counts[::7] = NO_SERVO_COUNTS
+    return FrameBatch(
+        seq=np.arange(rows, dtype=np.uint64) + np.uint64(2**60),
+        t_mono_ns=t_mono_ns,
+        t_ns=t_mono_ns + 10**18,
+        padc=padc,
+        tadc=rng.integers(470, 490, (rows, tiles)).astype(np.uint16),
+        sample_offset_us=rng.integers(-100, 3000, (rows, tiles)).astype(np.int32),
+        servo_counts=servo_counts,
+        servo_age_us=np.where(servo_counts == NO_SERVO_COUNTS, NO_SERVO_AGE, 5).astype(np.int32),
+        status=rng.integers(0, 64, (rows, tiles)).astype(np.uint8),
+        frame_status=rng.integers(0, 32, rows).astype(np.uint8),
+        reference_force_n=np.full(rows, np.nan, dtype=np.float32),
+    )
+
+
+def extra(rows: int = ROWS, tiles: int = 2) -> dict[str, Array]:
+    rng = np.random.default_rng(6)
+    force_n = rng.normal(0.0, 20.0, (rows, tiles))
+    force_n[rng.random((rows, tiles)) < 0.2] = np.nan
+    contact = rng.integers(0, 2, rows).astype(np.uint8)
+    contact[::5] = CONTACT_UNKNOWN
+    return {
+        "part": np.zeros(rows, dtype=np.uint16),
+        "force_n": force_n,
+        "grf_n": force_n.sum(axis=1),
+        "contact": contact,
+        "estimate_status": rng.integers(0, 512, rows).astype(np.uint16),
+        "phase": np.array(["rest, or 'not'" if i % 3 else 'a "tap"' for i in range(rows)]),
+    }
+
+
+def cut(batch: FrameBatch, columns: Mapping[str, Array], every: int) -> Iterator[Piece]:
+    for a in range(0, len(batch), every):
+        yield (
+            batch.rows(a, a + every),
+            {name: values[a : a + every] for name, values in columns.items()},
+        )
+
+
+def exported(to: Format, part: Slice | None = None, *, every: int = 20) -> bytes:
+    pieces = cut(frames(), extra(), every)
+    return b"".join(export(pieces, array(), NOTES, to, part or Slice()))
+
+
+def read(content: bytes, to: Format) -> pa.Table:
+    if to == "parquet":
+        return pq.read_table(io.BytesIO(content))
+    if to == "arrow":
+        return pa.ipc.open_stream(content).read_all()
+    return pacsv.read_csv(
+        io.BytesIO(content),
+        # A row of which the one column asked for is not known is an empty line.
+        parse_options=pacsv.ParseOptions(ignore_empty_lines=False),
+        convert_options=pacsv.ConvertOptions(
+            null_values=[""],
+            strings_can_be_null=False,
+        ),
+    )
+
+
+def values(table: pa.Table) -> dict[str, list[object]]:
+    """Values by column, floats in the precision of the file's type."""
+    return {
+        name: [np.float32(v) if isinstance(v, float) else v for v in table.column(name).to_pylist()]
+        for name in table.column_names
+    }
+
+
+def names(part: Slice, to: Format = "arrow") -> list[str]:
+    return read(exported(to, part), to).column_names
+
+
+# --- the same in every format ---------------------------------------------------------------------
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    every=st.sampled_from([1, 7, 20, ROWS]),
+    start=st.one_of(st.none(), st.integers(0, 60)),
+    end=st.one_of(st.none(), st.integers(1, 60)),
+    columns=st.lists(
+        st.sampled_from(["seq", "t_ns", "padc_1", "force_n", "grf_n", "contact", "phase"]),
+        unique=True,
+    ),
+)
+def test_every_format_says_the_same_of_a_slice(
+    every: int, start: int | None, end: int | None, columns: list[str]
+) -> None:
+    part = Slice(
+        None if start is None else start * PERIOD_NS * 1e-9,
+        None if end is None else end * PERIOD_NS * 1e-9,
+        tuple(columns),
+    )
+    tables = {to: read(exported(to, part, every=every), to) for to in FORMATS}
+    expected = range(start or 0, ROWS if end is None else min(end, ROWS))
+    for to, table in tables.items():
+        assert table.num_rows == len(expected), to
+        assert table.column_names == tables["arrow"].column_names, to
+        if expected:
+            assert values(table) == values(tables["arrow"]), to
+    if "seq" in tables["arrow"].column_names:
+        assert tables["arrow"].column("seq").to_pylist() == [2**60 + i for i in expected]
+
+
+def test_values_are_those_of_the_session_and_what_is_not_known_is_null() -> None:
+    batch, columns = frames(), extra()
+    table = read(exported("arrow"), "arrow")
+    padc = [None if v == NOT_READ else v for v in batch.padc[:, 1].tolist()]
+    assert table.column("padc_1").to_pylist() == padc
+    servo = [None if v == NO_SERVO_COUNTS else v for v in batch.servo_counts.tolist()]
+    assert table.column("servo_counts").to_pylist() == servo
+    contact = [None if v == CONTACT_UNKNOWN else v for v in columns["contact"].tolist()]
+    assert table.column("contact").to_pylist() == contact
+    force_n = [None if np.isnan(v) else np.float32(v) for v in columns["force_n"][:, 0]]
+    assert table.column("force_n_0").to_pylist() == force_n
+    assert table.column("reference_force_n").null_count == ROWS
+    assert table.column("t_ns").to_pylist() == batch.t_ns.tolist()
+    assert table.column("phase").to_pylist() == columns["phase"].tolist()
+
+
+def test_all_columns_come_in_the_order_of_a_sealed_file() -> None:
+    flat = [f for column in FRAMES for f in column.flat_names(2)]
+    further = ["part", "force_n_0", "force_n_1", "grf_n", "contact", "estimate_status", "phase"]
+    for to in FORMATS:
+        assert names(Slice(), to) == flat + further
+
+
+@pytest.mark.parametrize("to", ["parquet", "arrow"])
+def test_units_array_and_notes_go_with_it(to: Format) -> None:
+    schema = read(exported(to, Slice(columns=("force_n", "t_ns"))), to).schema
+    units = {field.name: (field.metadata or {}).get(b"unit") for field in schema}
+    assert units["force_n_1"] == b"N"
+    assert units["t_ns"] == b"ns"
+    assert all((field.metadata or {}).get(b"description") for field in schema)
+    assert schema.metadata is not None
+    assert ArrayInfo.model_validate_json(schema.metadata[ARRAY_INFO_KEY]) == array()
+    assert json.loads(schema.metadata[NOTES_KEY]) == NOTES
+
+
+def test_csv_is_lines_with_a_header() -> None:
+    part = Slice(0.0, 0.004, ("seq", "contact", "phase"))
+    lines = exported("csv", part).decode().splitlines()
+    assert [line.replace('"', "") for line in lines[:1]] == ["seq,contact,phase"]
+    assert lines[1].startswith(f'{2**60},,"a ""tap')  # the first contact is not known
+    assert len(lines) == 3
+
+
+def test_every_format_has_a_media_type() -> None:
+    assert set(MEDIA_TYPES) == set(FORMATS) == {"parquet", "arrow", "csv"}
+
+
+# --- the server's time ----------------------------------------------------------------------------
+
+
+def clock() -> ClockTable:
+    """The server's clock was set by an hour between the rows at 20 and at 60 ms."""
+    hour_ns = 3_600_000_000_000
+    rows = Rows(
+        np.array([0, 20_000_000, 60_000_000]), np.array([5, 5, 5 + hour_ns]), np.array([100] * 3)
+    )
+    return ClockTable({"0" * 32: rows}, [StreamFacts("0" * 32, 10**18, True)], ["0" * 32, "other"])
+
+
+def on_servers_axis(to: Format, part: Slice | None = None, *, every: int = 20) -> bytes:
+    columns = extra()
+    columns["part"][30:] = 1
+    pieces = cut(frames(), columns, every)
+    return b"".join(export(pieces, array(), NOTES, to, part or Slice(), clock()))
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_the_servers_time_is_added_and_raw_time_stays(to: Format) -> None:
+    table = read(on_servers_axis(to), to)
+    assert table.column_names[-2:] == ["t_server_ns", "t_server_uncertainty_ns"]
+    assert table.column("t_ns").to_pylist() == frames().t_ns.tolist()
+    t_server_ns = table.column("t_server_ns").to_pylist()
+    bound_ns = table.column("t_server_uncertainty_ns").to_pylist()
+    assert t_server_ns[:10] == [t_ns + 5 for t_ns in frames().t_ns[:10].tolist()]
+    assert all(100 < bound < 2000 for bound in bound_ns[:10])
+    assert all(bound > 1_800_000_000_000 for bound in bound_ns[10:30])
+    assert t_server_ns[30:] == bound_ns[30:] == [None] * (ROWS - 30)  # the stream was not measured
+
+
+@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("every", [1, 7])
+def test_any_pieces_give_the_same_servers_time(to: Format, every: int) -> None:
+    part = Slice(columns=("t_server_ns", "t_server_uncertainty_ns"))
+    found = read(on_servers_axis(to, part, every=every), to)
+    assert found.column_names == list(part.columns)
+    assert values(found) == values(read(on_servers_axis(to, part, every=ROWS), to))
+
+
+@pytest.mark.parametrize("to", ["parquet", "arrow"])
+def test_notes_say_how_the_servers_time_was_found(to: Format) -> None:
+    schema = read(on_servers_axis(to, Slice(columns=("t_server_ns",))), to).schema
+    assert schema.field("t_server_ns").type == pa.int64()
+    assert schema.field("t_server_ns").nullable
+    assert schema.metadata is not None
+    notes = json.loads(schema.metadata[NOTES_KEY])
+    (stream,) = notes.pop("clock")["streams"]
+    assert stream["state"] == "measured"
+    assert [stretch["rows"] for stretch in stream["stretches"]] == [2, 1]
+    assert abs(stream["steps"][0]["jump_ns"] - 3_600_000_000_000) < 10_000
+    assert notes == NOTES
+
+
+def test_the_servers_time_is_not_there_unless_it_is_asked_for() -> None:
+    assert "t_server_ns" not in names(Slice())
+    with pytest.raises(UsageError, match="clock `server`"):
+        exported("csv", Slice(columns=("t_server_ns",)))
+
+
+# --- rows -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "first", "last"),
+    [
+        (0.0, 0.02, 0, 9),
+        (0.02, 0.04, 10, 19),  # what ends where another begins shares no frame with it
+        (0.021, 0.0399, 11, 19),
+        (None, 0.002, 0, 0),
+        (0.098, None, 49, 49),
+        (0.0, 1e9, 0, 49),
+        (-5.0, None, 0, 49),
+    ],
+)
+def test_a_slice_begins_with_its_start_and_ends_before_its_end(
+    start_s: float | None, end_s: float | None, first: int, last: int
+) -> None:
+    table = read(exported("arrow", Slice(start_s, end_s, ("seq",))), "arrow")
+    assert table.column("seq").to_pylist() == [2**60 + i for i in range(first, last + 1)]
+
+
+@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("every", [20, ROWS])
+def test_an_empty_slice_still_has_a_header(to: Format, every: int) -> None:
+    part = Slice(0.05, 0.05, ("t_ns", "force_n"))
+    table = read(exported(to, part, every=every), to)
+    assert table.num_rows == 0
+    assert table.column_names == ["t_ns", "force_n_0", "force_n_1"]
+
+
+def test_seconds_count_from_the_first_frame_whatever_the_pieces_are() -> None:
+    part = Slice(0.03, 0.07, ("seq",))
+    assert len({exported("csv", part, every=every) for every in (1, 13, ROWS)}) == 1
+
+
+def test_only_a_slice_of_everything_is_all() -> None:
+    assert Slice().is_all
+    assert not Slice(start_s=0.0).is_all
+    assert not Slice(columns=("seq",)).is_all
+
+
+# --- columns --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        (("grf_n",), "grf_n"),
+        (("force_n",), "force_n_0 force_n_1"),
+        (("force_n_1",), "force_n_1"),
+        (("t_ns", "seq"), "t_ns seq"),
+        (("force_n_1", "seq", "force_n_0"), "force_n_1 seq force_n_0"),
+        (("force_n_1", "grf_n", "force_n"), "force_n_1 grf_n force_n_0"),
+        (("grf_n", "grf_n", "seq", "grf_n"), "grf_n seq"),
+        (("phase", "padc", "phase"), "phase padc_0 padc_1"),
+    ],
+)
+def test_columns_are_asked_for_by_tile_or_for_all_tiles_and_keep_their_order(
+    to: Format, asked: tuple[str, ...], expected: str
+) -> None:
+    assert names(Slice(columns=asked), to) == expected.split()
+
+
+@pytest.mark.parametrize(
+    "unknown", ["magic", "force_n_2", "force_n_", "FORCE_N", "", "true_grf_n", "x" * 10_000, "a\0"]
+)
+@pytest.mark.parametrize("to", FORMATS)
+def test_a_column_that_is_not_there_is_refused_before_the_first_chunk(
+    to: Format, unknown: str
+) -> None:
+    chunks = export(cut(frames(), extra(), 20), array(), {}, to, Slice(columns=("seq", unknown)))
+    with pytest.raises(UsageError, match="no column") as caught:
+        next(chunks)
+    assert len(str(caught.value)) < 1000
+    assert "force_n" in caught.value.expected
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.sampled_from([f for c in FRAMES for f in c.flat_names(2)]), min_size=1))
+def test_any_choice_of_columns_is_that_choice_without_repetitions(asked: Sequence[str]) -> None:
+    assert names(Slice(columns=tuple(asked))) == list(dict.fromkeys(asked))
+
+
+# --- in pieces ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: Format) -> None:
+    """Of an endless session the beginning comes, and what was given away is kept no longer."""
+    rows, asked = 500, 0
+    piece = frames(rows)
+
+    def endless() -> Iterator[Piece]:
+        nonlocal asked
+        while True:
+            asked += 1
+            later = (asked - 1) * rows * PERIOD_NS
+            yield replace(piece, t_ns=piece.t_ns + later), {}
+
+    chunks = export(endless(), array(), {}, to, Slice())
+    sizes = []
+    for number in range(1, 31):
+        sizes.append(len(next(chunks)))
+        assert asked <= number + 1
+    assert all(0 < size < 200 * rows for size in sizes)
+    assert max(sizes[1:]) < 1.5 * min(sizes[1:])
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_frames_outside_of_a_slice_make_no_chunks(to: Format) -> None:
+    part = Slice(0.09, None, ("seq",))
+    chunks = list(export(cut(frames(), extra(), 1), array(), {}, to, part))
+    assert len(chunks) <= 1 + 5 + 1
+    assert read(b"".join(chunks), to).num_rows == 5
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_a_session_without_frames_is_refused(to: Format) -> None:
+    with pytest.raises(UsageError, match="no frames"):
+        next(export([], array(), {}, to, Slice()))
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_an_error_on_the_way_is_not_the_end_of_a_file(to: Format) -> None:
+    def broken() -> Iterator[Piece]:
+        yield frames(), {}
+        raise OSError("the disk is gone")
+
+    chunks = export(broken(), array(), {}, to, Slice())
+    next(chunks)
+    with pytest.raises(OSError, match="the disk is gone"):
+        list(chunks)

@@ -1,0 +1,354 @@
+"""A recorded load from CSV or Parquet: what is read, and what is refused and how."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.emulation.ground.load_trace import LoadTrace
+from devices.errors import LoadTraceError
+from storage.formats.load_trace import read_load_trace
+
+Read = Callable[[str | bytes], LoadTrace]
+
+GOOD = """time_s,fz_n,cop_x_m,cop_y_m
+0.00,0,,
+0.01,10.5,0.01,-0.02
+0.02,20,0.02,-0.03
+"""
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Read:
+    """Reads this text from a CSV file called trace.csv."""
+
+    def reader(content: str | bytes) -> LoadTrace:
+        path = tmp_path / "trace.csv"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return read_load_trace(path)
+
+    return reader
+
+
+@pytest.fixture
+def read_parquet(tmp_path: Path) -> Callable[..., LoadTrace]:
+    """Reads these columns from a Parquet file."""
+
+    def reader(**columns: object) -> LoadTrace:
+        path = tmp_path / "trace.parquet"
+        pq.write_table(pa.table(columns), path)
+        return read_load_trace(path)
+
+    return reader
+
+
+def refusal(read: Read, content: str | bytes) -> str:
+    with pytest.raises(LoadTraceError) as caught:
+        read(content)
+    assert "trace.csv" in str(caught.value)
+    return str(caught.value)
+
+
+def rows(header: str, *lines: str) -> str:
+    return "\n".join([header, *lines]) + "\n"
+
+
+# --- what is read ---------------------------------------------------------------------------------
+
+
+def test_a_total_force_with_its_centre_is_read_and_empty_centres_stay_undefined(
+    read: Read,
+) -> None:
+    trace = read(GOOD)
+    assert trace.time_s.tolist() == [0.0, 0.01, 0.02]
+    assert trace.fz_n is not None
+    assert trace.fz_n.tolist() == [0.0, 10.5, 20.0]
+    np.testing.assert_array_equal(trace.cop_m, [[np.nan, np.nan], [0.01, -0.02], [0.02, -0.03]])
+    assert trace.cells_n is None
+    assert trace.angle_rad is None
+    assert trace.where.endswith("trace.csv")
+    columns = [trace.time_s, trace.fz_n, trace.cop_m]
+    assert {column.dtype for column in columns if column is not None} == {np.dtype(np.float64)}
+
+
+def test_names_are_matched_without_regard_to_case(read: Read) -> None:
+    trace = read(GOOD.replace("time_s,fz_n,cop_x_m,cop_y_m", "Time_S,fz_N,COP_x_m,cop_Y_m"))
+    assert trace.fz_n is not None
+    assert trace.fz_n[1] == 10.5
+    cells = read(rows("TIME_S,Cell1_N,CELL2_n", "0,1,2", "1,3,4"))
+    np.testing.assert_array_equal(cells.cells_n, [[1, 2], [3, 4]])
+
+
+def test_cells_are_put_in_the_order_of_their_numbers(read: Read) -> None:
+    numbers = [10, 1, 3, 2, 4, 5, 6, 9, 8, 7]
+    header = "time_s," + ",".join(f"cell{i}_n" for i in numbers)
+    line = ",".join(f"{10 * i}" for i in numbers)
+    trace = read(rows(header, f"0,{line}", f"1,{line}"))
+    assert trace.cells_n is not None
+    assert trace.cells_n[1].tolist() == [10.0 * i for i in range(1, 11)]
+
+
+def test_cells_beside_a_total_force_are_both_kept(read: Read) -> None:
+    trace = read(rows("time_s,fz_n,cell1_n,cell2_n", "0,3,1,2", "1,7,3,4"))
+    assert trace.fz_n is not None
+    assert trace.cells_n is not None
+    assert trace.cells_n.shape == (2, 2)
+
+
+def test_an_angle_is_read_and_other_columns_are_ignored(read: Read) -> None:
+    trace = read(rows("time_s,who,cell1_n,angle_rad,mz_nm", "0,me,1,0.5,", "1,you,2,-0.5,x"))
+    assert trace.angle_rad is not None
+    assert trace.angle_rad.tolist() == [0.5, -0.5]
+
+
+def test_a_mark_of_byte_order_as_spreadsheets_write_it_does_no_harm(read: Read) -> None:
+    assert len(read(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode()).time_s) == 3
+
+
+def test_time_may_begin_anywhere_and_steps_may_differ(read: Read) -> None:
+    trace = read(rows("time_s,cell1_n", "-5.5,1", "-5.4999999,2", "1e3,3"))
+    assert trace.time_s.tolist() == [-5.5, -5.4999999, 1000.0]
+
+
+@pytest.mark.parametrize("type_", [pa.float32(), pa.float64(), pa.int16(), pa.uint8()])
+def test_parquet_is_read_whatever_its_numbers_are_kept_in(
+    read_parquet: Callable[..., LoadTrace], type_: pa.DataType
+) -> None:
+    trace = read_parquet(
+        Time_s=pa.array([0, 1, 2], type_),
+        FZ_N=pa.array([0, 10, 20], type_),
+        cop_x_m=pa.array([None, 0.25, 0.5], pa.float32()),
+        cop_y_m=pa.array([float("nan"), 0.25, None], pa.float64()),
+    )
+    assert trace.time_s.tolist() == [0.0, 1.0, 2.0]
+    assert trace.fz_n is not None
+    assert trace.fz_n.tolist() == [0.0, 10.0, 20.0]
+    np.testing.assert_array_equal(trace.cop_m, [[np.nan, np.nan], [0.25, 0.25], [0.5, np.nan]])
+
+
+def test_parquet_in_several_row_groups_is_read_whole(tmp_path: Path) -> None:
+    path = tmp_path / "TRACE.PARQUET"
+    table = pa.table({"time_s": np.arange(100.0), "cell1_n": np.arange(100.0)})
+    pq.write_table(table, path, row_group_size=7)
+    trace = read_load_trace(path)
+    assert trace.cells_n is not None
+    assert trace.cells_n[:, 0].tolist() == list(range(100))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.floats(1e-6, 10.0), st.floats(0, 2000), st.floats(-1, 1)),
+        min_size=2,
+        max_size=20,
+    )
+)
+def test_numbers_survive_csv_bit_by_bit(
+    tmp_path_factory: pytest.TempPathFactory, made: list[tuple[float, float, float]]
+) -> None:
+    time_s = np.cumsum([step for step, _, _ in made])
+    lines = [f"{t!r},{f!r},{c!r},0" for t, (_, f, c) in zip(time_s.tolist(), made, strict=True)]
+    path = tmp_path_factory.mktemp("csv") / "trace.csv"
+    path.write_text(rows("time_s,fz_n,cop_x_m,cop_y_m", *lines))
+    trace = read_load_trace(path)
+    assert trace.fz_n is not None
+    assert trace.cop_m is not None
+    assert trace.time_s.tolist() == time_s.tolist()
+    assert trace.fz_n.tolist() == [f for _, f, _ in made]
+    assert trace.cop_m[:, 0].tolist() == [c for _, _, c in made]
+
+
+def test_a_plate_that_reads_a_little_below_zero_in_flight_is_not_upside_down(read: Read) -> None:
+    # A hop: most of it in flight, where a drifted plate reads -0.5 N, and a stance of 800 N.
+    lines = [f"{i / 100},{800 if 60 <= i < 80 else -0.5},0,0" for i in range(100)]
+    trace = read(rows("time_s,fz_n,cop_x_m,cop_y_m", *lines))
+    assert trace.fz_n is not None
+    assert trace.fz_n.max() == 800.0
+
+
+# --- files that are refused -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["nothing.csv", "nothing.parquet", "no/such/folder.csv"])
+def test_a_file_that_is_not_there_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    with pytest.raises(LoadTraceError, match="cannot be read") as caught:
+        read_load_trace(tmp_path / name)
+    assert name in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", ["", ".csv", ".parquet"])
+def test_a_folder_is_refused(tmp_path: Path, suffix: str) -> None:
+    folder = tmp_path / f"folder{suffix}"
+    folder.mkdir()
+    with pytest.raises(LoadTraceError, match="folder"):
+        read_load_trace(folder)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\n",
+        bytes(range(256)) * 4,
+        b"PAR1 and then nothing",
+        "time_s,fz_n,cop_x_m,cop_y_m\n0,1,0,0\n1,1,0\n",  # a short line
+        "time_s,fz_n,cop_x_m,cop_y_m,n\xe9\n0,1,0,0,1\n1,1,0,0,1\n".encode("latin-1"),
+        "time_s,fz_n,cop_x_m,cop_y_m\n0,1,0,0\n1,1,0,0\n".encode("utf-16"),
+    ],
+)
+def test_a_file_that_is_no_table_is_refused(read: Read, content: str | bytes) -> None:
+    refusal(read, content)
+
+
+def test_a_csv_that_is_called_parquet_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "trace.parquet"
+    path.write_text(GOOD)
+    with pytest.raises(LoadTraceError, match=r"trace\.parquet.*expected a CSV file"):
+        read_load_trace(path)
+
+
+# --- columns --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("column", ["time_s", "cop_x_m", "cop_y_m"])
+def test_a_missing_column_is_named_with_those_that_there_are(read: Read, column: str) -> None:
+    text = refusal(read, GOOD.replace(column, "other"))
+    assert f"column {column} is missing" in text
+    assert "other" in text
+
+
+def test_a_table_without_any_load_is_refused_with_what_it_has(read: Read) -> None:
+    text = refusal(read, GOOD.replace("fz_n", "fx_n"))
+    assert "no load in its columns" in text
+    assert "fx_n" in text
+    assert "cell1_n" in text
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right"),
+    [
+        ("time_ms", "time_s"),
+        ("time", "time_s"),
+        ("fz_kN", "fz_n"),
+        ("Fz", "fz_n"),
+        ("cop_x_mm", "cop_x_m"),
+        ("cop_y_cm", "cop_y_m"),
+    ],
+)
+def test_a_column_in_another_unit_is_recognised_and_both_names_are_said(
+    read: Read, wrong: str, right: str
+) -> None:
+    text = refusal(read, GOOD.replace(right, wrong))
+    assert f"{right}, converted from {wrong.lower()!r}" in text
+
+
+@pytest.mark.parametrize("names", ["fz_n,fz_N", "fz_n,fz_n"])
+def test_a_column_that_is_there_twice_is_refused(read: Read, names: str) -> None:
+    refusal(read, rows(f"time_s,{names},cop_x_m,cop_y_m", "0,1,2,0,0", "1,1,2,0,0"))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [((1, 2, 4), "1, 2, 4"), ((2, 3), "2, 3"), ((0, 1), "0, 1"), ((3,), "3")],
+)
+def test_cells_numbered_with_a_gap_are_refused(
+    read: Read, numbers: tuple[int, ...], said: str
+) -> None:
+    header = "time_s," + ",".join(f"cell{i}_n" for i in numbers)
+    line = ",".join("1" for _ in numbers)
+    text = refusal(read, rows(header, f"0,{line}", f"1,{line}"))
+    assert f"numbered {said}" in text
+    assert "without a gap" in text
+
+
+# --- rows -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("lines", "said"), [([], "0 rows"), (["0,1,0,0"], "1 rows")])
+def test_fewer_than_two_rows_are_refused(read: Read, lines: list[str], said: str) -> None:
+    text = refusal(read, rows("time_s,fz_n,cop_x_m,cop_y_m", *lines))
+    assert said in text
+    assert "at least two" in text
+
+
+@pytest.mark.parametrize(
+    ("times", "row", "said"),
+    [
+        ((0.0, 0.1, 0.1, 0.2), 3, "from 0.1 to 0.1"),
+        ((0.0, 0.1, 0.2, 0.15), 4, "from 0.2 to 0.15"),
+        ((1.0, 0.5, 0.2, 0.1), 2, "from 1 to 0.5"),
+    ],
+)
+def test_times_that_do_not_rise_are_refused_with_the_row(
+    read: Read, times: tuple[float, ...], row: int, said: str
+) -> None:
+    text = refusal(read, rows("time_s,cell1_n", *(f"{t},1" for t in times)))
+    assert f"at row {row};" in text
+    assert said in text
+    assert "Sort the rows" in text
+
+
+@pytest.mark.parametrize("value", ["", "NaN", "nan", "inf", "-inf"])
+@pytest.mark.parametrize(
+    ("header", "line", "column"),
+    [
+        ("time_s,fz_n,cop_x_m,cop_y_m", "1,{},0,0", "fz_n"),
+        ("time_s,fz_n,cop_x_m,cop_y_m", "{},1,0,0", "time_s"),
+        ("time_s,cell1_n,cell2_n,x", "1,1,{},0", "cell2_n"),
+        ("time_s,cell1_n,cell2_n,angle_rad", "1,1,1,{}", "angle_rad"),
+    ],
+)
+def test_what_is_no_number_where_there_must_be_one_is_refused_with_column_and_row(
+    read: Read, header: str, line: str, column: str, value: str
+) -> None:
+    text = refusal(read, rows(header, "0,0,0,0", line.format(value), "2,0,0,0"))
+    assert f"column {column} is" in text
+    assert "at row 2" in text
+
+
+def test_an_infinite_centre_of_pressure_is_refused_and_an_empty_one_is_not(read: Read) -> None:
+    assert "cop_y_m is inf at row 2" in refusal(read, GOOD.replace("-0.02", "inf"))
+    assert read(GOOD.replace("-0.02", "")).cop_m is not None
+
+
+@pytest.mark.parametrize("value", ["heavy", "1.5 N", "1;5"])
+def test_a_column_of_words_is_refused_by_name(read: Read, value: str) -> None:
+    assert "column fz_n is not numeric" in refusal(read, GOOD.replace("10.5", value))
+
+
+@pytest.mark.parametrize(
+    "time_s",
+    [
+        pa.array(["a", "b"]),
+        pa.array([0, 1], pa.timestamp("ms")),
+        pa.array([[0.0], [1.0]]),
+        pa.array([b"\x00", b"\x01"], pa.binary()),
+        pa.array([0, 2**60 + 1]),
+    ],
+)
+def test_a_parquet_column_that_is_no_number_is_refused_by_name(
+    read_parquet: Callable[..., LoadTrace], time_s: pa.Array
+) -> None:
+    with pytest.raises(LoadTraceError, match="column time_s is not numeric"):
+        read_parquet(time_s=time_s, cell1_n=[1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        rows("time_s,fz_n,cop_x_m,cop_y_m", "0,0,0,0", "1,-300,0,0", "2,-700,0,0", "3,-1,0,0"),
+        rows("time_s,cell1_n,cell2_n", "0,0,0", "1,-300,-10", "2,-700,-30", "3,-1,2"),
+    ],
+)
+def test_a_load_that_is_mostly_negative_is_refused_as_upside_down(read: Read, content: str) -> None:
+    # Pressed as it is, it would be clipped to no load at all without a word.
+    text = refusal(read, content)
+    assert "negative" in text
+    assert "Change its sign" in text

@@ -1,0 +1,168 @@
+"""Frames in flight: what was taken before SIGKILL is there after it, and nothing else is."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from devices.frames import ArrayInfo, FrameBatch
+from storage.journal import in_flight
+from storage.journal.in_flight import (
+    ROWS,
+    InFlight,
+    delete_in_flight,
+    open_in_flight,
+    read_in_flight,
+)
+
+Arrays = Callable[..., ArrayInfo]
+Frames = Callable[..., FrameBatch]
+
+
+def put(keeper: InFlight, batch: FrameBatch) -> None:
+    for i in range(len(batch)):
+        keeper.put(
+            *(int(batch.seq[i]), int(batch.t_mono_ns[i]), int(batch.t_ns[i])),
+            *(int(batch.servo_counts[i]), int(batch.servo_age_us[i])),
+            *(float(batch.reference_force_n[i]), int(batch.frame_status[i])),
+            *(column[i].tolist() for column in (batch.padc, batch.tadc)),
+            *(column[i].tolist() for column in (batch.sample_offset_us, batch.status)),
+        )
+
+
+def found(folder: Path) -> FrameBatch:
+    left = read_in_flight(folder)
+    assert left is not None
+    assert left[1] is not None
+    return left[1]
+
+
+def same(one: FrameBatch, other: FrameBatch) -> None:
+    for f in fields(FrameBatch):
+        assert getattr(one, f.name).tobytes() == getattr(other, f.name).tobytes(), f.name
+
+
+@pytest.mark.parametrize("last", [0, 9, ROWS - 1, ROWS, 3 * ROWS + 17])
+def test_the_newest_frames_are_there_whatever_came_before(
+    tmp_path: Path, array_of: Arrays, frames_of: Frames, last: int
+) -> None:
+    keeper = InFlight(tmp_path / "stream", array_of())
+    put(keeper, frames_of(max(0, last - ROWS - 50), last))
+    keeper.close()
+    same(found(tmp_path / "stream"), frames_of(max(0, last - ROWS + 1), last))
+
+
+def test_the_array_is_known_before_the_first_frame(tmp_path: Path, array_of: Arrays) -> None:
+    InFlight(tmp_path, array_of(3)).close()
+    assert read_in_flight(tmp_path) == (array_of(3), None)
+
+
+def test_after_another_start_of_the_machine_nothing_is_trusted(
+    tmp_path: Path, array_of: Arrays, frames_of: Frames, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeper = InFlight(tmp_path, array_of())
+    put(keeper, frames_of(0, 99))
+    keeper.close()
+    monkeypatch.setattr(in_flight, "kernel_boot_id", lambda: "another start")
+    assert read_in_flight(tmp_path) is None
+
+
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_a_damaged_row_ends_what_is_trusted_and_never_gives_another_frame(
+    tmp_path_factory: pytest.TempPathFactory,
+    array_of: Arrays,
+    frames_of: Frames,
+    data: st.DataObject,
+) -> None:
+    folder = tmp_path_factory.mktemp("damaged")
+    keeper = InFlight(folder, array_of())
+    put(keeper, frames_of(0, 199))
+    keeper.close()
+    path = folder / "in_flight"
+    content = bytearray(path.read_bytes())
+    begin = len(content) - ROWS * ((len(content) - 1000) // ROWS)
+    at = data.draw(st.integers(0, min(len(content) - 1, begin + 20_000)))
+    content[at : at + 3] = data.draw(st.binary(min_size=3, max_size=3))
+    path.write_bytes(content)
+    left = read_in_flight(folder)
+    if left is None or left[1] is None:
+        return
+    first = int(left[1].seq[0])
+    last = int(left[1].seq[-1])
+    assert last >= 198 or first == 0
+    same(left[1], frames_of(first, last))
+
+
+def test_a_full_disk_is_known_at_once_and_leaves_nothing_behind(
+    tmp_path: Path, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without room that is reserved, the first write to a mapped page would end the process."""
+
+    def full(descriptor: int, offset: int, length: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    assert open_in_flight(tmp_path, array_of()) is None
+    assert list(tmp_path.iterdir()) == []
+    assert open_in_flight(None, array_of()) is None
+
+
+def test_what_is_no_such_file_is_nothing(tmp_path: Path, array_of: Arrays) -> None:
+    assert read_in_flight(tmp_path) is None
+    for content in (b"", b"FootTile", bytes(5000)):
+        (tmp_path / "in_flight").write_bytes(content)
+        assert read_in_flight(tmp_path) is None
+    delete_in_flight(tmp_path)
+    delete_in_flight(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_killed_process_has_left_every_frame_that_it_had_taken(
+    tmp_path: Path, array_of: Arrays, frames_of: Frames
+) -> None:
+    code = """
+import json, sys
+from pathlib import Path
+from devices.frames import ArrayInfo
+from storage.in_flight import InFlight
+info = ArrayInfo.model_validate_json(sys.stdin.readline())
+keeper = InFlight(Path(sys.argv[1]), info)
+for seq in range(10_000_000):
+    keeper.put(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
+    if seq % 1000 == 999:
+        print(seq, flush=True)
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write(array_of().model_dump_json() + "\n")
+    process.stdin.close()
+    for _ in range(13):
+        said = int(process.stdout.readline())
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    rest = process.stdout.read().split()
+    process.stdout.close()
+    said = int(rest[-1]) if rest else said
+    frames = found(tmp_path)
+    assert int(frames.seq[-1]) >= said
+    assert len(frames) in (ROWS, ROWS - 1)  # it may have been in the midst of a row
+    np.testing.assert_array_equal(frames.t_ns, frames.seq.astype(np.int64) + 1)

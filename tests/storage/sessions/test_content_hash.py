@@ -1,0 +1,232 @@
+"""The hashes in a sealed file: of what it says, however it is cut, and of every byte of it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError
+from devices.frames import ArrayInfo, FrameBatch, TileInfo
+from storage.sessions.content_hash import file_hashes, write_file_hash
+from storage.sessions.file import SessionReader, SessionWriter
+
+FORMATS = Path(__file__).resolve().parents[3] / "docs" / "formats.md"
+UTC_NS = 10**18
+
+
+def array(tiles: int = 2) -> ArrayInfo:
+    return ArrayInfo(
+        node="bench",
+        boot_id="0" * 32,
+        tiles=tuple(
+            TileInfo(
+                serial=f"T{i + 1:02}",
+                mux=0x70,
+                channel=i,
+                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
+                x_m=0.1 / 3 * i,
+                y_m=0.0,
+                z_m=-0.15,
+                reference=False,
+                conversion_ms=1.6,
+            )
+            for i in range(tiles)
+        ),
+        servo=None,
+        schedule="simultaneous",
+        nominal_rate_hz=500.0,
+        utc_offset_ns=UTC_NS,
+        clock_set=True,
+        software="test",
+        scene="test",
+        models=("unwrap", "static"),
+    )
+
+
+def frames(rows: int, tiles: int = 2) -> FrameBatch:
+    """Frames over minutes, with everything in them that can be missing."""
+    rng = np.random.default_rng(rows)
+    t_mono_ns = 1_000_000_000 * np.arange(rows, dtype=np.int64)
+    shape = (rows, tiles)
+    return FrameBatch(
+        seq=np.arange(rows, dtype=np.uint64),
+        t_mono_ns=t_mono_ns,
+        t_ns=t_mono_ns + UTC_NS,
+        padc=rng.choice([300, 65535], shape).astype(np.uint16),
+        tadc=rng.choice([480, 65535], shape).astype(np.uint16),
+        sample_offset_us=rng.integers(-100, 3000, shape).astype(np.int32),
+        servo_counts=rng.choice([-(2**31), 5], rows).astype(np.int32),
+        servo_age_us=rng.choice([-1, 7], rows).astype(np.int32),
+        status=rng.integers(0, 64, shape).astype(np.uint8),
+        frame_status=rng.integers(0, 32, rows).astype(np.uint8),
+        reference_force_n=rng.choice([np.nan, -0.0, 3.25], rows).astype(np.float32),
+    )
+
+
+def extra(rows: int) -> dict[str, Any]:
+    rng = np.random.default_rng(rows + 1)
+    return {
+        "part": np.sort(rng.integers(0, 2, rows)).astype(np.uint16),
+        "grf_n": rng.choice([np.nan, 1 / 3, -1e-40], rows),
+        "contact": rng.choice([0, 1, 255], rows).astype(np.uint8),
+        "true_grf_n": rng.choice([np.nan, 1 / 3], rows),
+        "phase": np.array(["rest", "Ärmel"] * rows, dtype=object)[:rows],
+    }
+
+
+def write(path: Path, rows: int = 200, cuts: tuple[int, ...] = (), **notes: object) -> Path:
+    batch, columns = frames(rows), extra(rows)
+    with SessionWriter(path, array(), notes) as writer:
+        bounds = [0, *cuts, rows]
+        for begin, end in itertools.pairwise(bounds):
+            piece = {name: values[begin:end] for name, values in columns.items()}
+            writer.append(batch.rows(begin, end), piece)
+    return path
+
+
+def content(path: Path) -> dict[str, Any]:
+    with SessionReader(path) as reader:
+        assert reader.content is not None
+        return reader.content
+
+
+def test_the_lines_in_the_documents_make_the_same_hashes(tmp_path: Path) -> None:
+    section = FORMATS.read_text("utf-8").split("### Hashes")[1]
+    code = section.split("```python")[1].split("```")[0]
+    whole = write(tmp_path / "s.parquet", seed=7)
+    script = tmp_path / "check.py"
+    script.write_text(code)
+
+    def run(path: Path) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([sys.executable, script, path], capture_output=True, text=True)
+
+    agreed = run(whole)
+    assert (agreed.returncode, agreed.stderr) == (0, "")
+    digits = content(whole)["columns"]["grf_n"].encode()
+    changed = whole.read_bytes().replace(digits, digits[::-1])
+    (tmp_path / "other.parquet").write_bytes(changed)
+    assert "AssertionError: grf_n" in run(tmp_path / "other.parquet").stderr
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.integers(1, 199), max_size=4, unique=True).map(sorted))
+def test_content_has_one_hash_however_it_was_cut(
+    tmp_path_factory: pytest.TempPathFactory, cuts: list[int]
+) -> None:
+    folder = tmp_path_factory.mktemp("cut")
+    whole = write(folder / "a.parquet")
+    cut = write(folder / "b.parquet", 200, tuple(cuts))
+    assert content(whole) == content(cut)
+
+
+def test_row_groups_and_encodings_do_not_change_the_hashes_of_columns(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet")
+    said = content(path)
+    other = tmp_path / "other.parquet"
+    pq.write_table(pq.read_table(path), other, row_group_size=7, compression="snappy")
+    from storage.sessions.content_hash import ContentDigest
+
+    digest = ContentDigest()
+    for group in range(pq.ParquetFile(other).num_row_groups):
+        digest.feed(pq.ParquetFile(other).read_row_group(group))
+    assert digest.content() == said
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("reference_force_n", np.float32(np.nan), np.float32(0.0)),
+        ("reference_force_n", np.float32(-0.0), np.float32(0.0)),
+        ("padc", 65535, 65534),
+        ("servo_age_us", -1, 0),
+    ],
+)
+def test_nothing_that_is_missing_is_taken_for_a_number(
+    tmp_path: Path, name: str, before: Any, after: Any
+) -> None:
+    found = []
+    for value in (before, after):
+        batch = frames(3)
+        getattr(batch, name)[...] = value
+        path = tmp_path / f"{len(found)}.parquet"
+        with SessionWriter(path, array(), {}) as writer:
+            writer.append(batch, {})
+        found.append(content(path)["columns"])
+    changed = {column for column in found[0] if found[0][column] != found[1][column]}
+    assert {re.sub(r"_\d$", "", column) for column in changed} == {name}
+
+
+def test_counts_and_parts_are_in_the_metadata(tmp_path: Path) -> None:
+    with SessionWriter(tmp_path / "s.parquet", array(), {}) as writer:
+        batch = frames(10)
+        writer.append(batch, {"part": np.array([0] * 4 + [1] * 6, np.uint16)})
+    said = content(tmp_path / "s.parquet")
+    assert said["frames"] == 10
+    assert said["parts"] == [
+        {"part": 0, "seq_first": 0, "seq_last": 3, "frames": 4},
+        {"part": 1, "seq_first": 4, "seq_last": 9, "frames": 6},
+    ]
+    raw = pq.ParquetFile(tmp_path / "s.parquet").metadata.metadata
+    assert json.loads(raw[b"foottile.content"]) == said
+
+
+def test_notes_and_array_are_in_the_content_hash(tmp_path: Path) -> None:
+    hashes = set()
+    for number, notes in enumerate(({"a": 1}, {"a": 2}, {})):
+        with SessionReader(write(tmp_path / f"{number}.parquet", **notes)) as reader:
+            hashes.add(reader.content_sha256)
+    assert len(hashes) == 3
+
+
+def test_a_changed_note_is_seen_whenever_the_file_is_opened(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", calibration="by hand")
+    whole = path.read_bytes()
+    table = pq.read_table(path)
+    changed = {**table.schema.metadata, b"foottile.notes": b'{"calibration": "by foot"}'}
+    said = pq.ParquetFile(path).metadata.metadata
+    kept = {key: said[key] for key in said if key.startswith(b"foottile.content")}
+    pq.write_table(table.replace_schema_metadata({**changed, **kept}), path)
+    with pytest.raises(FileFormatError, match="not the one that was sealed"):
+        SessionReader(path)
+    path.write_bytes(whole)
+    SessionReader(path).close()
+
+
+def test_the_file_hash_is_of_every_byte(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", 40)
+    whole = path.read_bytes()
+    stated, found = file_hashes(path) or ("", "other")
+    assert stated == found
+    for at in range(0, len(whole), 41):
+        damaged = bytearray(whole)
+        damaged[at] ^= 0x04
+        path.write_bytes(damaged)
+        hashes = file_hashes(path)
+        assert hashes is None or hashes[0] != hashes[1], at
+
+
+@pytest.mark.parametrize("size", [0, 3, 11, 12, 100])
+def test_what_is_too_short_states_no_hash(tmp_path: Path, size: int) -> None:
+    path = write(tmp_path / "s.parquet", 40)
+    path.write_bytes(path.read_bytes()[-size:] if size else b"")
+    assert file_hashes(path) is None
+    with pytest.raises(FileFormatError, match="no place"):
+        write_file_hash(path)
+
+
+def test_a_note_that_looks_like_the_hash_is_none(tmp_path: Path) -> None:
+    trap = "foottile.file_sha256\x18\x40" + "0" * 64
+    path = write(tmp_path / "s.parquet", trap=trap)
+    stated, found = file_hashes(path) or ("", "other")
+    assert stated == found

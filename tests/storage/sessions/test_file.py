@@ -1,0 +1,663 @@
+"""The sealed session: what is in the file, when it appears, and which files are refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError
+from devices.frames import (
+    FRAME_COLUMNS,
+    NO_SERVO_AGE,
+    NO_SERVO_COUNTS,
+    NOT_READ,
+    ArrayInfo,
+    FrameBatch,
+    TileInfo,
+)
+from storage.durable import remove_stale_temporaries
+from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN
+from storage.sessions.file import FORMAT_KEY, NOTES_KEY, SessionReader, SessionWriter
+
+
+def array(tiles: int = 2) -> ArrayInfo:
+    return ArrayInfo(
+        node="bench",
+        boot_id="0" * 32,
+        tiles=tuple(
+            TileInfo(
+                serial=f"T{i + 1:02}",
+                mux=0x70,
+                channel=i,
+                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
+                x_m=0.1 / 3 * i,
+                y_m=0.0,
+                z_m=-0.15,
+                reference=False,
+                conversion_ms=1.6,
+            )
+            for i in range(tiles)
+        ),
+        servo=None,
+        schedule="simultaneous",
+        nominal_rate_hz=500.0,
+        utc_offset_ns=10**18,
+        clock_set=True,
+        software="test",
+        scene="test",
+        models=("unwrap", "static"),
+    )
+
+
+def frames(rows: int, tiles: int = 2, *, seed: int = 0, period_ns: int = 2_000_000) -> FrameBatch:
+    rng = np.random.default_rng(seed)
+    t_mono_ns = period_ns * np.arange(rows, dtype=np.int64)
+    shape = (rows, tiles)
+    return FrameBatch(
+        seq=np.arange(rows, dtype=np.uint64),
+        t_mono_ns=t_mono_ns,
+        t_ns=t_mono_ns + 10**18,
+        padc=rng.integers(250, 420, shape).astype(np.uint16),
+        tadc=rng.integers(470, 490, shape).astype(np.uint16),
+        sample_offset_us=rng.integers(-100, 3000, shape).astype(np.int32),
+        servo_counts=rng.integers(-5000, 5000, rows).astype(np.int32),
+        servo_age_us=rng.integers(0, 20000, rows).astype(np.int32),
+        status=rng.integers(0, 64, shape).astype(np.uint8),
+        frame_status=rng.integers(0, 32, rows).astype(np.uint8),
+        reference_force_n=rng.normal(0, 30, rows).astype(np.float32),
+    )
+
+
+def anything(rows: int, tiles: int, seed: int) -> FrameBatch:
+    """Any bits, the ends of every type and what stands for "not known" among them."""
+    rng = np.random.default_rng(seed)
+    columns: dict[str, Any] = {}
+    for name, (dtype, per_tile) in FRAME_COLUMNS.items():
+        shape = (rows, tiles) if per_tile else (rows,)
+        if np.issubdtype(dtype, np.floating):
+            values = rng.choice([np.nan, np.inf, -np.inf, -0.0, 1e-40, 29.97], shape).astype(dtype)
+        else:
+            ends = np.iinfo(dtype)
+            values = rng.integers(ends.min, ends.max, shape, dtype=dtype, endpoint=True)
+            values[rng.random(shape) < 0.3] = ends.max
+            values[rng.random(shape) < 0.3] = ends.min
+        columns[name] = values
+    t_mono_ns = np.sort(rng.integers(0, 10**15, rows))
+    return FrameBatch(**columns | {"t_mono_ns": t_mono_ns})
+
+
+def same(one: FrameBatch, other: FrameBatch) -> None:
+    for f in fields(FrameBatch):
+        a, b = getattr(one, f.name), getattr(other, f.name)
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), f.name
+        np.testing.assert_array_equal(a, b, err_msg=f.name)
+
+
+def write(
+    path: Path, batch: FrameBatch, notes: dict[str, object] | None = None, **extra: np.ndarray
+) -> Path:
+    with SessionWriter(path, array(batch.tile_count), notes or {}) as writer:
+        writer.append(batch, extra)
+    return path
+
+
+def read(path: Path) -> FrameBatch:
+    with SessionReader(path) as session:
+        return session.frames()
+
+
+def rewritten(path: Path, table: pa.Table, **metadata: bytes | None) -> Path:
+    """The table as a Parquet file with these metadata changed; None takes an entry out."""
+    kept = dict(table.schema.metadata) | {
+        f"foottile.{key}".encode(): value for key, value in metadata.items()
+    }
+    kept = {key: value for key, value in kept.items() if value is not None}
+    pq.write_table(table.replace_schema_metadata(kept), path)
+    return path
+
+
+def refused(path: Path, match: str | None = None) -> None:
+    with pytest.raises(FileFormatError, match=match) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+
+
+# --- what is in the file --------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    rows=st.integers(1, 40),
+    tiles=st.integers(1, 9),
+    seed=st.integers(0, 2**32 - 1),
+    cut=st.integers(0, 40),
+)
+def test_frames_survive_the_file(
+    tmp_path_factory: pytest.TempPathFactory, rows: int, tiles: int, seed: int, cut: int
+) -> None:
+    path = tmp_path_factory.mktemp("round") / "session.parquet"
+    batch = anything(rows, tiles, seed)
+    with SessionWriter(path, array(tiles), {}) as writer:
+        for piece in (batch.rows(0, cut), batch.rows(cut, rows)):
+            if len(piece):
+                writer.append(piece, {})
+    with SessionReader(path) as session:
+        assert session.info == array(tiles)
+        assert session.frame_count == rows
+        same(session.frames(), batch)
+
+
+def test_the_columns_are_flat_and_those_of_the_contract_in_order(tmp_path: Path) -> None:
+    schema = pq.read_schema(write(tmp_path / "s.parquet", frames(5)))
+    assert " ".join(schema.names) == (
+        "seq t_mono_ns t_ns padc_0 padc_1 tadc_0 tadc_1 sample_offset_us_0 sample_offset_us_1 "
+        "servo_counts servo_age_us status_0 status_1 frame_status reference_force_n"
+    )
+    types = {name: str(schema.field(name).type) for name in schema.names}
+    assert types["seq"] == "uint64"
+    assert types["t_ns"] == "int64"
+    assert types["padc_1"] == "uint16"
+    assert types["sample_offset_us_0"] == types["servo_counts"] == "int32"
+    assert types["status_1"] == types["frame_status"] == "uint8"
+    assert types["reference_force_n"] == "float"
+
+
+def test_units_survive_the_file(tmp_path: Path) -> None:
+    schema = pq.read_schema(write(tmp_path / "s.parquet", frames(5)))
+    for field in schema:
+        assert field.metadata[b"unit"], field.name
+        assert field.metadata[b"description"], field.name
+    assert schema.field("t_ns").metadata[b"unit"] == b"ns"
+    assert schema.field("padc_1").metadata[b"unit"] == b"counts"
+
+
+def test_integers_are_delta_encoded_floats_split_and_all_of_it_zstd(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    write(
+        path,
+        frames(500),
+        grf_n=np.random.default_rng(0).normal(size=500),
+        contact=np.ones(500, dtype=np.uint8),
+        true_grf_n=np.random.default_rng(1).normal(size=500),
+        phase=np.array(["rest"] * 500),
+    )
+    group = pq.ParquetFile(path).metadata.row_group(0)
+    chunks = [group.column(i) for i in range(group.num_columns)]
+    assert {chunk.compression for chunk in chunks} == {"ZSTD"}
+    for chunk in chunks:
+        expected = {
+            "FLOAT": "BYTE_STREAM_SPLIT",
+            "DOUBLE": "BYTE_STREAM_SPLIT",
+            "INT32": "DELTA_BINARY_PACKED",
+            "INT64": "DELTA_BINARY_PACKED",
+            "BYTE_ARRAY": "RLE_DICTIONARY",
+        }[chunk.physical_type]
+        assert expected in chunk.encodings, chunk.path_in_schema
+
+
+def test_a_quiet_hour_is_small(tmp_path: Path) -> None:
+    # performance.md: some 6 bytes a frame of four tiles where CSV takes 54
+    rng = np.random.default_rng(3)
+    rows = 20_000
+    quiet = replace(
+        frames(rows, 4),
+        padc=(380 + np.rint(rng.normal(0, 1.3, (rows, 4)))).astype(np.uint16),
+        tadc=(480 + np.rint(rng.normal(0, 0.5, (rows, 4)))).astype(np.uint16),
+        sample_offset_us=np.tile(np.array([0, 0, 0, 0], dtype=np.int32), (rows, 1)),
+        servo_counts=np.full(rows, NO_SERVO_COUNTS, dtype=np.int32),
+        servo_age_us=np.full(rows, NO_SERVO_AGE, dtype=np.int32),
+        status=np.zeros((rows, 4), dtype=np.uint8),
+        frame_status=np.zeros(rows, dtype=np.uint8),
+        reference_force_n=np.full(rows, np.nan, dtype=np.float32),
+    )
+    assert write(tmp_path / "s.parquet", quiet).stat().st_size < 8 * rows
+
+
+def test_what_is_not_known_is_null_in_the_file_and_what_it_was_in_memory(tmp_path: Path) -> None:
+    batch = replace(
+        frames(4),
+        padc=np.array([[300, NOT_READ]] * 4, dtype=np.uint16),
+        tadc=np.array([[NOT_READ, 480]] * 4, dtype=np.uint16),
+        servo_counts=np.array([0, NO_SERVO_COUNTS, -1, 7], dtype=np.int32),
+        servo_age_us=np.array([NO_SERVO_AGE, 0, 5, 5], dtype=np.int32),
+        reference_force_n=np.array([np.nan, 0.0, -1.0, np.inf], dtype=np.float32),
+    )
+    contact = np.array([0, 1, CONTACT_UNKNOWN, 1], dtype=np.uint8)
+    grf_n = np.array([np.nan, 1.0, -0.0, np.inf])
+    path = write(tmp_path / "s.parquet", batch, contact=contact, grf_n=grf_n)
+    table = pq.read_table(path)
+
+    def nulls(name: str) -> list[bool]:
+        return table.column(name).is_null().to_pylist()
+
+    assert nulls("padc_0") == [False] * 4
+    assert nulls("padc_1") == [True] * 4
+    assert nulls("tadc_0") == [True] * 4
+    assert nulls("servo_counts") == [False, True, False, False]
+    assert nulls("servo_age_us") == [True, False, False, False]
+    assert nulls("reference_force_n") == [True, False, False, False]
+    assert nulls("contact") == [False, False, True, False]
+    assert nulls("grf_n") == [True, False, False, False]
+    assert not any(table.column("seq").is_null().to_pylist())
+    with SessionReader(path) as session:
+        ((back, extra),) = session.batches("contact", "grf_n")
+    same(back, batch)
+    assert extra["contact"].tolist() == contact.tolist()
+    np.testing.assert_array_equal(extra["grf_n"], grf_n)
+
+
+def test_what_is_always_known_cannot_be_null(tmp_path: Path) -> None:
+    schema = pq.read_schema(write(tmp_path / "s.parquet", frames(3)))
+    known = {name for name in schema.names if not schema.field(name).nullable}
+    assert known == {
+        *("seq", "t_mono_ns", "t_ns", "frame_status", "status_0", "status_1"),
+        *("sample_offset_us_0", "sample_offset_us_1"),
+    }
+
+
+def test_estimates_are_kept_in_single_truth_in_double_precision_and_notes_as_text(
+    tmp_path: Path,
+) -> None:
+    third = np.full(3, 1 / 3)
+    path = write(
+        tmp_path / "s.parquet",
+        frames(3),
+        force_n=np.array([[1 / 3, np.nan], [2e-3, 0.1], [1e9, -1.0]]),
+        true_grf_n=third,
+        pressed_tile=np.array(["T01", None, "T02"], dtype=object),
+        estimate_status=np.array([0, 511, 3], dtype=np.uint16),
+    )
+    with SessionReader(path) as session:
+        assert session.has("force_n", "true_grf_n", "pressed_tile")
+        assert not session.has("force_n", "grf_n")
+        ((_, extra),) = session.batches("force_n", "true_grf_n", "pressed_tile", "estimate_status")
+    assert extra["force_n"].dtype == np.float32
+    np.testing.assert_array_equal(
+        extra["force_n"], np.float32([[1 / 3, np.nan], [2e-3, 0.1], [1e9, -1.0]])
+    )
+    assert extra["true_grf_n"].tobytes() == third.tobytes()
+    assert extra["pressed_tile"].tolist() == ["T01", None, "T02"]
+    assert extra["estimate_status"].tolist() == [0, 511, 3]
+
+
+def test_notes_survive_and_may_be_added_before_the_first_group(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    with SessionWriter(path, array(), {"seed": 7, "scene": {"name": "mud"}}) as writer:
+        writer.append(frames(3), {})
+        writer.add_notes({"lag_ms": 9.2})
+    with SessionReader(path) as session:
+        assert session.notes == {"seed": 7, "scene": {"name": "mud"}, "lag_ms": 9.2}
+
+
+def test_the_same_session_is_the_same_bytes(tmp_path: Path) -> None:
+    notes: dict[str, object] = {"b": 1, "a": 2}
+    one = write(tmp_path / "one.parquet", frames(300), notes)
+    two = write(tmp_path / "two.parquet", frames(300), dict(reversed(notes.items())))
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_an_integer_that_does_not_fit_its_column_is_an_error_and_not_another_integer(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(pa.ArrowInvalid):
+        write(tmp_path / "s.parquet", frames(2), estimate_status=np.array([1, 65536 + 1]))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_that_was_read_is_closed(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", frames(3))
+
+    def is_open() -> bool:
+        return str(path) in {os.path.realpath(fd) for fd in Path("/proc/self/fd").iterdir()}
+
+    with SessionReader(path) as session:
+        assert len(session.frames()) == 3
+        assert is_open()
+    assert not is_open()
+
+
+# --- row groups -----------------------------------------------------------------------------------
+
+
+def group_seconds(path: Path) -> list[float]:
+    with SessionReader(path) as session:
+        return [
+            float(batch.t_mono_ns[-1] - batch.t_mono_ns[0]) * 1e-9 for batch, _ in session.batches()
+        ]
+
+
+def test_a_row_group_is_about_a_minute(tmp_path: Path) -> None:
+    # 150 s in pieces of a second
+    path, batch = tmp_path / "s.parquet", frames(3000, period_ns=50_000_000)
+    with SessionWriter(path, array(), {}) as writer:
+        for begin in range(0, 3000, 20):
+            writer.append(batch.rows(begin, begin + 20), {})
+    seconds = group_seconds(path)
+    assert len(seconds) == 3
+    assert all(59.0 <= s <= 62.0 for s in seconds[:-1])
+    same(read(path), batch)
+
+
+def test_one_long_batch_is_cut_into_row_groups_of_a_minute_too(tmp_path: Path) -> None:
+    # else whoever reads it one group at a time holds all of it at once
+    batch = frames(3000, period_ns=200_000_000)  # ten minutes
+    path = write(tmp_path / "s.parquet", batch)
+    assert all(s <= 62.0 for s in group_seconds(path))
+    same(read(path), batch)
+
+
+def test_a_gap_of_an_hour_is_no_reason_for_a_group_of_its_own_for_every_frame(
+    tmp_path: Path,
+) -> None:
+    batch = frames(300)
+    t_mono_ns = batch.t_mono_ns + np.where(np.arange(300) >= 150, 3_600_000_000_000, 0)
+    path = tmp_path / "s.parquet"
+    with SessionWriter(path, array(), {}) as writer:
+        for begin in range(0, 300, 10):
+            writer.append(replace(batch, t_mono_ns=t_mono_ns).rows(begin, begin + 10), {})
+    assert pq.ParquetFile(path).num_row_groups <= 3
+
+
+# --- when it appears ------------------------------------------------------------------------------
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_file_appears_only_when_it_is_sealed_and_nothing_stays_beside_it(
+    tmp_path: Path,
+) -> None:
+    path, batch = tmp_path / "s.parquet", frames(3000, period_ns=50_000_000)
+    with SessionWriter(path, array(), {}) as writer:
+        for begin in range(0, 3000, 300):
+            writer.append(batch.rows(begin, begin + 300), {})
+            assert not path.exists()
+        assert names_in(tmp_path)  # the first minute is on disk already, under another name
+    assert names_in(tmp_path) == ["s.parquet"]
+
+
+def fail(path: Path, batch: FrameBatch | None, error: type[BaseException]) -> None:
+    """Write the batch, if there is one, and then fail within the block."""
+    with SessionWriter(path, array(), {}) as writer:
+        if batch is not None:
+            writer.append(batch, {})
+        raise error
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("rows", [0, 3, 3000])
+def test_an_exception_in_the_block_leaves_nothing_behind(
+    tmp_path: Path, error: type[BaseException], rows: int
+) -> None:
+    batch = frames(rows, period_ns=50_000_000) if rows else None
+    with pytest.raises(error):
+        fail(tmp_path / "s.parquet", batch, error)
+    assert names_in(tmp_path) == []
+
+
+def test_a_file_that_is_there_stays_until_the_new_one_is_sealed(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", frames(5))
+    old = path.read_bytes()
+    with SessionWriter(path, array(), {}) as writer:
+        writer.append(frames(1300, period_ns=50_000_000), {})
+        assert path.read_bytes() == old
+    assert len(read(path)) == 1300
+
+
+def test_a_file_that_is_there_survives_a_failure(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", frames(5))
+    old = path.read_bytes()
+    with pytest.raises(RuntimeError):
+        fail(path, frames(1300, period_ns=50_000_000), RuntimeError)
+    assert path.read_bytes() == old
+    assert names_in(tmp_path) == ["s.parquet"]
+
+
+def test_a_session_without_frames_is_refused_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    with pytest.raises(FileFormatError, match="no frames"), SessionWriter(path, array(), {}):
+        pass
+    assert names_in(tmp_path) == []
+
+
+def test_it_is_synced_before_it_gets_its_name_and_the_folder_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, events = tmp_path / "s.parquet", []
+    fsync = os.fsync
+
+    def watched(descriptor: int) -> None:
+        target = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        events.append(("folder" if target == tmp_path else "file", path.exists()))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    write(path, frames(5))
+    assert events == [("file", False), ("folder", True)]
+
+
+def test_while_it_is_written_its_name_says_whose_it_is(tmp_path: Path) -> None:
+    with SessionWriter(tmp_path / "s.parquet", array(), {}) as writer:
+        writer.append(frames(3000, period_ns=50_000_000), {})
+        (name,) = names_in(tmp_path)
+        assert name.startswith(f".s.parquet.{os.getpid()}.")
+        assert remove_stale_temporaries(tmp_path) == []
+    assert names_in(tmp_path) == ["s.parquet"]
+
+
+@contextmanager
+def disk_with_room_for(size: int) -> Iterator[None]:
+    """No file may grow beyond `size` bytes: a write fails as it does on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("room", [0, 1, 100, 4000, 9000])
+def test_a_full_disk_is_an_os_error_and_leaves_nothing_behind(tmp_path: Path, room: int) -> None:
+    path, batch = tmp_path / "s.parquet", frames(2000)
+    assert write(tmp_path / "whole.parquet", batch).stat().st_size > 10_000
+    (tmp_path / "whole.parquet").unlink()
+    with pytest.raises(OSError, match=r"[Ff]ile too large|EFBIG"), disk_with_room_for(room):
+        write(path, batch)
+    assert names_in(tmp_path) == []
+
+
+def test_a_folder_that_is_not_there_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="missing"):
+        write(tmp_path / "missing" / "s.parquet", frames(5))
+
+
+# --- which files are refused ----------------------------------------------------------------------
+
+
+def test_a_file_that_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
+    refused(tmp_path / "nothing.parquet", "cannot be read as Parquet")
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1", b"time_s,fz_n\n0,1\n", b"\0" * 5000])
+def test_a_file_that_is_no_parquet_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "s.parquet"
+    path.write_bytes(content)
+    refused(path, "cannot be read as Parquet")
+
+
+def test_a_folder_is_refused_by_name(tmp_path: Path) -> None:
+    refused(tmp_path)
+
+
+def test_somebody_elses_parquet_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    pq.write_table(pa.table({"seq": [1, 2], "grf_n": [1.0, 2.0]}), path)
+    refused(path, "states no format.*written by foottile")
+
+
+def test_a_truncated_file_is_refused_by_name(tmp_path: Path) -> None:
+    whole = write(tmp_path / "s.parquet", frames(200)).read_bytes()
+    path = tmp_path / "cut.parquet"
+    for size in range(0, len(whole), 97):
+        path.write_bytes(whole[:size])
+        refused(path)
+
+
+def outcome(path: Path, expected: FrameBatch) -> str:
+    """What becomes of a damaged file: an error of ours, an unexpected one, or other values."""
+    try:
+        batch = read(path)
+    except FileFormatError as error:
+        return "refused" if str(path) in str(error) else f"refused without its name: {error}"
+    except Exception as error:  # whatever it is, it is the finding
+        return repr(error)
+    columns = [(getattr(batch, f.name), getattr(expected, f.name)) for f in fields(FrameBatch)]
+    return "read" if all(np.array_equal(a, b) for a, b in columns) else "changed unnoticed"
+
+
+def test_no_flipped_bit_is_an_unexpected_error(tmp_path: Path) -> None:
+    batch = frames(100)
+    whole = write(tmp_path / "s.parquet", batch, {"seed": 7}).read_bytes()
+    path, outcomes = tmp_path / "flipped.parquet", {}
+    for at in range(0, len(whole), 13):
+        damaged = bytearray(whole)
+        damaged[at] ^= 0x80 if at % 2 else 0x01
+        path.write_bytes(damaged)
+        outcomes[at] = outcome(path, batch)
+    unexpected = set(outcomes.values()) - {"refused", "read", "changed unnoticed"}
+    assert unexpected == set()
+
+
+def test_no_flipped_bit_of_the_data_changes_a_value_unnoticed(tmp_path: Path) -> None:
+    # Parquet pages can carry a checksum. Without, a flip in packed integers is another integer.
+    batch = frames(100)
+    path = write(tmp_path / "s.parquet", batch)
+    whole = path.read_bytes()
+    metadata = pq.ParquetFile(path).metadata
+    last = metadata.row_group(0).column(metadata.num_columns - 1)
+    unnoticed = []
+    for at in range(4, last.data_page_offset + last.total_compressed_size, 11):
+        damaged = bytearray(whole)
+        damaged[at] ^= 0x10
+        path.write_bytes(damaged)
+        if outcome(path, batch) == "changed unnoticed":
+            unnoticed.append(at)
+    assert unnoticed == []
+
+
+def test_a_later_format_says_so_and_what_to_do(tmp_path: Path) -> None:
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
+    refused(rewritten(tmp_path / "later.parquet", table, format=b"3"), "format.*3.*Update foottile")
+    refused(rewritten(tmp_path / "none.parquet", table, format=None), "format")
+
+
+def test_a_later_format_says_so_even_if_it_describes_its_array_in_a_new_way(
+    tmp_path: Path,
+) -> None:
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
+    info = json.loads(array().model_dump_json()) | {"hall_sensors": 4}
+    path = tmp_path / "later.parquet"
+    rewritten(path, table, format=b"3", array_info=json.dumps(info).encode())
+    refused(path, "Update foottile")
+
+
+@pytest.mark.parametrize("notes", [None, b"", b"{", b"\xff", b"[1]", b"3"])
+def test_notes_that_are_missing_or_damaged_are_refused_by_name(
+    tmp_path: Path, notes: bytes | None
+) -> None:
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
+    refused(rewritten(tmp_path / "other.parquet", table, notes=notes))
+
+
+@pytest.mark.parametrize("info", [None, b"", b"{}", b"\xff"])
+def test_an_array_that_is_missing_or_damaged_is_refused_by_name(
+    tmp_path: Path, info: bytes | None
+) -> None:
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
+    refused(rewritten(tmp_path / "other.parquet", table, array_info=info))
+
+
+def test_the_keys_of_the_metadata_are_those_of_the_format(tmp_path: Path) -> None:
+    metadata = pq.read_schema(write(tmp_path / "s.parquet", frames(5))).metadata
+    assert (FORMAT_KEY, ARRAY_INFO_KEY, NOTES_KEY) == (
+        b"foottile.format",
+        b"foottile.array_info",
+        b"foottile.notes",
+    )
+    assert metadata[FORMAT_KEY] == b"2"
+    assert json.loads(metadata[ARRAY_INFO_KEY])["tiles"][1]["serial"] == "T02"
+
+
+@pytest.mark.parametrize("name", ["seq", "t_ns", "padc_1", "status_0", "servo_counts"])
+def test_a_file_without_one_of_the_columns_is_refused(tmp_path: Path, name: str) -> None:
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
+    refused(rewritten(tmp_path / "other.parquet", table.drop_columns([name])), name)
+
+
+@pytest.mark.parametrize(
+    ("name", "type_"),
+    [
+        ("seq", pa.int64()),
+        ("t_ns", pa.float64()),
+        ("padc_0", pa.int32()),
+        ("padc_1", pa.string()),
+        ("status_0", pa.uint16()),
+        ("reference_force_n", pa.float64()),
+    ],
+)
+def test_a_file_with_a_column_of_another_type_is_refused(
+    tmp_path: Path, name: str, type_: pa.DataType
+) -> None:
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
+    at = table.schema.get_field_index(name)
+    changed = table.set_column(at, name, table.column(name).cast(type_, safe=False))
+    refused(rewritten(tmp_path / "other.parquet", changed), name)
+
+
+@pytest.mark.parametrize("name", ["seq", "t_mono_ns", "status_1", "sample_offset_us_0"])
+def test_a_file_with_an_empty_value_where_none_may_be_is_refused(tmp_path: Path, name: str) -> None:
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(3)))
+    at = table.schema.get_field_index(name)
+    type_ = table.schema.field(name).type
+    changed = table.set_column(at, name, pa.array([1, None, 2], type_))
+    refused(rewritten(tmp_path / "other.parquet", changed), f"{name} has 1 empty")
+
+
+def test_a_column_that_was_asked_for_and_is_not_there_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "s.parquet", frames(3))
+    with SessionReader(path) as session, pytest.raises(FileFormatError, match="grf_n"):
+        next(session.batches("grf_n"))
+
+
+def test_a_file_with_more_columns_than_ours_is_read(tmp_path: Path) -> None:
+    # people add their own in pandas
+    batch = frames(5)
+    table = pq.read_table(write(tmp_path / "s.parquet", batch))
+    table = table.append_column("my_filter_n", pa.array(np.arange(5.0)))
+    same(read(rewritten(tmp_path / "more.parquet", table)), batch)
+
+
+def test_a_file_that_describes_fewer_tiles_than_it_has_is_refused(tmp_path: Path) -> None:
+    # a COP of half of the foot would look right
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5, 4)))
+    two = array(2).model_dump_json().encode()
+    refused(rewritten(tmp_path / "two.parquet", table, array_info=two), "2 tiles")
+
+
+def test_a_file_whose_rows_were_all_filtered_away_is_refused_by_name(tmp_path: Path) -> None:
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
+    refused(rewritten(tmp_path / "none.parquet", table.slice(0, 0)))

@@ -1,0 +1,262 @@
+"""What is kept of a session beside its frames, and ids that stay in their folder."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError, StorageError, UnknownError
+from storage.sessions.folder import (
+    ClockOffset,
+    Event,
+    Ledger,
+    Part,
+    PartLedger,
+    Session,
+    SessionFolder,
+    new_session_id,
+)
+
+ID = "20200131T235959Z-0a1b2c"
+BOOT = "f" * 32
+
+BAD_IDS = [
+    *("", ".", "..", "../x", "../" + ID, "/" + ID, "/etc/passwd", ID + "/..", ID + "/", "a/" + ID),
+    *(
+        ID + "\0",
+        "\0" + ID,
+        ID + "\n",
+        " " + ID,
+        ID + "0",
+        ID[:-1],
+        ID.upper(),
+        ID.replace("Z", ""),
+    ),
+    *("\u0662" + ID[1:], ID[:9] + "\uff12" + ID[10:], "%2e%2e%2fx", "x" * 100_000),
+]
+
+
+def session(session_id: str = ID, **changes: Any) -> Session:
+    content: dict[str, Any] = {
+        "id": session_id,
+        "name": "first walk",
+        "node": "bench",
+        "state": "recording",
+        "started_t_ns": 10**18,
+        "parts": (Part(boot_id=BOOT, seq_first=0),),
+        "scene": "mud",
+    }
+    return Session(**content | changes)
+
+
+def whole() -> Session:
+    return session(
+        state="sealed",
+        stopped_t_ns=10**18 + 1,
+        parts=(
+            Part(boot_id=BOOT, seq_first=5, seq_last=9),
+            Part(boot_id="0" * 32, seq_first=0, seq_last=2**62),
+        ),
+        subject='Ärmel \'n "Söhne"\n\u2028',
+        notes="\x00\ud7ff🦶",
+        tags=("a", "b", ""),
+        events=(Event(id="e1", label="slip", t_ns=10**18 + 7),),
+        clock=(ClockOffset(boot_id=BOOT, t_mono_ns=1, server_minus_node_ns=-2, uncertainty_ns=3),),
+        missed_slots_at_start=4,
+        unsynced_tail_max={BOOT: 17},
+        problem="none",
+        ledger=Ledger(
+            complete=False,
+            lossy=True,
+            parts=(
+                PartLedger(
+                    boot_id=BOOT,
+                    seq_first=5,
+                    seq_last=9,
+                    recorded=3,
+                    lost={"evicted": 1},
+                    pending=1,
+                ),
+            ),
+            missed_slots=2,
+        ),
+        frames=5,
+        duration_s=1 / 3,
+        bytes=123,
+        sha256="ab" * 32,
+        calibration_id="c",
+        absolute_scale="assumed",
+    )
+
+
+# --- ids ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", BAD_IDS, ids=lambda text: ascii(text)[:30])
+def test_what_is_no_id_is_no_session_and_no_path(tmp_path: Path, bad: str) -> None:
+    folder = SessionFolder(tmp_path / "sessions")
+    with pytest.raises(UnknownError) as caught:
+        folder.path(bad)
+    assert len(str(caught.value)) < 1000
+    with pytest.raises(UnknownError):
+        folder.load(bad)
+    with pytest.raises(UnknownError):
+        folder.save(session(bad))
+    assert list(tmp_path.iterdir()) == []
+
+
+@settings(max_examples=300)
+@given(st.one_of(st.text(max_size=40), st.from_regex(r"\A\d{8}T\d{6}Z-[0-9a-f]{6}\Z")))
+def test_a_path_is_directly_in_the_folder_and_its_name_is_plain(text: str) -> None:
+    try:
+        path = SessionFolder(Path("/data/sessions")).path(text)
+    except UnknownError:
+        return
+    assert path.parent == Path("/data/sessions")
+    assert re.fullmatch(r"[0-9TZ]{16}-[0-9a-f]{6}", path.name)
+
+
+def test_ids_sort_by_time_and_are_of_utc() -> None:
+    east = timezone(timedelta(hours=9))
+    at = datetime(2020, 2, 1, 8, 59, 59, tzinfo=east)
+    assert new_session_id(at).startswith("20200131T235959Z-")
+    made = [new_session_id(at + timedelta(seconds=n)) for n in range(100)]
+    assert made == sorted(made)
+    folder = SessionFolder(Path("x"))
+    assert [folder.path(one).name for one in made] == made
+
+
+def test_two_sessions_of_one_second_have_different_ids(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = iter(["000001", "000002"])
+    monkeypatch.setattr("secrets.token_hex", lambda n: next(drawn))
+    now = datetime(2020, 1, 1, tzinfo=UTC)
+    assert [new_session_id(now) for _ in "ab"] == [
+        "20200101T000000Z-000001",
+        "20200101T000000Z-000002",
+    ]
+
+
+def test_ids_are_newest_first_and_other_names_are_none(tmp_path: Path) -> None:
+    folder = SessionFolder(tmp_path)
+    made = [f"2020013{i}T000000Z-00000{i}" for i in (1, 0, 5, 3)]
+    for one in made:
+        folder.save(session(one))
+    for name in ("lost+found", ".20200131T235959Z-0a1b2c.tmp", "20200131"):
+        (tmp_path / name).mkdir()
+    assert list(folder.ids()) == sorted(made, reverse=True)
+
+
+def test_a_folder_that_is_not_there_yet_has_no_sessions(tmp_path: Path) -> None:
+    assert list(SessionFolder(tmp_path / "none").ids()) == []
+    (tmp_path / "file").write_bytes(b"")
+    assert list(SessionFolder(tmp_path / "file").ids()) == []
+
+
+# --- save and load --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kept", [session(), whole()], ids=["new", "sealed"])
+def test_a_session_survives_its_file(tmp_path: Path, kept: Session) -> None:
+    folder = SessionFolder(tmp_path / "data" / "sessions")
+    folder.save(kept)
+    assert folder.load(ID) == kept
+    assert [p.name for p in folder.path(ID).iterdir()] == ["session.json"]
+
+
+@given(st.text(max_size=30), st.lists(st.text(max_size=5), max_size=3))
+@settings(max_examples=30, deadline=None)
+def test_whatever_a_person_writes_is_kept_as_it_is(
+    tmp_path_factory: pytest.TempPathFactory, text: str, tags: list[str]
+) -> None:
+    folder = SessionFolder(tmp_path_factory.mktemp("sessions"))
+    kept = session(name=text, notes=text[::-1], subject=text, tags=tuple(tags))
+    folder.save(kept)
+    assert folder.load(ID) == kept
+
+
+def test_saving_again_replaces_and_touches_no_other_file(tmp_path: Path) -> None:
+    folder = SessionFolder(tmp_path)
+    folder.save(session())
+    (folder.path(ID) / "frames.parquet").write_bytes(b"frames")
+    folder.save(whole())
+    assert folder.load(ID) == whole()
+    assert (folder.path(ID) / "frames.parquet").read_bytes() == b"frames"
+
+
+def test_a_session_that_is_not_there_is_unknown(tmp_path: Path) -> None:
+    folder = SessionFolder(tmp_path)
+    with pytest.raises(UnknownError, match=ID):
+        folder.load(ID)
+    (tmp_path / ID).mkdir()
+    with pytest.raises(UnknownError, match=ID):
+        folder.load(ID)
+
+
+def test_a_file_that_is_cut_off_anywhere_is_damaged(tmp_path: Path) -> None:
+    folder = SessionFolder(tmp_path)
+    folder.save(session())
+    path = folder.path(ID) / "session.json"
+    content = path.read_bytes()
+    for length in range(len(content)):
+        path.write_bytes(content[:length])
+        with pytest.raises(FileFormatError, match="not a session") as caught:
+            folder.load(ID)
+        assert caught.value.where == str(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b'"recording"', b'"resting"'),
+        (b'"mud"', b"null"),
+        (b'"started_t_ns"', b'"begun_t_ns"'),
+        (b'"first walk"', b'"\xff"'),
+        (b'"seq_first": 0', b'"seq_first": 0.5'),
+        (b"{", b'{"further": 1,'),
+    ],
+)
+def test_what_is_not_a_session_is_refused_with_its_path(
+    tmp_path: Path, old: bytes, new: bytes
+) -> None:
+    folder = SessionFolder(tmp_path)
+    folder.save(session())
+    path = folder.path(ID) / "session.json"
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new, 1))
+    with pytest.raises(FileFormatError, match="not a session") as caught:
+        folder.load(ID)
+    assert caught.value.where == str(path)
+
+
+def test_a_folder_in_place_of_the_file_is_damage_too(tmp_path: Path) -> None:
+    (tmp_path / ID / "session.json").mkdir(parents=True)
+    with pytest.raises(FileFormatError, match="not a session"):
+        SessionFolder(tmp_path).load(ID)
+
+
+def test_a_session_that_cannot_be_written_stays_what_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    folder = SessionFolder(tmp_path)
+    folder.save(session())
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(StorageError, match="No space left"):
+        folder.save(whole())
+    assert folder.load(ID) == session()
+    assert [p.name for p in folder.path(ID).iterdir()] == ["session.json"]
+
+
+def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
+    (tmp_path / "sessions").write_bytes(b"a file")
+    with pytest.raises(StorageError):
+        SessionFolder(tmp_path / "sessions").save(session())

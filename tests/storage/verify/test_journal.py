@@ -1,0 +1,294 @@
+"""A journal proves itself: what is damaged is told from what was not yet written."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError
+from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
+from storage.intervals import Intervals
+from storage.journal.journal import Journal
+from storage.journal.segment import INDEX_SUFFIX, RECORD, SegmentWriter
+from storage.journal.stream_notes import NOTES_FILE, StreamNotes
+from storage.schema import wire_schema
+from storage.verify.journal import verify_stream
+from storage.verify.segment import verify_segment
+from storage.wire import EncodedBatch, encode
+
+BOOT = "a" * 32
+UTC_NS = 10**18
+
+
+def array(**changes: Any) -> ArrayInfo:
+    tile = TileInfo(
+        serial="T01",
+        mux=0x70,
+        channel=0,
+        coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
+        x_m=0.0,
+        y_m=0.0,
+        z_m=-0.15,
+        reference=False,
+        conversion_ms=1.6,
+    )
+    content: dict[str, Any] = {
+        "node": "bench",
+        "boot_id": BOOT,
+        "tiles": (tile,),
+        "servo": None,
+        "schedule": "simultaneous",
+        "nominal_rate_hz": 500.0,
+        "utc_offset_ns": UTC_NS,
+        "clock_set": True,
+        "software": "test",
+        "scene": "test",
+        "models": ("static",),
+    }
+    return ArrayInfo(**content | changes)
+
+
+def frames(first: int, last: int, *, at_ns: int | None = None) -> FrameBatch:
+    seq = np.arange(first, last + 1, dtype=np.uint64)
+    columns: dict[str, Any] = {
+        name: np.full((len(seq), 1) if per_tile else len(seq), 7, dtype)
+        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
+    }
+    t_mono_ns = 2_000_000 * seq.astype(np.int64) + (0 if at_ns is None else at_ns)
+    columns |= {"seq": seq, "t_mono_ns": t_mono_ns, "t_ns": t_mono_ns + UTC_NS}
+    return FrameBatch(**columns)
+
+
+def stream(root: Path, *, next_seq: int | None = None) -> Path:
+    """The journal of a stream of 40 frames in batches of 5, closed in order."""
+    folder = root / "journal" / "bench" / BOOT
+    journal = Journal(folder, array())
+    for first in range(0, 40, 5):
+        journal.append(frames(first, first + 4))
+    journal.close()
+    StreamNotes(array_info=array(), next_seq=next_seq).save(folder)
+    return folder
+
+
+def segment_of(folder: Path) -> Path:
+    (path,) = folder.glob("*.arrows")
+    return path
+
+
+def index_of(folder: Path) -> Path:
+    return segment_of(folder).with_suffix(INDEX_SUFFIX)
+
+
+def ends(folder: Path) -> list[int]:
+    records = np.frombuffer(index_of(folder).read_bytes(), RECORD)
+    return [int(r["offset"] + r["length"]) for r in records if r["count"]]
+
+
+def problems(folder: Path) -> str:
+    return "; ".join(verify_stream(folder).problems)
+
+
+def opened(folder: Path) -> Path:
+    """As it is while it is written: the mark of the end is not there yet."""
+    path = index_of(folder)
+    path.write_bytes(path.read_bytes()[: -RECORD.itemsize])
+    return folder
+
+
+def test_a_whole_journal_is_counted_and_nothing_is_touched(tmp_path: Path) -> None:
+    folder = stream(tmp_path, next_seq=40)
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
+    report = verify_stream(folder)
+    assert report.problems == report.remarks == []
+    assert report.held == Intervals([(0, 39)])
+    assert not report.missing
+    assert not report.unsynced
+    assert before == {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in folder.iterdir()}
+
+
+def test_a_journal_that_is_being_written_is_whole(tmp_path: Path) -> None:
+    folder = tmp_path / "journal" / "bench" / BOOT
+    journal = Journal(folder, array())
+    StreamNotes(array_info=array()).save(folder)
+    assert problems(folder) == ""
+    for first in range(0, 20, 5):
+        journal.append(frames(first, first + 4))
+        report = verify_stream(folder)
+        assert (report.problems, report.held.last) == ([], first + 4)
+    journal.close()
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_segment_that_was_cut_at_any_byte_is_damaged_if_it_was_closed(
+    tmp_path: Path, closed: bool
+) -> None:
+    folder = stream(tmp_path)
+    path = segment_of(folder)
+    if not closed:
+        opened(folder)
+    whole, boundaries = path.read_bytes(), ends(folder)
+    for size in sorted({*range(0, len(whole), 97), *boundaries[:-1], len(whole) - 1}):
+        path.write_bytes(whole[:size])
+        report = verify_stream(folder)
+        gone = 40 - 5 * sum(end <= size for end in boundaries)
+        if closed:
+            assert report.problems, size
+        else:  # nobody was promised what is gone, and the index still says how much it is
+            assert report.problems == [], size
+            assert report.unsynced.count == gone or size < boundaries[0]
+            assert report.held.count == 40 - gone
+
+
+def test_a_cut_at_a_batch_of_segment_and_index_is_seen_by_the_stream_s_end(tmp_path: Path) -> None:
+    folder = stream(tmp_path, next_seq=40)
+    path, index = segment_of(folder), index_of(folder)
+    path.write_bytes(path.read_bytes()[: ends(folder)[4]])
+    index.write_bytes(index.read_bytes()[: 5 * RECORD.itemsize])
+    report = verify_stream(folder)
+    assert report.missing == Intervals([(25, 39)])
+    assert "cut behind frame 24" in "; ".join(report.problems)
+    (tmp_path / "nodes").mkdir()  # a server may still get the rest
+    report = verify_stream(folder)
+    assert (report.problems, report.missing.count) == ([], 15)
+
+
+def test_batches_that_are_in_no_index_are_seen(tmp_path: Path) -> None:
+    folder = stream(tmp_path)
+    index = index_of(folder)
+    whole = index.read_bytes()
+    index.write_bytes(whole[: 4 * RECORD.itemsize])
+    assert "4 batches behind its last one are in no index" in problems(folder)
+    index.write_bytes(whole[: 7 * RECORD.itemsize])  # the newest may be on its way
+    report = verify_stream(folder)
+    assert report.problems == []
+    assert "in no index" in "; ".join(report.remarks)
+
+
+def test_an_index_that_is_missing_is_said(tmp_path: Path) -> None:
+    folder = stream(tmp_path)
+    index_of(folder).unlink()
+    assert "is missing" in problems(folder)
+
+
+def test_a_segment_that_is_missing_is_said(tmp_path: Path) -> None:
+    folder = stream(tmp_path)
+    segment_of(folder).unlink()
+    assert "the segment of this index is missing" in problems(folder)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_one_flipped_bit_anywhere_in_a_closed_segment_or_its_index_is_found(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    base = tmp_path_factory.getbasetemp() / "flipped_journal"
+    if not base.exists():
+        stream(base, next_seq=40)
+    folder = base / "journal" / "bench" / BOOT
+    path = data.draw(st.sampled_from([segment_of(folder), index_of(folder)]))
+    whole = path.read_bytes()
+    content = bytearray(whole)
+    at = data.draw(st.integers(0, len(content) - 1))
+    content[at] ^= 1 << data.draw(st.integers(0, 7))
+    try:
+        path.write_bytes(content)
+        report = verify_stream(folder)
+    finally:
+        path.write_bytes(whole)
+    # A header has padding, and bytes that nobody reads.
+    harmless = path.suffix == ".arrows" and at < ends(folder)[0] and report.held.count == 40
+    assert report.problems or harmless
+
+
+def test_a_damaged_batch_costs_itself_only_and_is_named(tmp_path: Path) -> None:
+    folder = opened(stream(tmp_path))
+    path = segment_of(folder)
+    content = bytearray(path.read_bytes())
+    content[ends(folder)[3] - 9] ^= 1
+    path.write_bytes(content)
+    report = verify_stream(folder)
+    assert "frames 15 to 19 do not agree with their checksum" in "; ".join(report.problems)
+    assert report.held == Intervals([(0, 14), (20, 39)])
+    assert report.lost.by_reason["corrupt"] == Intervals([(15, 19)])
+
+
+def test_a_journal_in_another_stream_s_place_is_seen(tmp_path: Path) -> None:
+    folder = stream(tmp_path)
+    other = folder.with_name("b" * 32)
+    folder.rename(other)
+    assert "wrongly placed" in problems(other)
+
+
+def test_a_segment_of_another_stream_is_seen(tmp_path: Path) -> None:
+    folder = stream(tmp_path / "one")
+    other = tmp_path / "two"
+    journal = Journal(other, array(boot_id="b" * 32))
+    journal.append(frames(40, 49))
+    journal.close()
+    for path in other.iterdir():
+        shutil.copy(path, folder)
+    assert "another stream or array" in problems(folder)
+
+
+def test_frames_behind_the_stream_s_end_are_seen(tmp_path: Path) -> None:
+    assert "it ended with 29" in problems(stream(tmp_path, next_seq=30))
+
+
+def test_notes_that_are_damaged_are_named(tmp_path: Path) -> None:
+    folder = stream(tmp_path)
+    (folder / NOTES_FILE).write_bytes(b"{")
+    assert problems(folder).startswith(NOTES_FILE)
+    (folder / NOTES_FILE).unlink()
+    report = verify_stream(folder)
+    assert report.problems == []
+    assert "nothing says where the stream ended" in "; ".join(report.remarks)
+
+
+def test_time_that_runs_back_from_one_segment_to_the_next_is_seen(tmp_path: Path) -> None:
+    folder = stream(tmp_path)
+    payload = encode(late := frames(40, 44, at_ns=-(10**9)), wire_schema(array()))
+    header = wire_schema(array()).serialize().to_pybytes()
+    writer = SegmentWriter(folder / f"{40:020d}.arrows", header)
+    writer.append(EncodedBatch.of(late, payload))
+    writer.close()
+    assert "time runs back before frame 40" in problems(folder)
+
+
+def test_a_segment_proves_itself_alone(tmp_path: Path) -> None:
+    path = segment_of(stream(tmp_path))
+    report = verify_segment(path)
+    assert (report.held.count, report.is_closed, report.problems) == (40, True, [])
+    with pytest.raises(FileFormatError, match=r"none\.arrows"):
+        verify_segment(path.with_name("none.arrows"))
+
+
+def test_what_was_cut_off_after_a_crash_is_mentioned(tmp_path: Path) -> None:
+    folder = opened(stream(tmp_path))
+    path = segment_of(folder)
+    path.write_bytes(path.read_bytes() + b"half a batch")
+    assert verify_stream(folder).problems == []
+    Journal.open(folder).close()
+    report = verify_stream(folder)
+    assert (report.problems, report.held.count) == ([], 40)
+    assert "no whole batch" in "; ".join(report.remarks)
+
+
+def test_what_a_disk_refused_once_and_was_written_again_is_no_disorder(tmp_path: Path) -> None:
+    folder = tmp_path / "journal" / "bench" / array().boot_id
+    journal = Journal(folder, array())
+    for first in range(0, 40, 10):
+        journal.append(frames(first, first + 9))
+    journal.disown(Intervals([(20, 39)]))
+    for first in range(20, 60, 10):
+        journal.append(frames(first, first + 9))
+    StreamNotes(array_info=array(), next_seq=60).save(folder)
+    journal.close()
+    report = verify_stream(folder)
+    assert report.problems == []
+    assert list(report.held) == [(0, 59)]
