@@ -196,8 +196,7 @@ def verify_journal(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 
 def imports(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    import service.sealing
-
+    import service.sessions.sealing
     import storage.verify
 
     return {"modules": [service.sessions.sealing.__name__, storage.verify.data.__name__]}

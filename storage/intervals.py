@@ -79,6 +79,14 @@ class Intervals:
             gaps._intervals.append((at, last))
         return gaps
 
-    def without(self, other: Intervals) -> Intervals:
+    def __or__(self, other: Intervals) -> Intervals:
+        """The numbers that are in either."""
+        return Intervals((*self, *other))
+
+    def __and__(self, other: Intervals) -> Intervals:
+        """The numbers that are in both."""
+        return Intervals(pair for a, b in self._intervals for pair in other.within(a, b))
+
+    def __sub__(self, other: Intervals) -> Intervals:
         """The numbers of this set that are not in `other`."""
         return Intervals(gap for a, b in self._intervals for gap in other.missing(a, b))

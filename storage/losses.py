@@ -42,23 +42,18 @@ class Losses:
 
     def add(self, numbers: Intervals, reason: str) -> None:
         """Note a loss."""
-        for first, last in numbers.without(self.all):
+        for first, last in numbers - self.all:
             self.by_reason.setdefault(reason, Intervals()).add(first, last)
 
     def found(self, numbers: Intervals) -> None:
         """These numbers are held after all."""
         self.by_reason = {
-            reason: left
-            for reason, lost in self.by_reason.items()
-            if (left := lost.without(numbers))
+            reason: left for reason, lost in self.by_reason.items() if (left := lost - numbers)
         }
 
     def within(self, numbers: Intervals) -> dict[str, Intervals]:
         """Of these numbers the lost ones, by reason."""
-        found = {
-            reason: numbers.without(numbers.without(lost))
-            for reason, lost in self.by_reason.items()
-        }
+        found = {reason: numbers & lost for reason, lost in self.by_reason.items()}
         return {reason: lost for reason, lost in found.items() if lost}
 
     def as_pairs(self) -> AsPairs:

@@ -44,5 +44,5 @@ class Backlog:
     def done(self, boot_id: str, first: int, last: int) -> None:
         """These are sent, or cannot be."""
         gone = Intervals([(first, last)])
-        left = [(s, n.without(gone) if s == boot_id else n) for s, n in self._lacks]
+        left = [(s, n - gone if s == boot_id else n) for s, n in self._lacks]
         self._lacks = [(stream, numbers) for stream, numbers in left if numbers]

@@ -49,7 +49,7 @@ from service.node.backlog import Backlog
 from service.node.dial import dial
 from service.node.flow import Flow
 from storage.intervals import Intervals
-from storage.journal.node_stream import KeptStream
+from storage.journal.node_stream import NodeStream
 from storage.sessions.ledger import NO_END
 from storage.wire import EncodedBatch
 
@@ -88,12 +88,12 @@ class Publisher:
         self,
         server: str,
         *,
-        present: Callable[[], KeptStream],
-        streams: Callable[[], Mapping[str, KeptStream]],
+        present: Callable[[], NodeStream],
+        streams: Callable[[], Mapping[str, NodeStream]],
         hello: Callable[[], Hello],
         status: Callable[[int], Status],
         wanted: Callable[[str, Wanted, tuple[str, ...]], None],
-        damaged: Callable[[KeptStream, Intervals], None],
+        damaged: Callable[[NodeStream, Intervals], None],
         token: str | None,
         report: Callable[[str], None],
     ) -> None:
@@ -289,7 +289,7 @@ class Publisher:
             except StorageError:
                 # Evicted meanwhile, and counted; what is still there is tried again.
                 found = []
-                for gone in Intervals([(first, last)]).without(stream.held):
+                for gone in Intervals([(first, last)]) - stream.held:
                     backlog.done(boot_id, *gone)
                 time.sleep(_READ_AGAIN_S)
                 return []

@@ -18,7 +18,7 @@ from service.server_clock import utc_ns
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
 from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import KeptStream
+from storage.journal.node_stream import NodeStream
 from storage.sessions.folder import Part, Session, SessionFolder, new_session_id
 from storage.sessions.ledger import NO_END, StreamState, ledger_of, lost_numbers
 
@@ -62,7 +62,7 @@ class NodeRecording:
         self._left_over = self._unfinished()
         self._need()
 
-    def goes_on_in(self, stream: KeptStream) -> None:
+    def goes_on_in(self, stream: NodeStream) -> None:
         """A stream has begun: it belongs to the session from its first frame on."""
         if self._name is None:
             return
@@ -118,7 +118,7 @@ class NodeRecording:
                 self._left_over.remove(session)
                 self._need()
 
-    def _new(self, part: Part, stream: KeptStream) -> Session:
+    def _new(self, part: Part, stream: NodeStream) -> Session:
         calibration = self._calibration
         return Session(
             id=new_session_id(datetime.now(UTC)),
@@ -180,11 +180,11 @@ class NodeRecording:
             for part in session.parts
         )
 
-    def _streams(self, session: Session) -> dict[str, KeptStream]:
+    def _streams(self, session: Session) -> dict[str, NodeStream]:
         ids = {part.boot_id for part in session.parts}
         return {s.boot_id: s for s in self._journal.streams if s.boot_id in ids}
 
-    def _has_other_tiles(self, session: Session, stream: KeptStream) -> bool:
+    def _has_other_tiles(self, session: Session, stream: NodeStream) -> bool:
         before = self._streams(session).get(session.parts[-1].boot_id)
         return before is not None and not before.info.has_same_tiles_as(stream.info)
 

@@ -17,7 +17,7 @@ from service.node.publisher import Publisher
 from service.node.recording import NodeRecording
 from service.rig.rig import RigOptions
 from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import KeptStream
+from storage.journal.node_stream import NodeStream
 from storage.journal.wanted import ServerWants
 
 _LOOK_S = 0.02
@@ -117,7 +117,7 @@ class _Node:
             report=report,
         )
         self._health = Health()
-        self._present: KeptStream | None = None
+        self._present: NodeStream | None = None
         self._messages: asyncio.Queue[Message] = asyncio.Queue()
         self._publisher: Publisher | None = None
         self._publishing: asyncio.Task[None] | None = None
@@ -190,7 +190,7 @@ class _Node:
         if self._publisher is not None:
             self._publisher.renew()
 
-    def _take(self, stream: KeptStream, message: Batch) -> None:
+    def _take(self, stream: NodeStream, message: Batch) -> None:
         self._journal.put(stream, message.batch, message.missed_slots)
         self._health = message.health
         if self._publisher is not None:
@@ -213,7 +213,7 @@ class _Node:
         self._publishing = asyncio.create_task(self._publisher.run())
         self._publishing.add_done_callback(self._tell_failure)
 
-    def _stream(self) -> KeptStream:
+    def _stream(self) -> NodeStream:
         if self._present is None:
             raise RuntimeError("no stream has begun")
         return self._present
@@ -283,7 +283,7 @@ class _Node:
         streams = self._journal.streams
         if everything and self._present is not None:
             present = self._present
-            behind = present.held.without(present.acked).count
+            behind = (present.held - present.acked).count
             return behind + sum(
                 self._journal.undelivered(stream).count for stream in streams if stream != present
             )
@@ -307,7 +307,7 @@ class _Node:
         )
 
 
-def _earlier(stream: KeptStream) -> EarlierStream:
+def _earlier(stream: NodeStream) -> EarlierStream:
     held = stream.held
     first = next(iter(held))[0] if held else 0
     journal = stream.journal

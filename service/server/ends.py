@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare
 from service.server.nodes import Node
-from service.server.streams import ReceivedStream, common
+from service.server.streams import ServerStream
 from service.server_clock import utc_ns
 from storage.intervals import Intervals
 from storage.losses import GIVEN_UP
@@ -40,7 +40,7 @@ def first_part(node: Node, last_seq: int, last_t_ns: int, pre_roll_s: float) -> 
         reached_t_ns = journal.t_ns_near(seq_first, newest=False)
         if reached_t_ns is not None and reached_t_ns > since_t_ns:
             back = round((reached_t_ns - since_t_ns) * 1e-9 * node.info.nominal_rate_hz)
-            coming = common(node.missing, node.present.may_come)
+            coming = node.missing & node.present.may_come
             coming = coming.within(max(0, seq_first - back), seq_first - 1)
             seq_first = min((first for first, _ in coming), default=seq_first)
     return Part(boot_id=node.boot_id, seq_first=seq_first)
@@ -271,7 +271,7 @@ def _following(session: Session, node: Node) -> Iterable[str]:
 
 
 def _seq_at_stop(
-    session: Session, node: Node, stream: ReceivedStream | None, *, waiting: bool
+    session: Session, node: Node, stream: ServerStream | None, *, waiting: bool
 ) -> int | None:
     """The last frame of the open part's stream before the stop; None if it has not passed it.
 
@@ -293,7 +293,7 @@ def _seq_at_stop(
     if after == last + 1:
         return last
     gap = Intervals([(last + 1, after - 1)])
-    if waiting and common(gap, stream.may_come):
+    if waiting and gap & stream.may_come:
         return None
     # The stop lies among frames that are lost: by the rate, so many of them came after it.
     after_t_ns = journal.t_ns_near(after, newest=False) or stop_t_ns
@@ -301,7 +301,7 @@ def _seq_at_stop(
     return min(after - 1, max(last, after - late))
 
 
-def _at_end(session: Session, node: Node, stream: ReceivedStream | None) -> Session:
+def _at_end(session: Session, node: Node, stream: ServerStream | None) -> Session:
     """The session with its last part reaching to the end of a stream that has ended."""
     newest = stream.held.last if stream is not None else None
     beyond = 0 if newest is None else newest + 1
@@ -312,7 +312,7 @@ def _at_end(session: Session, node: Node, stream: ReceivedStream | None) -> Sess
     return ended(session, max(next_seq, beyond) - 1, tail=tail)
 
 
-def _silent_frames(session: Session, node: Node | None, stream: ReceivedStream | None) -> int:
+def _silent_frames(session: Session, node: Node | None, stream: ServerStream | None) -> int:
     """How many frames there may have been since the last that is known of, until now or the stop.
 
     The node does not say how its stream ended.

@@ -25,7 +25,7 @@ from devices.errors import (
 from devices.frames import ArrayInfo, FrameBatch
 from service.link import PROTOCOL, Hello, Pairs, StreamNumbers
 from service.server.live_estimates import LiveEstimates
-from service.server.streams import ReceivedStream, common
+from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
 from service.sessions.pipeline import Columns
 from service.sessions.tares import RecordedTare, TareHistory
@@ -62,7 +62,7 @@ class Node:
         self.hello = hello
         self.connected = False
         self.tares = TareHistory(folder / "tares.json")
-        self.streams: dict[str, ReceivedStream] = {}
+        self.streams: dict[str, ServerStream] = {}
         """By boot_id: those that are kept here, and those that it said it has."""
         self.has_spoken = False
         """Has it said hello since the server was started?"""
@@ -84,7 +84,7 @@ class Node:
         for path in sorted(journals.glob("*")):
             if _BOOT_ID.fullmatch(path.name):
                 try:
-                    self.streams[path.name] = ReceivedStream.open(path)
+                    self.streams[path.name] = ServerStream.open(path)
                 except FileFormatError as error:
                     log.warning("a journal is left out: %s", error)
         self.present = self._stream_of(self.info)
@@ -132,12 +132,12 @@ class Node:
     @property
     def backlog_frames(self) -> int:
         """How many of them the node still has."""
-        return common(self.missing, self.present.may_come).count
+        return (self.missing & self.present.may_come).count
 
     @property
     def lost(self) -> dict[str, int]:
         """How many of them it has not, by reason."""
-        gone = self.missing.without(self.present.may_come)
+        gone = self.missing - self.present.may_come
         named = {why: lost.count for why, lost in self.present.lost.within(gone).items()}
         if unnamed := gone.count - sum(named.values()):
             named[NODE_RESTARTED] = named.get(NODE_RESTARTED, 0) + unnamed
@@ -178,7 +178,7 @@ class Node:
         # What is here but was never acknowledged, because the link broke before: acknowledge it.
         for name in self.order:
             stream = self.streams[name]
-            stream.owed = common(stream.held, stream.may_come)
+            stream.owed = stream.held & stream.may_come
         if known != (hello.array_info, hello.calibration):
             self.live, self.tare_keeper = self._estimates()
         try:
@@ -197,8 +197,8 @@ class Node:
             stream, present = self.streams[name], name == self.boot_id
             wanted = needed.get(name, Intervals())
             asked = stream.lacks(wanted, all_of_it=present)
-            first = common(asked, wanted).within(0, self.hello.next_seq - 1 if present else NO_END)
-            numbers = _joined([*first, *asked.without(first)])
+            first = (asked & wanted).within(0, self.hello.next_seq - 1 if present else NO_END)
+            numbers = _joined([*first, *asked - first])
             if numbers:
                 ends = [(a, None if b >= NO_END else b) for a, b in numbers]
                 found.append(StreamNumbers(boot_id=name, numbers=tuple(ends)))
@@ -210,7 +210,7 @@ class Node:
         self._pace.clear()
 
     def take(
-        self, stream: ReceivedStream, payload: bytes, now_t_ns: int
+        self, stream: ServerStream, payload: bytes, now_t_ns: int
     ) -> tuple[int, int, list[Estimated]]:
         """One message of frames: kept, and estimated if it is news.
 
@@ -300,9 +300,9 @@ class Node:
             make_folder(self._folder)
         write_whole(self._folder / "hello.json", self.hello.model_dump_json().encode())
 
-    def _stream_of(self, info: ArrayInfo) -> ReceivedStream:
+    def _stream_of(self, info: ArrayInfo) -> ServerStream:
         if info.boot_id not in self.streams:
-            self.streams[info.boot_id] = ReceivedStream(self._journals_folder / info.boot_id, info)
+            self.streams[info.boot_id] = ServerStream(self._journals_folder / info.boot_id, info)
         return self.streams[info.boot_id]
 
     def _look_for_tare(self) -> None:

@@ -27,7 +27,6 @@ from service.estimation.calibration import Calibration
 from service.link import ClockRow, StreamNumbers, Wanted
 from service.server import ends as parts
 from service.server.nodes import Node, Nodes
-from service.server.streams import common
 from service.server.trash import Trash
 from service.server_clock import utc_ns
 from service.sessions.sealing import Sources, seal, write_events
@@ -444,7 +443,7 @@ class Recorder:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
                 stream.disown(damaged, corrupt=True)
                 log.warning("session %s: %s", session.id, error)
-                if common(stream.may_come, damaged):
+                if stream.may_come & damaged:
                     self._ask_again(node)
 
     async def _seal(self, session_id: str) -> None:

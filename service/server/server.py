@@ -16,7 +16,7 @@ from service.link import Close, Wanted
 from service.server.live import Hub
 from service.server.nodes import Node, Nodes
 from service.server.recorder import Recorder
-from service.server.streams import ReceivedStream
+from service.server.streams import ServerStream
 from service.server.trash import Trash, destroy
 from service.server.views import NodeView, SessionView
 from service.server_clock import utc_ns
@@ -39,7 +39,7 @@ class Link:
 
     def __init__(self, node: Node) -> None:
         self.node = node
-        self.stream: ReceivedStream = node.present
+        self.stream: ServerStream = node.present
         """Whose frames come."""
         self.wanted: Wanted | None = None
         """What sessions need, as the node was told last."""
@@ -211,7 +211,7 @@ class Server:
         streams = [stream for stream in node.streams.values() if stream.has_news]
         await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
 
-    async def _sync_stream(self, node: Node, stream: ReceivedStream) -> None:
+    async def _sync_stream(self, node: Node, stream: ServerStream) -> None:
         unsynced, stream.unsynced = stream.unsynced, Intervals()
         owed, stream.owed = stream.owed, Intervals()
         try:

@@ -27,7 +27,7 @@ CLOCK_ROWS = 128
 _AROUND_MAX = 32
 
 
-class ReceivedStream:
+class ServerStream:
     """One stream: what is here of it, what may come, what is lost.
 
     Args:
@@ -63,7 +63,7 @@ class ReceivedStream:
         self._clock_unsynced = False
 
     @classmethod
-    def open(cls, folder: Path) -> ReceivedStream:
+    def open(cls, folder: Path) -> ServerStream:
         """A stream that was kept before.
 
         Raises:
@@ -85,7 +85,7 @@ class ReceivedStream:
             stream._first_seq = next(iter(journal.held))[0]
             # Most likely it was deleted because nothing needed it.
             stream._guessed = True
-            stream._forgotten = journal.held.missing(0, newest).without(stream.lost.all)
+            stream._forgotten = journal.held.missing(0, newest) - stream.lost.all
         return stream
 
     @property
@@ -126,7 +126,7 @@ class ReceivedStream:
     def may_come(self) -> Intervals:
         """Numbers that the node may still give, or has given."""
         known = Intervals([(0, NO_END)]) if self.node_has is None else self.node_has
-        return known.without(Losses(self.notes.lost).all)
+        return known - Losses(self.notes.lost).all
 
     @property
     def lost(self) -> Losses:
@@ -134,7 +134,7 @@ class ReceivedStream:
         lost = Losses(self.notes.lost)
         if self.journal is not None:
             for reason, numbers in self.journal.lost.by_reason.items():
-                lost.add(numbers.without(self.may_come), reason)
+                lost.add(numbers - self.may_come, reason)
         return lost
 
     def around(self, t_ns: int, *, at_least: int, waiting: bool = False) -> tuple[int, int] | None:
@@ -162,7 +162,7 @@ class ReceivedStream:
             ends = held.within(after, after) and (last < at_least or held.within(last, last))
             missing = held.missing(last + 1, after - 1) if after > last + 1 else Intervals()
             none_came = missing.count == after - last - 1
-            if ends and (none_came or (waiting and common(missing, self.may_come))):
+            if ends and (none_came or (waiting and missing & self.may_come)):
                 return found
         newest = self.journal.last_seq_until(t_ns, at_least=at_least)
         if newest is None:
@@ -177,7 +177,7 @@ class ReceivedStream:
         """What should be here and is not, from the first frame known of up to `newest`."""
         if self._first_seq is None or newest < self._first_seq:
             return Intervals()
-        return self.held.missing(self._first_seq, newest).without(self._forgotten)
+        return self.held.missing(self._first_seq, newest) - self._forgotten
 
     def lacks(self, needed: Intervals, *, all_of_it: bool) -> Intervals:
         """What the node has and is missing here.
@@ -188,10 +188,10 @@ class ReceivedStream:
         """
         if self.node_has is None:
             return Intervals()
-        asked = self.may_come.without(self.held)
+        asked = self.may_come - self.held
         if all_of_it:
-            return asked.without(self._forgotten.without(needed))
-        return common(asked, needed)
+            return asked - (self._forgotten - needed)
+        return asked & needed
 
     def is_present(self, hello: Hello) -> None:
         """The node takes this stream now."""
@@ -263,7 +263,7 @@ class ReceivedStream:
             return
         self.journal.disown(doubtful)
         if corrupt:
-            self.journal.lost.add(doubtful.without(self.held), CORRUPT)
+            self.journal.lost.add(doubtful - self.held, CORRUPT)
 
     def prune(self, before_t_ns: int, keep: Intervals) -> None:
         """Delete what is older and not in `keep`.
@@ -304,7 +304,7 @@ class ReceivedStream:
         )
         if self._guessed:
             self._guessed = False
-            self._forgotten = self._forgotten.without(self.may_come)
+            self._forgotten = self._forgotten - self.may_come
 
     def _log_clock(self, row: ClockOffset) -> None:
         self._clock_log.append(row)
@@ -312,8 +312,3 @@ class ReceivedStream:
 
     def _see_from(self, seq: int) -> None:
         self._first_seq = seq if self._first_seq is None else min(self._first_seq, seq)
-
-
-def common(a: Intervals, b: Intervals) -> Intervals:
-    """Numbers that are in both."""
-    return a.without(a.without(b))

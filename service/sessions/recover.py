@@ -227,7 +227,7 @@ def _of_no_session(
         )
         journal, hello = stream.journal, hello_of(data, node)
         # What was lost between two frames does not part them; what a session took does.
-        own = Intervals((*journal.held, *stream.losses.all)).without(taken)
+        own = (journal.held | stream.losses.all) - taken
         for run in own:
             held = list(journal.held.within(*run))
             if not held:

@@ -86,7 +86,7 @@ class Stream:
             except DamagedFramesError as error:
                 damaged = Intervals([(error.seq_first, error.seq_last)])
                 self.journal.disown(damaged)
-                self.losses.add(damaged.without(self.journal.held), CORRUPT)
+                self.losses.add(damaged - self.journal.held, CORRUPT)
                 at = error.seq_last + 1
             else:
                 return

@@ -165,8 +165,8 @@ class Journal:
             if not any(segment.held.within(*interval) for interval in doubtful):
                 continue
             for record in segment.records():
-                if not Intervals([numbers(record)]).without(doubtful):
-                    segment.held = segment.held.without(Intervals([numbers(record)]))
+                if not (Intervals([numbers(record)]) - doubtful):
+                    segment.held = segment.held - Intervals([numbers(record)])
             if segment.path in written:
                 segment.is_doubtful = True
             else:
@@ -347,11 +347,11 @@ class Journal:
 
     def _take_in(self, segment: Segment) -> None:
         """Take in a segment that was there; what was disowned once may be in two of them."""
-        twice = segment.held.without(segment.held.without(self.held))
+        twice = segment.held & self.held
         if twice:
             for record in segment.records():
-                if not Intervals([numbers(record)]).without(self.held):
-                    segment.held = segment.held.without(Intervals([numbers(record)]))
+                if not (Intervals([numbers(record)]) - self.held):
+                    segment.held = segment.held - Intervals([numbers(record)])
         if segment.held:
             self._segments.append(segment)
             for interval in segment.held:

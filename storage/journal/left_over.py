@@ -9,7 +9,7 @@ from devices.acquisition import RangeFlag
 from devices.frames import ArrayInfo, FrameBatch
 from storage.intervals import Intervals
 from storage.journal.in_flight import read_in_flight
-from storage.journal.node_stream import KeptStream, opened
+from storage.journal.node_stream import NodeStream, opened
 from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
 from storage.kernel import kernel_boot_id
 from storage.losses import DISK_SLOW
@@ -19,7 +19,7 @@ from storage.wire import EncodedBatch, encode
 _MESSAGE_FRAMES = 64
 
 
-def taken_up(folder: Path) -> KeptStream | None:
+def taken_up(folder: Path) -> NodeStream | None:
     """A stream that an earlier process left, with what it had in flight when it was killed.
 
     If the machine itself went down, what was in flight is lost; how much that can have been is
@@ -33,7 +33,7 @@ def taken_up(folder: Path) -> KeptStream | None:
     if stream is None:
         if left is None:
             return None
-        stream = KeptStream(folder, StreamNotes(array_info=left[0]), None)
+        stream = NodeStream(folder, StreamNotes(array_info=left[0]), None)
         stream.notes = stream.notes.model_copy(update={"kernel_boot_id": kernel_boot_id()})
     if stream.notes.has_ended:
         return stream
@@ -74,7 +74,7 @@ def _oldest(held: Intervals) -> int:
     return next(iter(held))[0] if held else 0
 
 
-def in_flight_since(stream: KeptStream) -> FrameBatch | None:
+def in_flight_since(stream: NodeStream) -> FrameBatch | None:
     """What acquisition had taken and not handed over when it ended; None if that is nothing.
 
     Raises:

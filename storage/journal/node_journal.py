@@ -25,7 +25,7 @@ from storage.intervals import Intervals
 from storage.journal.in_flight import delete_in_flight
 from storage.journal.journal import Journal
 from storage.journal.left_over import encoded, in_flight_since, taken_up
-from storage.journal.node_stream import KeptStream
+from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import PROMISE_S, StreamNotes
 from storage.journal.wanted import ServerWants, Wanted
 from storage.kernel import kernel_boot_id
@@ -79,7 +79,7 @@ class NodeJournal:
         self._tidied_s = self._synced_s = self._weighed_s = -math.inf
         self._began_s = time.monotonic()
         self._wants_changed = False
-        self._damaged: deque[tuple[KeptStream, Intervals]] = deque()
+        self._damaged: deque[tuple[NodeStream, Intervals]] = deque()
         self._lost_before: dict[str, object] = {}
         self._wake = threading.Event()
         self._stopping = threading.Event()
@@ -89,7 +89,7 @@ class NodeJournal:
                 self._lock(root / ".lock", fcntl.LOCK_SH)
                 self._lock(self.folder / ".lock", fcntl.LOCK_EX)
             self.wanted = Wanted(self.folder / "wanted.json")
-            self.streams: list[KeptStream] = self._found()
+            self.streams: list[NodeStream] = self._found()
         except BaseException:
             self._locks.close()
             raise
@@ -119,18 +119,18 @@ class NodeJournal:
         )
         return (f"{trouble[1]}; {waiting_s:.0f} s of frames wait in memory",)
 
-    def begin(self, info: ArrayInfo) -> KeptStream:
+    def begin(self, info: ArrayInfo) -> NodeStream:
         """A new stream; those before have ended."""
         for stream in self.streams:
             stream.has_ended = True
         number = max((stream.notes.number for stream in self.streams), default=0) + 1
         notes = StreamNotes(array_info=info, number=number, kernel_boot_id=kernel_boot_id())
-        stream = KeptStream(self.folder / info.boot_id, notes, None)
+        stream = NodeStream(self.folder / info.boot_id, notes, None)
         self.streams = [*self.streams, stream]
         self._wake.set()
         return stream
 
-    def put(self, stream: KeptStream, batch: EncodedBatch, missed_slots: int = 0) -> None:
+    def put(self, stream: NodeStream, batch: EncodedBatch, missed_slots: int = 0) -> None:
         """Keep the newest frames; returns at once."""
         stream.put(batch, missed_slots)
         while sum(each.waiting_bytes for each in self.streams) > WAITING_BYTES:
@@ -144,12 +144,12 @@ class NodeJournal:
             self._wants_changed = True
             self._wake.set()
 
-    def damaged(self, stream: KeptStream, numbers: Intervals) -> None:
+    def damaged(self, stream: NodeStream, numbers: Intervals) -> None:
         """Frames on disk turned out not to be what was written."""
         self._damaged.append((stream, numbers))
         self._wake.set()
 
-    def undelivered(self, stream: KeptStream) -> Intervals:
+    def undelivered(self, stream: NodeStream) -> Intervals:
         """What sessions need of a stream and no server has yet, of what is held."""
         held = stream.held
         with stream.lock:
@@ -242,7 +242,7 @@ class NodeJournal:
             return
         self._trouble = None
 
-    def _write(self, stream: KeptStream) -> None:
+    def _write(self, stream: NodeStream) -> None:
         if stream.journal is None and not stream.is_settled:
             begun = Journal(stream.folder, stream.info)
             stream.save_notes()
@@ -264,7 +264,7 @@ class NodeJournal:
                 stream.lost.found(batch.numbers)
             stream.unsynced.append(batch)
 
-    def _sync(self, stream: KeptStream) -> None:
+    def _sync(self, stream: NodeStream) -> None:
         if stream.journal is None or not stream.unsynced:
             return
         with stream.lock:
@@ -289,7 +289,7 @@ class NodeJournal:
             with suppress(StorageError):
                 stream.save_notes(sync_max_s=took_s)
 
-    def _settle(self, stream: KeptStream) -> None:
+    def _settle(self, stream: NodeStream) -> None:
         """Note where a stream has ended, once all of it is on disk."""
         if stream.is_settled or not stream.has_ended or stream.waiting or stream.unsynced:
             return
@@ -309,7 +309,7 @@ class NodeJournal:
         stream.forget_recent()
         stream.is_settled = True
 
-    def _rescue(self, stream: KeptStream) -> bool:
+    def _rescue(self, stream: NodeStream) -> bool:
         """Take over what acquisition had taken when it was killed; was there anything?"""
         try:
             rows = in_flight_since(stream)
@@ -361,7 +361,7 @@ class NodeJournal:
                     stream.save_notes()
                     self._lost_before[stream.boot_id] = lost
 
-    def _is_past_ring(self, stream: KeptStream) -> bool:
+    def _is_past_ring(self, stream: NodeStream) -> bool:
         """Has a stream that ended outlasted the ring, in this process or since it was written?"""
         ring_s = RING_NS * 1e-9
         if time.monotonic() - self._began_s > ring_s:
@@ -372,7 +372,7 @@ class NodeJournal:
             return False
         return stream.is_settled and time.time() - written_s > ring_s
 
-    def _keep(self, stream: KeptStream) -> Intervals:
+    def _keep(self, stream: NodeStream) -> Intervals:
         """What must not be deleted."""
         with stream.lock:
             return self.wanted.unmet(stream.boot_id, stream.acked_by)
@@ -406,7 +406,7 @@ class NodeJournal:
 
     # --- what was there ---------------------------------------------------------------------------
 
-    def _found(self) -> list[KeptStream]:
+    def _found(self) -> list[NodeStream]:
         streams = []
         if self.folder.is_dir():
             with storage_errors(self.folder):

@@ -20,7 +20,7 @@ RECENT_BYTES = 4 << 20
 """What is kept in memory of the newest frames, for the live picture."""
 
 
-class KeptStream:
+class NodeStream:
     """Frames of one stream, wherever they are. Safe to use from several threads.
 
     Args:
@@ -134,7 +134,7 @@ class KeptStream:
                 if batch.seq_first <= seq_last and batch.seq_last >= seq_first
             ]
         for batch in memory:
-            asked = asked.without(batch.numbers)
+            asked = asked - batch.numbers
         at = 0
         for first, last in asked:
             while at < len(memory) and memory[at].seq_first < first:
@@ -155,8 +155,8 @@ class KeptStream:
         with self.lock:
             elsewhere = self.acked
             if needed_here is not None:
-                elsewhere = elsewhere.without(needed_here)
-            self.lost.add(numbers.without(elsewhere), reason)
+                elsewhere = elsewhere - needed_here
+            self.lost.add(numbers - elsewhere, reason)
 
     def forget_recent(self) -> None:
         """It has ended: nothing of it is news any more."""
@@ -177,7 +177,7 @@ class KeptStream:
         notes.save(self.folder)
 
 
-def opened(folder: Path) -> KeptStream | None:
+def opened(folder: Path) -> NodeStream | None:
     """A stream that is on disk already; None if there is nothing of it.
 
     Raises:
@@ -198,4 +198,4 @@ def opened(folder: Path) -> KeptStream | None:
         notes = StreamNotes(array_info=journal.info)
     if notes is None:
         return None
-    return KeptStream(folder, notes, journal)
+    return NodeStream(folder, notes, journal)

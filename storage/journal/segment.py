@@ -286,7 +286,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
             elif found is not None:
                 # What is damaged before something whole was damaged later; at the end of a file
                 # that was not closed it never was on the disk, and nobody was promised it.
-                damaged = Intervals((*damaged, *doubtful))
+                damaged = damaged | doubtful
                 doubtful = Intervals()
                 if found["count"]:
                     good.append(found)

@@ -89,7 +89,7 @@ class Wanted:
         unmet = Intervals(self._local.get(boot_id, ()))
         for server_id, server in list(self._servers.items()):
             has = acked_by.get(server_id, Intervals())
-            for interval in server.numbers(boot_id).without(has):
+            for interval in server.numbers(boot_id) - has:
                 unmet.add(*interval)
         return unmet
 
@@ -102,7 +102,7 @@ class Wanted:
         return Intervals(
             interval
             for server_id, server in list(self._servers.items())
-            for interval in server.numbers(boot_id).without(acked_by.get(server_id, Intervals()))
+            for interval in server.numbers(boot_id) - acked_by.get(server_id, Intervals())
         )
 
     def say(self, server_id: str, wants: ServerWants) -> bool:

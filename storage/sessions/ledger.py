@@ -58,8 +58,8 @@ def ledger_of(
         if last >= part.seq_first:
             gaps = stream.held.missing(part.seq_first, last)
         lost = {reason: lost.count for reason, lost in stream.lost.within(gaps).items()}
-        unknown = gaps.without(stream.lost.all)
-        never = unknown.without(stream.may_come)
+        unknown = gaps - stream.lost.all
+        never = unknown - stream.may_come
         if never:
             lost[NODE_RESTARTED] = lost.get(NODE_RESTARTED, 0) + never.count
         length = max(0, last - part.seq_first + 1)
@@ -97,7 +97,7 @@ def lost_numbers(
         losses = found.setdefault(part.boot_id, Losses())
         for reason, numbers in stream.lost.within(gaps).items():
             losses.add(numbers, reason)
-        losses.add(gaps.without(stream.lost.all).without(stream.may_come), NODE_RESTARTED)
+        losses.add(gaps - stream.lost.all - stream.may_come, NODE_RESTARTED)
     return {
         boot_id: {reason: list(pairs) for reason, pairs in losses.as_pairs().items()}
         for boot_id, losses in found.items()

@@ -107,7 +107,7 @@ def part_problems(parts: list[PartFrames], ledger: Ledger, lost: dict[str, Losse
         if frames != said.recorded:
             problems.append(f"{name}: {frames} frames, and the ledger has {said.recorded}")
         held = found.held if found is not None else Intervals()
-        beyond = held.without(Intervals([(said.seq_first, said.seq_last)] if _length(said) else []))
+        beyond = held - Intervals([(said.seq_first, said.seq_last)] if _length(said) else [])
         if beyond:
             first, last = next(iter(beyond))
             problems.append(
@@ -122,7 +122,7 @@ def part_problems(parts: list[PartFrames], ledger: Ledger, lost: dict[str, Losse
                 f"accounts for {accounted}"
             )
         if said.boot_id in lost:
-            unnamed = gaps.without(lost[said.boot_id].all)
+            unnamed = gaps - lost[said.boot_id].all
             if unnamed and not said.pending:
                 problems.append(f"{name}: frames {_named(unnamed)} are missing and not named lost")
     return problems

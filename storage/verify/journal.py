@@ -57,7 +57,7 @@ class StreamReport:
         first = next(iter(self.held), (0, 0))[0]
         if last is None or last < first:
             return Intervals()
-        return self.held.missing(first, last).without(self.lost.all)
+        return self.held.missing(first, last) - self.lost.all
 
 
 def verify_stream(folder: Path) -> StreamReport:
@@ -98,9 +98,9 @@ def verify_stream(folder: Path) -> StreamReport:
             report.held.add(*pair)
         for pair in segment.unsynced:
             report.unsynced.add(*pair)
-    report.unsynced = report.unsynced.without(report.held)
+    report.unsynced = report.unsynced - report.held
     for segment in segments:
-        report.lost.add(segment.damaged.without(report.held), CORRUPT)
+        report.lost.add(segment.damaged - report.held, CORRUPT)
     _check_stream(report, segments, is_servers=(folder.parents[2] / "nodes").is_dir())
     return report
 

@@ -24,11 +24,11 @@ from typing import Any, TypeVar
 import httpx
 import numpy as np
 import pytest
-import service.recorder
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 import service.server
+import service.server.recorder
 from devices.frames import (
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,

@@ -54,12 +54,17 @@ def test_within_missing_and_without_are_those_of_sets(
 
 
 @given(pairs, pairs)
-def test_what_is_without_another_is_their_difference(
+def test_union_intersection_and_difference_are_those_of_sets(
     added: list[tuple[int, int]], other: list[tuple[int, int]]
 ) -> None:
-    left = Intervals(added).without(Intervals(other))
-    assert members(left) == members(added) - members(other)
-    assert_tidy(left)
+    a, b = Intervals(added), Intervals(other)
+    for made, expected in (
+        (a | b, members(a) | members(b)),
+        (a & b, members(a) & members(b)),
+        (a - b, members(a) - members(b)),
+    ):
+        assert members(made) == expected
+        assert_tidy(made)
 
 
 @given(pairs, pairs)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import service.recorder
-import service.routes.sessions
 from playwright.sync_api import Page, expect
 
+import service.api.routes.sessions
 import service.server
+import service.server.recorder
 from tests.service.conftest import FakeNode, Play, Running
 from tests.web.conftest import wait_until
 

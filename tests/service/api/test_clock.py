@@ -15,8 +15,8 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
-import service.routes.sessions
 
+import service.api.routes.sessions
 from service.cli.main import main
 from service.link import ClockRow
 from service.offline.client import Client

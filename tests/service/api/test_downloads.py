@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
-import service.routes.sessions
 
+import service.api.routes.sessions
 from devices.errors import LinkError, StateError
 from service.offline.client import Client
 

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-import service.routes.live
+
+import service.api.routes.live
 
 LIVE = "/api/v1/live"
 

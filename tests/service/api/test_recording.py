@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import service.recorder
-import service.routes.sessions
 
+import service.api.routes.sessions
+import service.server.recorder
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.sessions.file import SessionReader
 
@@ -694,11 +694,10 @@ def test_what_people_write_comes_back_as_it_is(
 def test_a_session_is_sealed_again_when_the_disk_was_full(
     running: Running, tared: FakeNode, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import service.recorder
-
+    import service.server.recorder
     from devices.errors import StorageError
 
-    seal = service.recorder.seal
+    seal = service.server.recorder.seal
     tried = threading.Event()
 
     def refusing(*arguments: Any) -> Any:

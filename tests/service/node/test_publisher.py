@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import service.publisher
 from websockets.asyncio.server import ServerConnection, serve
 
+import service.node.publisher
 import service.server
 from devices.errors import UsageError
 from service.link import (
@@ -37,7 +37,7 @@ from service.link import (
 )
 from service.node.publisher import Publisher, ingest_url
 from storage.intervals import Intervals
-from storage.journal.node_stream import KeptStream
+from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, decode
@@ -61,10 +61,10 @@ class Publishing:
         node: FakeNode,
         server: str,
         token: str | None = None,
-        earlier: Sequence[KeptStream] = (),
+        earlier: Sequence[NodeStream] = (),
     ) -> None:
         self.node = node
-        self.stream = KeptStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
+        self.stream = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
         self.earlier = tuple(earlier)
         self.reports: list[str] = []
         self.wanted: list[tuple[str, Wanted, tuple[str, ...]]] = []
@@ -368,7 +368,7 @@ def test_the_newest_frames_come_first_and_the_past_behind_them(node: FakeNode) -
 def test_earlier_streams_are_named_before_their_frames(node: FakeNode) -> None:
     async def scenario() -> list[tuple[str, int, int]]:
         async with played() as script:
-            old = KeptStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
+            old = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
             for batch in batches(node, 50):
                 old.put(batch, 0)
             old_id = node.boot_id
@@ -442,7 +442,7 @@ def test_a_new_stream_is_announced_by_a_new_hello(node: FakeNode) -> None:
             before = publishing.stream
             node.reboot()
             publishing.earlier = (before,)
-            publishing.stream = KeptStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
+            publishing.stream = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
             publishing.publisher.renew()
             publishing.take(10)
             await publishing.emptied()

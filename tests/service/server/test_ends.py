@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import service.routes.sessions
 
+import service.api.routes.sessions
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.sessions.file import SessionReader
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import service.ingest
-import service.nodes
-import service.streams
-import storage.segment
 from websockets.exceptions import ConnectionClosed
 
 import service.server
+import service.server.ingest
+import service.server.nodes
+import service.server.streams
+import storage.journal.segment
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from service.link import INGEST_PATH, MESSAGE_BYTES_MAX
 from storage.intervals import Intervals
@@ -227,7 +227,7 @@ def test_a_killed_server_has_every_frame_that_it_acknowledged(
     copy = tmp_path / "copy"
     shutil.copytree(data / "journal" / "bench" / node.boot_id, copy)
     journal = Journal.open(copy)
-    assert not node.acked.without(journal.held)
+    assert not (node.acked - journal.held)
     held = journal.held.last
     assert held is not None
     found, sent = read_all(journal), node.all_sent()
@@ -549,7 +549,7 @@ def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
     monkeypatch: pytest.MonkeyPatch,
     until: Until,
 ) -> None:
-    write_all = storage.segment.write_all
+    write_all = storage.journal.segment.write_all
     check_storage = running.server.check_storage
     full = threading.Event()
 
@@ -604,7 +604,7 @@ def test_one_message_that_a_full_disk_did_not_take_is_asked_for_again(
     until: Until,
 ) -> None:
     # Space is there again before the server's next tick has seen that there was none.
-    write_all = storage.segment.write_all
+    write_all = storage.journal.segment.write_all
     node.connect()
     node.send(10)
     node.acknowledged(9)
@@ -739,7 +739,7 @@ def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
     node.tiles += 1
     full = threading.Event()
     full.set()
-    keep = service.nodes.Node.keep
+    keep = service.server.nodes.Node.keep
 
     def refusing(kept: object) -> None:
         if full.is_set():

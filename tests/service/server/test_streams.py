@@ -150,7 +150,7 @@ def test_frames_of_two_streams_in_any_order_and_any_number_of_times_are_each_hel
             )
             lacks = told.lacks(old=[(0, NO_END)])
             for boot in (OLD, NEW):
-                missing = [*Intervals(whole).without(sent[boot])]
+                missing = [*Intervals(whole) - sent[boot]]
                 if boot == NEW:  # nothing beyond what the node has taken is here yet
                     joined = [*Intervals([*missing, (total, NO_END)])]
                     missing = [(a, None if b == NO_END else b) for a, b in joined]

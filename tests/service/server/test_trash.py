@@ -10,10 +10,10 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-import service.recorder
-import service.routes.sessions
 
+import service.api.routes.sessions
 import service.server
+import service.server.recorder
 from storage.intervals import Intervals
 from storage.sessions.folder import DOOMED_PREFIX, SessionFolder
 
@@ -133,7 +133,7 @@ def test_a_session_that_is_recorded_is_not_deleted(running: Running, tared: Fake
 def test_a_session_that_is_being_sealed_is_not_deleted(
     running: Running, tared: FakeNode, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seal = service.recorder.seal
+    seal = service.server.recorder.seal
     may_seal = threading.Event()
 
     def slow(*arguments: Any) -> Any:
@@ -356,7 +356,7 @@ def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_th
     def refusing(*_: object) -> None:
         raise StorageError("No space left on device")
 
-    seal = service.recorder.seal
+    seal = service.server.recorder.seal
     monkeypatch.setattr(service.server.recorder, "seal", refusing)
     session = start(running)
     tared.send(20)
@@ -405,4 +405,4 @@ def test_frames_of_an_unsealed_session_are_never_pruned(
     pending(running, tared)
     node = running.server.nodes.get("bench")
     running.call(lambda: node.prune(running.server.recorder.needed("bench")))
-    assert not Intervals([(70, 119)]).without(node.present.held)
+    assert not (Intervals([(70, 119)]) - node.present.held)

@@ -137,7 +137,7 @@ def test_a_killed_process_has_left_every_frame_that_it_had_taken(
 import json, sys
 from pathlib import Path
 from devices.frames import ArrayInfo
-from storage.in_flight import InFlight
+from storage.journal.in_flight import InFlight
 info = ArrayInfo.model_validate_json(sys.stdin.readline())
 keeper = InFlight(Path(sys.argv[1]), info)
 for seq in range(10_000_000):

@@ -21,7 +21,7 @@ from storage.journal import in_flight, node_journal, segment
 from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal
 from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import KeptStream
+from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from storage.journal.wanted import ServerWants
 from storage.sessions.ledger import NO_END
@@ -66,21 +66,21 @@ def start(tmp_path: Path) -> Iterator[Start]:
 def fill(batch_of: Batches) -> Callable[..., None]:
     """Take frames `first` to `last`, ten in a batch."""
 
-    def put(journal: NodeJournal, stream: KeptStream, first: int, last: int) -> None:
+    def put(journal: NodeJournal, stream: NodeStream, first: int, last: int) -> None:
         for begin in range(first, last + 1, 10):
             journal.put(stream, batch_of(begin, min(begin + 9, last)))
 
     return put
 
 
-Fill = Callable[[NodeJournal, KeptStream, int, int], None]
+Fill = Callable[[NodeJournal, NodeStream, int, int], None]
 
 
-def on_disk(stream: KeptStream) -> Intervals:
+def on_disk(stream: NodeStream) -> Intervals:
     return Intervals(stream.journal.held) if stream.journal is not None else Intervals()
 
 
-def given(stream: KeptStream, first: int, last: int) -> list[int]:
+def given(stream: NodeStream, first: int, last: int) -> list[int]:
     """First numbers of the batches that it gives for these frames."""
     return [batch.seq_first for batch in stream.batches(first, last)]
 
@@ -141,7 +141,7 @@ def killed(journal: NodeJournal, folder: Path) -> Path:
     return copy
 
 
-def flying(stream: KeptStream, frames: FrameBatch) -> None:
+def flying(stream: NodeStream, frames: FrameBatch) -> None:
     keeper = InFlight(stream.folder, stream.info)
     for i in range(len(frames)):
         keeper.put(
@@ -230,7 +230,7 @@ def test_a_disk_that_was_slower_than_the_promise_widens_the_bound(
 def test_killed_before_its_notes_were_written_a_stream_is_found_by_what_was_in_flight(
     start: Start, array_of: Arrays, frames_of: Callable[..., FrameBatch], tmp_path: Path
 ) -> None:
-    keeper_of = KeptStream(
+    keeper_of = NodeStream(
         tmp_path / "journal" / "leg" / ("2" * 32),
         StreamNotes(array_info=array_of(boot_id="2" * 32)),
         None,

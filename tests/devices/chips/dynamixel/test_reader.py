@@ -217,7 +217,7 @@ def test_an_instant_answer_has_no_negative_uncertainty() -> None:
 
 # Protocol 1.0 against scripted bytes
 
-# hardware.md 5.1; three bytes are asked for, see devices.dynamixel_protocol1
+# hardware.md 5.1; three bytes are asked for, see devices.chips.dynamixel.protocol1
 READ_3_FROM_36 = bytes.fromhex("FFFF 01 04 02 24 03 D1")
 READ_3_FROM_0 = bytes.fromhex("FFFF 01 04 02 00 03 F5")
 STATUS_1_AT_548 = status_1(0, 0x24, 0x02, 0)
