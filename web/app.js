@@ -1,19 +1,19 @@
 // Ties the page together: one state, messages in, one drawing per display frame.
 
-import { Actions } from "./actions.js";
-import { takeTokenFromAddress } from "./api.js";
-import { Bars } from "./bars.js";
-import { Foot } from "./foot.js";
-import { drawGrf } from "./grf.js";
-import { Link } from "./link.js";
-import { Marks } from "./marks.js";
-import { Notes } from "./notes.js";
-import { Sessions } from "./sessions.js";
-import { Status } from "./status.js";
-import { Tares } from "./tares.js";
-import { byId, el, setText } from "./text.js";
-import { Trace } from "./trace.js";
-import { Trash } from "./trash.js";
+import { Actions } from "./live/actions.js";
+import { takeTokenFromAddress } from "./common/api.js";
+import { Bars } from "./live/bars.js";
+import { Foot } from "./live/foot.js";
+import { drawGrf } from "./live/grf.js";
+import { Link } from "./common/link.js";
+import { Marks } from "./live/marks.js";
+import { Notes } from "./live/notes.js";
+import { Sessions } from "./sessions/list.js";
+import { Status } from "./live/status.js";
+import { Tares } from "./live/tares.js";
+import { byId, el, setText } from "./common/text.js";
+import { Trace } from "./live/trace.js";
+import { Trash } from "./sessions/trash.js";
 
 const NODE_KEY = "foottile.node";
 const RESYNC_MS = 5000; // frame counts of a running recording are counted here between two looks
