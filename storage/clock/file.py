@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import FileFormatError, UsageError
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.durable import write_whole
+from storage.sessions.events import write_table
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import ClockOffset
 
@@ -30,15 +29,7 @@ _FIELDS: list[pa.Field[Any]] = [
 _SCHEMA = pa.schema(_FIELDS)
 
 
-class _Stream(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-    boot_id: str
-    utc_offset_ns: int | None = None
-    clock_set: bool | None = None
-
-
-_STREAMS = TypeAdapter(tuple[_Stream, ...])
+_STREAMS = TypeAdapter(tuple[StreamFacts, ...])
 
 
 def write_clock(path: Path, rows: Sequence[ClockOffset], streams: Sequence[StreamFacts]) -> None:
@@ -48,12 +39,9 @@ def write_clock(path: Path, rows: Sequence[ClockOffset], streams: Sequence[Strea
         StorageError: the disk is full or not writable.
         OverflowError: a number does not fit an int64.
     """
-    facts = [_Stream(**vars(stream)).model_dump() for stream in streams]
     columns = {name: [getattr(row, name) for row in rows] for name in _SCHEMA.names}
-    schema = _SCHEMA.with_metadata({STREAMS_KEY: json.dumps(facts).encode()})
-    sink = pa.BufferOutputStream()
-    pq.write_table(pa.table(columns, schema=schema), sink, compression="zstd")
-    write_whole(path, sink.getvalue().to_pybytes())
+    schema = _SCHEMA.with_metadata({STREAMS_KEY: _STREAMS.dump_json(tuple(streams))})
+    write_table(pa.table(columns, schema=schema), path)
 
 
 def read_clock(path: Path) -> tuple[dict[str, Rows], dict[str, StreamFacts]]:
@@ -80,7 +68,7 @@ def read_clock(path: Path) -> tuple[dict[str, Rows], dict[str, StreamFacts]]:
         str(boot_id): Rows(*(values[boot_ids == boot_id] for values in arrays))
         for boot_id in dict.fromkeys(boot_ids.tolist())
     }
-    return rows, {s.boot_id: StreamFacts(**dict(s)) for s in facts}
+    return rows, {stream.boot_id: stream for stream in facts}
 
 
 def clock_beside(reader: SessionReader) -> ClockTable:

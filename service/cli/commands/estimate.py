@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from service.cli.commands.simulate import OFFLINE_LAG_MS
 from service.cli.options import (
     JsonOption,
     output_path,
@@ -18,6 +17,7 @@ from service.cli.options import (
     say,
     stdout,
 )
+from service.estimation import OFFLINE_LAG_MS
 
 
 def estimate_command(
