@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from devices.extras import needs_extra
 from service.cli.commands.simulate import OFFLINE_LAG_MS
 from service.cli.options import (
     JsonOption,
@@ -20,6 +21,7 @@ from service.cli.options import (
 )
 
 
+@needs_extra("server", "`foottile estimate`")
 def estimate_command(
     session: Annotated[Path, typer.Argument(metavar="IN.parquet", help="Session to estimate.")],
     out: Annotated[Path, typer.Option(help="Session to write, with the new estimates.")],

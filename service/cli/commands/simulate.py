@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 import typer
 
 from devices.errors import UsageError
+from devices.extras import needs_extra
 from devices.scene.file import AnySchedule, Scene, ScheduleName, load_scene
 from service.cli.emulation import (
     CopAxesOption,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 OFFLINE_LAG_MS = 100.0
 
 
+@needs_extra("server", "`foottile simulate`")
 def simulate_command(
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")],
     out: Annotated[
