@@ -15,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
+from devices.arrays import Times
+
 NOT_READ = 65535
 NO_SERVO_COUNTS = -(2**31)
 NO_SERVO_AGE = -1
@@ -75,8 +77,8 @@ class FrameBatch:
     """
 
     seq: npt.NDArray[np.uint64]
-    t_mono_ns: npt.NDArray[np.int64]
-    t_ns: npt.NDArray[np.int64]
+    t_mono_ns: Times
+    t_ns: Times
     padc: npt.NDArray[np.uint16]
     tadc: npt.NDArray[np.uint16]
     sample_offset_us: npt.NDArray[np.int32]

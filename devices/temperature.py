@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Times
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 
 HELD_NS = 1_000_000_000
@@ -28,7 +29,7 @@ class HeldTemperature:
     """
 
     tadc: npt.NDArray[np.uint16]
-    t_mono_ns: npt.NDArray[np.int64]
+    t_mono_ns: Times
 
 
 def hold_temperature(

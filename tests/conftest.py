@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# What a builder asserts is explained as in a test.
+pytest.register_assert_rewrite("tests.builders")
+
 # Beside other tests on the same cores the time that an example takes says nothing.
 settings.register_profile("foottile", settings(), deadline=None)
 settings.load_profile("foottile")

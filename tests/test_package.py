@@ -19,8 +19,8 @@ def test_a_wheel_holds_the_scenes_and_the_packages_and_no_tests(tmp_path: Path) 
     names = zipfile.ZipFile(wheel).namelist()
     for scene in (ROOT / "devices" / "scenes").glob("*.toml"):
         assert f"devices/scene/builtin/{scene.name}" in names
-    for path in (ROOT / "web").iterdir():
-        assert f"service/web/{path.name}" in names
+    for path in (ROOT / "web").rglob("*.*"):
+        assert f"service/web/{path.relative_to(ROOT / 'web')}" in names
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {
         *("devices", "storage", "service")
     }

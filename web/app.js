@@ -1,19 +1,26 @@
 // Ties the page together: one state, messages in, one drawing per display frame.
+//
+// common/    REST calls, the websocket, dialogs, notices, words and elements
+// live/      panels that draw the newest frame, and the buttons beside them
+// sessions/  the list of recorded sessions, and the trash
+//
+// A panel is a class that owns one element of index.html; it is made here and handed what the
+// server says. Panels do not know each other. No build step, and nothing from another host.
 
-import { Actions } from "./actions.js";
-import { takeTokenFromAddress } from "./api.js";
-import { Bars } from "./bars.js";
-import { Foot } from "./foot.js";
-import { drawGrf } from "./grf.js";
-import { Link } from "./link.js";
-import { Marks } from "./marks.js";
-import { Notes } from "./notes.js";
-import { Sessions } from "./sessions.js";
-import { Status } from "./status.js";
-import { Tares } from "./tares.js";
-import { byId, el, setText } from "./text.js";
-import { Trace } from "./trace.js";
-import { Trash } from "./trash.js";
+import { takeTokenFromAddress } from "./common/api.js";
+import { Link } from "./common/link.js";
+import { byId, el, setText } from "./common/text.js";
+import { Actions } from "./live/actions.js";
+import { Bars } from "./live/bars.js";
+import { Foot } from "./live/foot.js";
+import { drawGrf } from "./live/grf.js";
+import { Marks } from "./live/marks.js";
+import { Notes } from "./live/notes.js";
+import { Status } from "./live/status.js";
+import { Tares } from "./live/tares.js";
+import { Trace } from "./live/trace.js";
+import { Sessions } from "./sessions/list.js";
+import { Trash } from "./sessions/trash.js";
 
 const NODE_KEY = "foottile.node";
 const RESYNC_MS = 5000; // frame counts of a running recording are counted here between two looks

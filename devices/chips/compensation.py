@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
 from devices.frames import NOT_READ, FrameBatch, TileInfo, TileStatus
-
-Floats = npt.NDArray[np.float64]
 
 _ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of what rounding to one count takes away
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.buses.i2c import I2cBus, i2c_msg
 from devices.errors import TileSetupError
 
@@ -102,11 +103,11 @@ class Coefficients:
 def compensate_kpa(
     padc: npt.ArrayLike,
     tadc: npt.ArrayLike,
-    a0: float | npt.NDArray[np.float64],
-    b1: float | npt.NDArray[np.float64],
-    b2: float | npt.NDArray[np.float64],
-    c12: float | npt.NDArray[np.float64],
-) -> npt.NDArray[np.float64]:
+    a0: float | Floats,
+    b1: float | Floats,
+    b2: float | Floats,
+    c12: float | Floats,
+) -> Floats:
     """Absolute pressure in kPa from raw counts (DS 8.2, eq. 1 and 2).
 
     Both counts are unsigned, `tadc` above 511 is the normal case below about 20 degC. Nothing is
@@ -120,7 +121,7 @@ def compensate_kpa(
 
 def padc_of_kpa(
     pressure_kpa: npt.ArrayLike, tadc: npt.ArrayLike, coefficients: Coefficients
-) -> npt.NDArray[np.float64]:
+) -> Floats:
     """The unrounded `padc` at which `compensate_kpa` gives `pressure_kpa`: its exact inverse."""
     c = coefficients
     t = np.asarray(tadc, dtype=np.float64)
@@ -128,9 +129,7 @@ def padc_of_kpa(
     return np.asarray((pcomp - c.a0 - c.b2 * t) / (c.b1 + c.c12 * t))
 
 
-def kpa_per_padc(
-    tadc: npt.ArrayLike, b1: float | npt.NDArray[np.float64], c12: float | npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def kpa_per_padc(tadc: npt.ArrayLike, b1: float | Floats, c12: float | Floats) -> Floats:
     """Pressure step of one count of `padc` in kPa; negative: `padc` falls as pressure rises."""
     return np.asarray((b1 + c12 * np.asarray(tadc, dtype=np.float64)) * _KPA_PER_PCOMP)
 

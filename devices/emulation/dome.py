@@ -16,14 +16,12 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import lfilter
 
+from devices.arrays import Floats
 from devices.emulation.parts import DomePart, random_of
 from devices.emulation.surroundings import Surroundings
 from devices.scene.file import EmulationScene
-
-Floats = npt.NDArray[np.float64]
 
 GRID_S = 0.0005
 """Between grid points pressure is taken as linear: in a tap of 20 ms that is off by 0.01 kPa."""

@@ -10,12 +10,10 @@ import math
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.emulation.parts import random_of
 from devices.scene.file import EmulationScene
-
-Floats = npt.NDArray[np.float64]
 
 _WEATHER_KPA = (99.0, 101.0)
 """An ordinary day between sea level and 200 m (hardware.md 8: 1.17 kPa per 100 m)."""

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Bools, Floats
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import SAMPLE_PART_OF_CONVERSION, Coefficients, compensate_kpa
 from devices.emulation.world import World
@@ -22,8 +23,6 @@ _ROUNDING_NS = 2_000  # offsets are whole microseconds
 _NEIGHBOURS = 5
 
 Counts = npt.NDArray[np.uint16]
-Bools = npt.NDArray[np.bool_]
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from functools import partial
 from typing import get_args
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats, Times
 from devices.chips.dynamixel.models import COUNTS_PER_TURN
 from devices.clock import Clock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
@@ -29,7 +29,7 @@ from devices.emulation.dome import Domes
 from devices.emulation.faults import Faults
 from devices.emulation.ground.grounds import Rolling, make_ground, tile_positions_m
 from devices.emulation.ground.hopping import Hopping
-from devices.emulation.ground.load_trace import Floats, PressedTrace
+from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation, Mill
 from devices.emulation.parts import draw_chip, draw_dome, random_of
 from devices.emulation.surroundings import Surroundings
@@ -203,7 +203,7 @@ class World:
             stop.set()
             thread.join()
 
-    def truth(self, t_mono_ns: npt.NDArray[np.int64]) -> Truth:
+    def truth(self, t_mono_ns: Times) -> Truth:
         """Ground truth at instants of the node's monotonic clock."""
         t_s = self._seconds(t_mono_ns)
         forces_n = self.ground.forces_n(t_s)
@@ -252,7 +252,7 @@ class World:
             )
         return Surroundings(emulation, ground if isinstance(ground, Hopping) else None, draw)
 
-    def _seconds(self, t_ns: npt.NDArray[np.int64]) -> Floats:
+    def _seconds(self, t_ns: Times) -> Floats:
         if not self._begun:
             return np.zeros(len(t_ns))
         return np.asarray(np.maximum(t_ns - self.epoch_ns, 0) * 1e-9)

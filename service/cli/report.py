@@ -8,7 +8,7 @@ from statistics import median
 
 from rich.table import Table
 
-from service.estimation.stances import Stance
+from service.estimation.foot.stances import Stance
 from service.offline.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
 
 PHASES = {

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from typing import Literal, Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from devices.arrays import Floats
 from devices.errors import CalibrationError
 from service.estimation.bench_facts import BenchFacts
 from service.estimation.effects import Effects
@@ -183,7 +183,7 @@ class Calibration(BaseModel):
         return calibration
 
 
-def loop_share(force_n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def loop_share(force_n: Floats) -> Floats:
     """How far a hysteresis loop is open at a force: closed at zero, half open at one newton."""
     return np.asarray(1.0 - LOOP_OPENS_N / (np.abs(force_n) + LOOP_OPENS_N))
 

@@ -13,12 +13,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Bools, Floats, Ints, Times
 from devices.frames import FrameBatch
 from devices.temperature import HeldTemperature, hold_temperature
-from service.estimation.contact import UNKNOWN, UNLOADED, UNSEEN_NS, RunState, believed, seeming
 from service.estimation.estimates import COP_COLUMNS, Estimates, EstimateStatus
-from service.estimation.geometry import angle_rad, to_ground_x_m
-from service.estimation.kinematics import Readings, counts_at, readings_of
+from service.estimation.foot.contact import (
+    UNKNOWN,
+    UNLOADED,
+    UNSEEN_NS,
+    RunState,
+    believed,
+    seeming,
+)
+from service.estimation.foot.geometry import angle_rad, to_ground_x_m
+from service.estimation.foot.kinematics import Readings, counts_at, readings_of
 from service.estimation.lower import Felt, LowerState, felt, tile_kpa
 from service.estimation.models import denoise
 from service.estimation.plan import SIGMAS, EstimationPlan
@@ -30,9 +38,6 @@ from service.estimation.upper import (
     grid_index,
     summed,
 )
-
-Floats = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
 
 HULL_SIGMAS = 3.0
 
@@ -51,7 +56,7 @@ class _Known:
     t_ns: Times
     readings: Readings | None
     """None without a servo."""
-    loaded: npt.NDArray[np.int64]
+    loaded: Ints
     since_ns: Times
 
     @property
@@ -278,7 +283,7 @@ def _no_estimates(plan: EstimationPlan) -> Estimates:
     )
 
 
-def _cop_masked(plan: EstimationPlan, foot: Foot) -> npt.NDArray[np.bool_]:
+def _cop_masked(plan: EstimationPlan, foot: Foot) -> Bools:
     """Where a centre of pressure would be more doubtful than useful."""
     normals, offsets_m = plan.hull
     (x_m, y_m, _), (sigma_x_m, sigma_y_m) = foot.cop_m, foot.cop_sigma_m
@@ -296,7 +301,7 @@ def _cop_masked(plan: EstimationPlan, foot: Foot) -> npt.NDArray[np.bool_]:
     return ~good
 
 
-def _unseen(frames: FrameBatch, state: EstimationState) -> npt.NDArray[np.bool_]:
+def _unseen(frames: FrameBatch, state: EstimationState) -> Bools:
     """Frames before which the foot was not seen for so long that it may have been anywhere.
 
     A frame lost here and there is no reason to begin anew, or a link that loses every third would
@@ -306,9 +311,7 @@ def _unseen(frames: FrameBatch, state: EstimationState) -> npt.NDArray[np.bool_]
     return np.asarray(np.diff(frames.t_mono_ns, prepend=last_t_ns) > UNSEEN_NS)
 
 
-def _after_gap(
-    plan: EstimationPlan, frames: FrameBatch, state: EstimationState
-) -> npt.NDArray[np.bool_]:
+def _after_gap(plan: EstimationPlan, frames: FrameBatch, state: EstimationState) -> Bools:
     # Unsigned throughout: a difference wraps, and a number of any size is compared as it is.
     first = frames.seq[:1] - np.uint64(1) if state.last_seq is None else [state.last_seq]
     before = np.concatenate([np.asarray(first, dtype=np.uint64), frames.seq[:-1]])

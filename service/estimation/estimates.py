@@ -8,7 +8,7 @@ from enum import IntFlag
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from devices.arrays import Floats, Times
 
 COP_COLUMNS = (
     "cop_x_m",
@@ -53,7 +53,7 @@ class Estimates:
     """
 
     seq: npt.NDArray[np.uint64]
-    t_ns: npt.NDArray[np.int64]
+    t_ns: Times
     gauge_kpa: Floats
     force_n: Floats
     force_sigma_n: Floats

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
@@ -25,8 +26,6 @@ from service.estimation.models.rubber import Rubber
 from service.estimation.models.static import StaticCurves
 from service.estimation.models.temperature import Temperature
 from service.estimation.tare.tare import Tare
-
-Floats = npt.NDArray[np.float64]
 
 MODELS = (
     "unwrap",

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Bools, Floats, Ints, Times
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.estimates import EstimateStatus
@@ -15,9 +16,6 @@ from service.estimation.models.outliers import despiked
 from service.estimation.models.unwrap import unwrap
 from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
 from service.estimation.tare.drift import has_warmed
-
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 NEVER_NS = -(1 << 62)
 
@@ -43,7 +41,7 @@ class Felt:
     noise_n: Floats
     sigma_n: Floats
     gas_n: Floats
-    t_mono_ns: npt.NDArray[np.int64]
+    t_mono_ns: Times
     beyond: Bools
     status: npt.NDArray[np.uint16]
 
@@ -69,7 +67,7 @@ class LowerState:
     ambient: ambient.AmbientState = ambient.AT_REST
     gas: gas.GasState | None = None
     skew: skew.SkewState | None = None
-    bound_ns: npt.NDArray[np.int64] | None = None
+    bound_ns: Times | None = None
     """When each tile was last beyond its range."""
 
 
@@ -175,10 +173,10 @@ def felt(
 
 def _since(
     happened: Bools,
-    t_ns: npt.NDArray[np.int64],
-    before_ns: npt.NDArray[np.int64] | None,
+    t_ns: Times,
+    before_ns: Times | None,
     memory_ns: Floats,
-) -> tuple[Bools, npt.NDArray[np.int64]]:
+) -> tuple[Bools, Ints]:
     """Where something has happened within so long before, and when last; arrays over tiles."""
     first = np.full(happened.shape[1], NEVER_NS) if before_ns is None else before_ns
     last_ns = np.maximum.accumulate(np.where(happened, t_ns, NEVER_NS), axis=0)

@@ -11,16 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.chips.compensation import Compensation
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
-from service.estimation.contact import ContactRule
-from service.estimation.geometry import grid_indices, hull
+from service.estimation.foot.contact import ContactRule
+from service.estimation.foot.geometry import grid_indices, hull
 from service.estimation.ladder import MODELS, Ladder, make_ladder
 from service.estimation.tare.tare import Tare
-
-Floats = npt.NDArray[np.float64]
 
 CONTACT_ON_SIGMA = 5.0
 CONTACT_OFF_SIGMA = 3.0

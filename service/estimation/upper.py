@@ -10,15 +10,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats, Ints, Times
 from service.estimation.compiled import compiled
 from service.estimation.lower import Felt
 from service.estimation.models import denoise
 from service.estimation.models.rubber import RubberState
 from service.estimation.plan import EstimationPlan
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,8 @@ class Forces:
 def forces(
     plan: EstimationPlan,
     known: Felt,
-    frame_t_ns: npt.NDArray[np.int64],
-    run: npt.NDArray[np.int64],
+    frame_t_ns: Times,
+    run: Ints,
     first: int,
     stop: int,
     state: UpperState,

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Floats
 from service.estimation.estimates import EstimateStatus
-
-Floats = npt.NDArray[np.float64]
 
 JUDGED = (
     "t_ns",

@@ -13,8 +13,8 @@ from devices.errors import CalibrationError, FileFormatError, TareError, UsageEr
 from devices.frames import ArrayInfo
 from devices.scene.file import Scene, load_scene
 from service.estimation.calibration import Calibration
+from service.estimation.foot.stances import Stance, Stances
 from service.estimation.plan import EstimationPlan
-from service.estimation.stances import Stance, Stances
 from service.estimation.tare.tare import Tare
 from service.offline.accuracy import JUDGED, Accuracy
 from service.offline.calibrations import BENCH, find_calibration

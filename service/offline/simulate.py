@@ -30,7 +30,7 @@ from devices.emulation.world import World
 from devices.errors import UsageError
 from devices.frames import FrameBatch, TileStatus
 from devices.scene.file import AnySchedule, Scene, ServoScene
-from service.estimation.stances import Stance, Stances
+from service.estimation.foot.stances import Stance, Stances
 from service.offline.accuracy import JUDGED, Accuracy, judge
 from service.rig.description import describe
 from service.rig.peripherals import open_recovery_lines, open_reference_sensor

@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.frames import FrameBatch
-from service.estimation.contact import UNKNOWN
+from service.estimation.foot.contact import UNKNOWN
 from service.server.nodes import Estimated, Node
 from storage.intervals import Intervals
-
-Floats = npt.NDArray[np.float64]
 
 SUMMARY_NS = 1_000_000_000
 """A message sums up a second at most; older frames are reported as dropped."""

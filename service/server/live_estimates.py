@@ -6,13 +6,13 @@ from collections import deque
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.chips.compensation import Compensation
 from devices.errors import FootTileError, TareError
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
 from service.estimation.calibration import Calibration
-from service.estimation.contact import UNSEEN_NS
+from service.estimation.foot.contact import UNSEEN_NS
 from service.estimation.models.static import StaticCurves
 from service.estimation.plan import make_plan
 from service.estimation.tare.automatic import Look, first_in_flight, look_in_flight
@@ -22,8 +22,6 @@ from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, Est
 
 LIVE_LAG_MS = 10.0
 _TADC_OVER_NS = 1_000_000_000
-
-Floats = npt.NDArray[np.float64]
 
 
 class LiveEstimates:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Bools, Floats
 from devices.emulation.ground.hopping import Hopping
-from devices.emulation.ground.load_trace import CopTransform, Floats, LoadTrace, PressedTrace, press
+from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace, press
 from devices.emulation.ground.mill import Indentation
 from devices.emulation.parts import random_of
 from devices.errors import SceneError, UsageError
@@ -71,7 +71,7 @@ class Standing:
         self,
         ground: PlateGround,
         positions_m: Floats,
-        bears: npt.NDArray[np.bool_],
+        bears: Bools,
         seed: int,
         lead_s: float,
     ) -> None:
@@ -122,7 +122,7 @@ class Rolling:
         self,
         ground: RollingGround,
         positions_m: Floats,
-        bears: npt.NDArray[np.bool_],
+        bears: Bools,
         lead_s: float,
     ) -> None:
         self._ground = ground

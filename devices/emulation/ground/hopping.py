@@ -14,10 +14,9 @@ import math
 from bisect import bisect_right
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Bools, Floats
 from devices.emulation.ground.hopping_leg import STEP_S, HoppingLeg, Leg, Strip
-from devices.emulation.ground.load_trace import Floats
 from devices.emulation.ground.soft_ground import SoftGround
 from devices.emulation.parts import random_of
 from devices.errors import SceneError
@@ -55,7 +54,7 @@ class Hopping:
         self,
         ground: PoppyGround | MudGround,
         positions_m: Floats,
-        bears: npt.NDArray[np.bool_],
+        bears: Bools,
         seed: int,
         lead_s: float,
         *,

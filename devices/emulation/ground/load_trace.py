@@ -12,11 +12,9 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Bools, Floats
 from devices.errors import LoadTraceError, UsageError
-
-Floats = npt.NDArray[np.float64]
 
 FORCE_LIMIT_N = 120.0
 """Four times what a tile is made for (paper III-A: 25 to 35 N); more is not pressed on it. Below it
@@ -97,7 +95,7 @@ class PressedTrace:
 def press(
     trace: LoadTrace,
     positions_m: Floats,
-    bears: npt.NDArray[np.bool_],
+    bears: Bools,
     *,
     load_scale: float,
     cop: CopTransform,

@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Floats, Ints, Times
 from devices.clock import Clock
 from devices.emulation.chips.mcp3208 import EmulatedMcp3208, amplifier_volts
-from devices.emulation.ground.load_trace import Floats
 from devices.scene.file import IndentationGround, ReferenceScene, TileScene
 
 _MILL_NOISE_N = 0.02
@@ -124,7 +124,7 @@ class Mill:
     def __init__(
         self,
         ground: Indentation,
-        seconds: Callable[[npt.NDArray[np.int64]], Floats],
+        seconds: Callable[[Ints], Floats],
         rng: np.random.Generator,
     ) -> None:
         self._ground = ground
@@ -145,7 +145,7 @@ class Mill:
     def _noise_n(self) -> float:
         return _MILL_NOISE_N * float(self._rng.standard_normal())
 
-    def notes(self, t_mono_ns: npt.NDArray[np.int64]) -> dict[str, npt.NDArray[np.object_]]:
+    def notes(self, t_mono_ns: Times) -> dict[str, npt.NDArray[np.object_]]:
         """What the mill's operator notes at each instant.
 
         Returns:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.errors import CalibrationError
 from service.estimation.bench.indentation import (
     Indentation,
@@ -21,8 +21,6 @@ from service.estimation.bench.indentation import (
     strokes,
     unloaded,
 )
-
-Floats = npt.NDArray[np.float64]
 
 LOADED_N = 1.0
 LOADED_KPA = 3.0

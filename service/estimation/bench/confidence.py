@@ -9,12 +9,10 @@ spread of a repeat itself.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import stdtrit
 
+from devices.arrays import Floats
 from service.estimation.calibration import BASIS, TileCalibration, loop_share
-
-Floats = npt.NDArray[np.float64]
 
 _UPPER_95 = 0.975
 

@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats
 from service.estimation.bench.identify import identify
 from service.estimation.bench.indentation import Indentation, pressed_in, soak, unloaded
 from service.estimation.bench.press import Presses, joined, presses
 from service.estimation.bench.soak import fit_soak
 from service.estimation.calibration import TileCalibration, is_monotonic
 from service.estimation.effects import Effects, TemperatureEffect
-
-Floats = npt.NDArray[np.float64]
 
 _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])
 """Takes a cubic in x = gauge / range without constant term to u = 2 x - 1, as far as it varies."""

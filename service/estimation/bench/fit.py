@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import nnls
 
+from devices.arrays import Floats
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, indicative_degc
 from devices.errors import CalibrationError
 from service.estimation.bench.checks import (
@@ -38,8 +38,6 @@ from service.estimation.calibration import (
     is_monotonic,
     loop_share,
 )
-
-Floats = npt.NDArray[np.float64]
 
 BAND_STEPS = 10
 MEAN_STEPS = 30

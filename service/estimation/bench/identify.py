@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares, nnls
 
+from devices.arrays import Bools, Floats
 from service.estimation.bench.model import pressed
 from service.estimation.bench.press import Presses
 from service.estimation.effects import (
@@ -25,8 +26,6 @@ from service.estimation.effects import (
     TemperatureEffect,
 )
 from service.estimation.models.hysteresis import WIDTHS_N
-
-Floats = npt.NDArray[np.float64]
 
 TERMS = 2
 _SCATTER = (0.003, 0.03)
@@ -312,7 +311,7 @@ class _Problem:
 def _systematic(
     residual_n: Floats,
     force_n: Floats,
-    fast: npt.NDArray[np.bool_],
+    fast: Bools,
 ) -> float:
     """How far the curve is off where slow strokes agree with one another, root mean square.
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Bools, Floats, Ints, Times
 from devices.errors import CalibrationError
 from service.estimation.bench.soak import Soak
-
-Floats = npt.NDArray[np.float64]
 
 BLOCKS_PER_STROKE = 60
 BASELINE_NS = 1_000_000_000
@@ -41,11 +40,11 @@ class Indentation:
 
     serial: str
     where: str
-    t_ns: npt.NDArray[np.int64]
+    t_ns: Times
     kpa: Floats
     reference_n: Floats
     phase: npt.NDArray[np.str_]
-    under_spindle: npt.NDArray[np.bool_]
+    under_spindle: Bools
     tadc: Floats
     """Temperature in counts; NaN where it is not known."""
 
@@ -63,10 +62,10 @@ class Strokes:
 
     gauge_kpa: Floats
     force_n: Floats
-    repeat: npt.NDArray[np.int64]
-    loading: npt.NDArray[np.bool_]
+    repeat: Ints
+    loading: Bools
 
-    def rows(self, mask: npt.NDArray[np.bool_]) -> Strokes:
+    def rows(self, mask: Bools) -> Strokes:
         """The blocks in `mask`."""
         return Strokes(
             self.gauge_kpa[mask], self.force_n[mask], self.repeat[mask], self.loading[mask]
@@ -167,7 +166,7 @@ def stroke_rows(recording: Indentation) -> list[tuple[int, int, int]]:
 def _blocks(
     recording: Indentation,
     zero: Unloaded,
-    rows: npt.NDArray[np.int64],
+    rows: Ints,
     repeat: int,
     loading: bool,
 ) -> list[_Block]:
@@ -200,7 +199,7 @@ def rests(recording: Indentation) -> Floats:
     return np.array(found)
 
 
-def _run_begin(rows: npt.NDArray[np.bool_]) -> int:
+def _run_begin(rows: Bools) -> int:
     """Where the run of True that lasts to the end begins."""
     off = np.flatnonzero(~rows)
     return int(off[-1]) + 1 if len(off) else 0

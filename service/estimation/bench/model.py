@@ -10,14 +10,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats
 from service.estimation.compiled import compiled
 from service.estimation.models.gas import warmed
 from service.estimation.models.hysteresis import played
 from service.estimation.models.rubber import crept_parts
-
-Floats = npt.NDArray[np.float64]
 
 _NEWTON_STEPS = 30
 _GAS_STEPS = 6

@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Bools, Floats, Ints
 from service.estimation.bench.indentation import Indentation, Unloaded
 from service.estimation.models.outliers import spikes
-
-Floats = npt.NDArray[np.float64]
 
 BLOCK = 10
 _NOISE_MIN_KPA = 0.03
@@ -41,8 +39,8 @@ class Presses:
     force_n: Floats
     kpa: Floats
     weight: Floats
-    loading: npt.NDArray[np.int64]
-    fast: npt.NDArray[np.bool_]
+    loading: Ints
+    fast: Bools
 
     @property
     def loadings(self) -> int:

@@ -9,15 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Bools, Floats, Ints
 from service.estimation.bench.effects_fit import curve_over_range, loadings
 from service.estimation.bench.indentation import Indentation
 from service.estimation.bench.model import pressed
 from service.estimation.calibration import TileCalibration
 from service.estimation.models.hysteresis import WIDTHS_N
-
-Floats = npt.NDArray[np.float64]
 
 _BEFORE_S = 0.02
 _AFTER_S = 0.1
@@ -92,9 +90,7 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
     return found
 
 
-def _moments(
-    t_s: Floats, force_n: Floats, loading: npt.NDArray[np.int64], fast: npt.NDArray[np.bool_]
-) -> dict[str, int]:
+def _moments(t_s: Floats, force_n: Floats, loading: Ints, fast: Bools) -> dict[str, int]:
     """Where to look: the second of the loadings that were held, and of those that were not."""
     held: list[int] = []
     tapped: list[int] = []

@@ -9,14 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from devices.arrays import Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN, indicative_degc
 from service.estimation.effects import Parameter, TemperatureEffect
-
-Floats = npt.NDArray[np.float64]
 
 STEP_MIN_K = 1.0
 _LAG_S = (0.3, 30.0)

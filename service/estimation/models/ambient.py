@@ -11,12 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats, Times
 from service.estimation.compiled import compiled
-
-Floats = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
 
 SMOOTHING_S = 0.03
 HELD_S = 0.2

@@ -11,12 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats, Times
 from service.estimation.compiled import compiled
-
-Floats = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
 
 PAST_NS = 250_000_000
 REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])

@@ -19,12 +19,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats, Times
 from service.estimation.compiled import compiled
-
-Floats = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
 
 RESTART = 5.0
 """After so many gamma tau without a reading the gas has the temperature of its wall."""

@@ -15,11 +15,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats
 from service.estimation.compiled import compiled
-
-Floats = npt.NDArray[np.float64]
 
 WIDTHS_N = np.array([0.6, 1.5, 4.0])
 """Half widths of the plays; their parts are what is fitted."""

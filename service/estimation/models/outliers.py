@@ -8,10 +8,8 @@ needs the reading after it, so frames wait for one more.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
+from devices.arrays import Bools, Floats
 
 FAR = 3.0
 """In units of the noise that a reading has about the mean of two; one healthy reading in 600."""

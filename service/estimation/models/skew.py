@@ -9,10 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
+from devices.arrays import Bools, Floats, Times
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ def aligned(
     values: Floats,
     t_ns: Times,
     frame_t_ns: Times,
-    broken: npt.NDArray[np.bool_],
+    broken: Bools,
     state: SkewState,
 ) -> tuple[Floats, SkewState]:
     """Values at the frames' instants.

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.errors import CalibrationError
 from service.estimation.calibration import (
     BASIS,
@@ -23,8 +23,6 @@ from service.estimation.calibration import (
 )
 from service.estimation.compiled import compiled
 from service.estimation.effects import RubberEffect
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

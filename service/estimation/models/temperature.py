@@ -13,12 +13,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats, Times
 from service.estimation.compiled import compiled
-
-Floats = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
 
 SETTLE_S = 0.5
 """So long is the mean of the chip's temperature taken for that of the gas."""

@@ -11,10 +11,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MIN_KPA
 
 
-def unwrap(kpa: npt.NDArray[np.float64], kpa_per_count: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def unwrap(kpa: Floats, kpa_per_count: npt.ArrayLike) -> Floats:
     """Absolute pressure with wrapped counts taken back below zero.
 
     Args:

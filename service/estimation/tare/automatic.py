@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Bools
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch
@@ -20,8 +20,6 @@ from service.estimation.calibration import Calibration
 from service.estimation.tare.drift import expected_shift_kpa, warmer_k
 from service.estimation.tare.flight import WINDOW_NS, tare_in_flight
 from service.estimation.tare.tare import LOADED_KPA, NEAR_BASELINE_KPA, Tare
-
-Floats = npt.NDArray[np.float64]
 
 APART_NS = 60_000_000_000
 """Two automatic tares are at least a minute apart."""
@@ -70,7 +68,7 @@ def look_in_flight(
     present: Tare,
     anchor: Tare | None,
     free_since_t_ns: int,
-    bears: npt.NDArray[np.bool_] | None = None,
+    bears: Bools | None = None,
 ) -> Look:
     """Whether the baseline should follow what a foot in the air reads.
 
@@ -154,7 +152,7 @@ def _too_far(
     other: Tare,
     bound_kpa: float,
     serials: tuple[str, ...],
-    bears: npt.NDArray[np.bool_],
+    bears: Bools,
     which: str,
 ) -> str | None:
     """Why a baseline has moved too far from another one to be believed."""

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Bools, Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from service.estimation.tare.tare import Tare
-
-Floats = npt.NDArray[np.float64]
 
 SEALED_AT_K = 298.0
 """A sealed bubble's pressure is proportional to its absolute temperature; about 25 degC."""
@@ -34,7 +33,7 @@ def expected_shift_kpa(tare: Tare, warmer: Floats) -> Floats:
     return np.asarray(tare.baseline_kpa / SEALED_AT_K * warmer)
 
 
-def has_warmed(tare: Tare, tadc_counts: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+def has_warmed(tare: Tare, tadc_counts: npt.ArrayLike) -> Bools:
     """Which tiles are warmer or colder than at the tare by more than the baseline can bear.
 
     Args:

@@ -8,8 +8,8 @@ tare, because a tare under load makes every force after it too small.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Bools, Times
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import NOT_READ, FrameBatch
@@ -41,7 +41,7 @@ def tare_in_flight(
     serials: tuple[str, ...],
     *,
     present: Tare | None,
-    bears: npt.NDArray[np.bool_] | None = None,
+    bears: Bools | None = None,
 ) -> Tare:
     """The tare from the newest unloaded window of `frames`.
 
@@ -122,7 +122,7 @@ def tare_in_flight(
     return tare
 
 
-def _window_ns(since_ns: npt.NDArray[np.int64]) -> int:
+def _window_ns(since_ns: Times) -> int:
     enough_ns = 1.25 * FRAMES_MIN * float(np.median(np.diff(since_ns)))
     return int(min(max(WINDOW_NS, enough_ns), WINDOW_MAX_NS))
 
@@ -153,7 +153,7 @@ def _refuse_above(
     tare: Tare,
     present: Tare,
     serials: tuple[str, ...],
-    bears: npt.NDArray[np.bool_] | None,
+    bears: Bools | None,
 ) -> None:
     rise_kpa = tare.baseline_kpa - present.baseline_kpa
     if bears is not None:

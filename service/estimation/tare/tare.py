@@ -12,15 +12,13 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Bools, Floats
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch, FrameStatus
 from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration
-
-Floats = npt.NDArray[np.float64]
 
 FRAMES_MIN = 20
 RECOGNISE_WITHIN_NS = 60_000_000_000
@@ -148,7 +146,7 @@ def tare_from_rows(
     frames: FrameBatch,
     compensation: Compensation,
     serials: tuple[str, ...],
-    rows: npt.NDArray[np.bool_],
+    rows: Bools,
     source: Source,
 ) -> Tare:
     """The tare from those `frames` that `rows` marks, a boolean array over them.
@@ -208,7 +206,7 @@ def refuse_stuck(
     compensation: Compensation,
     calibration: Calibration,
     serials: tuple[str, ...],
-    rows: npt.NDArray[np.bool_],
+    rows: Bools,
 ) -> None:
     """Refuse a baseline of readings that are all the same, unless the bench saw no noise either.
 
@@ -238,7 +236,7 @@ def _recognise(
     compensation: Compensation,
     calibration: Calibration,
     serials: tuple[str, ...],
-) -> npt.NDArray[np.bool_]:
+) -> Bools:
     """Rows of half a second without load.
 
     Of all windows in which every tile is quiet, still and near its bench baseline, those count in
@@ -263,7 +261,7 @@ def _recognise(
         dtype=np.float64,
     )
     since_ns = frames.t_ns - frames.t_ns[0]
-    found: list[tuple[npt.NDArray[np.bool_], Floats, Floats]] = []
+    found: list[tuple[Bools, Floats, Floats]] = []
     for begin_ns in range(0, int(since_ns[-1]) + 1, WINDOW_NS // 2):
         rows = (since_ns >= begin_ns) & (since_ns < begin_ns + WINDOW_NS)
         window_kpa = kpa[rows]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from devices.chips.compensation import Compensation
 from devices.frames import FrameBatch, FrameStatus
 from devices.scene.file import load_scene
-from service.estimation.geometry import angle_rad
+from service.estimation.foot.geometry import angle_rad
 from service.offline.simulate import SimulateOptions, Simulation
 
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import NO_SERVO_AGE, FrameBatch
-from service.estimation.contact import UNKNOWN
+from service.estimation.foot.contact import UNKNOWN
 from service.server.live import SUMMARY_NS, Encoder, Hub, Piece, Subscriber, min_of, sum_up
 from service.server.nodes import Node
 

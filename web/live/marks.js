@@ -1,8 +1,8 @@
 // Marks keep the instant of the press, and wait here while the server cannot be reached.
 
-import * as api from "./api.js";
-import { notice } from "./notices.js";
-import { byId, setText } from "./text.js";
+import * as api from "../common/api.js";
+import { notice } from "../common/notices.js";
+import { byId, setText } from "../common/text.js";
 
 const AGAIN_MS = 2000;
 

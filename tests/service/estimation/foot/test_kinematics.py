@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus, ServoInfo
 from service.estimation.estimate import EstimationState, finish, step
-from service.estimation.kinematics import Readings, counts_at, readings_of
+from service.estimation.foot.kinematics import Readings, counts_at, readings_of
 
 FramesOf = Callable[..., FrameBatch]
 

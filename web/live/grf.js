@@ -1,6 +1,6 @@
 // The ground reaction force as one big number with its uncertainty, and whether the foot stands.
 
-import { byId, number, plain, setData, setText } from "./text.js";
+import { byId, number, plain, setData, setText } from "../common/text.js";
 import { ESTIMATE } from "./tile.js";
 
 export function drawGrf(node, frame) {

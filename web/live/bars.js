@@ -1,6 +1,6 @@
 // One bar per tile, with the span of the summarised frames, so that no peak hides between messages.
 
-import { byId, el, number, plain, setData, setText } from "./text.js";
+import { byId, el, number, plain, setData, setText } from "../common/text.js";
 import { FAULT_STATES, fullScale, hasFullScale, readTile, unitOf } from "./tile.js";
 
 const BELOW_ZERO = 0.1; // room below the zero line, as a share of full scale

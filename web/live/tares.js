@@ -1,8 +1,8 @@
 // The history of a node's tares: when, why, and whether it was undone. Loaded when it is opened.
 
-import * as api from "./api.js";
-import { notice } from "./notices.js";
-import { byId, el, localTime, number, setText } from "./text.js";
+import * as api from "../common/api.js";
+import { notice } from "../common/notices.js";
+import { byId, el, localTime, number, setText } from "../common/text.js";
 
 const SHOWN = 20;
 

@@ -1,8 +1,8 @@
 // Tare, Record, Stop, Mark: buttons, fields and shortcuts.
 
-import * as api from "./api.js";
-import { notice } from "./notices.js";
-import { byId, duration, el, localTime, setText } from "./text.js";
+import * as api from "../common/api.js";
+import { notice } from "../common/notices.js";
+import { byId, duration, el, localTime, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
 

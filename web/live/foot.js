@@ -1,6 +1,6 @@
 // The foot from the side (line of tiles) or from above (grid), with forces, COP and its uncertainty.
 
-import { byId, number, plain, setData, setText } from "./text.js";
+import { byId, number, plain, setData, setText } from "../common/text.js";
 import { ESTIMATE, FRAME, FAULT_STATES, readTile } from "./tile.js";
 
 const Z95 = 1.96;

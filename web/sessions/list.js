@@ -1,10 +1,10 @@
 // The list of sessions: newest first, kept up to date by the link, more on request.
 
-import * as api from "./api.js";
-import { ask, edit } from "./dialogs.js";
-import { frames, lossesInWords } from "./losses.js";
-import { notice, quietly } from "./notices.js";
-import { byId, bytes, duration, el, localTime } from "./text.js";
+import * as api from "../common/api.js";
+import { ask, edit } from "../common/dialogs.js";
+import { frames, lossesInWords } from "../common/losses.js";
+import { notice, quietly } from "../common/notices.js";
+import { byId, bytes, duration, el, localTime } from "../common/text.js";
 
 const MOST = 500; // a page left open for weeks must not grow without end
 

@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from devices.frames import ServoInfo
-from service.estimation.geometry import angle_rad, grid_indices, hull, to_ground_x_m
+from service.estimation.foot.geometry import angle_rad, grid_indices, hull, to_ground_x_m
 
 coordinates = st.integers(-100, 100).map(lambda mm: mm / 1000)
 points = st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=8, unique=True)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.contact import UNLOADED, ContactRule, believed, seeming
+from service.estimation.foot.contact import UNLOADED, ContactRule, believed, seeming
 
 RULE = ContactRule(on_n=5.0, off_n=3.0, min_ns=10_000_000)
 MS = 1_000_000

@@ -7,11 +7,9 @@ A positive angle is a roll forward (right-handed about y).
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from devices.arrays import Floats
 from devices.frames import ServoInfo
-
-Floats = npt.NDArray[np.float64]
 
 _SAME_PLACE_M = 1e-6
 

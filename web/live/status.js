@@ -1,6 +1,6 @@
 // How good the picture is: rate, loss, latency, age; and when it is no picture of now at all.
 
-import { byId, number, roughly, setData, setText } from "./text.js";
+import { byId, number, roughly, setData, setText } from "../common/text.js";
 
 const FROZEN_AFTER_MS = 600; // with a tick of 100 ms well within the promised second
 const LATE_MS = 1000; // frames that old when they arrive show the past

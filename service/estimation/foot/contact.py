@@ -9,14 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+
+from devices.arrays import Bools, Floats, Ints, Times
 
 UNKNOWN = 255
 UNSEEN_NS = 50_000_000
 """A foot that was not seen for so long may have been lifted and put down again; for less, not."""
-
-Floats = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -50,9 +48,9 @@ def seeming(
     rule: ContactRule,
     grf_n: Floats,
     t_ns: Times,
-    broken: npt.NDArray[np.bool_],
+    broken: Bools,
     state: RunState,
-) -> tuple[npt.NDArray[np.int64], Times, RunState]:
+) -> tuple[Ints, Times, RunState]:
     """Per frame whether the foot seems loaded (0 or 1), and since when it has seemed so.
 
     Frames without a force change nothing; at a frame that is `broken` from the one before (a gap)
@@ -71,11 +69,11 @@ def believed(
     rule: ContactRule,
     lag_ns: int,
     rows: int,
-    loaded: npt.NDArray[np.int64],
+    loaded: Ints,
     since_ns: Times,
     t_ns: Times,
     contact: int,
-) -> npt.NDArray[np.int64]:
+) -> Ints:
     """Contact of the first `rows` frames, looking `lag_ns` ahead.
 
     Args:
@@ -95,9 +93,7 @@ def believed(
     return _filled_forward(loaded[:rows], lasted_ns >= rule.min_ns, contact)
 
 
-def _filled_forward(
-    values: npt.NDArray[np.int64], valid: npt.NDArray[np.bool_], before: int
-) -> npt.NDArray[np.int64]:
+def _filled_forward(values: Ints, valid: Bools, before: int) -> Ints:
     """Every value, or where it is not valid the last valid one."""
     last = np.maximum.accumulate(np.where(valid, np.arange(len(values)), -1))
     return np.where(last >= 0, values[last], before)

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.estimation.contact import UNKNOWN
-
-Floats = npt.NDArray[np.float64]
+from devices.arrays import Floats, Ints, Times
+from service.estimation.foot.contact import UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -52,14 +51,12 @@ class Stances:
 
     def __init__(self) -> None:
         self._over: list[Stance] = []
-        self._pieces: list[tuple[npt.NDArray[np.int64], Floats]] = []
+        self._pieces: list[tuple[Ints, Floats]] = []
         self._contact = 0
         self._begun = False
         self._seen = False
 
-    def feed(
-        self, t_ns: npt.NDArray[np.int64], grf_n: Floats, contact: npt.NDArray[np.uint8]
-    ) -> None:
+    def feed(self, t_ns: Times, grf_n: Floats, contact: npt.NDArray[np.uint8]) -> None:
         """Take n more frames.
 
         Args:

@@ -1,9 +1,9 @@
 // The trash: what was deleted, to be had back or deleted for good. Loaded when it is opened.
 
-import * as api from "./api.js";
-import { ask } from "./dialogs.js";
-import { notice, quietly } from "./notices.js";
-import { byId, bytes, el, localTime, setText } from "./text.js";
+import * as api from "../common/api.js";
+import { ask } from "../common/dialogs.js";
+import { notice, quietly } from "../common/notices.js";
+import { byId, bytes, el, localTime, setText } from "../common/text.js";
 
 export class Trash {
   /** `onRestored(session)` takes a session that is back. */

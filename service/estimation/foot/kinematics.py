@@ -12,11 +12,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from devices.arrays import Bools, Floats, Ints, Times
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
-
-Floats = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 _AGE_UNIT_NS = 1000
 """Ages are cut to microseconds: of one reading, two frames may say instants that far apart."""
@@ -38,11 +35,11 @@ class Readings:
 
     t_ns: Times
     sampled_ns: Times
-    counts: npt.NDArray[np.int64]
-    known: Flags
-    dated: Flags
-    begins: Flags
-    joins: Flags
+    counts: Ints
+    known: Bools
+    dated: Bools
+    begins: Bools
+    joins: Bools
 
     def rows(self, start: int, stop: int) -> Readings:
         """Rows `start` to `stop` as views."""
@@ -60,7 +57,7 @@ class Readings:
 
 def readings_of(
     frames: FrameBatch,
-    broken: Flags,
+    broken: Bools,
     before: Readings | None,
     counts_per_turn: int,
 ) -> Readings:
@@ -105,7 +102,7 @@ def counts_at(readings: Readings, rows: int, lag_ns: int) -> Floats:
     joins = np.append(readings.joins, False)
     sampled_ns = np.append(readings.sampled_ns, 0)
 
-    def following(at: npt.NDArray[np.intp]) -> tuple[npt.NDArray[np.intp], Flags]:
+    def following(at: npt.NDArray[np.intp]) -> tuple[npt.NDArray[np.intp], Bools]:
         after = begins[np.searchsorted(begins, at, side="right")]
         return after, (after <= last_seen) & joins[after]
 

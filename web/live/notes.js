@@ -1,7 +1,7 @@
 // Plain notes about what to trust. They change seldom: an estimate's flag is held so it can be read.
 
-import { lossesInWords } from "./losses.js";
-import { byId, el, number, roughly, setText } from "./text.js";
+import { lossesInWords } from "../common/losses.js";
+import { byId, el, number, roughly, setText } from "../common/text.js";
 import { ESTIMATE, FRAME, TILE } from "./tile.js";
 
 const HOLD_MS = 3000;

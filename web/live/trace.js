@@ -1,6 +1,6 @@
 // The ground reaction force of the last ten seconds, drawn at display rate on a canvas.
 
-import { byId, setText } from "./text.js";
+import { byId, setText } from "../common/text.js";
 
 const WINDOW_S = 10;
 const MOST_POINTS = 2000; // 10 s at 30 Hz are 300; the rest guards against a server gone wild

@@ -1,0 +1,71 @@
+"""Arrays that were never wired: facts of tiles and of the array, and whatever a test changes.
+
+The chips have b1 = -2 and neither b2 nor c12, so a count is 130/1023 kPa (data sheet eq. 1 and 2)
+whatever the temperature, and 500 counts are 100.0049 kPa.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from devices.frames import ArrayInfo, ServoInfo, TileInfo
+
+PERIOD_NS = 2_000_000
+UTC_NS = 10**18
+"""`t_ns` minus `t_mono_ns` of every frame, unless a test wants another."""
+COUNT_KPA = 130 / 1023
+UNLOADED_COUNTS = 500
+UNLOADED_KPA = 787 * 65 / 1023 + 50
+NEWTON_CHIP = (1787 * 8, 0xC000, 0, 0)
+DATA_SHEET_CHIP = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
+"""The example of data sheet section 3.6."""
+
+
+def make_tile(number: int = 0, **facts: Any) -> TileInfo:
+    """The tile with this number from 0: T01, T02 and so on, in a line, eight behind a mux."""
+    content: dict[str, Any] = {
+        "serial": f"T{number + 1:02}",
+        "mux": 0x70 + number // 8,
+        "channel": number % 8,
+        "coefficient_words": NEWTON_CHIP,
+        "x_m": 0.014 * number,
+        "y_m": 0.0,
+        "z_m": -0.15,
+        "reference": False,
+        "conversion_ms": 1.6,
+    }
+    return TileInfo(**content | facts)
+
+
+def make_servo(**facts: Any) -> ServoInfo:
+    """A servo whose angle is the segment's, in a foot that rolls over an arc of 150 mm."""
+    content: dict[str, Any] = {
+        "model": "MX-28",
+        "counts_per_turn": 4096,
+        "zero_counts": 2048,
+        "sign": 1,
+        "ratio": 1.0,
+        "ankle_travel_m_per_rad": 0.15,
+    }
+    return ServoInfo(**content | facts)
+
+
+def make_array(tiles: int | Sequence[TileInfo] = 2, **facts: Any) -> ArrayInfo:
+    """An array of so many tiles, or of these."""
+    if isinstance(tiles, int):
+        tiles = [make_tile(number) for number in range(tiles)]
+    content: dict[str, Any] = {
+        "node": "bench",
+        "boot_id": "0" * 32,
+        "tiles": tuple(tiles),
+        "servo": None,
+        "schedule": "simultaneous",
+        "nominal_rate_hz": 1e9 / PERIOD_NS,
+        "utc_offset_ns": UTC_NS,
+        "clock_set": True,
+        "software": "test",
+        "scene": "test",
+        "models": ("unwrap", "static"),
+    }
+    return ArrayInfo(**content | facts)
