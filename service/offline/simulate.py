@@ -29,7 +29,8 @@ from devices.emulation.ground.load_trace import CopTransform, LoadTrace, Pressed
 from devices.emulation.world import World
 from devices.errors import UsageError
 from devices.frames import FrameBatch, TileStatus
-from devices.scene.file import AnySchedule, Scene, ServoScene
+from devices.scene.file import Scene
+from devices.scene.hardware import AnySchedule, ServoScene
 from service.estimation.foot.stances import Stance, Stances
 from service.offline.accuracy import JUDGED, Accuracy, judge
 from service.rig.description import describe

@@ -12,7 +12,8 @@ from devices.clock import Clock
 from devices.errors import UsageError
 from devices.recovery.recovery import BusRecovery, GpioRecovery, open_recovery
 from devices.reference import ReferenceForce
-from devices.scene.file import EMULATED, Scene
+from devices.scene.file import Scene
+from devices.scene.hardware import EMULATED
 
 if TYPE_CHECKING:
     from devices.emulation.world import World

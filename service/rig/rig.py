@@ -21,7 +21,8 @@ from devices.emulation.ground.load_trace import CopTransform, LoadTrace
 from devices.errors import I2cError, TileSetupError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
-from devices.scene.file import EMULATED, Scene, ServoScene
+from devices.scene.file import Scene
+from devices.scene.hardware import EMULATED, ServoScene
 from service.rig.description import describe
 from service.rig.peripherals import open_recovery_lines, open_reference_sensor
 from storage.journal.in_flight import InFlight, open_in_flight
