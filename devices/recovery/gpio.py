@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from devices.errors import BusSetupError
 from devices.extras import needs_extra
-from devices.scene.file import RecoveryScene
+from devices.scene.hardware import RecoveryScene
 
 if TYPE_CHECKING:
     from gpiod import LineRequest

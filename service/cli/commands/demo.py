@@ -13,7 +13,7 @@ import typer
 
 from devices.errors import FootTileError, UsageError
 from devices.extras import needs_extra
-from devices.scene.file import EMULATED
+from devices.scene.hardware import EMULATED
 from service.cli.commands.node import calibration_of
 from service.cli.commands.serve import PREPARING, announce
 from service.cli.emulation import (

@@ -9,7 +9,8 @@ import typer
 
 from devices.errors import UsageError
 from devices.extras import needs_extra
-from devices.scene.file import AnySchedule, Scene, ScheduleName, load_scene
+from devices.scene.file import Scene, load_scene
+from devices.scene.hardware import AnySchedule, ScheduleName
 from service.cli.emulation import (
     CopAxesOption,
     CopOffsetOption,
