@@ -17,20 +17,11 @@ import typer.main
 from pydantic import BaseModel
 
 from devices.frames import FRAME_COLUMNS, FrameBatch
-from devices.scene.file import (
-    ArrayScene,
-    EmulationScene,
-    FaultScene,
-    GroundScene,
-    MudGround,
-    PoppyGround,
-    RecoveryScene,
-    ReferenceScene,
-    Scene,
-    ServoScene,
-    TileScene,
-    builtin_scenes,
-)
+from devices.scene.emulation import EmulationScene
+from devices.scene.faults import FaultScene
+from devices.scene.file import Scene, builtin_scenes
+from devices.scene.grounds import GroundScene, MudGround, PoppyGround
+from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
 from service.api.app import make_app
 from service.api.settings import Settings
 from service.cli.main import app

@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING
 
 from devices.errors import BusSetupError
-from devices.scene.file import RecoveryScene
+from devices.scene.hardware import RecoveryScene
 
 if TYPE_CHECKING:
     from gpiod import LineRequest

@@ -12,7 +12,7 @@ from typing import Protocol
 
 from devices.clock import Clock
 from devices.recovery.gpio import GpioLines
-from devices.scene.file import RecoveryScene
+from devices.scene.hardware import RecoveryScene
 
 CLOCKS = 9
 """The rest of a byte and its acknowledge, from wherever it was broken off."""

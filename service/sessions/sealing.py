@@ -6,7 +6,6 @@ pending gives away as CSV or Arrow.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from storage.clock.file import CLOCK_NAME, write_clock
 from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
 from storage.durable import write_whole
 from storage.journal.journal import Journal
+from storage.sessions.content_hash import sha256_of
 from storage.sessions.file import SessionWriter
 from storage.sessions.folder import FRAMES_NAME, Ledger, Session
 
@@ -211,12 +211,6 @@ def table_of_rows(sources: Sources) -> ClockTable:
     where = f"session {sources.session.id}"
     rows = rows_by_stream(sources.session.clock, where=where)
     return ClockTable(rows, sources.streams, parts, where=where)
-
-
-def sha256_of(path: Path) -> str:
-    """Hash of a file's bytes, in hexadecimal digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _gathered(batches: Iterator[FrameBatch]) -> Iterator[FrameBatch]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import FootTileError, UsageError
-from devices.scene.file import EMULATED
+from devices.scene.hardware import EMULATED
 from service.cli.commands.node import calibration_of
 from service.cli.commands.serve import PREPARING, announce
 from service.cli.emulation import (

@@ -114,10 +114,10 @@ def export_command(
     ] = "node",
 ) -> None:
     """Write a sealed session, or a slice of it, in another format."""
-    from storage.clock.file import clock_beside
     from storage.durable import storage_errors
     from storage.formats.export import CLOCKS, FORMATS, Slice, export
     from storage.schema import FRAMES, KNOWN
+    from storage.sessions.clock import clock_beside
     from storage.sessions.file import SessionReader
 
     if to not in FORMATS:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 import typer
 
 from devices.errors import UsageError
-from devices.scene.file import AnySchedule, Scene, ScheduleName, load_scene
+from devices.scene.file import Scene, load_scene
+from devices.scene.hardware import AnySchedule, ScheduleName
 from service.cli.emulation import (
     CopAxesOption,
     CopOffsetOption,

@@ -15,7 +15,7 @@ from devices.clock import VirtualClock
 from devices.errors import BusSetupError
 from devices.recovery.gpio import GpioLines
 from devices.recovery.recovery import GpioRecovery, open_recovery
-from devices.scene.file import RecoveryScene
+from devices.scene.hardware import RecoveryScene
 
 gpiod = pytest.importorskip("gpiod")
 ACTIVE, INACTIVE = gpiod.line.Value.ACTIVE, gpiod.line.Value.INACTIVE

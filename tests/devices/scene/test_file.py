@@ -12,15 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import SceneError
-from devices.scene.file import (
-    FaultKind,
-    MudGround,
-    PoppyGround,
-    Scene,
-    builtin_scenes,
-    load_scene,
-    parse_scene,
-)
+from devices.scene.faults import FaultKind
+from devices.scene.file import Scene, builtin_scenes, load_scene, parse_scene
+from devices.scene.grounds import MudGround, PoppyGround
 
 TILE = """
 [[tile]]
