@@ -39,7 +39,7 @@ from __future__ import annotations
 class FootTileError(Exception):
     """Base of all errors; composes its text from the facts it keeps.
 
-    `exit_code` is what the command line returns for it (design: 1 failed, 2 usage).
+    `exit_code` is what the command line returns for it (1 failed, 2 usage).
     """
 
     exit_code = 1

@@ -72,7 +72,7 @@ class SessionReport:
         return not self.problems and self.ledger is not None and self.ledger.complete
 
     def as_dict(self) -> dict[str, Any]:
-        """The ledger, and what was found (design.md 6)."""
+        """The ledger, and what was found (docs/formats.md)."""
         empty = Ledger(complete=False, lossy=False, parts=(), missed_slots=0)
         ledger = self.ledger or empty
         if self.problems:
