@@ -29,17 +29,15 @@ from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
 from service.sessions.pipeline import Columns
 from service.sessions.tares import RecordedTare, TareHistory
+from storage.clock.offset import ClockOffset
 from storage.durable import make_folder, storage_errors, write_whole
 from storage.intervals import NO_END, Intervals, with_open_ends
-from storage.journal.journal import Journal
+from storage.journal.journal import RING_NS, Journal
 from storage.losses import NODE_RESTARTED
-from storage.sessions.folder import ClockOffset
 from storage.wire import decode
 
 log = logging.getLogger("foottile.nodes")
 
-RING_NS = 600_000_000_000
-"""Frames of no session are kept so long, for pre-roll and for what was not recorded in time."""
 _RATE_OVER_NS = 1_000_000_000
 _NODE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 _BOOT_ID = re.compile(r"[0-9a-f]{32}")

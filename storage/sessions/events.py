@@ -25,15 +25,6 @@ def write_events(session: Session, folder: Path) -> None:
         "label": pa.array([event.label for event in events], pa.string()),
         "t_ns": pa.array([event.t_ns for event in events], pa.int64()),
     }
-    write_table(pa.table(columns), folder / EVENTS_NAME)
-
-
-def write_table(table: pa.Table, path: Path) -> None:
-    """Write a small table as a Parquet file, whole or not at all.
-
-    Raises:
-        StorageError: the disk is full or not writable.
-    """
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
-    write_whole(path, sink.getvalue().to_pybytes())
+    pq.write_table(pa.table(columns), sink, compression="zstd")
+    write_whole(folder / EVENTS_NAME, sink.getvalue().to_pybytes())

@@ -68,7 +68,7 @@ class SessionReport:
         return sum(part.recorded for part in self.ledger.parts) if self.ledger else 0
 
     def as_dict(self) -> dict[str, Any]:
-        """The ledger, and what was found (design.md 6)."""
+        """The ledger, and what was found (docs/formats.md)."""
         empty = Ledger(complete=False, lossy=False, parts=(), missed_slots=0)
         ledger = self.ledger or empty
         if self.problems:

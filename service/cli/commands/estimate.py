@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from devices.extras import needs_extra
 from service.cli.options import (
     JsonOption,
     output_path,
@@ -20,6 +21,7 @@ from service.cli.options import (
 from service.estimation import OFFLINE_LAG_MS
 
 
+@needs_extra("server", "`foottile estimate`")
 def estimate_command(
     session: Annotated[Path, typer.Argument(metavar="IN.parquet", help="Session to estimate.")],
     out: Annotated[Path, typer.Option(help="Session to write, with the new estimates.")],

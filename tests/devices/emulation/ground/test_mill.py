@@ -12,7 +12,8 @@ from devices.chips.mcp3208 import Mcp3208
 from devices.clock import VirtualClock
 from devices.emulation.world import World
 from devices.reference import ReferenceForce
-from devices.scene.file import ReferenceScene, Scene
+from devices.scene.file import Scene
+from devices.scene.hardware import ReferenceScene
 
 SceneOf = Callable[..., Scene]
 
