@@ -30,7 +30,8 @@ from devices.array.startup import make_ready
 from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import VirtualClock
 from devices.emulation.world import World
-from devices.scene.file import Scene, ScheduleName, build_scene, load_scene
+from devices.scene.file import Scene, build_scene, load_scene
+from devices.scene.hardware import ScheduleName
 
 COUNTS = (1, 2, 4, 8, 16, 32, 64)
 SECONDS, FRAMES_MIN = 4.0, 60

@@ -10,7 +10,7 @@ import math
 
 from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF, Mcp3208
 from devices.errors import SpiError
-from devices.scene.file import ReferenceScene
+from devices.scene.hardware import ReferenceScene
 
 
 class ReferenceForce:

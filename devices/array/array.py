@@ -28,7 +28,7 @@ from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError
 from devices.frames import NOT_READ, TileInfo, TileStatus
 from devices.recovery.recovery import BusRecovery
-from devices.scene.file import ScheduleName
+from devices.scene.hardware import ScheduleName
 
 AUDIT_NS = 1_000_000_000
 """The muxes' control registers are read back so often."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from devices.errors import SceneError
-from devices.scene.file import ScheduleName
+from devices.scene.hardware import ScheduleName
 
 SELECT_BITS = 20
 CONVERT_BITS = 29

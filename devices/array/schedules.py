@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from devices.scene.file import ScheduleName
+from devices.scene.hardware import ScheduleName
 
 if TYPE_CHECKING:
     from collections.abc import Callable

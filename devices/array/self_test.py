@@ -26,7 +26,7 @@ from devices.chips.tca9548a import ADDRESSES, CHANNELS, MuxRouter, Tca9548a
 from devices.clock import Clock
 from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
 from devices.frames import TileInfo
-from devices.scene.file import TileScene
+from devices.scene.hardware import TileScene
 
 _SETTLED_NS = 3_200_000  # the longest conversion and a little more
 _SHORTEST_NS = 800_000

@@ -16,7 +16,8 @@ from devices.clock import Clock
 from devices.errors import BusFaultError, SceneError
 from devices.frames import TileInfo
 from devices.recovery.recovery import BusRecovery
-from devices.scene.file import AnySchedule, ArrayScene, Scene
+from devices.scene.file import Scene
+from devices.scene.hardware import AnySchedule, ArrayScene
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import NamedTuple
 
-from devices.scene.file import BUS, RATE, FaultKind, FaultScene
+from devices.scene.faults import BUS, RATE, FaultKind, FaultScene
 
 _BEFORE_NS = 2**62
 

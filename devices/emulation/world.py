@@ -33,7 +33,10 @@ from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation, Mill
 from devices.emulation.parts import draw_chip, draw_dome, random_of
 from devices.emulation.surroundings import Surroundings
-from devices.scene.file import BUS, FaultKind, MudGround, Scene, ServoScene, TileFault
+from devices.scene.faults import BUS, FaultKind, TileFault
+from devices.scene.file import Scene
+from devices.scene.grounds import MudGround
+from devices.scene.hardware import ServoScene
 
 _FORESIGHT_S = 0.4
 

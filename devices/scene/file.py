@@ -4,8 +4,7 @@ A scene is TOML. Every key is listed with its unit and default where its section
 unknown key, a wrong type or a contradiction is a `SceneError` that names the key and the remedy.
 Built-in scenes are files of the same form in `devices/scene/builtin/`.
 
-Sections are described by noun in `devices.scene.hardware`, `scene_grounds`, `scene_emulation` and
-`scene_faults`, and imported from here.
+Sections are described in `hardware`, `grounds`, `emulation` and `faults` beside this module.
 """
 
 from __future__ import annotations
@@ -20,62 +19,11 @@ from typing import Annotated, Self
 from pydantic import Field, ValidationError, model_validator
 
 from devices.errors import SceneError
-from devices.scene.emulation import EmulationScene, ReadDuringConversion
-from devices.scene.faults import BUS, RATE, BusFault, FaultKind, FaultScene, MuxFault, TileFault
-from devices.scene.grounds import (
-    GroundScene,
-    IndentationGround,
-    MudGround,
-    NoGround,
-    PlateGround,
-    PoppyGround,
-    RollingGround,
-    TraceGround,
-)
-from devices.scene.hardware import (
-    EMULATED,
-    AnySchedule,
-    ArrayScene,
-    RecoveryScene,
-    ReferenceScene,
-    ScheduleName,
-    ServoScene,
-    TileScene,
-)
+from devices.scene.emulation import EmulationScene
+from devices.scene.faults import FaultScene
+from devices.scene.grounds import GroundScene, MudGround, NoGround
+from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
 from devices.scene.quantities import NotNegative, Section
-
-__all__ = [
-    "BUS",
-    "EMULATED",
-    "RATE",
-    "AnySchedule",
-    "ArrayScene",
-    "BusFault",
-    "EmulationScene",
-    "FaultKind",
-    "FaultScene",
-    "GroundScene",
-    "IndentationGround",
-    "MudGround",
-    "MuxFault",
-    "NoGround",
-    "PlateGround",
-    "PoppyGround",
-    "ReadDuringConversion",
-    "RecoveryScene",
-    "ReferenceScene",
-    "RollingGround",
-    "Scene",
-    "ScheduleName",
-    "ServoScene",
-    "TileFault",
-    "TileScene",
-    "TraceGround",
-    "build_scene",
-    "builtin_scenes",
-    "load_scene",
-    "parse_scene",
-]
 
 
 class Scene(Section):

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import UsageError
-from devices.scene.file import EMULATED, Scene, load_scene
+from devices.scene.file import Scene, load_scene
+from devices.scene.hardware import EMULATED
 from service.cli.options import pair
 
 if TYPE_CHECKING:

@@ -16,7 +16,8 @@ from devices.chips.mpl115a2 import CONVERSION_TYPICAL_NS
 from devices.clock import Clock
 from devices.errors import I2cError
 from devices.frames import TileInfo
-from devices.scene.file import ArrayScene, Scene, ScheduleName, TileScene
+from devices.scene.file import Scene
+from devices.scene.hardware import ArrayScene, ScheduleName, TileScene
 
 _AS_ASKED = 0.95
 _PI_TRAP = 0.625  # core clock 250 MHz where the kernel believes in 400 MHz (hardware.md 3.2)

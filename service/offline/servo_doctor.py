@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from devices.buses.serial_line import latency_remark, latency_timer_ms
 from devices.chips.dynamixel.probe import BAUDRATES, FoundServo, probe
 from devices.clock import Clock
-from devices.scene.file import ServoScene
+from devices.scene.hardware import ServoScene
 
 
 @dataclass(frozen=True)

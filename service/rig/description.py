@@ -5,7 +5,8 @@ from __future__ import annotations
 from devices.chips.dynamixel.models import COUNTS_PER_TURN
 from devices.clock import UtcAnchor
 from devices.frames import ArrayInfo, ServoInfo, TileInfo
-from devices.scene.file import Scene, ScheduleName
+from devices.scene.file import Scene
+from devices.scene.hardware import ScheduleName
 from service.version import SOFTWARE
 
 

@@ -20,7 +20,9 @@ from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.faults import Faults
 from devices.frames import TileInfo
 from devices.recovery.recovery import BusRecovery
-from devices.scene.file import BUS, FaultKind, ReadDuringConversion, ScheduleName, TileFault
+from devices.scene.emulation import ReadDuringConversion
+from devices.scene.faults import BUS, FaultKind, TileFault
+from devices.scene.hardware import ScheduleName
 
 DATA_SHEET = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 FORUM = (0x3591, 0xC0A2, 0xC625, 0x2C18)

@@ -30,7 +30,8 @@ from devices.frames import (
     FrameStatus,
     TileStatus,
 )
-from devices.scene.file import Scene, ScheduleName, TileScene
+from devices.scene.file import Scene
+from devices.scene.hardware import ScheduleName, TileScene
 from tests.builders.scenes import make_scene
 from tests.devices.rigs import SCHEDULES, SETTLED
 

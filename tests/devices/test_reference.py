@@ -12,7 +12,7 @@ from devices.chips.mcp3208 import Mcp3208
 from devices.clock import VirtualClock
 from devices.emulation.chips.mcp3208 import EmulatedMcp3208, Volts, amplifier_volts
 from devices.reference import ReferenceForce
-from devices.scene.file import ReferenceScene
+from devices.scene.hardware import ReferenceScene
 
 SCENE = ReferenceScene(channel=3, zero_v=1.65, n_per_v=100 / 3.3)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from devices.buses.spi import MAX_SPEED_HZ
 from devices.chips.mcp3208 import COUNTS_MAX, COUNTS_PER_VREF
 from devices.clock import Clock
-from devices.scene.file import ReferenceScene
+from devices.scene.hardware import ReferenceScene
 
 Volts = Callable[[int, int], float]
 """Input and instant in ns -> voltage there; noise and non-linearity are its business."""

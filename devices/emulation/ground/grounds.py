@@ -16,17 +16,17 @@ from devices.emulation.ground.load_trace import CopTransform, LoadTrace, Pressed
 from devices.emulation.ground.mill import Indentation
 from devices.emulation.parts import random_of
 from devices.errors import SceneError, UsageError
-from devices.scene.file import (
+from devices.scene.file import Scene
+from devices.scene.grounds import (
     IndentationGround,
     MudGround,
     NoGround,
     PlateGround,
     PoppyGround,
     RollingGround,
-    Scene,
-    TileScene,
     TraceGround,
 )
+from devices.scene.hardware import TileScene
 
 
 class Ground(Protocol):

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from devices.arrays import Floats, Ints, Times
 from devices.clock import Clock
 from devices.emulation.chips.mcp3208 import EmulatedMcp3208, amplifier_volts
-from devices.scene.file import IndentationGround, ReferenceScene, TileScene
+from devices.scene.grounds import IndentationGround
+from devices.scene.hardware import ReferenceScene, TileScene
 
 _MILL_NOISE_N = 0.02
 

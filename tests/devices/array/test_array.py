@@ -12,7 +12,7 @@ from smbus2 import i2c_msg
 from devices.array.array import TileArray
 from devices.errors import BusMisuseError, BusSetupError, SceneError
 from devices.frames import NOT_READ, TileStatus
-from devices.scene.file import ScheduleName
+from devices.scene.hardware import ScheduleName
 from tests.devices.rigs import (
     COEFFICIENTS,
     CONVERT,

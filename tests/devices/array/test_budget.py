@@ -19,7 +19,7 @@ from devices.array.budget import (
     read_bits,
 )
 from devices.errors import SceneError
-from devices.scene.file import ScheduleName
+from devices.scene.hardware import ScheduleName
 from tests.devices.rigs import SCHEDULES, full
 
 NS = (1, 2, 4, 8, 16, 32, 64)

@@ -23,7 +23,9 @@ from devices.emulation.witness import Verdict, Witness
 from devices.emulation.world import World
 from devices.frames import NOT_READ, FrameBatch, FrameStatus, TileStatus
 from devices.recovery.recovery import GpioRecovery
-from devices.scene.file import BusFault, FaultKind, MuxFault, ScheduleName, TileFault, build_scene
+from devices.scene.faults import BusFault, FaultKind, MuxFault, TileFault
+from devices.scene.file import build_scene
+from devices.scene.hardware import ScheduleName
 from tests.devices.rigs import FOUR, SCHEDULES, TWO_MUXES, Plugs
 
 BEGIN_S, LENGTH_S, RECOVERED_S, RUN_S = 0.7, 0.4, 1.2, 2.6

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.array.budget import BusTiming, frame_s
-from devices.scene.file import ReadDuringConversion, ScheduleName
+from devices.scene.emulation import ReadDuringConversion
+from devices.scene.hardware import ScheduleName
 from tests.devices.rigs import (
     CONVERT,
     FOUR,

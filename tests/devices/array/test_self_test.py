@@ -22,7 +22,7 @@ from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.parts import draw_chip, random_of
 from devices.emulation.world import World
 from devices.errors import BusFaultError, TileSetupError
-from devices.scene.file import ReadDuringConversion
+from devices.scene.emulation import ReadDuringConversion
 from tests.builders.scenes import make_scene
 from tests.devices.rigs import DATA_SHEET, FORUM, FOUR, ONE, TWO_MUXES, Plugs, Wires
 

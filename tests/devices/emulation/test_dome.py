@@ -23,7 +23,7 @@ from scipy.optimize import brentq
 from devices.emulation.dome import GRID_S, Domes
 from devices.emulation.parts import DomePart
 from devices.emulation.surroundings import Surroundings
-from devices.scene.file import EmulationScene
+from devices.scene.emulation import EmulationScene
 
 Floats = npt.NDArray[np.float64]
 Force = Callable[[Floats], Floats]

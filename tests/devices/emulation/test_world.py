@@ -339,7 +339,7 @@ def test_a_reader_of_the_servo_gets_the_true_angle_back(
         with contextlib.closing(servo):
             assert servo.identify().model_number == {1: 29, 2: 30}[protocol]  # MX-28
             reading = servo.read_position()
-    # design.md 3: angle = sign (counts - zero) 2 pi / counts per turn * ratio
+    # docs/scenes.md: angle = sign (counts - zero) 2 pi / counts per turn * ratio
     angle_rad = sign * (reading.counts - 1000) * 2 * math.pi / 4096 * ratio
     true_rad = world.truth(np.array([reading.t_mono_ns])).true_angle_rad[0]
     assert angle_rad == pytest.approx(true_rad, abs=0.51 * 2 * math.pi / 4096 * ratio + 1e-4)

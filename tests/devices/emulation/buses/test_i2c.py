@@ -19,7 +19,7 @@ from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
-from devices.scene.file import ReadDuringConversion
+from devices.scene.emulation import ReadDuringConversion
 
 MUX, OTHER_MUX, TILE = 0x70, 0x71, 0x60
 TC_NS = 1_600_000

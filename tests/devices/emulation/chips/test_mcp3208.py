@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from devices.clock import VirtualClock
 from devices.emulation.chips.mcp3208 import EmulatedMcp3208, Volts, amplifier_volts
-from devices.scene.file import ReferenceScene
+from devices.scene.hardware import ReferenceScene
 
 VREF_V = 4.096  # one count is one millivolt
 

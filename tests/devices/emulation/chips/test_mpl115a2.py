@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
 from devices.emulation.faults import Fault
-from devices.scene.file import ReadDuringConversion
+from devices.scene.emulation import ReadDuringConversion
 
 WORDS = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 TC_NS = 1_900_000

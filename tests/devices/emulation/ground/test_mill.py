@@ -10,7 +10,7 @@ from devices.chips.mcp3208 import Mcp3208
 from devices.clock import VirtualClock
 from devices.emulation.world import World
 from devices.reference import ReferenceForce
-from devices.scene.file import ReferenceScene
+from devices.scene.hardware import ReferenceScene
 from tests.builders.scenes import make_scene
 
 PLUS_MINUS_50_N = ReferenceScene(zero_v=1.65, n_per_v=100 / 3.3)
