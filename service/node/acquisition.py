@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection
 
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
-from service.node.news import News
+from service.node.notices import Notices
 from service.rig.rig import Rig, RigOptions
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, encode
@@ -28,7 +28,8 @@ _WAITING_MAX = 4096
 """Batches that may wait for a parent that does not read, 100 s; then frames are lost and counted
 as a gap in `seq`."""
 _END_S = 5.0
-_NEWS_NS = 500_000_000
+_LOOK_EVERY_NS = 500_000_000
+"""Of the stream's own time: so often is the array asked how it is."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Batch:
 
     batch: EncodedBatch
     missed_slots: int
-    news: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
     """What has become wrong with the array, or right again."""
     health: Health = Health()  # frozen, so one for all is safe
 
@@ -151,17 +152,17 @@ def _run(options: RigOptions, connection: Connection) -> None:
 def _stream(rig: Rig, connection: Connection, stop: threading.Event) -> None:
     connection.send(Started(rig.info, tuple(rig.remarks)))
     rig.remarks.clear()
-    news, news_due_ns, health = News(), 0, Health()
+    notices, look_ns, health = Notices(), 0, Health()
     waiting: queue.Queue[_Item | None] = queue.Queue(_WAITING_MAX)
     sender = threading.Thread(target=_send, args=(rig.info, waiting, connection, stop))
     sender.start()
     try:
         for batch in rig.batches(stop.is_set):
             told: tuple[str, ...] = ()
-            if batch.t_mono_ns[-1] >= news_due_ns:
-                told = news.since(rig.troubles())
-                health = Health(news.lasting, rig.counts())
-                news_due_ns = int(batch.t_mono_ns[-1]) + _NEWS_NS
+            if batch.t_mono_ns[-1] >= look_ns:
+                told = notices.since(rig.troubles())
+                health = Health(notices.lasting, rig.counts())
+                look_ns = int(batch.t_mono_ns[-1]) + _LOOK_EVERY_NS
             with suppress(queue.Full):
                 waiting.put_nowait((batch, rig.acquisition.missed_slots, told, health))
     finally:
@@ -177,10 +178,10 @@ def _send(
 ) -> None:
     schema = wire_schema(info)
     while (item := waiting.get()) is not None:
-        frames, missed_slots, news, health = item
+        frames, missed_slots, notices, health = item
         encoded = EncodedBatch.of(frames, encode(frames, schema))
         try:
-            connection.send(Batch(encoded, missed_slots, news, health))
+            connection.send(Batch(encoded, missed_slots, notices, health))
         except OSError:
             stop.set()
             return

@@ -195,8 +195,8 @@ class _Node:
         self._health = message.health
         if self._publisher is not None:
             self._publisher.notify()
-        for news in message.news:
-            self._report(news)
+        for notice in message.notices:
+            self._report(notice)
 
     def _publish(self, server: str) -> None:
         self._publisher = Publisher(

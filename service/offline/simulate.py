@@ -28,13 +28,13 @@ from devices.emulation.ground.grounds import press_on
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace
 from devices.emulation.world import World
 from devices.errors import UsageError
-from devices.frames import FrameBatch, FrameStatus, TileStatus
+from devices.frames import FrameBatch, TileStatus
 from devices.scene.file import Scene
 from devices.scene.hardware import AnySchedule, ServoScene
 from service.estimation.foot.stances import Stance, Stances
 from service.offline.accuracy import JUDGED, Accuracy, judge
 from service.rig.description import describe
-from service.rig.reference import recovery_of, reference_of
+from service.rig.peripherals import open_recovery_lines, open_reference_sensor
 from service.sessions.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
 from storage.sessions.file import SessionWriter
 
@@ -122,20 +122,20 @@ class Simulation:
             scene,
             self._clock,
             schedule=options.schedule,
-            recovery=recovery_of(scene, self._clock, self._world),
-            beside=reference_of(scene, self._clock, self._world, stack),
+            recovery=open_recovery_lines(scene, self._clock, self._world),
+            beside=open_reference_sensor(scene, self._clock, self._world, stack),
         )
         self.choice = ready.choice
         self.unmeasured = ready.unmeasured
         self.array = ready.array
         # The machine was switched on earlier, the session and its scene begin now.
         self._world.begin()
-        self._begin_ns = self._clock.now_ns()
-        self._end_ns = self._begin_ns + duration_ns
-        anchor = UtcAnchor.of(self._begin_ns, START_NS, clock_set=True)
+        begin_ns = self._clock.now_ns()
+        self._end_ns = begin_ns + duration_ns
+        anchor = UtcAnchor.of(begin_ns, START_NS, clock_set=True)
         servo = None
         if scene.servo is not None:
-            servo = _polled_servo(self._world, scene.servo, self._begin_ns, stack)
+            servo = _polled_servo(self._world, scene.servo, begin_ns, stack)
         self.rate_hz = min(scene.rate_hz or ready.predicted_hz, ready.predicted_hz)
         self.info = describe(
             scene,
@@ -147,22 +147,25 @@ class Simulation:
             rate_hz=self.rate_hz,
         )
         self.acquisition = Acquisition(
-            ready.array, ready.tiles, self._clock, anchor, rate_hz=scene.rate_hz, servo=servo
+            ready.array,
+            ready.tiles,
+            self._clock,
+            anchor,
+            rate_hz=scene.rate_hz,
+            servo=servo,
+            lead_end_ns=begin_ns + round(options.lead_s * 1e9),
         )
 
     def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
         """Frames with what the emulation adds: truth if asked for, the mill's notes."""
-        lead_ns = self._begin_ns + round(self._options.lead_s * 1e9)
         mill = self._world.mill
         batches = self.acquisition.run(lambda: self._clock.now_ns() >= self._end_ns)
         # Nobody watches, so frames may gather: batching does not change a bit of the result.
         while gathered := list(islice(batches, _GATHER)):
             batch = FrameBatch.concatenate(gathered)
-            lead = np.where(batch.t_mono_ns < lead_ns, FrameStatus.LEAD, 0).astype(np.uint8)
             extra: dict[str, npt.NDArray[Any]] = {}
             if self._options.truth:
                 extra |= asdict(self._world.truth(batch.t_mono_ns))
-            batch = replace(batch, frame_status=batch.frame_status | lead)
             if mill is not None:
                 extra |= mill.notes(batch.t_mono_ns)
                 # What the sensor reads while nothing is pressed is no reference for any tile.

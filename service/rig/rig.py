@@ -19,12 +19,13 @@ from devices.clock import SpinningClock, SystemClock, UtcAnchor
 from devices.emulation.ground.grounds import press_on
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace
 from devices.errors import I2cError, TileSetupError
+from devices.extras import needs_extra
 from devices.frames import ArrayInfo, FrameBatch
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
 from devices.scene.file import Scene
 from devices.scene.hardware import EMULATED, ServoScene
 from service.rig.description import describe
-from service.rig.reference import recovery_of, reference_of
+from service.rig.peripherals import open_recovery_lines, open_reference_sensor
 from storage.journal.in_flight import InFlight, open_in_flight
 
 if TYPE_CHECKING:
@@ -81,10 +82,10 @@ class Rig:
         world = self._world(options, stack)
         self._bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
         stack.callback(self._bus.close)
-        self._recovery = recovery_of(scene, self._clock, world)
-        self._beside = reference_of(scene, self._clock, world, stack)
+        self._recovery = open_recovery_lines(scene, self._clock, world)
+        self._reference_n = open_reference_sensor(scene, self._clock, world, stack)
         self._ready = make_ready(
-            self._bus, scene, self._clock, recovery=self._recovery, beside=self._beside
+            self._bus, scene, self._clock, recovery=self._recovery, beside=self._reference_n
         )
         self.remarks = [f"schedule {self._ready.choice.schedule}: {self._ready.choice.reason}"]
         """What a user should hear about it."""
@@ -175,7 +176,7 @@ class Rig:
                 self._clock,
                 self._ready,
                 recovery=self._recovery,
-                beside=self._beside,
+                beside=self._reference_n,
             )
         except (I2cError, TileSetupError):  # it is being plugged: go on with the others
             self._renew_at_ns = self._clock.now_ns() + _RENEW_AGAIN_NS
@@ -189,7 +190,8 @@ class Rig:
         if not options.emulated and (scene.servo is None or scene.servo.port != EMULATED):
             return None
         # Here, because a real node need not wait for scipy, nor have room for it.
-        from devices.emulation.world import World
+        with needs_extra("emulation", "an emulated array"):
+            from devices.emulation.world import World
 
         sys.setswitchinterval(_SWITCH_S)
         pressed = None

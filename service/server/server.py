@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import logging
 import re
 import time
 import uuid
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TextIO
 
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
@@ -21,6 +20,7 @@ from service.server.trash import Trash, destroy
 from service.server.views import NodeView, SessionView
 from service.server_clock import utc_ns
 from storage.durable import make_folder, remove_stale_temporaries, storage_errors, write_whole
+from storage.folder_lock import locked
 from storage.intervals import Intervals
 from storage.sessions.folder import Session, SessionFolder
 
@@ -82,7 +82,14 @@ class Server:
         self.data = data
         with storage_errors(data, "Choose another folder with --data"):
             make_folder(data)
-        self._lock = _locked(data)
+        self._lock = ExitStack()
+        self._lock.enter_context(
+            locked(
+                data,
+                refusal="another foottile server uses this data folder",
+                remedy="Stop it, or choose another folder with --data",
+            )
+        )
         try:
             remove_stale_temporaries(data)
             self.check_storage()
@@ -249,19 +256,3 @@ def _id_of(data: Path) -> str:
         kept = uuid.uuid4().hex
         write_whole(path, kept.encode() + b"\n")
     return kept
-
-
-def _locked(data: Path) -> TextIO:
-    """The folder's lock: two servers on one folder would each undo what the other writes."""
-    with storage_errors(data):
-        lock = (data / ".lock").open("w")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            lock.close()
-            raise StorageError(
-                "another foottile server uses this data folder",
-                where=str(data),
-                remedy="Stop it, or choose another folder with --data",
-            ) from error
-    return lock

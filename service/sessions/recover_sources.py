@@ -15,13 +15,14 @@ from service.estimation.tare.tare import Tare
 from service.sessions.sealing import Sources
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockLog
+from storage.clock.offset import ClockOffset
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.segment import SUFFIX
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes, unsynced_tail_max
 from storage.losses import CORRUPT, Losses
-from storage.sessions.folder import ClockOffset, Session
+from storage.sessions.folder import Session
 
 RATE_MAX_HZ = 1000.0
 """Of a stream of which not even the description is left: no bus is faster."""

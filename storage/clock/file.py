@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
-from devices.errors import FileFormatError, UsageError
+from devices.errors import FileFormatError
 from storage.clock.bounds import Rows
-from storage.clock.table import ClockTable, StreamFacts
+from storage.clock.offset import ClockOffset
+from storage.clock.table import StreamFacts
 from storage.durable import write_whole
-from storage.sessions.file import SessionReader
-from storage.sessions.folder import ClockOffset
 
 CLOCK_NAME = "clock.parquet"
 STREAMS_KEY = b"foottile.streams"
@@ -30,15 +29,7 @@ _FIELDS: list[pa.Field[Any]] = [
 _SCHEMA = pa.schema(_FIELDS)
 
 
-class _Stream(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-    boot_id: str
-    utc_offset_ns: int | None = None
-    clock_set: bool | None = None
-
-
-_STREAMS = TypeAdapter(tuple[_Stream, ...])
+_STREAMS = TypeAdapter(tuple[StreamFacts, ...])
 
 
 def write_clock(path: Path, rows: Sequence[ClockOffset], streams: Sequence[StreamFacts]) -> None:
@@ -48,7 +39,7 @@ def write_clock(path: Path, rows: Sequence[ClockOffset], streams: Sequence[Strea
         StorageError: the disk is full or not writable.
         OverflowError: a number does not fit an int64.
     """
-    facts = [_Stream(**vars(stream)).model_dump() for stream in streams]
+    facts = [vars(stream) for stream in streams]
     columns = {name: [getattr(row, name) for row in rows] for name in _SCHEMA.names}
     schema = _SCHEMA.with_metadata({STREAMS_KEY: json.dumps(facts).encode()})
     sink = pa.BufferOutputStream()
@@ -80,40 +71,4 @@ def read_clock(path: Path) -> tuple[dict[str, Rows], dict[str, StreamFacts]]:
         str(boot_id): Rows(*(values[boot_ids == boot_id] for values in arrays))
         for boot_id in dict.fromkeys(boot_ids.tolist())
     }
-    return rows, {s.boot_id: StreamFacts(**dict(s)) for s in facts}
-
-
-def clock_beside(reader: SessionReader) -> ClockTable:
-    """The clock table that lies beside a sealed session's frames.
-
-    Raises:
-        UsageError: there is none.
-        FileFormatError: it is damaged, or the session's notes are.
-    """
-    path = reader.path.with_name(CLOCK_NAME)
-    if not path.is_file():
-        raise UsageError(
-            f"there is no {CLOCK_NAME} beside {reader.path.name}, so the server's time is unknown",
-            where=str(reader.path.parent),
-            expected="a session's folder as a server sealed it",
-            remedy="Leave the clock at `node`, or fetch the session's folder whole",
-        )
-    rows, facts = read_clock(path)
-    info = reader.info
-    facts.setdefault(info.boot_id, StreamFacts(info.boot_id, info.utc_offset_ns, info.clock_set))
-    parts = _parts(reader)
-    streams = [facts.get(boot_id, StreamFacts(boot_id)) for boot_id in dict.fromkeys(parts)]
-    return ClockTable(rows, streams, parts, where=str(path))
-
-
-def _parts(reader: SessionReader) -> list[str]:
-    """Streams by number of part; a file that was never recorded is of one."""
-    session = reader.notes.get("session")
-    if session is None:
-        return [reader.info.boot_id]
-    try:
-        return [str(part["boot_id"]) for part in session["parts"]]
-    except (TypeError, KeyError) as error:
-        raise FileFormatError(
-            "its notes do not say which streams it is of", where=str(reader.path)
-        ) from error
+    return rows, {stream.boot_id: stream for stream in facts}

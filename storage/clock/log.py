@@ -15,8 +15,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from devices.errors import StorageError
+from storage.clock.offset import ClockOffset
 from storage.durable import make_folder, storage_errors, sync_folder
-from storage.sessions.folder import ClockOffset
 
 NAME = "clock.jsonl"
 

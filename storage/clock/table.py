@@ -14,9 +14,9 @@ import numpy as np
 
 from devices.errors import FileFormatError
 from storage.clock.bounds import ClockMap, Int64, Rows, Stretch
+from storage.clock.offset import ClockOffset
 from storage.clock.summary import ClockSummary, State, StepSummary, StreamSummary, StretchSummary
 from storage.schema import NO_INSTANT, Array
-from storage.sessions.folder import ClockOffset
 
 INSTANT_END_NS = 2**62
 """The year 2116; up to it sums of an instant and an offset can be kept apart from nonsense."""

@@ -33,6 +33,8 @@ from storage.wire import FRAMES_MAX, EncodedBatch, decode, encode
 
 SEGMENT_NS = 60_000_000_000
 """A segment is closed after a minute of frames: what is not needed is deleted by segments."""
+RING_NS = 600_000_000_000
+"""Frames of no session are kept so long, for pre-roll and for what was not recorded in time."""
 _OPEN_MAX = 2
 _WINDOW_FRAMES = 1 << 16
 """So many frames' index is in memory when a journal of any length is read."""

@@ -8,7 +8,6 @@ needs stay until a server has them on its disk; others are a ring of ten minutes
 from __future__ import annotations
 
 import errno
-import fcntl
 import logging
 import math
 import shutil
@@ -21,9 +20,10 @@ from pathlib import Path
 from devices.errors import StorageError
 from devices.frames import ArrayInfo
 from storage.durable import make_folder, storage_errors
+from storage.folder_lock import locked
 from storage.intervals import Intervals
 from storage.journal.in_flight import delete_in_flight
-from storage.journal.journal import Journal
+from storage.journal.journal import RING_NS, Journal
 from storage.journal.left_over import encoded, in_flight_since, taken_up
 from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import PROMISE_S, StreamNotes
@@ -34,8 +34,6 @@ from storage.wire import EncodedBatch
 
 log = logging.getLogger("foottile.journal")
 
-RING_NS = 600_000_000_000
-"""Frames of no session are kept so long, for pre-roll."""
 BUDGET_BYTES = 4 << 30
 """A day and a half of four tiles at full rate."""
 WAITING_BYTES = 32 << 20
@@ -86,8 +84,8 @@ class NodeJournal:
         self._thread = threading.Thread(target=self._run, name="journal")
         try:
             if not is_recovery:
-                self._lock(root / ".lock", fcntl.LOCK_SH)
-                self._lock(self.folder / ".lock", fcntl.LOCK_EX)
+                self._lock(root, is_shared=True)
+                self._lock(self.folder, is_shared=False)
             self.wanted = Wanted(self.folder / "wanted.json")
             self.streams: list[NodeStream] = self._found()
         except BaseException:
@@ -423,20 +421,20 @@ class NodeJournal:
                 stream.notes = stream.notes.model_copy(update={"number": before + 1})
         return streams
 
-    def _lock(self, path: Path, how: int) -> None:
+    def _lock(self, folder: Path, *, is_shared: bool) -> None:
+        with suppress(OSError):
+            make_folder(folder)
+        lock = locked(
+            folder,
+            is_shared=is_shared,
+            refusal="another foottile process uses this folder",
+            remedy="Stop it, or choose another folder with --journal or another --name",
+        )
         try:
-            make_folder(path.parent)
-            file = self._locks.enter_context(path.open("a"))
-        except OSError:  # a disk that takes nothing has no second user either
-            return
-        try:
-            fcntl.flock(file, how | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise StorageError(
-                "another foottile process uses this folder",
-                where=str(path.parent),
-                remedy="Stop it, or choose another folder with --journal or another --name",
-            ) from error
+            self._locks.enter_context(lock)
+        except StorageError as error:
+            if error.errno is None:  # a disk that takes nothing has no second user either
+                raise
 
 
 def settle_left_over(root: Path) -> None:

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import FileFormatError, UnknownError
 from storage.checked_json import with_check, without_check
+from storage.clock.offset import ClockOffset
 from storage.durable import make_folder, storage_errors, sync_folder, write_whole
 
 FRAMES_NAME = "frames.parquet"
@@ -68,15 +69,6 @@ class Event(_Record):
     label: str
     t_ns: int
     """In the server's UTC."""
-
-
-class ClockOffset(_Record):
-    """One measurement of the clocks' offset."""
-
-    boot_id: str
-    t_mono_ns: int
-    server_minus_node_ns: int
-    uncertainty_ns: int
 
 
 class Session(_Record):

@@ -12,9 +12,10 @@ from starlette.concurrency import run_in_threadpool
 from devices.errors import StateError, UnknownError
 from service.api.routes.access import ServerState, problems
 from service.sessions.sealing import table_of_rows
-from storage.clock.file import CLOCK_NAME, clock_beside
+from storage.clock.file import CLOCK_NAME
 from storage.clock.summary import ClockSummary
 from storage.formats.export import MEDIA_TYPES
+from storage.sessions.clock import clock_beside
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import FRAMES_NAME, Session
 

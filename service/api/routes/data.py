@@ -22,11 +22,13 @@ from devices.frames import FRAME_COLUMNS
 from service.api.problems import problem
 from service.api.routes.access import ServerState, problems
 from service.server.server import Server
-from service.sessions.sealing import SessionFrames, sha256_of, table_of_rows
+from service.sessions.sealing import SessionFrames, table_of_rows
 from service.version import SOFTWARE
-from storage.clock.file import CLOCK_NAME, clock_beside
+from storage.clock.file import CLOCK_NAME
 from storage.formats.export import MEDIA_TYPES, ClockName, Format, Slice, export
 from storage.schema import KNOWN
+from storage.sessions.clock import clock_beside
+from storage.sessions.content_hash import sha256_of
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import FRAMES_NAME, Session
 

@@ -18,13 +18,14 @@ from devices.errors import StorageError
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, FrameStatus
 from service.sessions import recover as recover_module
 from service.sessions.recover import Recovery, recover
+from storage.clock.offset import ClockOffset
 from storage.folder_lock import locked
 from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
 from storage.losses import Losses
 from storage.sessions.file import SessionReader
-from storage.sessions.folder import ClockOffset, Event, Part, Session, SessionFolder
+from storage.sessions.folder import Event, Part, Session, SessionFolder
 from storage.verify.data import as_dict, verdict_of, verify
 
 ID = "20200101T000000Z-00000a"

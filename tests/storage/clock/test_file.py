@@ -12,10 +12,11 @@ import pytest
 
 from devices.errors import FileFormatError, UsageError
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, TileInfo
-from storage.clock.file import clock_beside, read_clock, write_clock
+from storage.clock.file import read_clock, write_clock
+from storage.clock.offset import ClockOffset
 from storage.clock.table import StreamFacts
+from storage.sessions.clock import clock_beside
 from storage.sessions.file import SessionReader, SessionWriter
-from storage.sessions.folder import ClockOffset
 
 SECOND = 1_000_000_000
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from devices.errors import StorageError
 from storage.clock.log import ClockLog
-from storage.sessions.folder import ClockOffset
+from storage.clock.offset import ClockOffset
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from storage.clock.bounds import Rows
+from storage.clock.offset import ClockOffset
 from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
 from storage.schema import NO_INSTANT
-from storage.sessions.folder import ClockOffset
 
 SECOND = 1_000_000_000
 HOUR = 3600 * SECOND

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, StorageError, UnknownError
+from storage.clock.offset import ClockOffset
 from storage.sessions.folder import (
-    ClockOffset,
     Event,
     Ledger,
     Part,

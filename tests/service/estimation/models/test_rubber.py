@@ -70,7 +70,7 @@ def test_readings_at_one_instant_and_back_in_time_creep_nothing() -> None:
     assert out == pytest.approx([10.0, 10.0, 20.0], abs=1e-9)
 
 
-def test_without_creeping_parts_force_is_what_is_felt() -> None:
+def test_without_creeping_parts_force_is_what_appears() -> None:
     apparent_n = np.sin(np.arange(20.0))
     assert (
         compensated(apparent_n, 0.002 * np.arange(20), part=(0.0, 0.0)).tolist()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 
-class News:
-    """Tells what lasts: what comes and goes within a look is for the frames' flags."""
+class Notices:
+    """Tells what lasts; what comes and goes between two looks is only in the frames' flags."""
 
     def __init__(self) -> None:
         self._last: Mapping[str, str] = {}

@@ -1,4 +1,4 @@
-"""What stands beside an array: its reference force sensor, and lines that free its bus."""
+"""What is wired beside an array: its reference force sensor, and lines that free its bus."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from devices.emulation.world import World
 
 
-def reference_of(
+def open_reference_sensor(
     scene: Scene, clock: Clock, world: World | None, stack: ExitStack
 ) -> Callable[[], float] | None:
-    """Reads the scene's reference force in newtons; None if it has none.
+    """A function that reads the scene's reference force in newtons; None if it has no sensor.
 
     Raises:
         UsageError: an emulated sensor for a ground that has none.
@@ -45,8 +45,8 @@ def reference_of(
     return ReferenceForce(Mcp3208(device, where=reference.port), reference).read_n
 
 
-def recovery_of(scene: Scene, clock: Clock, world: World | None) -> BusRecovery | None:
-    """What can free the scene's bus; None if nothing is wired.
+def open_recovery_lines(scene: Scene, clock: Clock, world: World | None) -> BusRecovery | None:
+    """Lines that can free the scene's bus; None if none are wired.
 
     Raises:
         BusSetupError: the lines cannot be had.
