@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from devices.extras import needs_extra
-from service.cli.commands.simulate import OFFLINE_LAG_MS
 from service.cli.options import (
     JsonOption,
     output_path,
@@ -19,6 +18,7 @@ from service.cli.options import (
     say,
     stdout,
 )
+from service.estimation import OFFLINE_LAG_MS
 
 
 @needs_extra("server", "`foottile estimate`")

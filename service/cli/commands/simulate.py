@@ -34,11 +34,10 @@ from service.cli.options import (
     stdout,
 )
 from service.cli.report import ASSUMED_SCALE, accuracy_table, stances_json, stances_line
+from service.estimation import OFFLINE_LAG_MS
 
 if TYPE_CHECKING:
     from service.offline.simulate import Simulated
-
-OFFLINE_LAG_MS = 100.0
 
 
 @needs_extra("server", "`foottile simulate`")
