@@ -197,14 +197,17 @@ def _label(axes: Axes, mode: str, goal_n: float | None, marks: Sequence[_Mark]) 
     marks = sorted(marks, key=lambda m: (not m.rung.is_default, not m.rung.is_built_up))
     ns, errors_n = [m.ns for m in marks], [m.error_n.median for m in marks]
     front = pareto(list(zip(ns, errors_n, strict=True)))
+    bars = [([m.ns, m.ns], [m.error_n.low, m.error_n.high]) for m in marks]
+    along = ([ns[i] for i in front], [errors_n[i] for i in front])
+    goal = (list(axes.get_xlim()), [goal_n or 0.0] * 2)
+    x_lines, y_lines = zip(*bars, along, goal, strict=True)
     colour, _ = STYLES[mode]
     allocate(
         *(axes, ns, errors_n, [m.name for m in marks]),
         x_scatter=ns,
         y_scatter=errors_n,
-        x_lines=[[x, x] for x in ns] + [[ns[i] for i in front], axes.get_xlim()],
-        y_lines=[[m.error_n.low, m.error_n.high] for m in marks]
-        + [[errors_n[i] for i in front], [goal_n or 0.0] * 2],
+        x_lines=list(x_lines),
+        y_lines=list(y_lines),
         min_distance=0.018,
         textsize=[9.5 if m.rung.is_default else 8.5 for m in marks],
         fontweight=["bold" if m.rung.is_default else "normal" for m in marks],
