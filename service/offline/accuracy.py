@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -59,10 +59,9 @@ class Covered:
     def __add__(self, other: Covered) -> Covered:
         return Covered(self.frames + other.frames, self.within + other.within)
 
-    def as_dict(self) -> dict[str, float | int | None]:
+    def as_dict(self) -> dict[str, float]:
         """For JSON."""
-        share = self.share if self.frames else None
-        return {"frames": self.frames, "within": self.within, "coverage_95": share}
+        return {"frames": self.frames, "within": self.within, "coverage_95": self.share}
 
 
 @dataclass(frozen=True)
@@ -108,17 +107,6 @@ class Accuracy:
     cop_masked_share: float
     """The same as a part of all frames with more than 3 N of truth."""
     saturated_frames: int
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON: what is not finite is null."""
-        numbers = {
-            f.name: value if math.isfinite(value) else None
-            for f in fields(self)
-            for value in (getattr(self, f.name),)
-            if isinstance(value, float | int)
-        }
-        phases = {name: covered.as_dict() for name, covered in self.grf_phases.items()}
-        return {**numbers, "grf_phases": phases, "cop_covered": self.cop_covered.as_dict()}
 
 
 def judge(c: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0) -> Accuracy:

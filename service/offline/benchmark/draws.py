@@ -21,7 +21,8 @@ from service.estimation.calibration import Calibration
 from service.offline.accuracy import JUDGED, Accuracy, judge
 from service.offline.benchmark.rungs import Rung
 from service.offline.calibrations import find_calibration
-from service.offline.simulate import SimulateOptions, Simulation, joined
+from service.offline.findings import joined
+from service.offline.simulate import SimulateOptions, Simulation
 from service.rig.emulated import EmulatedFoot
 from service.sessions.pipeline import EstimateOptions, EstimateStream
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.cli.options import plain
 from service.estimation.estimates import EstimateStatus
 from service.offline.accuracy import JUDGED, PHASES, Accuracy, Covered, judge, phases_of
 
@@ -186,7 +187,7 @@ def test_a_published_estimate_is_compared_with_the_truth_one_look_ahead_later() 
 def test_where_there_is_nothing_to_judge_figures_are_nan_and_null_in_json() -> None:
     a = judge(columns([0.4, 0.4], cop_x_m=[np.nan, np.nan]))
     assert (a.grf_frames, a.cop_frames, a.stances) == (0, 0, 0)
-    figures = a.as_dict()
+    figures = plain(a)
     nothing = {name for name, value in figures.items() if value is None}
     assert nothing == {
         "grf_mae_n",
