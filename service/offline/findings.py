@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from devices.frames import FrameBatch
 from service.estimation.foot.stances import Stance, Stances
-from service.offline.accuracy import JUDGED, Accuracy, judge
+from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 
 if TYPE_CHECKING:
     from service.estimation.plan import EstimationPlan
@@ -47,13 +47,13 @@ class FindingsOf:
         self._stances.feed(batch.t_ns, columns["grf_n"], columns["contact"])
         if self._judging:
             known = {"t_ns": batch.t_ns, **columns}
-            self._judged.append({name: known[name] for name in JUDGED})
+            self._judged.append({name: known[name] for name in COMPARED})
 
     def finish(self, plan: EstimationPlan) -> Findings:
         """All of it; `plan` is what the estimates were made with."""
         accuracy = None
         if self._judged:
-            accuracy = judge(joined(self._judged), lag_ms=plan.lag_ns * 1e-6)
+            accuracy = accuracy_of(joined(self._judged), lag_ms=plan.lag_ns * 1e-6)
         return Findings(self._stances.finish(), accuracy, plan.assumed_scale)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.cli.options import plain
-from service.offline.accuracy import Accuracy, judge
+from service.offline.accuracy import Accuracy, accuracy_of
 from service.offline.benchmark.draws import Drawn
 from service.offline.benchmark.figures import Spread, coverage_of, figures_of, measured_of, pareto
 from service.offline.benchmark.rungs import rungs
@@ -30,7 +30,7 @@ def accuracy(error_n: float, frames: int = 20) -> Accuracy:
         "cop_sigma_x_m": np.full(frames, 1e-4),
         "estimate_status": np.zeros(frames, dtype=np.uint16),
     }
-    return judge(columns)
+    return accuracy_of(columns)
 
 
 def test_a_spread_is_median_and_5_to_95_percent() -> None:
