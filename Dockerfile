@@ -17,7 +17,8 @@ COPY web web
 RUN pip install --no-index --find-links /wheels hatchling \
     && pip wheel --no-deps --no-build-isolation -w /dist . \
     && python -m venv /opt/foottile \
-    && /opt/foottile/bin/pip install --no-index --find-links /wheels /dist/foottile-*.whl
+    && /opt/foottile/bin/pip install --no-index --find-links /wheels \
+        "$(ls /dist/foottile-*.whl)[server,emulation]"
 
 FROM python:3.12-slim-bookworm
 COPY --from=build /opt/foottile /opt/foottile

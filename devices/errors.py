@@ -3,6 +3,7 @@
     FootTileError
      +-- SceneError            (ValueError)    a scene file is wrong; exit code 2
      +-- UsageError            (ValueError)    a command's options do not fit together; exit code 2
+     |    +-- MissingExtraError                this installation lacks a package for what is asked
      +-- LoadTraceError        (ValueError)    a load trace cannot be pressed on the tiles
      +-- I2cError              (OSError)
      |    +-- NoAcknowledgeError               nobody answered at an address
@@ -11,7 +12,7 @@
      |    +-- BusSetupError                    no such bus, no permission
      +-- TileSetupError                        a tile's coefficients are absent or implausible
      +-- SpiError              (OSError)       a transfer over SPI failed
-     |    +-- SpiSetupError                    no such SPI device, no permission, no spidev
+     |    +-- SpiSetupError                    no such SPI device, no permission
      |    +-- AdcSilentError                   no converter drives the line
      +-- ServoError
      |    +-- ServoSetupError                  no such serial port
@@ -38,7 +39,7 @@ from __future__ import annotations
 class FootTileError(Exception):
     """Base of all errors; composes its text from the facts it keeps.
 
-    `exit_code` is what the command line returns for it (design: 1 failed, 2 usage).
+    `exit_code` is what the command line returns for it (1 failed, 2 usage).
     """
 
     exit_code = 1
@@ -86,6 +87,10 @@ class UsageError(FootTileError, ValueError):
     """Options of a command do not fit together or name something that is not there."""
 
     exit_code = 2
+
+
+class MissingExtraError(UsageError):
+    """This installation lacks a package for what is asked; an extra brings it."""
 
 
 class LoadTraceError(FootTileError, ValueError):

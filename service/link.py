@@ -82,8 +82,6 @@ class _Message(BaseModel):
 
 Pairs = tuple[tuple[_Seq, _Seq], ...]
 """Numbers as closed intervals."""
-OpenPairs = tuple[tuple[_Seq, _Seq | None], ...]
-"""The same; one without an end goes on with every frame to come."""
 PairsByReason = dict[Annotated[str, Field(pattern=r"^[a-z_]{1,40}$")], Pairs]
 
 
@@ -133,7 +131,8 @@ class StreamNumbers(_Message):
     """Numbers of one stream."""
 
     boot_id: str
-    numbers: OpenPairs
+    numbers: tuple[tuple[_Seq, _Seq | None], ...]
+    """An interval without an end goes on with every frame to come."""
 
 
 class Wanted(_Message):
@@ -169,7 +168,7 @@ class Ack(_Message):
     seq_last: _Seq
 
 
-class Stream(_Message):
+class FramesOf(_Message):
     """The frames that follow are of this stream."""
 
     type: Literal["stream"] = "stream"
@@ -217,11 +216,11 @@ class Status(_Message):
     """How often what went wrong in this stream, by serial and reason."""
 
 
-FromNode: TypeAdapter[Hello | Stream | Probe | ClockRow | Status | Lost] = TypeAdapter(
-    Annotated[Hello | Stream | Probe | ClockRow | Status | Lost, Field(discriminator="type")]
-)
-FromServer: TypeAdapter[Welcome | Ack | Wanted | Probe] = TypeAdapter(
-    Annotated[Welcome | Ack | Wanted | Probe, Field(discriminator="type")]
+SaidByNode = Hello | FramesOf | Probe | ClockRow | Status | Lost
+SaidByServer = Welcome | Ack | Wanted | Probe
+FromNode: TypeAdapter[SaidByNode] = TypeAdapter(Annotated[SaidByNode, Field(discriminator="type")])
+FromServer: TypeAdapter[SaidByServer] = TypeAdapter(
+    Annotated[SaidByServer, Field(discriminator="type")]
 )
 
 

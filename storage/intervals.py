@@ -5,6 +5,12 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator
 
+NO_END = 2**62
+"""In place of the last number of an interval that goes on with every number to come."""
+
+OpenPairs = tuple[tuple[int, int | None], ...]
+"""Intervals as they travel and are kept; None: this one goes on with every number to come."""
+
 
 class Intervals:
     """A set of integers, kept as sorted intervals `(first, last)` that neither touch nor overlap.
@@ -93,3 +99,13 @@ class Intervals:
     def __sub__(self, other: Intervals) -> Intervals:
         """The numbers of this set that are not in `other`."""
         return Intervals(gap for a, b in self._intervals for gap in other.missing(a, b))
+
+
+def closed(pairs: Iterable[tuple[int, int | None]]) -> Intervals:
+    """Intervals of which some have no end, as a set."""
+    return Intervals((first, NO_END if last is None else last) for first, last in pairs)
+
+
+def with_open_ends(pairs: Iterable[tuple[int, int]]) -> OpenPairs:
+    """The same the other way round."""
+    return tuple((first, None if last >= NO_END else last) for first, last in pairs)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
@@ -184,3 +186,50 @@ def test_every_setting_can_be_given_on_the_command_line() -> None:
     serve = typer.main.get_command(app).commands["serve"]
     options = {parameter.name for parameter in serve.params}
     assert set(Settings.model_fields) - {"token"} <= options
+
+
+CITED = re.compile(
+    r"\b(hardware|performance)\.md((?:,? (?:and |to )?\d{1,2}(?:\.\d)?\b(?!\.?\d))*)"
+)
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+
+
+def sources() -> Iterator[Path]:
+    for folder in ("devices", "storage", "service", "tests", "benchmarks"):
+        yield from sorted((ROOT / folder).rglob("*.py"))
+
+
+def sections(document: Path) -> set[str]:
+    return set(re.findall(r"^##+ (\d+(?:\.\d)?)\.? ", document.read_text("utf-8"), re.MULTILINE))
+
+
+def test_every_section_that_the_source_cites_exists() -> None:
+    known = {name: sections(ROOT / "docs" / f"{name}.md") for name in ("hardware", "performance")}
+    cited = 0
+    for path in sources():
+        text = re.sub(r"\s+", " ", path.read_text("utf-8"))
+        for document, numbers in CITED.findall(text):
+            for number in re.findall(r"[\d.]+", numbers):
+                cited += 1
+                assert number in known[document], (
+                    f"{path.relative_to(ROOT)}: {document}.md {number}"
+                )
+    assert cited > 80
+
+
+def anchors(document: Path) -> set[str]:
+    """Of its headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", document.read_text("utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_link_between_documents_leads_somewhere(document: Path) -> None:
+    for link in LINK.findall(document.read_text("utf-8")):
+        if "://" in link:
+            continue
+        path, _, anchor = link.partition("#")
+        target = (document.parent / path).resolve() if path else document
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link

@@ -9,12 +9,15 @@ from __future__ import annotations
 from typing import Protocol
 
 from devices.errors import SpiSetupError, UsageError
+from devices.extras import needs_extra
 
 MAX_SPEED_HZ = 1_000_000
 """What an MCP3208 stands at the Pi's 3.3 V (hardware.md 6)."""
 
 MODE = 0
 """Clock idle low, bits taken at its rising edge: mode 0,0 of the MCP3208 data sheet."""
+
+_INSTALL = "Install it: pip install 'foottile[rig]' (it is compiled, and needs gcc)"
 
 
 class SpiDevice(Protocol):
@@ -37,21 +40,16 @@ def open_spi(name: str, emulated: SpiDevice | None = None) -> SpiDevice:
     An emulated device has to be handed in: the world behind it is made by whoever runs it.
 
     Raises:
-        SpiSetupError: the device is missing or may not be opened, or spidev is not installed.
+        SpiSetupError: the device is missing or may not be opened.
+        MissingExtraError: spidev is not installed.
         UsageError: `"emulated"` without an emulated device.
     """
     if name == "emulated":
         if emulated is None:
             raise UsageError("SPI device 'emulated' needs an emulated world, and none was given")
         return emulated
-    try:
+    with needs_extra("rig", f"the SPI device {name}", remedy=_INSTALL):
         from spidev import SpiDev
-    except ImportError as error:
-        raise SpiSetupError(
-            "a device on SPI needs spidev",
-            where=name,
-            remedy="Install the extra: pip install '.[rig]' (it is compiled, and needs gcc)",
-        ) from error
     device = SpiDev()
     try:
         device.open_path(name)

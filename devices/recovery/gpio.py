@@ -17,6 +17,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING
 
 from devices.errors import BusSetupError
+from devices.extras import needs_extra
 from devices.scene.hardware import RecoveryScene
 
 if TYPE_CHECKING:
@@ -48,19 +49,14 @@ class GpioLines:
     """SCL, SDA and RESET of one bus.
 
     Raises:
-        BusSetupError: gpiod, or the tool that gives the pins back, is not installed.
+        MissingExtraError: gpiod is not installed.
+        BusSetupError: the tool that gives the pins back is not installed.
     """
 
     def __init__(self, scene: RecoveryScene) -> None:
         self._scene = scene
-        try:
+        with needs_extra("gpio", "recovery of the bus"):
             import gpiod  # noqa: F401  # a later import must not be the first to fail
-        except ImportError as error:
-            raise BusSetupError(
-                "recovery of the bus needs gpiod",
-                where=scene.gpiochip,
-                remedy="Install the extra: pip install '.[gpio]', or remove [recovery]",
-            ) from error
         tool = next(filter(None, map(shutil.which, _TOOLS)), None)
         if tool is None:
             raise BusSetupError(

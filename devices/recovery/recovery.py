@@ -125,7 +125,8 @@ def open_recovery(scene: RecoveryScene | None, clock: Clock) -> BusRecovery | No
     the mud. The bus must be idle meanwhile.
 
     Raises:
-        BusSetupError: gpiod or the tool that gives pins back is not installed, or a line is in use.
+        MissingExtraError: gpiod is not installed.
+        BusSetupError: the tool that gives pins back is not installed, or a line is in use.
     """
     if scene is None:
         return None

@@ -33,12 +33,12 @@ from service.link import (
     Ack,
     ClockRow,
     Close,
+    FramesOf,
     FromServer,
     Hello,
     Lost,
     Probe,
     Status,
-    Stream,
     Wanted,
     Welcome,
     heard,
@@ -48,9 +48,8 @@ from service.link import (
 from service.node.backlog import Backlog
 from service.node.dial import dial
 from service.node.flow import Flow
-from storage.intervals import Intervals
+from storage.intervals import NO_END, Intervals
 from storage.journal.node_stream import NodeStream
-from storage.sessions.ledger import NO_END
 from storage.wire import EncodedBatch
 
 PROBE_EVERY_S = 10.0
@@ -265,7 +264,7 @@ class Publisher:
                 continue
             if boot_id != named:
                 named = boot_id
-                await socket.send(say(Stream(boot_id=boot_id)))
+                await socket.send(say(FramesOf(boot_id=boot_id)))
             await socket.send(with_check(batch.payload))
             self._flow.sent(len(batch.payload))
             if self._flow.wants_mark:

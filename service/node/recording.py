@@ -16,11 +16,11 @@ from devices.errors import FootTileError, StorageError
 from service.estimation.calibration import Calibration
 from service.server_clock import utc_ns
 from storage.durable import remove_stale_temporaries
-from storage.intervals import Intervals
+from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
 from storage.sessions.folder import Part, Session, SessionFolder, new_session_id
-from storage.sessions.ledger import NO_END, StreamState, ledger_of, lost_numbers
+from storage.sessions.ledger import StreamState, ledger_of, lost_numbers
 
 
 class NodeRecording:

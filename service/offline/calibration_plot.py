@@ -37,7 +37,7 @@ def plot_calibration(
         recordings: what each tile was fitted to, by serial.
 
     Raises:
-        UsageError: matplotlib is not installed.
+        MissingExtraError: matplotlib is not installed.
     """
     tiles = calibration.tiles
     fast = {tile.serial: replays(recordings[tile.serial], tile) for tile in tiles}

@@ -15,6 +15,7 @@ from pathlib import Path
 from platformdirs import user_cache_path
 
 from devices.errors import CalibrationError
+from devices.extras import needs_extra
 from devices.scene.file import Scene, build_scene, load_scene
 from service.estimation.calibration import PRESETS, Calibration
 from service.version import SOFTWARE
@@ -88,8 +89,9 @@ def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) 
         except CalibrationError:
             kept.unlink(missing_ok=True)  # a damaged cache is no calibration, and no reason to fail
     # Here, because only the emulated bench needs the physics.
-    from service.offline.calibrate import calibrate
-    from service.offline.simulate import SimulateOptions, simulate
+    with needs_extra("server", "the emulated bench"):
+        from service.offline.calibrate import calibrate
+        from service.offline.simulate import SimulateOptions, simulate
 
     progress(f"pressing tile {serial} on the emulated bench")
     with tempfile.TemporaryDirectory(prefix="foottile-bench-") as work:

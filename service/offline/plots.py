@@ -1,11 +1,11 @@
-"""Plots for people. matplotlib is an extra: `pip install '.[plot]'`."""
+"""Plots for people."""
 
 from __future__ import annotations
 
 from io import BytesIO
 from typing import TYPE_CHECKING
 
-from devices.errors import UsageError
+from devices.extras import needs_extra
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -17,15 +17,11 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure of that size in inches.
 
     Raises:
-        UsageError: matplotlib is not installed.
+        MissingExtraError: matplotlib is not installed.
     """
-    try:
+    with needs_extra("plot", "a plot"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise UsageError(
-            "plots need matplotlib", remedy="Install the extra: pip install '.[plot]'"
-        ) from error
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

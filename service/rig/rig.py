@@ -19,6 +19,7 @@ from devices.clock import SpinningClock, SystemClock, UtcAnchor
 from devices.emulation.ground.grounds import press_on
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace
 from devices.errors import I2cError, TileSetupError
+from devices.extras import needs_extra
 from devices.frames import ArrayInfo, FrameBatch
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
 from devices.scene.file import Scene
@@ -189,7 +190,8 @@ class Rig:
         if not options.emulated and (scene.servo is None or scene.servo.port != EMULATED):
             return None
         # Here, because a real node need not wait for scipy, nor have room for it.
-        from devices.emulation.world import World
+        with needs_extra("emulation", "an emulated array"):
+            from devices.emulation.world import World
 
         sys.setswitchinterval(_SWITCH_S)
         pressed = None

@@ -18,10 +18,10 @@ from service.server.nodes import Node
 from service.server.streams import ServerStream
 from service.server_clock import utc_ns
 from storage.clock.offset import ClockOffset
-from storage.intervals import Intervals
+from storage.intervals import NO_END, Intervals
 from storage.losses import GIVEN_UP
 from storage.sessions.folder import Part, Session, new_session_id
-from storage.sessions.ledger import NO_END, StreamState
+from storage.sessions.ledger import StreamState
 
 _UNHEARD_S = 1.0
 _SLOWEST = 1.5

@@ -19,13 +19,14 @@ from service.link import (
     Ack,
     ClockRow,
     Close,
+    FramesOf,
     FromNode,
     HangUp,
     Hello,
     Lost,
     Probe,
+    SaidByNode,
     Status,
-    Stream,
     Welcome,
     checked,
     close_reason,
@@ -142,7 +143,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
             case Probe(id=number):
                 answer = Probe(id=number, server_t_ns=utc_ns())
                 await socket.send_text(say(answer))
-            case Stream(boot_id=boot_id):
+            case FramesOf(boot_id=boot_id):
                 if boot_id not in node.order:
                     raise HangUp(Close.MALFORMED, f"stream {boot_id[:80]!r} was not announced")
                 link.stream = node.streams[boot_id]
@@ -195,7 +196,7 @@ async def _receive(socket: WebSocket) -> str | bytes:
     return data
 
 
-def _parse(message: str | bytes, code: Close) -> Hello | Stream | Probe | ClockRow | Status | Lost:
+def _parse(message: str | bytes, code: Close) -> SaidByNode:
     try:
         if isinstance(message, bytes):
             raise HangUp(code, "a text message was expected, and a binary one came")

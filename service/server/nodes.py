@@ -31,10 +31,9 @@ from service.sessions.pipeline import Columns
 from service.sessions.tares import RecordedTare, TareHistory
 from storage.clock.offset import ClockOffset
 from storage.durable import make_folder, storage_errors, write_whole
-from storage.intervals import Intervals
+from storage.intervals import NO_END, Intervals, with_open_ends
 from storage.journal.journal import RING_NS, Journal
 from storage.losses import NODE_RESTARTED
-from storage.sessions.ledger import NO_END
 from storage.wire import decode
 
 log = logging.getLogger("foottile.nodes")
@@ -198,8 +197,7 @@ class Node:
             first = (asked & wanted).within(0, self.hello.next_seq - 1 if present else NO_END)
             numbers = _joined([*first, *asked - first])
             if numbers:
-                ends = [(a, None if b >= NO_END else b) for a, b in numbers]
-                found.append(StreamNumbers(boot_id=name, numbers=tuple(ends)))
+                found.append(StreamNumbers(boot_id=name, numbers=with_open_ends(numbers)))
         return tuple(found)
 
     def detach(self) -> None:

@@ -29,10 +29,11 @@ from service.server import ends as parts
 from service.server.nodes import Node, Nodes
 from service.server.trash import Trash
 from service.server_clock import utc_ns
-from service.sessions.sealing import Sources, seal, write_events
-from storage.intervals import Intervals
+from service.sessions.sealing import Sources, seal
+from storage.intervals import NO_END, Intervals, with_open_ends
+from storage.sessions.events import write_events
 from storage.sessions.folder import Event, Ledger, Session, SessionFolder, new_session_id
-from storage.sessions.ledger import NO_END, ledger_of, lost_numbers
+from storage.sessions.ledger import ledger_of, lost_numbers
 
 log = logging.getLogger("foottile.recorder")
 
@@ -391,12 +392,11 @@ class Recorder:
 
     def wanted(self, node_name: str) -> Wanted:
         """The same as the node is told it."""
-        streams = []
-        for boot_id, numbers in sorted(self.needed(node_name).items()):
-            ends = tuple((a, None if b >= NO_END else b) for a, b in numbers)
-            streams.append(StreamNumbers(boot_id=boot_id, numbers=ends))
-        recording = bool(self.recording_on(node_name))
-        return Wanted(streams=tuple(streams), recording=recording)
+        streams = tuple(
+            StreamNumbers(boot_id=boot_id, numbers=with_open_ends(numbers))
+            for boot_id, numbers in sorted(self.needed(node_name).items())
+        )
+        return Wanted(streams=streams, recording=bool(self.recording_on(node_name)))
 
     def _settle(self, session_id: str) -> None:
         session = self._sessions[session_id]

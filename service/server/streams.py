@@ -15,12 +15,11 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.link import ClockRow, EarlierStream, Hello, PairsByReason
 from storage.clock.log import ClockLog
 from storage.clock.offset import ClockOffset
-from storage.intervals import Intervals
+from storage.intervals import NO_END, Intervals
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.schema import wire_schema
-from storage.sessions.ledger import NO_END
 
 CLOCK_ROWS = 128
 """So many measurements of a clock are at hand for a pre-roll; all of them are in the log."""

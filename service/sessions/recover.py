@@ -26,15 +26,16 @@ from service.sessions.recover_sources import (
     sources_of,
     with_clock_logs,
 )
-from service.sessions.sealing import seal, write_events
+from service.sessions.sealing import seal
 from storage.durable import remove_stale_temporaries
-from storage.intervals import Intervals
+from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import settle_left_over
 from storage.journal.segment import UNREAD_SUFFIX
 from storage.losses import GIVEN_UP, NODE_RESTARTED, Losses
+from storage.sessions.events import EVENTS_NAME, write_events
 from storage.sessions.folder import Ledger, Part, Session, SessionFolder, new_session_id
-from storage.sessions.ledger import NO_END, StreamState, ledger_of
-from storage.verify.session import EVENTS_NAME, verify_session
+from storage.sessions.ledger import StreamState, ledger_of
+from storage.verify.session import verify_session
 
 Outcome = Literal["sealed", "waiting", "failed"]
 Streams = Mapping[tuple[str, str], Stream]

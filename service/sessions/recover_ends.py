@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from service.sessions.recover_sources import RATE_MAX_HZ, Stream
+from storage.intervals import NO_END
 from storage.journal.stream_notes import unsynced_tail_max
 from storage.sessions.folder import Part, Session
-from storage.sessions.ledger import NO_END
 
 
 def with_ends(

@@ -11,24 +11,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from devices.errors import FileFormatError, FootTileError
 from devices.frames import ArrayInfo, FrameBatch
+from service.estimation import OFFLINE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.plan import EstimationPlan
 from service.estimation.tare.tare import Tare
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateStream, notes_of
 from storage.clock.file import CLOCK_NAME, write_clock
 from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
-from storage.durable import write_whole
 from storage.journal.journal import Journal
 from storage.sessions.content_hash import sha256_of
+from storage.sessions.events import write_events
 from storage.sessions.file import SessionWriter
 from storage.sessions.folder import FRAMES_NAME, Ledger, Session
 
-OFFLINE_LAG_MS = 100.0
 _GATHER_FRAMES = 4096
 
 
@@ -179,30 +177,6 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
 
 _IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts", "scene"}
 """What the sealed file says of its session; names and notes may change later and are not in it."""
-
-
-def write_events(session: Session, folder: Path) -> None:
-    """Write `events.parquet` anew.
-
-    Raises:
-        StorageError: the disk is full or not writable.
-    """
-    _write_table(
-        pa.table(
-            {
-                "id": pa.array([event.id for event in session.events], pa.string()),
-                "label": pa.array([event.label for event in session.events], pa.string()),
-                "t_ns": pa.array([event.t_ns for event in session.events], pa.int64()),
-            }
-        ),
-        folder / "events.parquet",
-    )
-
-
-def _write_table(table: pa.Table, path: Path) -> None:
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
-    write_whole(path, sink.getvalue().to_pybytes())
 
 
 def table_of_rows(sources: Sources) -> ClockTable:

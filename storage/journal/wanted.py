@@ -6,17 +6,14 @@ ask for these frames when it is back.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import FileFormatError
 from storage.durable import write_whole
-from storage.intervals import Intervals
-from storage.sessions.ledger import NO_END
-
-OpenPairs = tuple[tuple[int, int | None], ...]
+from storage.intervals import NO_END, Intervals, OpenPairs, closed
 
 
 class ServerWants(BaseModel):
@@ -125,8 +122,3 @@ class Wanted:
             StorageError: the disk is full or not writable.
         """
         write_whole(self._path, _File(servers=self._servers).model_dump_json().encode())
-
-
-def closed(pairs: Iterable[tuple[int, int | None]]) -> Intervals:
-    """Intervals of which some have no end."""
-    return Intervals((first, NO_END if last is None else last) for first, last in pairs)

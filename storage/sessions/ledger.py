@@ -12,8 +12,6 @@ from storage.intervals import Intervals
 from storage.losses import NODE_RESTARTED, Losses
 from storage.sessions.folder import Ledger, Part, PartLedger
 
-NO_END = 2**62
-
 
 @dataclass(frozen=True)
 class StreamState:

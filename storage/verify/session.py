@@ -16,16 +16,17 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import FileFormatError
-from storage.intervals import Intervals
+from storage.clock.file import CLOCK_NAME
+from storage.intervals import NO_END, Intervals
 from storage.losses import Losses
 from storage.sessions.claims import SESSION_NAME, Claims, bytes_of, claims_in, claims_of, first_line
 from storage.sessions.content_hash import file_hashes, sha256_of
+from storage.sessions.events import EVENTS_NAME
 from storage.sessions.folder import FRAMES_NAME, Event, Ledger, Session
-from storage.sessions.ledger import NO_END, StreamState, ledger_of
+from storage.sessions.ledger import StreamState, ledger_of
 from storage.verify.file import FileReport, ledger_problems, verify_file
 from storage.verify.journal import StreamReport, verify_stream
 
-EVENTS_NAME, CLOCK_NAME = "events.parquet", "clock.parquet"
 _TRIES = 3
 _SAME_S = 1e-6
 _CLOCK_COLUMNS = ("boot_id", "t_mono_ns", "server_minus_node_ns", "uncertainty_ns")
@@ -66,13 +67,8 @@ class SessionReport:
         """How many frames are recorded."""
         return sum(part.recorded for part in self.ledger.parts) if self.ledger else 0
 
-    @property
-    def is_complete(self) -> bool:
-        """Is it whole, and every frame of it there?"""
-        return not self.problems and self.ledger is not None and self.ledger.complete
-
     def as_dict(self) -> dict[str, Any]:
-        """The ledger, and what was found (design.md 6)."""
+        """The ledger, and what was found (docs/formats.md)."""
         empty = Ledger(complete=False, lossy=False, parts=(), missed_slots=0)
         ledger = self.ledger or empty
         if self.problems:

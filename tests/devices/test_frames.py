@@ -25,7 +25,7 @@ from devices.frames import (
     TileStatus,
 )
 
-# design.md 4, table of the columns
+# docs/formats.md, table of the columns
 DESIGN = {
     "seq": ("uint64", False),
     "t_mono_ns": ("int64", False),

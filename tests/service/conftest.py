@@ -46,9 +46,9 @@ from service.link import (
     SUBPROTOCOL,
     ClockRow,
     EarlierStream,
+    FramesOf,
     FromServer,
     Hello,
-    Stream,
     Wanted,
     heard,
     with_check,
@@ -490,12 +490,12 @@ class FakeNode:
 
     def send_earlier(self, stream: Earlier, seq_first: int, seq_last: int) -> None:
         """Send frames of a stream before this one, then go on with this one."""
-        self.socket.send(Stream(boot_id=stream.info.boot_id).model_dump_json())
+        self.socket.send(FramesOf(boot_id=stream.info.boot_id).model_dump_json())
         rows = FrameBatch.concatenate(stream.sent).rows(seq_first, seq_last + 1)
         for begin in range(0, len(rows), 10):
             batch = rows.rows(begin, begin + 10)
             self.socket.send(encode(batch, wire_schema(stream.info)))
-        self.socket.send(Stream(boot_id=self.boot_id).model_dump_json())
+        self.socket.send(FramesOf(boot_id=self.boot_id).model_dump_json())
 
     def payload(self, batch: FrameBatch) -> bytes:
         return encode(batch, wire_schema(self.info))

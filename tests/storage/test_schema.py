@@ -192,7 +192,7 @@ def test_what_was_received_outlives_its_reader() -> None:
 
 
 def test_the_wire_is_a_fixed_number_of_bytes_a_frame_beside_its_header() -> None:
-    # 8 + 8 + 8 + 4 + 4 + 1 + 4 of a frame, and 2 + 2 + 4 + 1 of each tile (design section 4)
+    # 8 + 8 + 8 + 4 + 4 + 1 + 4 of a frame, and 2 + 2 + 4 + 1 of each tile (docs/formats.md)
     record = record_of(frames(64, 4))
     assert record.nbytes == 64 * (37 + 4 * 9)
 

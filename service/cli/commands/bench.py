@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from devices.errors import UsageError
+from devices.extras import needs_extra
 from devices.scene.file import load_scene
 from service.cli.emulation import check_emulated
 from service.cli.options import JsonOption, json_text, print_json, remark, say, telling
@@ -22,6 +23,7 @@ SECONDS_MAX = 1000.0
 REPETITIONS, QUICK_REPETITIONS = 5, 3
 
 
+@needs_extra("server", "`foottile bench`")
 def bench_command(
     out: Annotated[
         Path, typer.Option(help="Folder for bench.json, bench.md and bench.png; made if absent.")

@@ -7,9 +7,11 @@ from typing import Annotated
 
 import typer
 
+from devices.extras import needs_extra
 from service.cli.options import JsonOption, output_path, print_json, progress, remark, stdout
 
 
+@needs_extra("server", "`foottile calibrate`")
 def calibrate_command(
     recordings: Annotated[
         list[Path],

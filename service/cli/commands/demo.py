@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import FootTileError, UsageError
+from devices.extras import needs_extra
 from devices.scene.hardware import EMULATED
 from service.cli.commands.node import calibration_of
 from service.cli.commands.serve import PREPARING, announce
@@ -28,6 +29,7 @@ from service.cli.emulation import (
     scene_with,
 )
 from service.cli.options import remark
+from service.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
     from service.server.server import Server
@@ -37,6 +39,7 @@ _SEAL_S = 20.0
 _END_S = 8.0
 
 
+@needs_extra("server", "`foottile demo`")
 def demo_command(
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")] = "rolling",
     load: LoadOption = None,
@@ -105,7 +108,7 @@ async def _demo(
     host: str, port: int, data: Path, seconds: float | None, node_arguments: list[str]
 ) -> None:
     from service.api.app import make_app
-    from service.api.serve import listen, serving, stop_on_signals, token_for, urls_of
+    from service.api.serve import listen, serving, token_for, urls_of
     from service.server.server import Server
 
     stop = stop_on_signals()

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.commands.simulate import OFFLINE_LAG_MS
+from devices.extras import needs_extra
 from service.cli.options import (
     JsonOption,
     output_path,
@@ -18,8 +18,10 @@ from service.cli.options import (
     say,
     stdout,
 )
+from service.estimation import OFFLINE_LAG_MS
 
 
+@needs_extra("server", "`foottile estimate`")
 def estimate_command(
     session: Annotated[Path, typer.Argument(metavar="IN.parquet", help="Session to estimate.")],
     out: Annotated[Path, typer.Option(help="Session to write, with the new estimates.")],

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from devices.errors import CalibrationError, UsageError
+from devices.errors import CalibrationError, MissingExtraError, UsageError
 from service.cli.emulation import (
     CopAxesOption,
     CopOffsetOption,
@@ -25,6 +25,7 @@ from service.cli.emulation import (
     scene_with,
 )
 from service.cli.options import remark, say
+from service.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
@@ -136,7 +137,6 @@ def node_command(
 
 
 async def _run(options: NodeOptions) -> Outcome:
-    from service.api.serve import stop_on_signals
     from service.node.run import run_node
 
     return await run_node(options, stop=stop_on_signals(), report=remark)
@@ -164,7 +164,7 @@ def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]
             parts_seed=options.parts_seed,
             progress=remark,
         )
-    except CalibrationError as error:
+    except (CalibrationError, MissingExtraError) as error:
         remark(f"no calibration, so no forces: {error}")
         return None, str(error)
     return calibration, None

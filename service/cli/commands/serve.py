@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from devices.extras import needs_extra
 from service.cli.options import remark, say
+from service.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
     from service.api.settings import Settings
 
 
+@needs_extra("server", "`foottile serve`")
 def serve_command(
     host: Annotated[
         str | None, typer.Option(help="Address to listen on; default 127.0.0.1: this machine only.")
@@ -43,7 +46,7 @@ def serve_command(
 
 async def _serve(settings: Settings) -> None:
     from service.api.app import make_app
-    from service.api.serve import listen, serving, stop_on_signals, token_for, urls_of
+    from service.api.serve import listen, serving, token_for, urls_of
     from service.server.server import Server
 
     stop = stop_on_signals()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError
+from devices.extras import needs_extra
 from service.cli.options import JsonOption, output_path, print_json, progress, remark, say, stdout
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ _LONG = {"ledger", "events", "clock", "calibration", "scene_content"}
 ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
 
 
+@needs_extra("server", "`foottile sessions`")
 def sessions_command(
     server: ServerOption = None,
     data: Annotated[
@@ -68,6 +70,7 @@ def sessions_command(
     stdout.print(table)
 
 
+@needs_extra("server", "`foottile pull`")
 def pull_command(
     session: Annotated[str, typer.Argument(help="Id of the session.")],
     out: Annotated[Path, typer.Option(help="Folder to put it in; made if absent.")],

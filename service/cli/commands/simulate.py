@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 import typer
 
 from devices.errors import UsageError
+from devices.extras import needs_extra
 from devices.scene.file import Scene, load_scene
 from devices.scene.hardware import AnySchedule, ScheduleName
 from service.cli.emulation import (
@@ -33,13 +34,13 @@ from service.cli.options import (
     stdout,
 )
 from service.cli.report import ASSUMED_SCALE, accuracy_table, stances_json, stances_line
+from service.estimation import OFFLINE_LAG_MS
 
 if TYPE_CHECKING:
     from service.offline.simulate import Simulated
 
-OFFLINE_LAG_MS = 100.0
 
-
+@needs_extra("server", "`foottile simulate`")
 def simulate_command(
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")],
     out: Annotated[

@@ -50,7 +50,7 @@ def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
     """The plot as a PNG.
 
     Raises:
-        UsageError: matplotlib is not installed.
+        MissingExtraError: matplotlib is not installed.
     """
     figure = new_figure(9.0, 1.4 + 5.0 * len(scenes))
     panels = figure.subplots(len(scenes), 2, squeeze=False)

@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 
 from devices.buses.spi import open_spi
-from devices.errors import SpiSetupError, UsageError
+from devices.errors import MissingExtraError, SpiSetupError, UsageError
 
 
 class FakeSpiDev:
@@ -74,7 +74,7 @@ def test_a_device_that_cannot_be_opened_is_closed_and_said(
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "spidev", None)
-    with pytest.raises(SpiSetupError, match=r"'\.\[rig\]'"):
+    with pytest.raises(MissingExtraError, match=r"'foottile\[rig\]'"):
         open_spi("/dev/spidev0.0")
 
 

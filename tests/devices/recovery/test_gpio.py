@@ -12,7 +12,7 @@ from typing import Any, Self
 import pytest
 
 from devices.clock import VirtualClock
-from devices.errors import BusSetupError
+from devices.errors import BusSetupError, MissingExtraError
 from devices.recovery.gpio import GpioLines
 from devices.recovery.recovery import GpioRecovery, open_recovery
 from devices.scene.hardware import RecoveryScene
@@ -181,7 +181,7 @@ def test_a_line_that_fails_while_it_is_moved_is_said(pi: Pi) -> None:
 
 def test_without_the_library_the_extra_is_named(pi: Pi, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gpiod", None)
-    with pytest.raises(BusSetupError, match=r"'\.\[gpio\]'"):
+    with pytest.raises(MissingExtraError, match=r"'foottile\[gpio\]'"):
         open_recovery(RecoveryScene(), VirtualClock())
 
 

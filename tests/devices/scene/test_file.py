@@ -88,7 +88,7 @@ def test_the_hopping_foot_is_the_rolling_one(name: str) -> None:
 
 
 def test_the_hopping_leg_is_the_papers_and_falls_from_10_cm() -> None:
-    # hardware.md 0: 909 g; design.md 6: a 10 cm drop, on wet ground about 5 cm deep
+    # hardware.md 0: 909 g; docs/scenes.md: a 10 cm drop, on wet ground about 5 cm deep
     for name in ("poppy", "mud"):
         ground = load_scene(name).ground
         assert isinstance(ground, PoppyGround | MudGround)

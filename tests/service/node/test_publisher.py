@@ -23,11 +23,11 @@ from service.link import (
     SUBPROTOCOL,
     Ack,
     EarlierStream,
+    FramesOf,
     FromNode,
     Hello,
     Lost,
     Status,
-    Stream,
     StreamNumbers,
     Wanted,
     Welcome,
@@ -323,7 +323,7 @@ class Script:
                 continue
             said = FromNode.validate_json(heard(message))
             self.said.append(said)
-            if isinstance(said, Stream):
+            if isinstance(said, FramesOf):
                 boot_id = said.boot_id
 
 

@@ -21,9 +21,8 @@ from devices.frames import (
 )
 from service.link import PROTOCOL, EarlierStream, Hello
 from service.server.nodes import Node
-from storage.intervals import Intervals
+from storage.intervals import NO_END, Intervals
 from storage.schema import wire_schema
-from storage.sessions.ledger import NO_END
 from storage.wire import encode
 
 PERIOD_NS = 2_000_000

@@ -16,7 +16,7 @@ import pytest
 
 from devices.errors import StorageError
 from devices.frames import ArrayInfo, FrameBatch, TileStatus
-from storage.intervals import Intervals
+from storage.intervals import NO_END, Intervals
 from storage.journal import in_flight, node_journal, retention, segment
 from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal
@@ -24,7 +24,6 @@ from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from storage.journal.wanted import ServerWants
-from storage.sessions.ledger import NO_END
 from storage.wire import EncodedBatch
 
 Arrays = Callable[..., ArrayInfo]

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from devices.errors import FileFormatError
-from storage.intervals import Intervals
+from storage.intervals import NO_END, Intervals
 from storage.journal.wanted import ServerWants, Wanted
-from storage.sessions.ledger import NO_END
 
 
 def test_a_servers_word_outlives_the_process(tmp_path: Path) -> None:

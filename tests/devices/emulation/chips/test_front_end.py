@@ -94,7 +94,7 @@ def test_one_reading_in_eighty_is_more_than_half_a_kpa_off(recording: Floats) ->
 
 def test_the_core_is_narrower_than_the_whole(recording: Floats) -> None:
     core = recording[np.abs(recording) < 0.5]
-    assert core.std() == pytest.approx(0.14, abs=0.015)  # design.md 5
+    assert core.std() == pytest.approx(0.14, abs=0.015)  # hardware.md 1.3
 
 
 def test_noise_is_white_unless_it_is_correlated(recording: Floats) -> None:

@@ -112,4 +112,4 @@ def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(run, monkey
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     outcome = run("bench", "--scene", "rolling", "--out", "o")
     assert outcome.code == 2
-    assert "pip install '.[plot]'" in outcome.err
+    assert "pip install 'foottile[plot]'" in outcome.err

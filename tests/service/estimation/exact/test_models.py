@@ -5,8 +5,6 @@ The same float64 readings go in. Goal of the design: less than 1e-9 N apart.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +13,7 @@ from mpmath import mpf
 
 from service.estimation.models import ambient, denoise, gas, rubber, temperature
 from service.estimation.models.hysteresis import Hysteresis
+from tests.service.estimation.exact import equations
 
 GOAL = 1e-9
 NAN = float("nan")
@@ -45,9 +44,7 @@ seeds = st.integers(0, 2**32 - 1)
     tau_s=st.sampled_from([1e-9, 0.0005, 0.012, 0.042, 100.0]),
     seed=seeds,
 )
-def test_gas_is_within_a_micropascal(
-    equations: SimpleNamespace, gamma: float, tau_s: float, seed: int
-) -> None:
+def test_gas_is_within_a_micropascal(gamma: float, tau_s: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     kpa = with_holes(rng, 100.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = wild_instants(rng, 40)
@@ -68,7 +65,7 @@ def test_gas_is_within_a_micropascal(
     seed=seeds,
 )
 def test_rubber_is_within_a_nanonewton(
-    equations: SimpleNamespace, parts: tuple[float, float], taus_s: tuple[float, float], seed: int
+    parts: tuple[float, float], taus_s: tuple[float, float], seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     felt_n = with_holes(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
@@ -94,7 +91,7 @@ def test_rubber_is_within_a_nanonewton(
     seed=seeds,
 )
 def test_hysteresis_is_within_a_nanonewton(
-    equations: SimpleNamespace, parts: tuple[float, float, float], swing_n: float, seed: int
+    parts: tuple[float, float, float], swing_n: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     felt_n = with_holes(rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40)))
@@ -109,9 +106,7 @@ def test_hysteresis_is_within_a_nanonewton(
 
 @settings(max_examples=15)
 @given(lag_s=st.sampled_from([1e-9, 0.3, 3.3, 30.0, 1e9]), seed=seeds)
-def test_temperature_is_within_a_billionth_of_a_count(
-    equations: SimpleNamespace, lag_s: float, seed: int
-) -> None:
+def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     tadc = with_holes(rng, 480.0 - rng.integers(0, 40, 60))
     t_ns = wild_instants(rng, 60)
@@ -132,7 +127,7 @@ def test_temperature_is_within_a_billionth_of_a_count(
 
 @settings(max_examples=15)
 @given(seed=seeds)
-def test_ambient_is_within_a_micropascal(equations: SimpleNamespace, seed: int) -> None:
+def test_ambient_is_within_a_micropascal(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kpa = with_holes(rng, rng.normal(0, 1.0, 60))
     t_ns = wild_instants(rng, 60)
@@ -141,16 +136,14 @@ def test_ambient_is_within_a_micropascal(equations: SimpleNamespace, seed: int) 
     for rows in in_two_parts(60):
         felt_kpa, _, state = model.felt(kpa[rows], t_ns[rows], state)
         out.append(felt_kpa)
-    averaged = equations.ambient(equations.exact(kpa), t_ns.tolist())
+    averaged = equations.smoothed(equations.exact(kpa), t_ns.tolist())
     expected = [None if x is None else mpf(0.11) * x for x in averaged]
     assert equations.apart(np.concatenate(out), expected) < GOAL
 
 
 @pytest.mark.parametrize("look_ms", [0, 3, 10, 100])
 @pytest.mark.parametrize("kind", ["still", "moving", "uneven", "few", "crowded"])
-def test_denoise_is_within_a_nanonewton(
-    equations: SimpleNamespace, look_ms: int, kind: str
-) -> None:
+def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str) -> None:
     rng = np.random.default_rng([look_ms, len(kind)])
     n = 90
     swing_n = {"still": 0.0, "moving": 25.0, "uneven": 5.0, "few": 1.0, "crowded": 0.0}[kind]
@@ -179,7 +172,7 @@ def test_denoise_is_within_a_nanonewton(
         denoise.REACHES,
         denoise.AGREE,
     )
-    found = equations.denoise(
+    found = equations.denoised(
         equations.exact(column),
         [mpf(0.3)] * n,
         t_ns.tolist(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from devices.frames import ArrayInfo
-from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.effects import Effects
 from service.estimation.models.ambient import AT_REST, SMOOTHING_S, Ambient
-from service.estimation.plan import EstimationPlan
+from tests.builders.arrays import array_at
+from tests.builders.calibrations import make_effects, newton_tile
+from tests.builders.estimates import newton_plan
 
 MODEL = Ambient(passed=np.array([1.0, 0.1]), relative_sigma=0.2)
 
@@ -57,23 +55,17 @@ def test_it_is_never_outside_what_was_read(kpa: list[float], step_s: float) -> N
     assert (out <= max(kpa) + 1e-12).all()
 
 
-def test_a_dome_passes_on_what_its_wall_gives_way_to(
-    info_of: Callable[..., ArrayInfo],
-    tile_of: Callable[..., TileCalibration],
-    effects_of: Callable[..., Effects],
-    plan_of: Callable[..., EstimationPlan],
-    calibration_of: Callable[..., Calibration],
-) -> None:
+def test_a_dome_passes_on_what_its_wall_gives_way_to() -> None:
     # hardware.md 9: c p/(1 + c p), a ninth of it with 0.00124 per kPa at 100 kPa
-    tiles = [tile_of("T01", effects=effects_of())]
-    bare = info_of([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)], references=[1])
-    plan = plan_of(bare, models=("static", "ambient"), tiles=tiles)
+    tiles = [newton_tile("T01", effects=make_effects())]
+    bare = array_at([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)], references=[1])
+    plan = newton_plan(bare, models=("static", "ambient"), tiles=tiles)
     assert plan.ladder.ambient is not None
     give = 0.0013 * plan.baseline_kpa[0]
     assert plan.ladder.ambient.passed == pytest.approx([give / (1 + give)])
     assert plan.ladder.ambient.relative_sigma == pytest.approx(0.0002 / 0.0013)
     with pytest.raises(UsageError, match="bare reference tile"):
-        plan_of(info_of([(0.0, 0.0, 0.0)]), models=("static", "ambient"), tiles=tiles)
+        newton_plan(array_at([(0.0, 0.0, 0.0)]), models=("static", "ambient"), tiles=tiles)
 
 
 def test_a_bare_tile_that_falls_silent_is_believed_for_a_fifth_of_a_second() -> None:
