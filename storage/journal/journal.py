@@ -19,13 +19,14 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import make_folder, storage_errors, sync_folder
 from storage.intervals import Intervals
-from storage.journal.segment import SUFFIX, Segment, SegmentWriter, numbers, payload_of, recover
+from storage.journal.segment import SUFFIX, Segment, SegmentWriter, recover
+from storage.journal.segment_bytes import payload_of, read_header
+from storage.journal.segment_index import numbers
 from storage.journal.stream_notes import StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.schema import array_info, wire_schema
@@ -86,10 +87,10 @@ class Journal:
                 if notes is not None:
                     return cls(folder, notes.array_info)
             for path in sorted(folder.glob("*" + SUFFIX)):
-                with suppress(pa.ArrowException, EOFError, FileFormatError):
-                    with pa.OSFile(str(path), "r") as file:
-                        schema = pa.ipc.open_stream(file).schema
-                    return cls(folder, array_info(schema, where=str(path)))
+                schema, _ = read_header(path)
+                with suppress(FileFormatError):
+                    if schema is not None:
+                        return cls(folder, array_info(schema, where=str(path)))
         raise FileFormatError("no readable journal segment", where=str(folder))
 
     @property
