@@ -29,7 +29,7 @@ def frames(*numbers: int, offset_ns: int = UTC_NS) -> FrameBatch:
     """Frames in which everything is known."""
     rng = np.random.default_rng(len(numbers))
     padc, tadc = rng.integers(0, 100, (2, len(numbers), 1))
-    known = {"servo_counts": 5, "servo_age_us": 7, "reference_force_n": 9.0}
+    known: dict[str, Any] = {"servo_counts": 5, "servo_age_us": 7, "reference_force_n": 9.0}
     return make_frames(numbers, 1, utc_offset_ns=offset_ns, padc=padc, tadc=tadc, **known)
 
 
