@@ -89,6 +89,17 @@ class Segment:
         found = found[np.array(held, dtype=np.bool_)]
         return found[np.argsort(found["seq_first"], kind="stable")]
 
+    def disown(self, doubtful: Intervals) -> None:
+        """Hold batches within these numbers no longer.
+
+        Raises:
+            OSError: the index cannot be read.
+        """
+        for record in self.records():
+            batch = Intervals([numbers(record)])
+            if not (batch - doubtful):
+                self.held = self.held - batch
+
     def rewrite_index(self) -> None:
         """Have only what counts in the index, which says that it was closed.
 

@@ -254,7 +254,7 @@ def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
     start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retention, "RING_NS", 200_000_000)
-    monkeypatch.setattr("storage.journal.journal.SEGMENT_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
     journal = start()
     stream = journal.begin(array_of())
     journal.want("laptop", wants((200, 249)))
@@ -270,7 +270,7 @@ def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
 def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
     start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("storage.journal.journal.SEGMENT_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
     monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
     journal = start(budget_bytes=60_000)
     stream = journal.begin(array_of())
@@ -443,7 +443,7 @@ def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
     start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retention, "RING_NS", 100_000_000)
-    monkeypatch.setattr("storage.journal.journal.SEGMENT_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
     journal = start()
     stream = journal.begin(array_of())
     journal.wanted.say_local({stream.boot_id: Intervals([(0, NO_END)])})
@@ -458,7 +458,7 @@ def test_what_one_server_has_another_still_gets(
     start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retention, "RING_NS", 100_000_000)
-    monkeypatch.setattr("storage.journal.journal.SEGMENT_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
     journal = start()
     stream = journal.begin(array_of())
     journal.want("laptop", wants((0, 199)))
