@@ -140,7 +140,7 @@ class NodeRecording:
         streams = self._streams(session)
         states = {
             boot_id: StreamState(
-                held=Intervals(stream.journal.held if stream.journal is not None else ()),
+                held=stream.stored,
                 lost=stream.lost,
                 unsynced_tail_max=stream.notes.unsynced_tail_max,
                 missed_slots=stream.missed_slots,
