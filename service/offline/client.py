@@ -109,20 +109,19 @@ class Client:
         url = f"/sessions/{session['id']}/data?format=parquet"
         try:
             with self._http.stream("GET", url, headers=headers) as answer:
-                if answer.is_error and not (
-                    have and answer.status_code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE
-                ):
+                status = answer.status_code
+                # All of it is here already, and only its name was lacking.
+                is_here = bool(have) and status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE
+                if answer.is_error and not is_here:
                     answer.read()
                     raise self._refused(answer)
-                resumed = have if answer.status_code == HTTPStatus.PARTIAL_CONTENT else 0
-                if not answer.is_error:
+                resumed = have if is_here or status == HTTPStatus.PARTIAL_CONTENT else 0
+                if not is_here:
                     with storage_errors(partial), partial.open("ab" if resumed else "wb") as file:
                         for chunk in answer.iter_bytes(_CHUNK):
                             file.write(chunk)
                         file.flush()
                         os.fsync(file.fileno())
-                else:
-                    resumed = have
         except httpx.HTTPError as error:
             raise LinkError(
                 f"the download broke off: {error}",
