@@ -190,7 +190,7 @@ def _described(stream: NodeStream) -> SessionStream:
     A session here ends with its stream, not by an instant: the date may have been set meanwhile.
     """
     return SessionStream(
-        held=Intervals(stream.journal.held if stream.journal is not None else ()),
+        held=stream.stored,
         lost=stream.lost,
         next_seq=stream.next_seq,
         unsynced_tail_max=stream.notes.unsynced_tail_max,

@@ -24,8 +24,7 @@ from devices.buses.i2c import open_bus
 from devices.chips.dynamixel.reader import open_servo
 from devices.chips.dynamixel.servo import PolledServo
 from devices.clock import UtcAnchor, VirtualClock
-from devices.emulation.ground.grounds import press_on
-from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace
+from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.world import World
 from devices.errors import UsageError
 from devices.frames import FrameBatch, TileStatus
@@ -34,6 +33,7 @@ from devices.scene.hardware import AnySchedule, ServoScene
 from service.estimation.foot.stances import Stance, Stances
 from service.offline.accuracy import JUDGED, Accuracy, judge
 from service.rig.description import describe
+from service.rig.emulated import EmulatedFoot
 from service.rig.peripherals import open_recovery_lines, open_reference_sensor
 from service.sessions.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
 from storage.sessions.file import SessionWriter
@@ -58,13 +58,8 @@ class SimulateOptions:
     otherwise_s: float | None = None
     """Length of a scene that has no end of its own, if `seconds` does not say one either."""
     schedule: AnySchedule | None = None
-    seed: int = 0
-    parts_seed: int = 0
-    lead_s: float = 1.0
     truth: bool = False
-    load: LoadTrace | None = None
-    load_scale: float = 1.0
-    cop: CopTransform = CopTransform()  # noqa: RUF009  # frozen, so one for all is safe
+    foot: EmulatedFoot = EmulatedFoot()  # noqa: RUF009  # frozen, so one for all is safe
 
 
 @dataclass(frozen=True)
@@ -97,25 +92,9 @@ class Simulation:
     def __init__(self, options: SimulateOptions, stack: ExitStack) -> None:
         scene = options.scene
         self._options = options
-        self.pressed = None
-        if options.load is not None:
-            self.pressed = press_on(
-                scene,
-                options.load,
-                load_scale=options.load_scale,
-                cop=options.cop,
-                lead_s=options.lead_s,
-            )
+        self.pressed = options.foot.pressed_on(scene)
         self._clock = VirtualClock()
-        self._world = World(
-            scene,
-            self._clock,
-            seed=options.seed,
-            parts_seed=options.parts_seed,
-            lead_s=options.lead_s,
-            pressed=self.pressed,
-            begun=False,
-        )
+        self._world = options.foot.world(scene, self._clock, self.pressed)
         duration_ns = _duration_ns(options, self._world.ground.duration_s)
         ready = make_ready(
             open_bus("emulated", self._world.i2c_adapter),
@@ -142,7 +121,7 @@ class Simulation:
             ready.tiles,
             anchor,
             node=NODE,
-            boot_id=f"{options.seed:032x}",
+            boot_id=f"{options.foot.seed:032x}",
             schedule=ready.choice.schedule,
             rate_hz=self.rate_hz,
         )
@@ -153,7 +132,7 @@ class Simulation:
             anchor,
             rate_hz=scene.rate_hz,
             servo=servo,
-            lead_end_ns=begin_ns + round(options.lead_s * 1e9),
+            lead_end_ns=begin_ns + round(options.foot.lead_s * 1e9),
         )
 
     def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
@@ -187,9 +166,9 @@ def simulate(
     """
     notes: dict[str, object] = {
         "scene": options.scene.model_dump(mode="json"),
-        "seed": options.seed,
-        "parts_seed": options.parts_seed,
-        "lead_s": options.lead_s,
+        "seed": options.foot.seed,
+        "parts_seed": options.foot.parts_seed,
+        "lead_s": options.foot.lead_s,
     }
     judged: list[Mapping[str, npt.NDArray[Any]]] = []
     frames = 0

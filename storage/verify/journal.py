@@ -10,7 +10,8 @@ import numpy as np
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
 from storage.intervals import Intervals
-from storage.journal.segment import INDEX_SUFFIX, RECORD, SUFFIX, UNREAD_SUFFIX
+from storage.journal.segment import SUFFIX, UNREAD_SUFFIX
+from storage.journal.segment_index import INDEX_SUFFIX, RECORD
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.sessions.claims import bytes_of

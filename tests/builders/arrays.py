@@ -20,6 +20,8 @@ UNLOADED_KPA = 787 * 65 / 1023 + 50
 NEWTON_CHIP = (1787 * 8, 0xC000, 0, 0)
 DATA_SHEET_CHIP = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 """The example of data sheet section 3.6."""
+FORUM_CHIP = (0x3591, 0xC0A2, 0xC625, 0x2C18)
+"""Another part, as someone read it out of their own."""
 
 
 def make_tile(number: int = 0, **facts: Any) -> TileInfo:
@@ -69,3 +71,25 @@ def make_array(tiles: int | Sequence[TileInfo] = 2, **facts: Any) -> ArrayInfo:
         "models": ("unwrap", "static"),
     }
     return ArrayInfo(**content | facts)
+
+
+def array_at(
+    positions_m: Sequence[tuple[float, float, float]],
+    *,
+    references: Sequence[int] = (),
+    chips: Sequence[tuple[int, int, int, int]] | None = None,
+    **facts: Any,
+) -> ArrayInfo:
+    """An array with tiles at these positions, some of them reference tiles."""
+    tiles = [
+        make_tile(
+            i,
+            x_m=x_m,
+            y_m=y_m,
+            z_m=z_m,
+            reference=i in references,
+            coefficient_words=chips[i] if chips else NEWTON_CHIP,
+        )
+        for i, (x_m, y_m, z_m) in enumerate(positions_m)
+    ]
+    return make_array(tiles, **facts)

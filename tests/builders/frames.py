@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -43,22 +44,22 @@ LAYOUTS: dict[str, Callable[[npt.NDArray[Any]], npt.NDArray[Any]]] = {
 
 
 def make_frames(
-    seq: int | npt.ArrayLike,
+    numbers: int | npt.ArrayLike,
     tiles: int = 2,
     *,
     period_ns: int = PERIOD_NS,
     utc_offset_ns: int = UTC_NS,
     **columns: npt.ArrayLike,
 ) -> FrameBatch:
-    """Frames with these numbers, or the first `seq`: unloaded, without servo and without faults.
+    """Frames with these numbers, or so many from 0 on: unloaded, without servo and without faults.
 
     Each of `columns` is broadcast to its shape, (frames,) or (frames, tiles), and cast to its type.
     Frame n is taken n periods after the clock began, unless `t_mono_ns` says otherwise.
     """
-    numbers = np.arange(seq) if isinstance(seq, int) else np.asarray(seq)
-    t_mono_ns = columns.get("t_mono_ns", period_ns * numbers.astype(np.int64))
+    seq = np.arange(numbers) if isinstance(numbers, int) else np.asarray(numbers)
+    t_mono_ns = columns.get("t_mono_ns", period_ns * seq.astype(np.int64))
     values: dict[str, npt.ArrayLike] = {
-        "seq": numbers,
+        "seq": seq,
         "t_mono_ns": t_mono_ns,
         "t_ns": np.asarray(t_mono_ns, np.int64) + utc_offset_ns,
         "padc": UNLOADED_COUNTS,
@@ -70,7 +71,15 @@ def make_frames(
         "frame_status": 0,
         "reference_force_n": np.nan,
     }
-    return _batch(values | columns, len(numbers), tiles)
+    return _batch(values | columns, len(seq), tiles)
+
+
+def with_columns(batch: FrameBatch, **columns: npt.ArrayLike) -> FrameBatch:
+    """The same frames with other columns, broadcast and cast; `t_ns` follows `t_mono_ns`."""
+    values: dict[str, npt.ArrayLike] = {f.name: getattr(batch, f.name) for f in fields(FrameBatch)}
+    if "t_mono_ns" in columns:
+        values["t_ns"] = np.asarray(columns["t_mono_ns"], np.int64) + batch.t_ns - batch.t_mono_ns
+    return _batch(values | columns, len(batch), batch.tile_count)
 
 
 def loaded_frames(forces_n: npt.ArrayLike, **columns: Any) -> FrameBatch:
@@ -109,6 +118,12 @@ def any_frames(rows: int, tiles: int = 2, seed: int = 0, **columns: npt.ArrayLik
 def laid_out(batch: FrameBatch, how: str) -> FrameBatch:
     """The same frames, lying in memory as one of `LAYOUTS`."""
     return FrameBatch(**{f.name: LAYOUTS[how](getattr(batch, f.name)) for f in fields(FrameBatch)})
+
+
+def cut_up(batch: FrameBatch, cuts: Iterable[int], how: str = "as it is") -> list[FrameBatch]:
+    """The frames in pieces, each laid out for itself; cuts beyond the last frame do not count."""
+    edges = sorted(cut for cut in cuts if 0 < cut < len(batch))
+    return [laid_out(batch.rows(a, b), how) for a, b in pairwise((0, *edges, len(batch)))]
 
 
 def assert_same_bits(one: Any, other: Any) -> None:

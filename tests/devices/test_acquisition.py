@@ -32,9 +32,8 @@ from devices.frames import (
 )
 from devices.scene.file import Scene
 from devices.scene.hardware import ScheduleName, TileScene
+from tests.builders.scenes import make_scene
 from tests.devices.rigs import SCHEDULES, SETTLED
-
-SceneOf = Callable[..., Scene]
 
 ANCHOR = UtcAnchor.of(0, 1_577_836_800_000_000_000, clock_set=True)
 FRAME_NS = 2_532_500  # simultaneous, four tiles, 400 kHz, 1.6 ms: bus_budget.py, strategy b
@@ -126,36 +125,34 @@ def at_its_own_pace(batch: FrameBatch, rate_hz: float) -> bool:
 
 
 @pytest.mark.parametrize("schedule", SCHEDULES)
-def test_frames_are_numbered_without_a_gap_and_their_time_rises(
-    scene_of: SceneOf, schedule: ScheduleName
-) -> None:
-    batch = foot(scene_of(array=TYPICAL, emulation=LIVELY), schedule=schedule).take(100)
+def test_frames_are_numbered_without_a_gap_and_their_time_rises(schedule: ScheduleName) -> None:
+    batch = foot(make_scene(array=TYPICAL, emulation=LIVELY), schedule=schedule).take(100)
     assert batch.seq.tolist() == list(range(len(batch)))
     assert (np.diff(batch.t_mono_ns) > 0).all()
     assert (batch.t_ns - batch.t_mono_ns == 1_577_836_800_000_000_000).all()
 
 
-def test_numbers_go_on_when_the_loop_is_run_again(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_numbers_go_on_when_the_loop_is_run_again() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     first, second = one.take(5), one.take(5)
     assert second.seq[0] == first.seq[-1] + 1
     assert second.t_mono_ns[0] > first.t_mono_ns[-1]
 
 
-def test_the_time_of_a_frame_is_the_sample_instant_of_its_first_tile(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_the_time_of_a_frame_is_the_sample_instant_of_its_first_tile() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     begin_ns = one.clock.now_ns()
     # select and CONVERT: 20 + 29 periods of 2.5 us; the sample lies a quarter into 1.6 ms
     assert one.take(1).t_mono_ns[0] == begin_ns + 122_500 + 400_000
 
 
-def test_tiles_of_a_simultaneous_frame_are_sampled_together(scene_of: SceneOf) -> None:
-    batch = foot(scene_of(array=TYPICAL, emulation=LIVELY)).take(20)
+def test_tiles_of_a_simultaneous_frame_are_sampled_together() -> None:
+    batch = foot(make_scene(array=TYPICAL, emulation=LIVELY)).take(20)
     assert (batch.sample_offset_us == 0).all()
 
 
-def test_tiles_of_a_sequential_frame_are_sampled_one_after_another(scene_of: SceneOf) -> None:
-    batch = foot(scene_of(array=TYPICAL, emulation=LIVELY), schedule="sequential").take(5)
+def test_tiles_of_a_sequential_frame_are_sampled_one_after_another() -> None:
+    batch = foot(make_scene(array=TYPICAL, emulation=LIVELY), schedule="sequential").take(5)
     exact_us = 1887.5 * np.arange(4)
     plain = np.abs(np.diff(batch.sample_offset_us, axis=1) - np.diff(exact_us)) < 1
     assert plain.mean() > 0.8, "but for second looks"
@@ -168,9 +165,9 @@ def test_tiles_of_a_sequential_frame_are_sampled_one_after_another(scene_of: Sce
     [("simultaneous", FRAME_NS), ("sequential", 7_550_000), ("pipelined", 1_837_500)],
 )
 def test_an_unpaced_stream_runs_at_the_rate_of_the_bus(
-    scene_of: SceneOf, schedule: ScheduleName, frame_ns: int
+    schedule: ScheduleName, frame_ns: int
 ) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY), schedule=schedule)
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY), schedule=schedule)
     batch = one.take(50)
     assert at_the_pace_of_the_bus(batch, frame_ns, looks=4)
     assert (batch.frame_status == 0).all()
@@ -178,8 +175,8 @@ def test_an_unpaced_stream_runs_at_the_rate_of_the_bus(
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 250.0, 360.0])
-def test_a_paced_stream_keeps_its_rate_exactly(scene_of: SceneOf, rate_hz: float) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY), rate_hz=rate_hz)
+def test_a_paced_stream_keeps_its_rate_exactly(rate_hz: float) -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY), rate_hz=rate_hz)
     batch = one.run_for(0.9)  # up to the first audit, which has a test of its own
     assert at_its_own_pace(batch, rate_hz)
     assert len(batch) == pytest.approx(0.9 * rate_hz, abs=1)
@@ -187,21 +184,19 @@ def test_a_paced_stream_keeps_its_rate_exactly(scene_of: SceneOf, rate_hz: float
     assert one.stream.missed_slots == 0
 
 
-def test_the_audit_of_a_second_costs_a_hundredth_of_it_at_most(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation={"noise_kpa": 0.165}), rate_hz=370.0)
+def test_the_audit_of_a_second_costs_a_hundredth_of_it_at_most() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation={"noise_kpa": 0.165}), rate_hz=370.0)
     batch = one.run_for(10.0)
     assert one.stream.missed_slots <= 0.01 * 3700
     assert (np.diff(batch.t_mono_ns) < 4 * FRAME_NS).all()
-    slower = foot(scene_of(array=TYPICAL, emulation={"noise_kpa": 0.165}), rate_hz=100.0)
+    slower = foot(make_scene(array=TYPICAL, emulation={"noise_kpa": 0.165}), rate_hz=100.0)
     slower.run_for(10.0)
     assert slower.stream.missed_slots == 0, "it fits into the pause between two frames"
 
 
 @pytest.mark.parametrize("rate_hz", [396.0, 400.0, 1000.0, 5000.0])
-def test_a_rate_that_the_bus_does_not_give_shows_as_missed_slots(
-    scene_of: SceneOf, rate_hz: float
-) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY), rate_hz=rate_hz)
+def test_a_rate_that_the_bus_does_not_give_shows_as_missed_slots(rate_hz: float) -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY), rate_hz=rate_hz)
     begin_ns = one.clock.now_ns()
     batch = one.run_for(0.9)
     period_ns = round(1e9 / rate_hz)
@@ -222,8 +217,8 @@ def test_a_rate_that_the_bus_does_not_give_shows_as_missed_slots(
         assert at_the_pace_of_the_bus(batch, FRAME_NS), "as fast as it can"
 
 
-def test_a_consumer_that_dawdles_is_counted_and_not_waited_for(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY), rate_hz=100.0)
+def test_a_consumer_that_dawdles_is_counted_and_not_waited_for() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY), rate_hz=100.0)
     frames = one.stream.run(lambda: False)
     first = next(frames)
     one.clock.sleep_until_ns(one.clock.now_ns() + 200_000_000)
@@ -236,28 +231,28 @@ def test_a_consumer_that_dawdles_is_counted_and_not_waited_for(scene_of: SceneOf
     assert second.seq[0] == first.seq[-1] + 1, "a missed slot never had a number"
 
 
-def test_batches_are_about_25_ms_long(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_batches_are_about_25_ms_long() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     sizes = [len(batch) for batch in one.batches(1.0)]
     assert set(sizes[:-1]) == {10}  # nine would be 22.8 ms, which is not yet enough
 
 
-def test_frames_that_are_further_apart_than_a_batch_come_one_by_one(scene_of: SceneOf) -> None:
-    slow = foot(scene_of(array=TYPICAL, emulation=LIVELY), rate_hz=10.0)
+def test_frames_that_are_further_apart_than_a_batch_come_one_by_one() -> None:
+    slow = foot(make_scene(array=TYPICAL, emulation=LIVELY), rate_hz=10.0)
     sizes = [len(batch) for batch in slow.batches(1.0)]
     assert sizes[0] <= 2
     assert set(sizes[1:]) == {1}
 
 
-def test_a_batch_is_contiguous_and_never_empty(scene_of: SceneOf) -> None:
-    for batch in foot(scene_of(array=TYPICAL, emulation=LIVELY)).batches(0.2):
+def test_a_batch_is_contiguous_and_never_empty() -> None:
+    for batch in foot(make_scene(array=TYPICAL, emulation=LIVELY)).batches(0.2):
         assert len(batch) > 0
         assert batch.padc.flags.c_contiguous
         assert batch.status.flags.c_contiguous
 
 
-def test_a_batch_is_not_touched_by_the_next_one(scene_of: SceneOf) -> None:
-    frames = foot(scene_of(array=TYPICAL, emulation=LIVELY)).stream.run(lambda: False)
+def test_a_batch_is_not_touched_by_the_next_one() -> None:
+    frames = foot(make_scene(array=TYPICAL, emulation=LIVELY)).stream.run(lambda: False)
     first = next(frames)
     kept = first.padc.copy(), first.seq.copy()
     next(frames)
@@ -265,13 +260,13 @@ def test_a_batch_is_not_touched_by_the_next_one(scene_of: SceneOf) -> None:
     np.testing.assert_array_equal(first.seq, kept[1])
 
 
-def test_nothing_is_taken_when_the_end_has_come_already(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_nothing_is_taken_when_the_end_has_come_already() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     assert list(one.stream.run(lambda: True)) == []
 
 
-def test_the_end_is_looked_for_before_every_frame(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_the_end_is_looked_for_before_every_frame() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     begin_ns = one.clock.now_ns()
     end_ns = begin_ns + 3 * FRAME_NS + 1  # in the middle of a batch
     batches = list(one.stream.run(lambda: one.clock.now_ns() >= end_ns))
@@ -281,9 +276,9 @@ def test_the_end_is_looked_for_before_every_frame(scene_of: SceneOf) -> None:
 # Faults while it runs
 
 
-def test_a_plug_pulled_by_a_scene_costs_one_tile_and_no_frame(scene_of: SceneOf) -> None:
+def test_a_plug_pulled_by_a_scene_costs_one_tile_and_no_frame() -> None:
     fault = {"kind": "no_answer", "tile": "T02", "t_s": 0.2, "duration_s": 0.1}
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY, fault=[fault]), rate_hz=200.0)
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY, fault=[fault]), rate_hz=200.0)
     begin_ns = one.world.epoch_ns
     batch = one.run_for(0.5)
     gone = np.array(has(TileStatus.NO_ANSWER, batch, 1))
@@ -302,8 +297,8 @@ def test_a_plug_pulled_by_a_scene_costs_one_tile_and_no_frame(scene_of: SceneOf)
     assert (batch.frame_status == 0).all()
 
 
-def test_a_plug_can_be_pulled_by_hand_under_a_running_stream(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_a_plug_can_be_pulled_by_hand_under_a_running_stream() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     frames = one.stream.run(lambda: False)
     assert not any(has(TileStatus.NO_ANSWER, next(frames), 2))
     with one.world.fault("no_answer", "T03"):
@@ -317,8 +312,8 @@ def test_a_plug_can_be_pulled_by_hand_under_a_running_stream(scene_of: SceneOf) 
     assert (after.status == 0).all()
 
 
-def test_a_part_that_stops_converting_becomes_stale(scene_of: SceneOf) -> None:
-    scene = scene_of(array=TYPICAL, emulation={"noise_kpa": 0.165})
+def test_a_part_that_stops_converting_becomes_stale() -> None:
+    scene = make_scene(array=TYPICAL, emulation={"noise_kpa": 0.165})
     one = foot(scene)
     before = one.take(3)
     with one.world.fault("stale", "T04"):
@@ -337,8 +332,8 @@ def test_a_part_that_stops_converting_becomes_stale(scene_of: SceneOf) -> None:
         assert not any(has(TileStatus.STALE, during, other))
 
 
-def test_an_array_with_noise_is_not_called_stale(scene_of: SceneOf) -> None:
-    scene = scene_of(((0x70, 0),), emulation={"noise_kpa": 0.165}, array=TYPICAL)
+def test_an_array_with_noise_is_not_called_stale() -> None:
+    scene = make_scene(((0x70, 0),), emulation={"noise_kpa": 0.165}, array=TYPICAL)
     batch = foot(scene).run_for(20.0)
     assert (batch.status == 0).all()
     same = (np.diff(batch.padc[:, 0].astype(int)) == 0) & (
@@ -382,8 +377,8 @@ def failing_foot(scene: Scene) -> tuple[Foot, Failing]:
     return one, made[0]
 
 
-def test_a_single_missing_acknowledge_is_retried_and_flagged(scene_of: SceneOf) -> None:
-    one, adapter = failing_foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_a_single_missing_acknowledge_is_retried_and_flagged() -> None:
+    one, adapter = failing_foot(make_scene(array=TYPICAL, emulation=LIVELY))
     one.take(5)
     pending = [True]
     adapter.clock = None
@@ -397,8 +392,8 @@ def test_a_single_missing_acknowledge_is_retried_and_flagged(scene_of: SceneOf) 
     assert (batch.padc < 1024).all()
 
 
-def test_a_bus_that_times_out_is_a_flag_and_every_frame_is_still_a_frame(scene_of: SceneOf) -> None:
-    one, adapter = failing_foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_a_bus_that_times_out_is_a_flag_and_every_frame_is_still_a_frame() -> None:
+    one, adapter = failing_foot(make_scene(array=TYPICAL, emulation=LIVELY))
     before = one.take(2)
     adapter.number, adapter.fails = 110, lambda _: True
     during = one.take(5)
@@ -417,8 +412,8 @@ def test_a_bus_that_times_out_is_a_flag_and_every_frame_is_still_a_frame(scene_o
     assert (np.abs(during.sample_offset_us) <= 1).all()
 
 
-def test_a_foot_without_a_single_answer_gives_frames_that_say_so(scene_of: SceneOf) -> None:
-    one, adapter = failing_foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_a_foot_without_a_single_answer_gives_frames_that_say_so() -> None:
+    one, adapter = failing_foot(make_scene(array=TYPICAL, emulation=LIVELY))
     adapter.clock, adapter.fails = None, lambda messages: bool(messages[0].addr == 0x60)
     batch = one.take(10)
     assert batch.seq.tolist() == list(range(len(batch)))
@@ -432,10 +427,8 @@ def test_a_foot_without_a_single_answer_gives_frames_that_say_so(scene_of: Scene
 @pytest.mark.parametrize(
     ("number", "kind"), [(22, BusMisuseError), (95, BusMisuseError), (19, BusSetupError)]
 )
-def test_a_bug_of_ours_is_raised_and_not_swallowed(
-    scene_of: SceneOf, number: int, kind: type[Exception]
-) -> None:
-    one, adapter = failing_foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_a_bug_of_ours_is_raised_and_not_swallowed(number: int, kind: type[Exception]) -> None:
+    one, adapter = failing_foot(make_scene(array=TYPICAL, emulation=LIVELY))
     one.take(1)
     adapter.clock, adapter.number, adapter.fails = None, number, lambda _: True
     with pytest.raises(kind):
@@ -489,8 +482,8 @@ def test_over_range_is_what_lies_outside_50_to_115_kpa(padc: int, tadc: int) -> 
     assert status == (0 if 50 <= kpa <= 115 else TileStatus.OVER_RANGE)
 
 
-def test_a_tile_that_was_not_read_is_not_called_over_range(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_a_tile_that_was_not_read_is_not_called_over_range() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     with one.world.fault("no_answer", "T01"):
         assert set(one.take(5).status[:, 0].tolist()) == {int(TileStatus.NO_ANSWER)}
 
@@ -517,23 +510,23 @@ def with_servo(scene: Scene, servo: Servo, start_ns: int = 0) -> Foot:
     return one
 
 
-def test_without_a_servo_position_and_age_say_so(scene_of: SceneOf) -> None:
-    batch = foot(scene_of(array=TYPICAL, emulation=LIVELY)).take(3)
+def test_without_a_servo_position_and_age_say_so() -> None:
+    batch = foot(make_scene(array=TYPICAL, emulation=LIVELY)).take(3)
     assert set(batch.servo_counts.tolist()) == {NO_SERVO_COUNTS}
     assert set(batch.servo_age_us.tolist()) == {NO_SERVO_AGE}
     assert (batch.frame_status == 0).all()
 
 
-def test_a_servo_that_has_not_answered_yet_is_stale(scene_of: SceneOf) -> None:
-    batch = with_servo(scene_of(array=TYPICAL, emulation=LIVELY), Servo(None)).take(3)
+def test_a_servo_that_has_not_answered_yet_is_stale() -> None:
+    batch = with_servo(make_scene(array=TYPICAL, emulation=LIVELY), Servo(None)).take(3)
     assert set(batch.servo_counts.tolist()) == {NO_SERVO_COUNTS}
     assert set(batch.servo_age_us.tolist()) == {NO_SERVO_AGE}
     assert (batch.frame_status == FrameStatus.SERVO_STALE).all()
 
 
-def test_the_newest_position_goes_with_a_frame_and_ages(scene_of: SceneOf) -> None:
+def test_the_newest_position_goes_with_a_frame_and_ages() -> None:
     servo = Servo((-4097, 1_000))
-    batch = with_servo(scene_of(array=TYPICAL, emulation=LIVELY), servo).take(30)
+    batch = with_servo(make_scene(array=TYPICAL, emulation=LIVELY), servo).take(30)
     assert set(batch.servo_counts.tolist()) == {-4097}
     age_ns = batch.t_mono_ns - 1_000
     assert batch.servo_age_us.tolist() == (age_ns // 1000).tolist()
@@ -544,18 +537,18 @@ def test_the_newest_position_goes_with_a_frame_and_ages(scene_of: SceneOf) -> No
     assert not stale.all()
 
 
-def test_a_servo_that_died_an_hour_ago_does_not_stop_the_stream(scene_of: SceneOf) -> None:
+def test_a_servo_that_died_an_hour_ago_does_not_stop_the_stream() -> None:
     # 2^31 us are 36 minutes, and int32 is what the column has.
     servo = Servo((2048, 0))
-    one = with_servo(scene_of(array=TYPICAL, emulation=LIVELY), servo, start_ns=3_600_000_000_000)
+    one = with_servo(make_scene(array=TYPICAL, emulation=LIVELY), servo, start_ns=3_600_000_000_000)
     batch = one.take(3)
     assert (batch.servo_counts == 2048).all()
     assert (batch.frame_status & FrameStatus.SERVO_STALE).all()
     assert (batch.servo_age_us > 30_000_000).all(), "old, however it is told"
 
 
-def test_the_force_beside_the_array_goes_with_the_frame(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_the_force_beside_the_array_goes_with_the_frame() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     assert np.isnan(one.take(3).reference_force_n).all()
     timing = BusTiming(400_000, (1.6e-3,) * 4, (0x70,) * 4)
     bus = I2cBus(one.world.i2c_adapter, "emulated")
@@ -576,8 +569,8 @@ def test_the_force_beside_the_array_goes_with_the_frame(scene_of: SceneOf) -> No
 # The same foot again
 
 
-def test_the_same_scene_gives_the_same_frames_to_the_bit(scene_of: SceneOf) -> None:
-    scene = scene_of(array=TYPICAL, emulation={"noise_kpa": 0.165})
+def test_the_same_scene_gives_the_same_frames_to_the_bit() -> None:
+    scene = make_scene(array=TYPICAL, emulation={"noise_kpa": 0.165})
     first, second = foot(scene).take(50), foot(scene).take(50)
     np.testing.assert_array_equal(first.padc, second.padc)
     np.testing.assert_array_equal(first.tadc, second.tadc)
@@ -588,8 +581,8 @@ def test_the_same_scene_gives_the_same_frames_to_the_bit(scene_of: SceneOf) -> N
 # A loop without a rate of its own
 
 
-def test_a_loop_that_was_stalled_says_how_many_frames_it_missed(scene_of: SceneOf) -> None:
-    one = foot(scene_of(array=TYPICAL, emulation=LIVELY))
+def test_a_loop_that_was_stalled_says_how_many_frames_it_missed() -> None:
+    one = foot(make_scene(array=TYPICAL, emulation=LIVELY))
     stream = Acquisition(one.array, one.array.tiles, one.clock, ANCHOR, expected_hz=1e9 / FRAME_NS)
     batches = stream.run(lambda: False)
     before = next(batches)

@@ -22,7 +22,12 @@ from service.estimation.bench.checks import (
     refuse_saturated_reference,
     refuse_unloaded,
 )
-from service.estimation.bench.confidence import curve_n, mean_band_n, new_loading_band_n
+from service.estimation.bench.confidence import (
+    cubic_basis,
+    curve_n,
+    mean_band_n,
+    new_loading_band_n,
+)
 from service.estimation.bench.indentation import (
     Indentation,
     Strokes,
@@ -32,27 +37,20 @@ from service.estimation.bench.indentation import (
     unloaded,
 )
 from service.estimation.bench_facts import BandPoint, BenchFacts
-from service.estimation.calibration import (
-    LOOP_OPENS_N,
-    TileCalibration,
-    is_monotonic,
-    loop_share,
-)
+from service.estimation.calibration import LOOP_OPENS_N, TileCalibration, is_monotonic, loop_share
 
 BAND_STEPS = 10
 MEAN_STEPS = 30
 
 
 class _Cubic:
-    """Least squares with the basis u^k - u0^k, which is zero at zero pressure by construction."""
+    """Least squares with `cubic_basis` over a range that is centred."""
 
     def __init__(self, high_kpa: float) -> None:
         self.offset_kpa = self.scale_kpa = high_kpa / 2
-        self.u0 = -1.0
 
     def design(self, gauge_kpa: Floats) -> Floats:
-        u = (gauge_kpa - self.offset_kpa) / self.scale_kpa
-        return np.stack([u**k - self.u0**k for k in (1, 2, 3)], axis=1)
+        return cubic_basis(gauge_kpa, self.offset_kpa, self.scale_kpa)
 
     def solve(self, blocks: Strokes) -> Floats:
         solution, *_ = np.linalg.lstsq(self.design(blocks.gauge_kpa), blocks.force_n, rcond=None)
@@ -85,7 +83,7 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
     residual_n = cubic.residual_n(blocks, coefficients)
     gains = _gains(blocks, blocks.force_n - residual_n)
     refuse_contradictions(gains, where)
-    if not is_monotonic(polynomial, (cubic.u0, 1.0)):
+    if not is_monotonic(polynomial, (-1.0, 1.0)):
         raise CalibrationError(
             "the fitted curve is not monotonic: force would fall while pressure rises",
             where=where,
@@ -95,7 +93,7 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
     r2 = float(1 - (residual_n**2).sum() / (spread_n**2).sum())
     refuse_poor_fit(r2, where)
     left_out = _left_out(cubic, blocks)
-    loop = cubic.solve(blocks.rows(blocks.loading)) - cubic.solve(blocks.rows(~blocks.loading))
+    loop = cubic.solve(blocks.select(blocks.loading)) - cubic.solve(blocks.select(~blocks.loading))
     relative_misfit, loop_misfit_n = _misfit(left_out.force_n, left_out.residual_n)
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
     tile = TileCalibration(
@@ -110,7 +108,7 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
         range_kpa=(0.0, high_kpa),
         monotonic=True,
         absolute_scale="measured",
-        covariance=tuple(tuple(float(c) for c in row) for row in left_out.covariance),
+        covariance=tuple(map(tuple, left_out.covariance.tolist())),
         relative_misfit=relative_misfit,
         loop_misfit_n=loop_misfit_n,
         r2=r2,
@@ -152,8 +150,8 @@ class _LeftOut:
 def _left_out(cubic: _Cubic, blocks: Strokes) -> _LeftOut:
     # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
     repeats = np.unique(blocks.repeat)
-    without = np.stack([cubic.solve(blocks.rows(blocks.repeat != r)) for r in repeats])
-    parts = [blocks.rows(blocks.repeat == r) for r in repeats]
+    without = np.stack([cubic.solve(blocks.select(blocks.repeat != r)) for r in repeats])
+    parts = [blocks.select(blocks.repeat == r) for r in repeats]
     deviation = without - without.mean(axis=0)
     return _LeftOut(
         force_n=np.concatenate([part.force_n for part in parts]),

@@ -22,6 +22,7 @@ from service.offline.accuracy import JUDGED, Accuracy, judge
 from service.offline.benchmark.rungs import Rung
 from service.offline.calibrations import find_calibration
 from service.offline.simulate import SimulateOptions, Simulation, joined
+from service.rig.emulated import EmulatedFoot
 from service.sessions.pipeline import EstimateOptions, EstimateStream
 
 LAGS_MS: Mapping[str, float] = {"live": 10.0, "offline": 100.0}
@@ -98,9 +99,8 @@ def record(
     serials = [tile.serial for tile in scene.tile]
     calibration = find_calibration(scene.calibration, serials, parts_seed=draw, progress=progress)
     with ExitStack() as stack:
-        options = SimulateOptions(
-            scene, seconds, otherwise_s=SECONDS, seed=draw, parts_seed=draw, truth=True
-        )
+        foot = EmulatedFoot(seed=draw, parts_seed=draw)
+        options = SimulateOptions(scene, seconds, otherwise_s=SECONDS, truth=True, foot=foot)
         simulation = Simulation(options, stack)
         pieces = [
             (frames, {name: extra[name] for name in _TRUTH})

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from devices.chips.compensation import Compensation
 from devices.frames import FrameBatch
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare.tare import take_tare
+from service.estimation.tare.recorded import take_tare
 from service.offline.benchmark.draws import LAGS_MS, Failure, Recording, reason
 from service.offline.benchmark.rungs import Rung
 from service.sessions.pipeline import CHUNK
@@ -39,7 +39,7 @@ class Endless:
         """Frames `begin` to `end` of the stream; `seq` and time rise throughout."""
         n = len(self._frames)
         lap, at = np.divmod(np.arange(begin, end), n)
-        once = FrameBatch(**{f.name: getattr(self._frames, f.name)[at] for f in fields(FrameBatch)})
+        once = self._frames.select(at)
         span_ns = int(self._frames.t_mono_ns[-1] - self._frames.t_mono_ns[0]) + self._period_ns
         return replace(
             once,

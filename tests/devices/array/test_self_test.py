@@ -23,19 +23,18 @@ from devices.emulation.parts import draw_chip, random_of
 from devices.emulation.world import World
 from devices.errors import BusFaultError, TileSetupError
 from devices.scene.emulation import ReadDuringConversion
-from devices.scene.file import Scene
+from tests.builders.scenes import make_scene
 from tests.devices.rigs import DATA_SHEET, FORUM, FOUR, ONE, TWO_MUXES, Plugs, Wires
 
-SceneOf = Callable[..., Scene]
 THIRD = (0x3000, 0xB000, 0xC000, 0x3000)
 
 
 # Who is there
 
 
-def test_every_tile_is_identified_in_the_order_of_the_scene(scene_of: SceneOf) -> None:
+def test_every_tile_is_identified_in_the_order_of_the_scene() -> None:
     plugs: Plugs = ((0x73, 7), (0x70, 2), (0x73, 0))
-    scene = scene_of(plugs)
+    scene = make_scene(plugs)
     wires = Wires(plugs, words={0: FORUM, 1: DATA_SHEET, 2: THIRD})
     found = identify(wires.bus, scene.tile)
     assert [tile.serial for tile in found] == ["T01", "T02", "T03"]
@@ -44,13 +43,13 @@ def test_every_tile_is_identified_in_the_order_of_the_scene(scene_of: SceneOf) -
     assert [(t.x_m, t.y_m, t.z_m) for t in found] == [(t.x_m, t.y_m, t.z_m) for t in scene.tile]
 
 
-def test_a_conversion_time_that_was_not_measured_is_the_data_sheets(scene_of: SceneOf) -> None:
-    found = identify(Wires(FOUR).bus, scene_of().tile)
+def test_a_conversion_time_that_was_not_measured_is_the_data_sheets() -> None:
+    found = identify(Wires(FOUR).bus, make_scene().tile)
     # Exactly, because it is printed and kept in files.
     assert [tile.conversion_ms for tile in found] == [1.6] * 4
 
 
-def test_coefficients_are_read_three_times_from_each_tile_alone(scene_of: SceneOf) -> None:
+def test_coefficients_are_read_three_times_from_each_tile_alone() -> None:
     wires = Wires(TWO_MUXES)
     open_at_reads = []
 
@@ -59,45 +58,43 @@ def test_coefficients_are_read_three_times_from_each_tile_alone(scene_of: SceneO
             open_at_reads.append([(m.address, m.mask) for m in wires.muxes if m.mask])
 
     wires.on_transaction = before
-    identify(wires.bus, scene_of(TWO_MUXES).tile)
+    identify(wires.bus, make_scene(TWO_MUXES).tile)
     alone = [[(mux, 1 << channel)] for mux, channel in TWO_MUXES]
     assert open_at_reads == [plug for plug in alone for _ in range(3)]
 
 
-def test_tiles_are_told_apart_although_every_channel_was_left_open(scene_of: SceneOf) -> None:
+def test_tiles_are_told_apart_although_every_channel_was_left_open() -> None:
     wires = Wires(TWO_MUXES, words={0: FORUM, 3: FORUM})
     for mux in (0x70, 0x73):  # somebody else used the bus before
         wires.adapter.i2c_rdwr(i2c_msg.write(mux, [0xFF]))
-    found = identify(wires.bus, scene_of(TWO_MUXES).tile)
+    found = identify(wires.bus, make_scene(TWO_MUXES).tile)
     assert [t.coefficient_words for t in found] == [FORUM, DATA_SHEET, DATA_SHEET, FORUM]
 
 
-def test_a_tile_that_is_absent_at_start_up_is_named_with_its_plug(scene_of: SceneOf) -> None:
+def test_a_tile_that_is_absent_at_start_up_is_named_with_its_plug() -> None:
     wires = Wires(TWO_MUXES)
     with wires.fault("no_answer", "T03"), pytest.raises(TileSetupError) as caught:
-        identify(wires.bus, scene_of(TWO_MUXES).tile)
+        identify(wires.bus, make_scene(TWO_MUXES).tile)
     assert caught.value.where == "tile T03 (mux 0x73 channel 0)"
     assert "does not answer" in caught.value.what
     assert "Plug it in" in caught.value.remedy
 
 
-def test_a_mux_that_is_absent_at_start_up_is_named_with_the_tile_behind_it(
-    scene_of: SceneOf,
-) -> None:
+def test_a_mux_that_is_absent_at_start_up_is_named_with_the_tile_behind_it() -> None:
     with pytest.raises(TileSetupError) as caught:
-        identify(Wires(FOUR).bus, scene_of(((0x74, 6),)).tile)
+        identify(Wires(FOUR).bus, make_scene(((0x74, 6),)).tile)
     assert caught.value.where == "tile T01 (mux 0x74 channel 6)"
     assert "0x74" in caught.value.what
 
 
-def test_a_part_without_coefficients_is_refused_and_named(scene_of: SceneOf) -> None:
+def test_a_part_without_coefficients_is_refused_and_named() -> None:
     wires = Wires(FOUR, words={3: (0, 0, 0, 0)})
     with pytest.raises(TileSetupError, match="no MPL115A2") as caught:
-        identify(wires.bus, scene_of().tile)
+        identify(wires.bus, make_scene().tile)
     assert caught.value.where == "tile T04 (mux 0x70 channel 3)"
 
 
-def test_coefficients_that_differ_from_read_to_read_are_refused(scene_of: SceneOf) -> None:
+def test_coefficients_that_differ_from_read_to_read_are_refused() -> None:
     wires = Wires(ONE)
     reads = 0
 
@@ -109,20 +106,20 @@ def test_coefficients_that_differ_from_read_to_read_are_refused(scene_of: SceneO
 
     wires.on_transaction = disturb
     with pytest.raises(TileSetupError, match="differ") as caught:
-        identify(wires.bus, scene_of(ONE).tile)
+        identify(wires.bus, make_scene(ONE).tile)
     assert "100 kHz" in caught.value.remedy
 
 
-def test_a_bus_that_fails_at_start_up_is_no_fault_of_a_tile(scene_of: SceneOf) -> None:
+def test_a_bus_that_fails_at_start_up_is_no_fault_of_a_tile() -> None:
     wires = Wires(FOUR)
     with wires.fault("scl_low"), pytest.raises(BusFaultError):
-        identify(wires.bus, scene_of().tile)
+        identify(wires.bus, make_scene().tile)
 
 
 # What is there, whatever a scene says
 
 
-def test_every_plug_of_every_mux_is_looked_behind(scene_of: SceneOf) -> None:
+def test_every_plug_of_every_mux_is_looked_behind() -> None:
     plugs: Plugs = ((0x70, 1), (0x72, 0), (0x72, 7), (0x77, 3))
     wires = Wires(plugs, words={1: FORUM, 2: THIRD})
     found = find_tiles(wires.bus)
@@ -163,10 +160,8 @@ def test_the_bus_clock_is_measured_within_a_hundredth(scl_hz: int) -> None:
 
 
 @pytest.mark.parametrize(("asked_hz", "real_hz"), [(400_000, 250_000), (100_000, 62_500)])
-def test_the_250_khz_trap_of_the_raspberry_pi_is_measured(
-    scene_of: SceneOf, asked_hz: float, real_hz: float
-) -> None:
-    scene = scene_of(ONE, array={"scl_hz": asked_hz}, emulation={"scl_part": 0.625})
+def test_the_250_khz_trap_of_the_raspberry_pi_is_measured(asked_hz: float, real_hz: float) -> None:
+    scene = make_scene(ONE, array={"scl_hz": asked_hz}, emulation={"scl_part": 0.625})
     clock = VirtualClock()
     bus = open_bus("emulated", World(scene, clock).i2c_adapter)
     found = measure_wires(bus, clock, identify(bus, scene.tile)[0])
@@ -244,10 +239,8 @@ def test_a_read_that_would_abort_a_conversion_never_comes_twice_and_never_in_a_p
 
 @pytest.mark.parametrize("tile", [0, 1, 2, 3])
 @pytest.mark.parametrize("mode", ["stale", "abort", "torn"])
-def test_drawn_parts_are_measured_as_they_are(
-    scene_of: SceneOf, mode: ReadDuringConversion, tile: int
-) -> None:
-    scene = scene_of(emulation={"noise_kpa": 0.165, "read_during_conversion": mode})
+def test_drawn_parts_are_measured_as_they_are(mode: ReadDuringConversion, tile: int) -> None:
+    scene = make_scene(emulation={"noise_kpa": 0.165, "read_during_conversion": mode})
     clock = VirtualClock()
     bus = open_bus("emulated", World(scene, clock, begun=False).i2c_adapter)
     info = identify(bus, scene.tile)[tile]
@@ -273,12 +266,12 @@ def test_a_tile_is_measured_alone_whatever_another_mux_was_left_with() -> None:
             assert wires.tc_ns[i] <= found <= 1.015 * wires.tc_ns[i]
 
 
-def test_a_tile_is_identified_alone_whatever_a_mux_without_tiles_of_the_scene_was_left_with(
-    scene_of: SceneOf,
-) -> None:
+def test_a_tile_is_identified_alone_whatever_a_mux_without_tiles_of_the_scene_was_left_with() -> (
+    None
+):
     wires = Wires(TWO_MUXES, words={0: FORUM})
     wires.adapter.i2c_rdwr(i2c_msg.write(0x73, [0xFF]))
-    found = identify(wires.bus, scene_of(ONE).tile)
+    found = identify(wires.bus, make_scene(ONE).tile)
     assert found[0].coefficient_words == FORUM
 
 

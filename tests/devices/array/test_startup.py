@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,9 +18,9 @@ from devices.errors import BusFaultError, BusSetupError, SceneError, TileSetupEr
 from devices.scene.faults import FaultKind
 from devices.scene.file import Scene, load_scene
 from devices.scene.hardware import ScheduleName
+from tests.builders.scenes import make_scene
 from tests.devices.rigs import ONE, SCHEDULES, Plugs, full
 
-SceneOf = Callable[..., Scene]
 NOISY = {"noise_kpa": 0.165}
 
 
@@ -41,8 +40,8 @@ def rate_hz(ready: Ready, clock: VirtualClock, seconds: float = 0.9) -> float:
     return frames / (clock.now_ns() - begin_ns) * 1e9
 
 
-def test_every_part_is_waited_for_as_long_as_it_takes(scene_of: SceneOf) -> None:
-    ready, *_ = started(scene_of(emulation=NOISY))
+def test_every_part_is_waited_for_as_long_as_it_takes() -> None:
+    ready, *_ = started(make_scene(emulation=NOISY))
     for tile, wait_s in zip(ready.tiles, ready.timing.conversions_s, strict=True):
         true_ms = draw_chip(tile.serial, 0).conversion_ns / 1e6
         assert true_ms <= tile.conversion_ms <= 1.015 * true_ms
@@ -50,15 +49,15 @@ def test_every_part_is_waited_for_as_long_as_it_takes(scene_of: SceneOf) -> None
     assert ready.unmeasured == ()
 
 
-def test_a_wait_that_the_scene_gives_is_not_measured(scene_of: SceneOf) -> None:
-    ready, _, clock, _ = started(scene_of(array={"wait_ms": 2.5, "conversion_ms": 1.6}))
+def test_a_wait_that_the_scene_gives_is_not_measured() -> None:
+    ready, _, clock, _ = started(make_scene(array={"wait_ms": 2.5, "conversion_ms": 1.6}))
     assert ready.timing.conversions_s == (2.5e-3,) * 4
     assert [tile.conversion_ms for tile in ready.tiles] == [1.6] * 4
     assert clock.now_ns() < 3_200_000_000, "measuring four parts takes longer"
 
 
-def test_a_part_that_cannot_be_measured_is_given_3_ms_and_named(scene_of: SceneOf) -> None:
-    scene = scene_of(((0x70, 0), (0x70, 1)), array={"schedule": "pipelined"}, emulation=NOISY)
+def test_a_part_that_cannot_be_measured_is_given_3_ms_and_named() -> None:
+    scene = make_scene(((0x70, 0), (0x70, 1)), array={"schedule": "pipelined"}, emulation=NOISY)
     clock = VirtualClock()
     world = World(scene, clock, begun=False)
     world.parts[1]._silicon = type(world.parts[1]._silicon)(
@@ -74,21 +73,19 @@ def test_a_part_that_cannot_be_measured_is_given_3_ms_and_named(scene_of: SceneO
 @pytest.mark.parametrize("tiles", [1, 2, 4, 8, 16])
 @pytest.mark.parametrize("schedule", SCHEDULES)
 def test_the_rate_is_98_parts_in_100_of_what_was_predicted(
-    scene_of: SceneOf, schedule: ScheduleName, tiles: int
+    schedule: ScheduleName, tiles: int
 ) -> None:
     array = {"schedule": schedule, "broadcast_channels": 64}
-    ready, _, clock, _ = started(scene_of(full(tiles), array=array, emulation=NOISY))
+    ready, _, clock, _ = started(make_scene(full(tiles), array=array, emulation=NOISY))
     for _ in range(5):
         ready.array.scan()
     assert rate_hz(ready, clock) >= 0.98 * ready.predicted_hz
 
 
 @pytest.mark.parametrize("schedule", SCHEDULES)
-def test_a_healthy_array_flags_nothing_from_its_first_frame_on(
-    scene_of: SceneOf, schedule: ScheduleName
-) -> None:
+def test_a_healthy_array_flags_nothing_from_its_first_frame_on(schedule: ScheduleName) -> None:
     two_muxes = ((0x70, 0), (0x70, 5), (0x73, 0), (0x73, 1))
-    scene = scene_of(two_muxes, array={"schedule": schedule}, emulation=NOISY)
+    scene = make_scene(two_muxes, array={"schedule": schedule}, emulation=NOISY)
     ready, _, clock, _ = started(scene)
     while clock.now_ns() < 20_000_000_000:
         assert ready.array.scan().status == [0] * 4
@@ -112,11 +109,9 @@ def test_parts_of_1_6_ms_at_400_khz_reach_544_frames_a_second() -> None:
     ("tiles", "schedule"),
     [(1, "simultaneous"), (2, "pipelined"), (8, "pipelined"), (16, "per_mux"), (24, "per_mux")],
 )
-def test_auto_takes_what_is_best_for_these_tiles_and_says_why(
-    scene_of: SceneOf, tiles: int, schedule: str
-) -> None:
+def test_auto_takes_what_is_best_for_these_tiles_and_says_why(tiles: int, schedule: str) -> None:
     array = {"wait_ms": 1.6, "conversion_ms": 1.6}
-    ready, *_ = started(scene_of(full(tiles), array=array))
+    ready, *_ = started(make_scene(full(tiles), array=array))
     assert ready.choice.schedule == schedule
     assert ready.array._schedule is schedules.SCHEDULES[ready.choice.schedule]
     muxes = (tiles + 7) // 8
@@ -125,52 +120,52 @@ def test_auto_takes_what_is_best_for_these_tiles_and_says_why(
     )
 
 
-def test_auto_takes_the_one_without_skew_if_it_holds_the_rate(scene_of: SceneOf) -> None:
-    ready, *_ = started(scene_of(emulation=NOISY, rate_hz=300.0))
+def test_auto_takes_the_one_without_skew_if_it_holds_the_rate() -> None:
+    ready, *_ = started(make_scene(emulation=NOISY, rate_hz=300.0))
     assert ready.choice.schedule == "simultaneous"
     assert "no skew" in ready.choice.reason
     assert "300 frames/s" in ready.choice.reason
-    assert started(scene_of(emulation=NOISY, rate_hz=420.0))[0].choice.schedule == "pipelined"
+    assert started(make_scene(emulation=NOISY, rate_hz=420.0))[0].choice.schedule == "pipelined"
 
 
-def test_a_broadcast_of_sixteen_is_refused_and_told_why(scene_of: SceneOf) -> None:
+def test_a_broadcast_of_sixteen_is_refused_and_told_why() -> None:
     array: dict[str, object] = {"schedule": "simultaneous", "wait_ms": 1.6}
     with pytest.raises(SceneError, match="opens 16 channels at once") as caught:
-        started(scene_of(full(16), array=array))
+        started(make_scene(full(16), array=array))
     assert "pull-ups" in caught.value.expected
-    assert started(scene_of(full(16), array=array | {"broadcast_channels": 16}))[0].predicted_hz > 0
+    assert (
+        started(make_scene(full(16), array=array | {"broadcast_channels": 16}))[0].predicted_hz > 0
+    )
 
 
-def test_what_was_asked_for_goes_before_what_the_scene_says(scene_of: SceneOf) -> None:
+def test_what_was_asked_for_goes_before_what_the_scene_says() -> None:
     array = {"schedule": "sequential", "wait_ms": 1.6}
-    assert started(scene_of(array=array))[0].choice.schedule == "sequential"
-    assert started(scene_of(array=array))[0].choice.reason == "as the scene says"
-    ready, *_ = started(scene_of(array=array), schedule="pipelined")
+    assert started(make_scene(array=array))[0].choice.schedule == "sequential"
+    assert started(make_scene(array=array))[0].choice.reason == "as the scene says"
+    ready, *_ = started(make_scene(array=array), schedule="pipelined")
     assert (ready.choice.schedule, ready.choice.reason) == ("pipelined", "as asked for")
 
 
 @pytest.mark.parametrize("asked", ["auto", "simultaneous", "sequential"])
-def test_beside_a_reference_force_tiles_are_sampled_with_it(scene_of: SceneOf, asked: str) -> None:
+def test_beside_a_reference_force_tiles_are_sampled_with_it(asked: str) -> None:
     array = {"schedule": asked, "wait_ms": 1.6}
-    ready, *_ = started(scene_of(array=array), beside=lambda: 7.0)
+    ready, *_ = started(make_scene(array=array), beside=lambda: 7.0)
     assert ready.choice.schedule == ("sequential" if asked == "sequential" else "simultaneous")
     assert ready.array.scan().reference_n == 7.0
 
 
 @pytest.mark.parametrize("asked", ["pipelined", "per_mux"])
-def test_what_cannot_be_sampled_with_a_reference_force_is_refused(
-    scene_of: SceneOf, asked: str
-) -> None:
+def test_what_cannot_be_sampled_with_a_reference_force_is_refused(asked: str) -> None:
     with pytest.raises(SceneError, match="beside a reference sensor"):
-        started(scene_of(array={"schedule": asked, "wait_ms": 1.6}), beside=lambda: 7.0)
+        started(make_scene(array={"schedule": asked, "wait_ms": 1.6}), beside=lambda: 7.0)
 
 
-def test_an_array_that_reads_less_temperature_is_predicted_to_be_faster(scene_of: SceneOf) -> None:
+def test_an_array_that_reads_less_temperature_is_predicted_to_be_faster() -> None:
     plugs: Plugs = full(8)
     array: dict[str, object] = {"schedule": "pipelined", "wait_ms": 1.6, "conversion_ms": 1.6}
-    whole = started(scene_of(plugs, array=array))[0].predicted_hz
+    whole = started(make_scene(plugs, array=array))[0].predicted_hz
     less, _, clock, _ = started(
-        scene_of(plugs, array=array | {"temperature_every": 10}, emulation=NOISY)
+        make_scene(plugs, array=array | {"temperature_every": 10}, emulation=NOISY)
     )
     # hardware.md 4: 435 with four bytes, 515 with two
     assert round(whole) == 435
@@ -178,8 +173,8 @@ def test_an_array_that_reads_less_temperature_is_predicted_to_be_faster(scene_of
     assert rate_hz(less, clock) >= 0.97 * less.predicted_hz
 
 
-def test_a_tile_that_is_absent_stops_the_start_and_is_named(scene_of: SceneOf) -> None:
-    scene = scene_of()
+def test_a_tile_that_is_absent_stops_the_start_and_is_named() -> None:
+    scene = make_scene()
     clock = VirtualClock()
     world = World(scene, clock)
     bus = open_bus("emulated", world.i2c_adapter)
@@ -187,16 +182,16 @@ def test_a_tile_that_is_absent_stops_the_start_and_is_named(scene_of: SceneOf) -
         make_ready(bus, scene, clock)
 
 
-def test_the_250_khz_trap_shows_in_what_is_predicted(scene_of: SceneOf) -> None:
+def test_the_250_khz_trap_shows_in_what_is_predicted() -> None:
     keys = {"schedule": "simultaneous", "wait_ms": 1.6}
-    trapped, *_ = started(scene_of(array=keys, emulation={"scl_part": 0.625}))
+    trapped, *_ = started(make_scene(array=keys, emulation={"scl_part": 0.625}))
     assert trapped.timing.scl_hz == pytest.approx(250_000, rel=0.01)
     # 373 periods of 4 us, and 1.6 ms
     assert trapped.predicted_hz == pytest.approx(1e6 / (373 * 4 + 1600), rel=0.01)
 
 
-def test_measuring_leaves_no_tile_with_a_conversion_of_its_own(scene_of: SceneOf) -> None:
-    scene = scene_of(ONE, emulation=NOISY)
+def test_measuring_leaves_no_tile_with_a_conversion_of_its_own() -> None:
+    scene = make_scene(ONE, emulation=NOISY)
     clock = VirtualClock()
     found = measured(open_bus("emulated", World(scene, clock).i2c_adapter), scene, clock)
     assert found.tiles[0].conversion_ms * 1e-3 == pytest.approx(found.timing.conversions_s[0])
@@ -234,26 +229,24 @@ def hanging(scene: Scene) -> tuple[World, I2cBus]:
     ("kind", "told"), [("sda_low", "SDA is stuck low"), ("scl_low", "the bus failed (ETIMEDOUT)")]
 )
 def test_a_bus_that_cannot_be_freed_is_told_by_the_wire_that_is_stuck(
-    scene_of: SceneOf, kind: FaultKind, told: str, helped: bool
+    kind: FaultKind, told: str, helped: bool
 ) -> None:
-    world, bus = hanging(scene := scene_of())
+    world, bus = hanging(scene := make_scene())
     with world.fault(kind), pytest.raises(BusFaultError, match=re.escape(told)) as caught:
         free_bus(bus, scene, Recovery(world) if helped else None)
     assert ("SDA is stuck low" in str(caught.value)) == (kind == "sda_low")
 
 
 @pytest.mark.parametrize("taken", [False, True])
-def test_a_bus_that_nine_clocks_do_not_move_is_freed_by_reset(
-    scene_of: SceneOf, taken: bool
-) -> None:
-    world, bus = hanging(scene := scene_of())
+def test_a_bus_that_nine_clocks_do_not_move_is_freed_by_reset(taken: bool) -> None:
+    world, bus = hanging(scene := make_scene())
     with world.fault("sda_low"):
         free_bus(bus, scene, Recovery(world, reset_frees=True, taken=taken))
         assert not world.i2c_adapter.line.sda_low(0)
 
 
-def test_what_kept_a_bus_from_being_freed_is_told(scene_of: SceneOf) -> None:
-    world, bus = hanging(scene := scene_of())
+def test_what_kept_a_bus_from_being_freed_is_told() -> None:
+    world, bus = hanging(scene := make_scene())
     with world.fault("sda_low"), pytest.raises(BusFaultError) as caught:
         free_bus(bus, scene, Recovery(world, taken=True))
     assert "could not be freed: /dev/gpiochip0: GPIO lines cannot be used" in str(caught.value)
@@ -262,10 +255,8 @@ def test_what_kept_a_bus_from_being_freed_is_told(scene_of: SceneOf) -> None:
 # Another part
 
 
-def test_a_replaced_part_is_identified_alone_whatever_the_array_left_open(
-    scene_of: SceneOf,
-) -> None:
-    scene = scene_of(((0x70, 0), (0x71, 0)), emulation=NOISY, array={"schedule": "pipelined"})
+def test_a_replaced_part_is_identified_alone_whatever_the_array_left_open() -> None:
+    scene = make_scene(((0x70, 0), (0x71, 0)), emulation=NOISY, array={"schedule": "pipelined"})
     before, bus, clock, world = started(scene)
     with world.fault("replaced", "T01"):
         before.array.scan()
@@ -278,8 +269,8 @@ def test_a_replaced_part_is_identified_alone_whatever_the_array_left_open(
     assert after.tiles[0].conversion_ms == pytest.approx(spare.conversion_ns / 1e6, rel=0.015)
 
 
-def test_a_replaced_part_is_identified_and_measured_anew(scene_of: SceneOf) -> None:
-    scene = scene_of(emulation=NOISY, array={"schedule": "pipelined"})
+def test_a_replaced_part_is_identified_and_measured_anew() -> None:
+    scene = make_scene(emulation=NOISY, array={"schedule": "pipelined"})
     before, bus, clock, world = started(scene)
     with world.fault("replaced", "T02"):
         before.array.scan()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,8 @@ from devices.emulation.world import World
 from devices.errors import TileSetupError
 from devices.frames import TileInfo
 from devices.scene.file import Scene, load_scene
+from tests.builders.scenes import make_scene
 
-SceneOf = Callable[..., Scene]
 Plugs = tuple[tuple[int, int], ...]
 ONE: Plugs = ((0x70, 0),)
 TWO: Plugs = ((0x70, 0), (0x70, 1))
@@ -110,17 +109,17 @@ def test_another_shelf_has_other_parts() -> None:
     assert draw_chip("T01", 1) == draw_chip("T01", 1)
 
 
-def test_the_coefficients_on_the_bus_are_those_of_the_serial(scene_of: SceneOf) -> None:
+def test_the_coefficients_on_the_bus_are_those_of_the_serial() -> None:
     plugs: Plugs = ((0x77, 7), (0x70, 3), (0x73, 0))
-    found = identified(scene_of(plugs))
+    found = identified(make_scene(plugs))
     assert [tile.coefficient_words for tile in found] == [
         draw_chip(serial, 0).coefficients.to_words() for serial in ("T01", "T02", "T03")
     ]
 
 
-def test_a_tile_is_the_same_in_every_scene_and_session(scene_of: SceneOf) -> None:
-    bench = scene_of(TWO, name="bench")
-    field = scene_of(((0x70, 5), (0x74, 2), (0x70, 6)), name="field")
+def test_a_tile_is_the_same_in_every_scene_and_session() -> None:
+    bench = make_scene(TWO, name="bench")
+    field = make_scene(((0x70, 5), (0x74, 2), (0x70, 6)), name="field")
     field = moved_to(moved_to(field, 1, serial="T02"), 0, serial="T09")
     assert identified(bench)[1].coefficient_words == identified(field, seed=3)[1].coefficient_words
     # Without noise an idle tile reads the same pressure: chip and dome are the same.
@@ -129,8 +128,8 @@ def test_a_tile_is_the_same_in_every_scene_and_session(scene_of: SceneOf) -> Non
     assert len(set(idle_bench.tolist())) == 1
 
 
-def test_a_seed_changes_the_noise_and_not_the_parts(scene_of: SceneOf) -> None:
-    scene = scene_of(TWO, emulation={"noise_kpa": 0.165})
+def test_a_seed_changes_the_noise_and_not_the_parts() -> None:
+    scene = make_scene(TWO, emulation={"noise_kpa": 0.165})
     first, again, other = counts(scene), counts(scene, seed=0), counts(scene, seed=1)
     np.testing.assert_array_equal(first, again)
     assert (first[:, 0] != other[:, 0]).mean() > 0.3
@@ -141,15 +140,15 @@ def test_a_seed_changes_the_noise_and_not_the_parts(scene_of: SceneOf) -> None:
     ]
 
 
-def test_a_tile_on_the_bench_does_not_see_the_noise_of_the_field(scene_of: SceneOf) -> None:
+def test_a_tile_on_the_bench_does_not_see_the_noise_of_the_field() -> None:
     noisy = {"noise_kpa": 0.165}
-    bench = counts(scene_of(ONE, name="bench", emulation=noisy), 200)[:, 0, 0]
-    field = counts(scene_of(ONE, name="field", emulation=noisy), 200)[:, 0, 0]
+    bench = counts(make_scene(ONE, name="bench", emulation=noisy), 200)[:, 0, 0]
+    field = counts(make_scene(ONE, name="field", emulation=noisy), 200)[:, 0, 0]
     assert abs(np.corrcoef(bench, field)[0, 1]) < 0.3
 
 
-def test_tiles_have_noise_of_their_own(scene_of: SceneOf) -> None:
-    read = counts(scene_of(TWO, emulation={"noise_kpa": 0.165}), 200)[:, 0]
+def test_tiles_have_noise_of_their_own() -> None:
+    read = counts(make_scene(TWO, emulation={"noise_kpa": 0.165}), 200)[:, 0]
     assert abs(np.corrcoef(read[:, 0], read[:, 1])[0, 1]) < 0.3
 
 
@@ -171,16 +170,16 @@ def conversion_us(scene: Scene, tile: int) -> float:
     return (asked_ns - stop_ns) / 1_000
 
 
-def test_every_part_has_a_conversion_time_of_its_own(scene_of: SceneOf) -> None:
-    scene = scene_of(TWO)
+def test_every_part_has_a_conversion_time_of_its_own() -> None:
+    scene = make_scene(TWO)
     for tile, serial in enumerate(("T01", "T02")):
         drawn_us = draw_chip(serial, 0).conversion_ns / 1_000
         assert conversion_us(scene, tile) == pytest.approx(drawn_us, abs=170)
     assert conversion_us(scene, 0) - conversion_us(scene, 1) > 300
 
 
-def test_a_scene_can_give_all_parts_the_same_conversion_time(scene_of: SceneOf) -> None:
-    scene = scene_of(TWO, array={"conversion_ms": 2.5})
+def test_a_scene_can_give_all_parts_the_same_conversion_time() -> None:
+    scene = make_scene(TWO, array={"conversion_ms": 2.5})
     assert [conversion_us(scene, tile) for tile in (0, 1)] == pytest.approx([2500] * 2, abs=170)
 
 
@@ -199,8 +198,8 @@ def kpa_of(world: World, array: TileArray, clock: VirtualClock, until_s: float) 
     return t_s, kpa
 
 
-def test_a_load_shows_as_the_pressure_that_the_dome_of_the_serial_has(scene_of: SceneOf) -> None:
-    scene = scene_of(ground={"kind": "plate", "load_n": 40.0, "sway_m": 0.0})
+def test_a_load_shows_as_the_pressure_that_the_dome_of_the_serial_has() -> None:
+    scene = make_scene(ground={"kind": "plate", "load_n": 40.0, "sway_m": 0.0})
     t_s, kpa = kpa_of(*switched_on(scene, lead_s=0.5), until_s=2.0)
     for tile, serial in enumerate(("T01", "T02", "T03", "T04")):
         dome = draw_dome(serial, 0)
@@ -213,10 +212,8 @@ def test_a_load_shows_as_the_pressure_that_the_dome_of_the_serial_has(scene_of: 
         assert loaded > idle + 4
 
 
-def test_a_bare_reference_tile_reads_the_atmosphere_plus_the_head_and_no_load(
-    scene_of: SceneOf,
-) -> None:
-    scene = scene_of(
+def test_a_bare_reference_tile_reads_the_atmosphere_plus_the_head_and_no_load() -> None:
+    scene = make_scene(
         TWO,
         ground={"kind": "plate", "load_n": 20.0, "sway_m": 0.0},
         emulation={"ambient_kpa": 99.3, "head_kpa": 8.0, "head_s": 1.5},
@@ -232,11 +229,9 @@ def test_a_bare_reference_tile_reads_the_atmosphere_plus_the_head_and_no_load(
     assert wet[:, 0].mean() - loaded[:, 0].mean() < 2.0
 
 
-def test_a_bare_reference_tile_has_the_noise_and_the_temperature_of_a_chip(
-    scene_of: SceneOf,
-) -> None:
+def test_a_bare_reference_tile_has_the_noise_and_the_temperature_of_a_chip() -> None:
     cold = {"noise_kpa": 0.165, "temperature_step_k": -4.0, "temperature_step_s": 1.0}
-    scene = moved_to(scene_of(TWO, emulation=cold), 1, reference=True)
+    scene = moved_to(make_scene(TWO, emulation=cold), 1, reference=True)
     _, array, clock = switched_on(scene)
     scans = []
     while clock.now_ns() < EPOCH_NS + 12_000_000_000:
@@ -253,8 +248,8 @@ def test_a_bare_reference_tile_has_the_noise_and_the_temperature_of_a_chip(
     assert kpa[t_s > 10].mean() == pytest.approx(kpa[t_s < 1].mean(), abs=0.05)
 
 
-def test_what_replaces_a_reference_tile_is_bare_too(scene_of: SceneOf) -> None:
-    scene = moved_to(scene_of(TWO, emulation={"ambient_kpa": 89.9}), 1, reference=True)
+def test_what_replaces_a_reference_tile_is_bare_too() -> None:
+    scene = moved_to(make_scene(TWO, emulation={"ambient_kpa": 89.9}), 1, reference=True)
     world, _, clock = switched_on(scene)
     with world.fault("replaced", "T02"):
         pass
@@ -274,9 +269,9 @@ def test_what_replaces_a_reference_tile_is_bare_too(scene_of: SceneOf) -> None:
     )
 
 
-def test_sixty_four_tiles_on_eight_muxes_are_found(scene_of: SceneOf) -> None:
+def test_sixty_four_tiles_on_eight_muxes_are_found() -> None:
     plugs = tuple((mux, channel) for mux in range(0x70, 0x78) for channel in range(8))
-    found = identified(scene_of(plugs))
+    found = identified(make_scene(plugs))
     assert len({tile.coefficient_words for tile in found}) == 64
 
 
@@ -287,8 +282,8 @@ def at(*t_s: float) -> npt.NDArray[np.int64]:
     return np.array([EPOCH_NS + round(t * 1e9) for t in t_s], dtype=np.int64)
 
 
-def test_truth_is_told_for_the_clocks_own_time_and_from_power_up(scene_of: SceneOf) -> None:
-    scene = scene_of(ground={"kind": "plate", "load_n": 40.0, "sway_m": 0.0})
+def test_truth_is_told_for_the_clocks_own_time_and_from_power_up() -> None:
+    scene = make_scene(ground={"kind": "plate", "load_n": 40.0, "sway_m": 0.0})
     world, _, _ = switched_on(scene, lead_s=0.5)
     truth = world.truth(at(0.0, 0.49, 0.65, 0.8, 9.0))
     np.testing.assert_allclose(truth.true_grf_n, [0, 0, 20, 40, 40], atol=1e-9)
@@ -297,8 +292,8 @@ def test_truth_is_told_for_the_clocks_own_time_and_from_power_up(scene_of: Scene
     assert np.isnan(truth.true_angle_rad).all()
 
 
-def test_without_load_there_is_no_centre_of_pressure(scene_of: SceneOf) -> None:
-    scene = scene_of(ground={"kind": "plate", "sway_m": 0.005})
+def test_without_load_there_is_no_centre_of_pressure() -> None:
+    scene = make_scene(ground={"kind": "plate", "sway_m": 0.005})
     world, _, _ = switched_on(scene, lead_s=0.5)
     truth = world.truth(at(0.0, 0.4, *np.linspace(1.0, 20.0, 200)))
     assert np.isnan(truth.true_cop_x_m[:2]).all()
@@ -354,13 +349,13 @@ def test_a_reader_of_the_servo_gets_the_true_angle_back(
 # The mill
 
 
-def test_only_the_mill_has_a_reference_force(scene_of: SceneOf) -> None:
-    assert switched_on(scene_of())[0].mill is None
-    assert switched_on(scene_of(ground={"kind": "indentation"}))[0].mill is not None
+def test_only_the_mill_has_a_reference_force() -> None:
+    assert switched_on(make_scene())[0].mill is None
+    assert switched_on(make_scene(ground={"kind": "indentation"}))[0].mill is not None
 
 
-def test_the_mills_notes_name_tile_and_phase(scene_of: SceneOf) -> None:
-    world, _, _ = switched_on(scene_of(TWO, ground={"kind": "indentation"}), lead_s=1.0)
+def test_the_mills_notes_name_tile_and_phase() -> None:
+    world, _, _ = switched_on(make_scene(TWO, ground={"kind": "indentation"}), lead_s=1.0)
     mill = world.mill
     assert mill is not None
     notes = mill.notes(at(0.5, 1.1, 2.0, 6.0, 10_000.0))
@@ -368,9 +363,9 @@ def test_the_mills_notes_name_tile_and_phase(scene_of: SceneOf) -> None:
     assert notes["phase"].tolist() == ["rest", "rest", "load", "unload", "soak"]
 
 
-def test_the_soak_is_warmer_at_its_end(scene_of: SceneOf) -> None:
+def test_the_soak_is_warmer_at_its_end() -> None:
     keys = {"kind": "indentation", "stroke_s": 0.1, "repeats": 2, "soak_k": 4.0}
-    scene = scene_of(ONE, ground=keys)
+    scene = make_scene(ONE, ground=keys)
     world, array, clock = switched_on(scene, lead_s=0.5)
     end_s = world.ground.duration_s
     assert end_s is not None
@@ -383,8 +378,8 @@ def test_the_soak_is_warmer_at_its_end(scene_of: SceneOf) -> None:
 # When the scene's time begins
 
 
-def test_until_it_begins_all_is_as_at_its_first_instant(scene_of: SceneOf) -> None:
-    scene = scene_of(ONE, ground={"kind": "plate", "load_n": 20.0, "sway_m": 0.0})
+def test_until_it_begins_all_is_as_at_its_first_instant() -> None:
+    scene = make_scene(ONE, ground={"kind": "plate", "load_n": 20.0, "sway_m": 0.0})
     world, array, clock = switched_on(scene, lead_s=0.5, begun=False)
     idle = {scan.padc[0] for scan in (array.scan() for _ in range(500))}
     assert clock.now_ns() > EPOCH_NS + 1_000_000_000, "the load would have come long ago"
@@ -399,9 +394,9 @@ def test_until_it_begins_all_is_as_at_its_first_instant(scene_of: SceneOf) -> No
     np.testing.assert_allclose(world.truth(t_ns).true_grf_n, [0.0, 20.0], atol=1e-9)
 
 
-def test_faults_wait_for_the_scene_to_begin(scene_of: SceneOf) -> None:
+def test_faults_wait_for_the_scene_to_begin() -> None:
     fault = {"kind": "no_answer", "tile": "T01", "t_s": 1e-4, "duration_s": 0.5}
-    world, array, clock = switched_on(scene_of(TWO, fault=[fault]), begun=False)
+    world, array, clock = switched_on(make_scene(TWO, fault=[fault]), begun=False)
     assert array.scan().status == [0, 0]
     world.begin()
     begin_ns = clock.now_ns()
@@ -411,22 +406,22 @@ def test_faults_wait_for_the_scene_to_begin(scene_of: SceneOf) -> None:
     assert array.scan().status == [0, 0]
 
 
-def test_a_tile_that_fails_from_the_first_instant_on_is_not_found(scene_of: SceneOf) -> None:
+def test_a_tile_that_fails_from_the_first_instant_on_is_not_found() -> None:
     fault = {"kind": "no_answer", "tile": "T02", "t_s": 0.0, "duration_s": 0.5}
     with pytest.raises(TileSetupError, match="T02"):
-        switched_on(scene_of(TWO, fault=[fault]), begun=False)
+        switched_on(make_scene(TWO, fault=[fault]), begun=False)
 
 
-def test_the_bus_is_as_fast_as_the_core_clock_lets_it(scene_of: SceneOf) -> None:
+def test_the_bus_is_as_fast_as_the_core_clock_lets_it() -> None:
     # hardware.md 3.2: 250 kHz where 400 was asked for, 5/8
-    world, _, clock = switched_on(scene_of(ONE, emulation={"scl_part": 0.625}))
+    world, _, clock = switched_on(make_scene(ONE, emulation={"scl_part": 0.625}))
     begin_ns = clock.now_ns()
     world.i2c_adapter.i2c_rdwr(i2c_msg.write(0x70, [1]))
     assert clock.now_ns() - begin_ns == 20 * 4_000
 
 
-def test_a_replaced_tile_is_another_part_for_ever(scene_of: SceneOf) -> None:
-    scene = scene_of(TWO)
+def test_a_replaced_tile_is_another_part_for_ever() -> None:
+    scene = make_scene(TWO)
     world, array, _ = switched_on(scene)
     bus = I2cBus(world.i2c_adapter, "emulated")
     with world.fault("replaced", "T02"):
@@ -437,8 +432,8 @@ def test_a_replaced_tile_is_another_part_for_ever(scene_of: SceneOf) -> None:
     assert found[1] != array.tiles[1].coefficient_words
 
 
-def test_a_tile_pressed_over_its_range_shows_no_pressure_of_its_range(scene_of: SceneOf) -> None:
-    world, array, _ = switched_on(scene_of(ONE))
+def test_a_tile_pressed_over_its_range_shows_no_pressure_of_its_range() -> None:
+    world, array, _ = switched_on(make_scene(ONE))
     parts = Coefficients.from_words(array.tiles[0].coefficient_words)
 
     def kpa() -> float:

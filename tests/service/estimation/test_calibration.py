@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -20,9 +19,7 @@ from service.estimation.calibration import (
     paper_eq2_shape,
 )
 from service.estimation.models.static import StaticCurves
-
-TileOf = Callable[..., TileCalibration]
-CalibrationOf = Callable[..., Calibration]
+from tests.builders.calibrations import make_calibration, newton_tile
 
 numbers = st.floats(-100, 100)
 
@@ -56,8 +53,6 @@ def changed(value: object) -> object:
     serial=st.text(min_size=1, max_size=8),
 )
 def test_a_calibration_survives_its_json_bit_by_bit(
-    tile_of: TileOf,
-    calibration_of: CalibrationOf,
     c: tuple[float, float, float, float],
     offset_n: float,
     scale_kpa: float,
@@ -65,7 +60,7 @@ def test_a_calibration_survives_its_json_bit_by_bit(
     variance: float,
     serial: str,
 ) -> None:
-    tile = tile_of(
+    tile = newton_tile(
         serial,
         coefficients=c,
         f_offset_n=offset_n,
@@ -74,32 +69,31 @@ def test_a_calibration_survives_its_json_bit_by_bit(
         covariance=((variance, 0.1, 0.0), (0.1, 1.0, 0.0), (0.0, 0.0, 1 / 3)),
         r2=0.9999,
     )
-    calibration = calibration_of(tile)
+    calibration = make_calibration(tile)
     again = Calibration.from_json(calibration.to_json(), where="here")
     assert again == calibration
     assert again.id == calibration.id
 
 
-def test_the_same_content_has_the_same_id_and_other_content_another(
-    tile_of: TileOf, calibration_of: CalibrationOf
-) -> None:
-    one, same = calibration_of(tile_of("T01")), calibration_of(tile_of("T01"))
+def test_the_same_content_has_the_same_id_and_other_content_another() -> None:
+    one, same = (
+        make_calibration(newton_tile("T01")),
+        make_calibration(newton_tile("T01")),
+    )
     assert one.id == same.id
     assert len(one.id) == 16
     assert int(one.id, 16) >= 0
     others = [
-        calibration_of(tile_of("T02")),
-        calibration_of(tile_of("T01", relative_misfit=1e-300)),
+        make_calibration(newton_tile("T02")),
+        make_calibration(newton_tile("T01", relative_misfit=1e-300)),
         one.model_copy(update={"date": "2020-01-02"}),
         one.model_copy(update={"reference": "another"}),
     ]
     assert len({one.id, *(other.id for other in others)}) == 5
 
 
-def test_an_edit_of_any_field_of_the_file_is_refused(
-    tile_of: TileOf, calibration_of: CalibrationOf
-) -> None:
-    text = calibration_of(tile_of("T01"), tile_of("T02", rmse_n=0.1)).to_json()
+def test_an_edit_of_any_field_of_the_file_is_refused() -> None:
+    text = make_calibration(newton_tile("T01"), newton_tile("T02", rmse_n=0.1)).to_json()
     paths = leaves(json.loads(text))
     assert len(paths) > 50
     for path in paths:
@@ -113,10 +107,8 @@ def test_an_edit_of_any_field_of_the_file_is_refused(
         assert "bench.json" in str(caught.value), path
 
 
-def test_an_edited_number_is_named_as_an_edit_and_not_as_a_format_error(
-    tile_of: TileOf, calibration_of: CalibrationOf
-) -> None:
-    calibration = calibration_of(tile_of("T01"))
+def test_an_edited_number_is_named_as_an_edit_and_not_as_a_format_error() -> None:
+    calibration = make_calibration(newton_tile("T01"))
     text = calibration.to_json().replace('"repeats": 4', '"repeats": 5')
     with pytest.raises(CalibrationError, match="edited by hand or damaged") as caught:
         Calibration.from_json(text, where="bench.json")
@@ -132,10 +124,8 @@ def test_a_text_that_is_no_calibration_is_refused_by_name(text: str) -> None:
         Calibration.from_json(text, where="bench.json")
 
 
-def test_an_unknown_field_and_a_missing_one_are_named(
-    tile_of: TileOf, calibration_of: CalibrationOf
-) -> None:
-    content = json.loads(calibration_of(tile_of("T01")).to_json())
+def test_an_unknown_field_and_a_missing_one_are_named() -> None:
+    content = json.loads(make_calibration(newton_tile("T01")).to_json())
     with pytest.raises(CalibrationError, match="colour"):
         Calibration.from_json(json.dumps(content | {"colour": "red"}), where="x")
     del content["tiles"][0]["p_scale_kpa"]
@@ -143,20 +133,16 @@ def test_an_unknown_field_and_a_missing_one_are_named(
         Calibration.from_json(json.dumps(content), where="x")
 
 
-def test_a_calibration_of_a_later_version_is_refused(
-    tile_of: TileOf, calibration_of: CalibrationOf
-) -> None:
-    content = json.loads(calibration_of(tile_of("T01")).to_json()) | {"version": 2}
+def test_a_calibration_of_a_later_version_is_refused() -> None:
+    content = json.loads(make_calibration(newton_tile("T01")).to_json()) | {"version": 2}
     with pytest.raises(CalibrationError, match="version"):
         Calibration.from_json(json.dumps(content), where="x")
 
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity"])
 @pytest.mark.parametrize("field", ["p_scale_kpa", "f_offset_n", "relative_misfit"])
-def test_nan_and_infinity_in_a_file_are_refused(
-    tile_of: TileOf, calibration_of: CalibrationOf, field: str, value: str
-) -> None:
-    content = json.loads(calibration_of(tile_of("T01")).to_json())
+def test_nan_and_infinity_in_a_file_are_refused(field: str, value: str) -> None:
+    content = json.loads(make_calibration(newton_tile("T01")).to_json())
     content["tiles"][0][field] = float(value)
     with pytest.raises(CalibrationError, match=field):
         Calibration.from_json(json.dumps(content), where="x")
@@ -180,15 +166,13 @@ def test_nan_and_infinity_in_a_file_are_refused(
         {"coefficients": (0.0, float("nan"), 0.0, 0.0)},
     ],
 )
-def test_a_contradictory_entry_cannot_be_made(tile_of: TileOf, changes: dict[str, object]) -> None:
+def test_a_contradictory_entry_cannot_be_made(changes: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
-        tile_of("T01", **changes)
+        newton_tile("T01", **changes)
 
 
-def test_a_missing_serial_is_named_with_what_there_is_and_the_remedy(
-    tile_of: TileOf, calibration_of: CalibrationOf
-) -> None:
-    calibration = calibration_of(tile_of("T01"), tile_of("T02"))
+def test_a_missing_serial_is_named_with_what_there_is_and_the_remedy() -> None:
+    calibration = make_calibration(newton_tile("T01"), newton_tile("T02"))
     with pytest.raises(CalibrationError) as caught:
         calibration.of("T07")
     text = str(caught.value)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.calibration import Calibration
 from service.estimation.effects import (
     WALL_PER_KPA,
     Effects,
@@ -18,6 +18,7 @@ from service.estimation.effects import (
     RubberEffect,
     TemperatureEffect,
 )
+from tests.builders.calibrations import make_calibration, make_effects, newton_tile
 
 
 def p(value: float) -> Parameter:
@@ -82,13 +83,9 @@ def test_the_limits_themselves_are_accepted() -> None:
     assert HysteresisEffect(part=(p(0.0), p(0.0), p(0.999))).part[2].value == 0.999
 
 
-def test_effects_survive_a_calibration_file_to_the_bit(
-    tile_of: Callable[..., TileCalibration],
-    effects_of: Callable[..., Effects],
-    calibration_of: Callable[..., Calibration],
-) -> None:
-    effects = effects_of(refused={"ambient": "for a test"})
-    calibration = calibration_of(tile_of("T01", effects=effects))
+def test_effects_survive_a_calibration_file_to_the_bit() -> None:
+    effects = make_effects(refused={"ambient": "for a test"})
+    calibration = make_calibration(newton_tile("T01", effects=effects))
     again = Calibration.from_json(calibration.to_json(), where="a file")
     assert again.of("T01").effects == effects
     assert again.id == calibration.id

@@ -1,11 +1,11 @@
 """The full ladder: any split the same bits, no warning and no infinity, and what must not matter.
 
-Tiles read one newton a count (see conftest); the last tile of an array is bare.
+Tiles read one newton a count (see tests/builders); the last tile of an array is bare.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -14,24 +14,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import NOT_READ, ArrayInfo, FrameBatch, ServoInfo, TileStatus
-from service.estimation.calibration import TileCalibration
-from service.estimation.effects import Effects
+from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.ladder import MODELS
 from service.estimation.plan import EstimationPlan
-
-InfoOf = Callable[..., ArrayInfo]
-TileOf = Callable[..., TileCalibration]
-EffectsOf = Callable[..., Effects]
-PlanOf = Callable[..., EstimationPlan]
-FramesOf = Callable[..., FrameBatch]
-Estimate = Callable[..., Estimates]
+from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
+from tests.builders.calibrations import make_effects, newton_tile
+from tests.builders.estimates import estimate, newton_plan
+from tests.builders.frames import LAYOUTS, assert_same_bits, cut_up, loaded_frames, with_columns
 
 SQUARE = [(0.0, 0.0, -0.15), (0.02, 0.0, -0.15), (0.0, 0.01, -0.15), (0.02, 0.01, -0.15)]
+CHIPS = [DATA_SHEET_CHIP, FORUM_CHIP] * 3
 BARE = (0.05, 0.05, -0.1)
-CHIPS = [(0x3ECE, 0xB3F9, 0xC517, 0x33C8), (0x3591, 0xC0A2, 0xC625, 0x2C18)] * 3
 EXTREME_CHIPS = [
     (0x7FFF, 0x8000, 0x8000, 0x7FFC),
     (0x0001, 0xFFFF, 0xFFFF, 0x0004),
@@ -39,72 +34,41 @@ EXTREME_CHIPS = [
     (0x7FFF, 0x8000, 0x7FFF, 0x8000),
     (0, 0, 0, 0),
 ]
-SERVO = ServoInfo(
-    model="MX-28",
-    counts_per_turn=4096,
-    zero_counts=2048,
-    sign=1,
-    ratio=1.0,
-    ankle_travel_m_per_rad=0.15,
-)
-LAYOUTS: dict[str, Callable[[Any], Any]] = {
-    "as it is": lambda values: values,
-    "fortran": np.asfortranarray,
-    "every other": lambda values: np.repeat(values, 2, axis=0)[::2],
-    "backwards": lambda values: values[::-1].copy()[::-1],
-}
 
 
-def same_bits(one: Estimates, other: Estimates) -> None:
-    for f in fields(Estimates):
-        a, b = getattr(one, f.name), getattr(other, f.name)
-        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), f.name
-
-
-def laid_out(frames: FrameBatch, how: str) -> FrameBatch:
-    return FrameBatch(**{f.name: LAYOUTS[how](getattr(frames, f.name)) for f in fields(FrameBatch)})
-
-
-@pytest.fixture(scope="session")
 def full_plan_of(
-    info_of: InfoOf, tile_of: TileOf, effects_of: EffectsOf, plan_of: PlanOf
-) -> Callable[..., EstimationPlan]:
+    positions_m: Sequence[tuple[float, float, float]] = SQUARE,
+    *,
+    models: Sequence[str] = MODELS,
+    lag_ms: float = 10.0,
+    sigma_n: float = 1.0,
+    **array: Any,
+) -> EstimationPlan:
     """All models over these tiles and a bare one; calibrations know all effects, each its own."""
-
-    def build(
-        positions_m: Sequence[tuple[float, float, float]] = SQUARE,
-        *,
-        models: Sequence[str] = MODELS,
-        lag_ms: float = 10.0,
-        sigma_n: float = 1.0,
-        **array: Any,
-    ) -> EstimationPlan:
-        places = [*positions_m, BARE]
-        info = info_of(places, references=[len(positions_m)], **array)
-        known = effects_of()
-        assert known.gas is not None
-        tiles = []
-        for i, serial in enumerate(info.serials[:-1]):
-            tau_s = known.gas.tau_s.model_copy(update={"value": 0.005 + 0.006 * i})
-            gas = known.gas.model_copy(update={"tau_s": tau_s})
-            curve = (0.0, 1.0 + 0.1 * i, 1e-3, 1e-5)
-            tiles.append(
-                tile_of(
-                    serial,
-                    coefficients=curve,
-                    relative_misfit=0.01,
-                    effects=known.model_copy(
-                        update={
-                            "gas": gas,
-                            "rubber": known.rubber
-                            and known.rubber.model_copy(update={"coefficients": curve}),
-                        }
-                    ),
-                )
+    places = [*positions_m, BARE]
+    info = array_at(places, references=[len(positions_m)], **array)
+    known = make_effects()
+    assert known.gas is not None
+    tiles = []
+    for i, serial in enumerate(info.serials[:-1]):
+        tau_s = known.gas.tau_s.model_copy(update={"value": 0.005 + 0.006 * i})
+        gas = known.gas.model_copy(update={"tau_s": tau_s})
+        curve = (0.0, 1.0 + 0.1 * i, 1e-3, 1e-5)
+        tiles.append(
+            newton_tile(
+                serial,
+                coefficients=curve,
+                relative_misfit=0.01,
+                effects=known.model_copy(
+                    update={
+                        "gas": gas,
+                        "rubber": known.rubber
+                        and known.rubber.model_copy(update={"coefficients": curve}),
+                    }
+                ),
             )
-        return plan_of(info, models=models, lag_ms=lag_ms, tiles=tiles, sigma_n=sigma_n)
-
-    return build
+        )
+    return newton_plan(info, models=models, lag_ms=lag_ms, tiles=tiles, sigma_n=sigma_n)
 
 
 def steps_taken(rows: int, tiles: int, seed: int) -> np.ndarray:
@@ -128,23 +92,21 @@ def troubled(frames: FrameBatch, seed: int) -> FrameBatch:
     steps_ns = rng.choice(
         [2_000_000] * 60 + [1, 2_000_007, 900_000, 8_000_000, 60 * 10**9], shape[0]
     )
-    t_mono_ns = np.cumsum(steps_ns)
     silent = rng.random(shape) < 0.02
     saturated = rng.random(shape) < 0.02
     status = np.where(rng.random(shape) < 0.02, 2 ** rng.integers(0, 6, shape), 0)
     warm = 480 - np.minimum(np.arange(shape[0]) // 20, 30)[:, None] + rng.integers(0, 2, shape)
     unread = silent | (rng.random(shape) < 0.2)
-    return replace(
+    return with_columns(
         frames,
-        seq=np.cumsum(rng.choice([1] * 60 + [2, 900], shape[0])).astype(np.uint64),
-        t_mono_ns=t_mono_ns,
-        t_ns=t_mono_ns + 1_577_836_800_000_000_000,
-        padc=np.where(silent, NOT_READ, np.where(saturated, 1010, frames.padc)).astype(np.uint16),
-        tadc=np.where(unread, NOT_READ, warm).astype(np.uint16),
-        status=np.where(silent, TileStatus.NO_ANSWER, status).astype(np.uint8),
-        sample_offset_us=rng.choice([0, 0, 400, 700, 1100], shape).astype(np.int32),
-        servo_counts=np.cumsum(rng.integers(-3, 9, shape[0])).astype(np.int32),
-        servo_age_us=rng.integers(0, 2000, shape[0]).astype(np.int32),
+        seq=np.cumsum(rng.choice([1] * 60 + [2, 900], shape[0])),
+        t_mono_ns=np.cumsum(steps_ns),
+        padc=np.where(silent, NOT_READ, np.where(saturated, 1010, frames.padc)),
+        tadc=np.where(unread, NOT_READ, warm),
+        status=np.where(silent, TileStatus.NO_ANSWER, status),
+        sample_offset_us=rng.choice([0, 0, 400, 700, 1100], shape),
+        servo_counts=np.cumsum(rng.integers(-3, 9, shape[0])),
+        servo_age_us=rng.integers(0, 2000, shape[0]),
     )
 
 
@@ -158,32 +120,26 @@ def troubled(frames: FrameBatch, seed: int) -> FrameBatch:
     tiles=st.integers(1, 4),
     seed=st.integers(0, 2**32 - 1),
     left_out=st.sets(st.sampled_from([name for name in MODELS if name != "static"])),
-    cuts=st.one_of(st.just("one by one"), st.sets(st.integers(1, 89))),
+    cuts=st.one_of(st.just(range(90)), st.sets(st.integers(1, 89))),
     how=st.sampled_from(list(LAYOUTS)),
 )
-def test_any_split_in_any_memory_order_gives_the_same_bits(
-    full_plan_of: Callable[..., EstimationPlan],
-    frames_of: FramesOf,
-    estimate: Estimate,
+def test_any_split_in_any_memory_order_gives_the_assert_same_bits(
     lag_ms: float,
     rows: int,
     tiles: int,
     seed: int,
     left_out: set[str],
-    cuts: str | set[int],
+    cuts: Collection[int],
     how: str,
 ) -> None:
     models = [name for name in MODELS if seed % 2 or name not in left_out]
     chips = CHIPS[: tiles + 1] if seed % 3 else None
-    plan = full_plan_of(SQUARE[:tiles], lag_ms=lag_ms, models=models, servo=SERVO, chips=chips)
-    frames = troubled(frames_of(steps_taken(rows, tiles, seed)), seed)
-    edges = sorted(cut for cut in (range(1, rows) if cuts == "one by one" else cuts) if cut < rows)
-    pieces = [
-        laid_out(frames.rows(begin, end), how)
-        for begin, end in zip((0, *edges), (*edges, rows), strict=True)
-    ]
-    whole, split = estimate(plan, frames), estimate(plan, *pieces)
-    same_bits(whole, split)
+    plan = full_plan_of(
+        SQUARE[:tiles], lag_ms=lag_ms, models=models, servo=make_servo(), chips=chips
+    )
+    frames = troubled(loaded_frames(steps_taken(rows, tiles, seed)), seed)
+    whole, split = estimate(plan, frames), estimate(plan, *cut_up(frames, cuts, how))
+    assert_same_bits(whole, split)
     assert split.seq.tolist() == frames.seq.tolist()
     assert split.t_ns.tolist() == frames.t_ns.tolist()
 
@@ -191,38 +147,32 @@ def test_any_split_in_any_memory_order_gives_the_same_bits(
 @pytest.mark.parametrize("lag_ms", [0, 1, 10, 100])
 @pytest.mark.parametrize("size", [1, 7, 300])
 def test_windows_reach_back_as_far_in_short_batches_as_in_long_ones(
-    full_plan_of: Callable[..., EstimationPlan],
-    frames_of: FramesOf,
-    estimate: Estimate,
-    lag_ms: float,
-    size: int,
+    lag_ms: float, size: int
 ) -> None:
     # Long quiet stretches, so that windows grow to all of the 250 ms and 128 samples.
     plan = full_plan_of(lag_ms=lag_ms)
     rng = np.random.default_rng(1)
     forces_n = np.repeat([0.0, 20.0, 35.0], 200)[:, None] + rng.normal(0, 1, (600, 5))
     t_mono_ns = np.cumsum(np.repeat([2_000_000, 1_000_000, 2_900_000], 200))
-    frames = frames_of(forces_n, t_mono_ns=t_mono_ns)
+    frames = loaded_frames(forces_n, t_mono_ns=t_mono_ns)
     whole = estimate(plan, frames)
     assert np.std(whole.force_n[150:190, 0]) < 0.8, "it averages"
-    same_bits(whole, estimate(plan, *(frames.rows(i, i + size) for i in range(0, 600, size))))
+    assert_same_bits(whole, estimate(plan, *cut_up(frames, range(0, 600, size))))
 
 
 @pytest.mark.parametrize("lag_ms", [0, 10])
-def test_a_step_may_be_taken_twice_from_the_same_state(
-    full_plan_of: Callable[..., EstimationPlan], frames_of: FramesOf, lag_ms: float
-) -> None:
-    plan = full_plan_of(lag_ms=lag_ms, servo=SERVO)
-    frames = troubled(frames_of(steps_taken(90, 4, 5)), 5)
+def test_a_step_may_be_taken_twice_from_the_same_state(lag_ms: float) -> None:
+    plan = full_plan_of(lag_ms=lag_ms, servo=make_servo())
+    frames = troubled(loaded_frames(steps_taken(90, 4, 5)), 5)
     _, state = step(plan, frames.rows(0, 40), EstimationState())
     first, after_first = step(plan, frames.rows(40, 90), state)
     finish(plan, state)
     again, after_again = step(plan, frames.rows(40, 90), state)
-    same_bits(first, again)
+    assert_same_bits(first, again)
     last, last_again = finish(plan, after_first), finish(plan, after_again)
     assert (last is None) == (last_again is None)
     if last is not None and last_again is not None:
-        same_bits(last, last_again)
+        assert_same_bits(last, last_again)
 
 
 # --- nothing wild gets out ------------------------------------------------------------------------
@@ -232,11 +182,7 @@ def test_a_step_may_be_taken_twice_from_the_same_state(
 @settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_whatever_the_frames_say_nothing_warns_and_nothing_is_infinite(
-    full_plan_of: Callable[..., EstimationPlan],
-    frames_of: FramesOf,
-    estimate: Estimate,
-    lag_ms: float,
-    seed: int,
+    lag_ms: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     shape = (40, 5)
@@ -245,11 +191,11 @@ def test_whatever_the_frames_say_nothing_warns_and_nothing_is_infinite(
         [EXTREME_CHIPS[k] for k in rng.integers(0, 5, 5)],
         None,
     ][seed % 3]
-    plan = full_plan_of(lag_ms=lag_ms, servo=SERVO, chips=chips)
+    plan = full_plan_of(lag_ms=lag_ms, servo=make_servo(), chips=chips)
     padc = rng.choice([rng.integers(0, 1024, shape), 0 * np.ones(shape), 1023 * np.ones(shape)])
     padc = np.where(rng.random(shape) < 0.5, padc, rng.choice([0, 1, 480, 500, 1010, 1023], shape))
     steps_ns = rng.choice([2_000_000] * 9 + [0, 1, 5_000_000, 60 * 10**9, 3600 * 10**9], 40)
-    frames = frames_of(
+    frames = loaded_frames(
         np.zeros(shape),
         padc=np.where(rng.random(shape) < 0.05, NOT_READ, padc),
         tadc=rng.choice([0, 480, 511, 512, 640, 1023, NOT_READ], shape),
@@ -271,24 +217,20 @@ def test_whatever_the_frames_say_nothing_warns_and_nothing_is_infinite(
     assert (e.contact[lost] == 255).all()
 
 
-def test_without_a_word_of_the_bare_tile_there_is_no_force_and_a_flag(
-    full_plan_of: Callable[..., EstimationPlan], frames_of: FramesOf, estimate: Estimate
-) -> None:
+def test_without_a_word_of_the_bare_tile_there_is_no_force_and_a_flag() -> None:
     forces_n = np.full((30, 5), 20.0)
     forces_n[:, 4] = np.nan
     forces_n[20, 4] = 0.0
-    e = estimate(full_plan_of(), frames_of(forces_n))
+    e = estimate(full_plan_of(), loaded_frames(forces_n))
     assert np.isnan(e.grf_n).tolist() == [True] * 20 + [False] * 10
     missing = (e.estimate_status & EstimateStatus.TILE_MISSING) != 0
     assert missing.tolist() == [True] * 20 + [False] * 10
 
 
-def test_a_centre_outside_the_tiles_is_nan_and_flagged(
-    full_plan_of: Callable[..., EstimationPlan], frames_of: FramesOf, estimate: Estimate
-) -> None:
+def test_a_centre_outside_the_tiles_is_nan_and_flagged() -> None:
     # Two tiles are pulled at by a tenth of what presses on the others.
     forces_n = np.tile([-8.0, 40.0, -8.0, 40.0, 0.0], (60, 1))
-    e = estimate(full_plan_of(sigma_n=0.3), frames_of(forces_n))
+    e = estimate(full_plan_of(sigma_n=0.3), loaded_frames(forces_n))
     assert (e.contact[20:] == 1).all()
     assert np.isnan(e.cop_x_m).all()
     assert (e.estimate_status & EstimateStatus.COP_MASKED).all()
@@ -299,17 +241,10 @@ def test_a_centre_outside_the_tiles_is_nan_and_flagged(
 
 @settings(max_examples=10)
 @given(order=st.permutations(range(4)), seed=st.integers(0, 1000))
-def test_the_order_of_the_tiles_does_not_matter(
-    full_plan_of: Callable[..., EstimationPlan],
-    plan_of: PlanOf,
-    frames_of: FramesOf,
-    estimate: Estimate,
-    order: list[int],
-    seed: int,
-) -> None:
+def test_the_order_of_the_tiles_does_not_matter(order: list[int], seed: int) -> None:
     plan = full_plan_of()
     columns = [*order, 4]
-    frames = troubled(frames_of(steps_taken(80, 4, seed)), seed)
+    frames = troubled(loaded_frames(steps_taken(80, 4, seed)), seed)
     other = replace(
         frames,
         **{
@@ -319,7 +254,7 @@ def test_the_order_of_the_tiles_does_not_matter(
     )
     tiles = tuple(plan.info.tiles[i] for i in columns)
     other_info = plan.info.model_copy(update={"tiles": tiles})
-    other_plan = plan_of(
+    other_plan = newton_plan(
         other_info, models=MODELS, lag_ms=10, tiles=plan.calibration.tiles, sigma_n=1.0
     )
     one, two = estimate(plan, frames), estimate(other_plan, other)
@@ -338,16 +273,10 @@ def test_the_order_of_the_tiles_does_not_matter(
     seed=st.integers(0, 1000),
 )
 def test_the_centre_moves_and_grows_with_the_tiles(
-    full_plan_of: Callable[..., EstimationPlan],
-    frames_of: FramesOf,
-    estimate: Estimate,
-    scale: float,
-    x_m: float,
-    y_m: float,
-    seed: int,
+    scale: float, x_m: float, y_m: float, seed: int
 ) -> None:
     moved = [(scale * x + x_m, scale * y + y_m, z) for x, y, z in SQUARE]
-    frames = frames_of(steps_taken(80, 4, seed))
+    frames = loaded_frames(steps_taken(80, 4, seed))
     one = estimate(replace(full_plan_of(), cop_sigma_max_m=1.0), frames)
     two = estimate(replace(full_plan_of(moved), cop_sigma_max_m=1.0), frames)
     assert two.grf_n.tobytes() == one.grf_n.tobytes()

@@ -39,11 +39,11 @@ from service.node.publisher import Publisher, ingest_url
 from storage.intervals import Intervals
 from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
+from storage.journal.wanted import Wanted as NodeWanted
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, decode
-
-Running = Any
-FakeNode = Any
+from tests.service.fake_node import FakeNode, NodeOf
+from tests.service.running import Running, ServeWith
 
 
 @pytest.fixture(autouse=True)
@@ -227,7 +227,7 @@ def test_a_server_that_comes_later_is_found(running: Running, node: FakeNode) ->
 
 
 def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
-    serve_with: Callable[..., Running], node_of: Callable[..., FakeNode]
+    serve_with: ServeWith, node_of: NodeOf
 ) -> None:
     running = serve_with(token="right")  # noqa: S106  # of this test
     node = node_of(running)
@@ -243,9 +243,7 @@ def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
     assert running.http.get("/nodes").json()["items"] == []
 
 
-def test_a_right_token_is_taken(
-    serve_with: Callable[..., Running], node_of: Callable[..., FakeNode]
-) -> None:
+def test_a_right_token_is_taken(serve_with: ServeWith, node_of: NodeOf) -> None:
     running = serve_with(token="right")  # noqa: S106  # of this test
     node = node_of(running)
 
@@ -259,7 +257,7 @@ def test_a_right_token_is_taken(
 
 
 def test_a_name_that_is_taken_is_reported(
-    running: Running, node: FakeNode, node_of: Callable[..., FakeNode]
+    running: Running, node: FakeNode, node_of: NodeOf
 ) -> None:
     node.connect()
     other = node_of(running)
@@ -425,7 +423,7 @@ def test_losses_are_said_whenever_they_change(node: FakeNode) -> None:
     async def scenario() -> list[Lost]:
         async with played() as script, Publishing(node, script.url) as publishing:
             await publishing.until(lambda: script.said)
-            publishing.stream.lose(Intervals([(3, 9)]), "disk_full")
+            publishing.stream.lose(Intervals([(3, 9)]), "disk_full", NodeWanted(Path("nowhere")))
             await publishing.until(lambda: any(isinstance(m, Lost) for m in script.said))
             await asyncio.sleep(0.1)
             return [message for message in script.said if isinstance(message, Lost)]
@@ -577,9 +575,7 @@ def another_server(no_threads_left: None) -> Iterator[str]:
         thread.join(5.0)
 
 
-def test_a_server_that_is_not_ours_is_reported_once(
-    another_server: str, running: Running, node: FakeNode
-) -> None:
+def test_a_server_that_is_not_ours_is_reported_once(another_server: str, node: FakeNode) -> None:
     async def scenario() -> list[str]:
         async with Publishing(node, another_server) as publishing:
             await publishing.until(lambda: publishing.reports)

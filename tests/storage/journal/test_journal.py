@@ -22,7 +22,8 @@ from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
 from storage.intervals import Intervals
 from storage.journal import segment as segment_module
-from storage.journal.journal import SEGMENT_NS, Journal
+from storage.journal.journal import Journal
+from storage.journal.open_segments import SEGMENT_NS
 from storage.schema import from_record_batch, wire_schema
 from storage.wire import encode
 

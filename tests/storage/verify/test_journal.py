@@ -15,7 +15,8 @@ from devices.errors import FileFormatError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.segment import INDEX_SUFFIX, RECORD, SegmentWriter
+from storage.journal.segment import SegmentWriter
+from storage.journal.segment_index import INDEX_SUFFIX, RECORD
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.schema import wire_schema
 from storage.verify.journal import verify_stream

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,9 +20,9 @@ from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation
 from devices.errors import SceneError, UsageError
 from devices.scene.file import Scene, load_scene
+from tests.builders.scenes import make_scene
 
 Floats = npt.NDArray[np.float64]
-SceneOf = Callable[..., Scene]
 FOUR = ((0x70, 0), (0x70, 1), (0x70, 2), (0x70, 3))
 
 
@@ -57,9 +56,9 @@ def with_reference(scene: Scene, tile: int) -> Scene:
 )
 @pytest.mark.parametrize("lead_s", [0.5, 2.0])
 def test_before_it_begins_nothing_is_loaded_and_afterwards_no_force_is_negative(
-    scene_of: SceneOf, ground: dict[str, Any], lead_s: float
+    ground: dict[str, Any], lead_s: float
 ) -> None:
-    made = ground_of(scene_of(ground=ground), lead_s=lead_s)
+    made = ground_of(make_scene(ground=ground), lead_s=lead_s)
     lead = made.forces_n(np.linspace(0, lead_s, 100, endpoint=False))
     np.testing.assert_array_equal(lead, np.zeros((100, 4)))
     forces_n = made.forces_n(np.linspace(lead_s, lead_s + 40, 4_001))
@@ -69,30 +68,30 @@ def test_before_it_begins_nothing_is_loaded_and_afterwards_no_force_is_negative(
     assert (forces_n.max() > 0) == (ground["kind"] != "none")
 
 
-def test_a_foot_in_the_air_has_neither_load_nor_angle_nor_end(scene_of: SceneOf) -> None:
-    made = ground_of(scene_of())
+def test_a_foot_in_the_air_has_neither_load_nor_angle_nor_end() -> None:
+    made = ground_of(make_scene())
     assert made.duration_s is None
     assert made.angle_rad(at(0.0, 1.0)) is None
 
 
-def test_a_recorded_load_has_to_be_given(scene_of: SceneOf) -> None:
+def test_a_recorded_load_has_to_be_given() -> None:
     with pytest.raises(UsageError, match="--load"):
-        ground_of(scene_of(ground={"kind": "trace"}))
+        ground_of(make_scene(ground={"kind": "trace"}))
 
 
 # Standing
 
 
-def test_who_stands_weighs_the_same_all_the_time(scene_of: SceneOf) -> None:
-    made = ground_of(scene_of(ground={"kind": "plate", "load_n": 40.0}))
+def test_who_stands_weighs_the_same_all_the_time() -> None:
+    made = ground_of(make_scene(ground={"kind": "plate", "load_n": 40.0}))
     t_s = np.linspace(1.5, 60.0, 2_000)
     np.testing.assert_allclose(made.forces_n(t_s).sum(axis=1), 40.0, atol=1e-9)
     assert made.duration_s is None
     assert made.angle_rad(t_s) is None
 
 
-def test_who_stands_sways_along_the_array_and_no_farther_than_said(scene_of: SceneOf) -> None:
-    scene = scene_of(ground={"kind": "plate", "sway_m": 0.004})
+def test_who_stands_sways_along_the_array_and_no_farther_than_said() -> None:
+    scene = make_scene(ground={"kind": "plate", "sway_m": 0.004})
     cop = cop_m(ground_of(scene).forces_n(np.linspace(2.0, 200.0, 20_000)), scene)
     assert np.abs(cop[:, 0]).max() <= 0.004 + 1e-9
     assert np.abs(cop[:, 0]).max() > 0.0035
@@ -100,8 +99,8 @@ def test_who_stands_sways_along_the_array_and_no_farther_than_said(scene_of: Sce
     np.testing.assert_allclose(cop[:, 1], 0.0, atol=1e-12)
 
 
-def test_who_stands_spreads_the_load_with_the_least_squares(scene_of: SceneOf) -> None:
-    scene = scene_of(ground={"kind": "plate"})
+def test_who_stands_spreads_the_load_with_the_least_squares() -> None:
+    scene = make_scene(ground={"kind": "plate"})
     forces_n = ground_of(scene).forces_n(np.linspace(2.0, 30.0, 50))
     x_m = tile_positions_m(scene.tile)[:, 0]
     rows = np.vstack([np.ones(4), x_m])
@@ -109,45 +108,45 @@ def test_who_stands_spreads_the_load_with_the_least_squares(scene_of: SceneOf) -
     np.testing.assert_allclose(forces_n, expected, atol=1e-9)
 
 
-def test_who_does_not_sway_loads_every_tile_alike(scene_of: SceneOf) -> None:
-    made = ground_of(scene_of(ground={"kind": "plate", "load_n": 20.0, "sway_m": 0.0}))
+def test_who_does_not_sway_loads_every_tile_alike() -> None:
+    made = ground_of(make_scene(ground={"kind": "plate", "load_n": 20.0, "sway_m": 0.0}))
     np.testing.assert_allclose(made.forces_n(at(2.0, 9.0)), 5.0)
 
 
-def test_the_foot_is_put_down_within_0_3_s(scene_of: SceneOf) -> None:
-    made = ground_of(scene_of(ground={"kind": "plate", "load_n": 20.0}), lead_s=1.0)
+def test_the_foot_is_put_down_within_0_3_s() -> None:
+    made = ground_of(make_scene(ground={"kind": "plate", "load_n": 20.0}), lead_s=1.0)
     total = made.forces_n(at(1.0, 1.15, 1.3, 1.4)).sum(axis=1)
     np.testing.assert_allclose(total, [0, 10, 20, 20], atol=1e-9)
 
 
-def test_a_seed_sways_differently(scene_of: SceneOf) -> None:
-    scene = scene_of(ground={"kind": "plate"})
+def test_a_seed_sways_differently() -> None:
+    scene = make_scene(ground={"kind": "plate"})
     t_s = np.linspace(2, 10, 50)
     first = ground_of(scene, seed=1).forces_n(t_s)
     np.testing.assert_array_equal(first, ground_of(scene, seed=1).forces_n(t_s))
     assert np.abs(first - ground_of(scene, seed=2).forces_n(t_s)).max() > 0.1
 
 
-def test_a_sway_that_would_lift_a_tile_is_refused(scene_of: SceneOf) -> None:
+def test_a_sway_that_would_lift_a_tile_is_refused() -> None:
     # Even share 1/4; at the outer tile x / sum x^2 is 21 / (2 (21^2 + 7^2)) per mm.
     limit_m = 0.25 / (21 / 980) / 1000
-    made = ground_of(scene_of(ground={"kind": "plate", "sway_m": limit_m * 0.999}))
+    made = ground_of(make_scene(ground={"kind": "plate", "sway_m": limit_m * 0.999}))
     assert made.forces_n(np.linspace(2, 100, 5_000)).min() >= 0
     with pytest.raises(SceneError, match=r"ground\.sway_m") as caught:
-        ground_of(scene_of(ground={"kind": "plate", "sway_m": limit_m * 1.001}))
+        ground_of(make_scene(ground={"kind": "plate", "sway_m": limit_m * 1.001}))
     assert f"{limit_m:.4f}" in caught.value.expected
     assert caught.value.exit_code == 2
 
 
-def test_a_reference_tile_under_a_standing_foot_bears_nothing(scene_of: SceneOf) -> None:
-    scene = with_reference(scene_of(ground={"kind": "plate", "load_n": 30.0}), 3)
+def test_a_reference_tile_under_a_standing_foot_bears_nothing() -> None:
+    scene = with_reference(make_scene(ground={"kind": "plate", "load_n": 30.0}), 3)
     forces_n = ground_of(scene).forces_n(np.linspace(2, 20, 50))
     np.testing.assert_array_equal(forces_n[:, 3], 0)
     np.testing.assert_allclose(forces_n.sum(axis=1), 30.0)
 
 
-def test_a_single_tile_can_be_stood_on(scene_of: SceneOf) -> None:
-    scene = scene_of(FOUR[:1], ground={"kind": "plate", "load_n": 12.0})
+def test_a_single_tile_can_be_stood_on() -> None:
+    scene = make_scene(FOUR[:1], ground={"kind": "plate", "load_n": 12.0})
     np.testing.assert_allclose(ground_of(scene).forces_n(at(3.0, 4.0)), [[12.0], [12.0]])
 
 
@@ -232,11 +231,11 @@ def test_a_reference_tile_on_a_rolling_foot_bears_nothing() -> None:
 # A recorded load
 
 
-def test_a_recorded_load_is_linear_between_samples_and_zero_outside(scene_of: SceneOf) -> None:
+def test_a_recorded_load_is_linear_between_samples_and_zero_outside() -> None:
     forces_n = np.array([[0.0] * 4, [1.0, 2.0, 3.0, 4.0], [3.0, 2.0, 1.0, 0.0], [0.0] * 4])
     angle_rad = np.array([0.1, 0.1, 0.3, 0.3])
     trace = PressedTrace(np.array([1.0, 1.01, 2.01, 2.02]), forces_n, angle_rad, 0, 0)
-    scene = scene_of(ground={"kind": "plate"})
+    scene = make_scene(ground={"kind": "plate"})
     made = make_ground(scene, seed=0, lead_s=1.0, pressed=trace)
     assert isinstance(made, TraceLoad), "a recorded load wins over the scene's ground"
     assert made.duration_s == 2.02
@@ -281,8 +280,8 @@ def test_a_looped_load_comes_again_after_a_second_in_the_air() -> None:
 
 
 @pytest.fixture
-def mill(scene_of: SceneOf) -> Indentation:
-    made = ground_of(scene_of(FOUR[:2], ground={"kind": "indentation"}), lead_s=1.0)
+def mill() -> Indentation:
+    made = ground_of(make_scene(FOUR[:2], ground={"kind": "indentation"}), lead_s=1.0)
     assert isinstance(made, Indentation)
     return made
 
@@ -366,9 +365,9 @@ def test_the_spindles_force_is_the_force_on_the_tile(mill: Indentation) -> None:
     assert (mill.forces_n(at(mill.duration_s + 1)) == 0).all()
 
 
-def test_the_mill_does_what_the_scene_says(scene_of: SceneOf) -> None:
+def test_the_mill_does_what_the_scene_says() -> None:
     keys = {"kind": "indentation", "load_n": 12.0, "stroke_s": 0.5, "repeats": 2, "soak_k": -3.0}
-    made = ground_of(scene_of(FOUR[:1], ground=keys), lead_s=0.0)
+    made = ground_of(make_scene(FOUR[:1], ground=keys), lead_s=0.0)
     assert isinstance(made, Indentation)
     _, forces_n, phases, _ = programme(made)
     assert forces_n.max() == pytest.approx(12.0, abs=0.03)
@@ -376,8 +375,8 @@ def test_the_mill_does_what_the_scene_says(scene_of: SceneOf) -> None:
     assert made.soak_k == -3.0
 
 
-def test_the_mill_leaves_a_reference_tile_alone(scene_of: SceneOf) -> None:
-    scene = with_reference(scene_of(FOUR[:3], ground={"kind": "indentation"}), 1)
+def test_the_mill_leaves_a_reference_tile_alone() -> None:
+    scene = with_reference(make_scene(FOUR[:3], ground={"kind": "indentation"}), 1)
     made = ground_of(scene)
     assert isinstance(made, Indentation)
     _, forces_n, _, tile = programme(made)

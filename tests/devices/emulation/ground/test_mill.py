@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -12,10 +10,8 @@ from devices.chips.mcp3208 import Mcp3208
 from devices.clock import VirtualClock
 from devices.emulation.world import World
 from devices.reference import ReferenceForce
-from devices.scene.file import Scene
 from devices.scene.hardware import ReferenceScene
-
-SceneOf = Callable[..., Scene]
+from tests.builders.scenes import make_scene
 
 PLUS_MINUS_50_N = ReferenceScene(zero_v=1.65, n_per_v=100 / 3.3)
 
@@ -26,8 +22,8 @@ def clock() -> VirtualClock:
 
 
 @pytest.fixture
-def world(scene_of: SceneOf, clock: VirtualClock) -> World:
-    return World(scene_of(((0x70, 0), (0x70, 1)), ground={"kind": "indentation"}), clock)
+def world(clock: VirtualClock) -> World:
+    return World(make_scene(((0x70, 0), (0x70, 1)), ground={"kind": "indentation"}), clock)
 
 
 def sensor_of(world: World, clock: VirtualClock, scene: ReferenceScene) -> ReferenceForce:

@@ -12,11 +12,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
+from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.file import SessionReader, SessionWriter
 from storage.sessions.folder import Part, Session, SessionFolder
+from tests.builders.arrays import make_array
 
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
@@ -35,9 +36,9 @@ def frames(first: int, last: int) -> FrameBatch:
 
 
 @pytest.fixture
-def data(tmp_path: Path, array_of: Callable[..., ArrayInfo]) -> Path:
+def data(tmp_path: Path) -> Path:
     """A node's folder after a crash: a session was being recorded, frames 0 to 99 are there."""
-    root, info = tmp_path / "data", array_of("bench", BOOT, UTC_NS)
+    root, info = tmp_path / "data", make_array(boot_id=BOOT)
     folder = root / "journal" / "bench" / BOOT
     journal = Journal(folder, info)
     journal.append(frames(0, 99))

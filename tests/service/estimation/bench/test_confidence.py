@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -13,10 +11,8 @@ from service.estimation.bench.confidence import (
     new_loading_band_n,
     student_t_95,
 )
-from service.estimation.calibration import TileCalibration
 from service.estimation.models.static import StaticCurves
-
-TileOf = Callable[..., TileCalibration]
+from tests.builders.calibrations import newton_tile
 
 
 @pytest.mark.parametrize(
@@ -36,9 +32,9 @@ def test_a_single_repeat_has_no_band() -> None:
         student_t_95(1)
 
 
-def test_the_band_of_the_mean_is_t_times_the_standard_error(tile_of: TileOf) -> None:
+def test_the_band_of_the_mean_is_t_times_the_standard_error() -> None:
     # One newton per unit, gain known to 2 %: 3.1824 x 2 % of the force.
-    tile = tile_of(
+    tile = newton_tile(
         "T01", covariance=((0.02**2, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), repeats=4
     )
     gauge_kpa = np.linspace(0.0, tile.range_kpa[1], 7)
@@ -46,8 +42,8 @@ def test_the_band_of_the_mean_is_t_times_the_standard_error(tile_of: TileOf) -> 
     np.testing.assert_allclose(mean_band_n(tile, gauge_kpa), expected_n, rtol=1e-6)
 
 
-def test_the_band_of_a_new_loading_adds_its_own_gain_and_loop(tile_of: TileOf) -> None:
-    tile = tile_of("T01", relative_misfit=0.03, loop_misfit_n=0.5, repeats=4)
+def test_the_band_of_a_new_loading_adds_its_own_gain_and_loop() -> None:
+    tile = newton_tile("T01", relative_misfit=0.03, loop_misfit_n=0.5, repeats=4)
     gauge_kpa = np.array([0.0, tile.range_kpa[1]])
     half_n = new_loading_band_n(tile, gauge_kpa)
     assert half_n[0] == 0.0
@@ -56,10 +52,8 @@ def test_the_band_of_a_new_loading_adds_its_own_gain_and_loop(tile_of: TileOf) -
     assert (mean_band_n(tile, gauge_kpa) == 0.0).all()
 
 
-def test_a_new_loadings_band_is_t_times_what_the_estimate_takes_as_its_sigma(
-    tile_of: TileOf,
-) -> None:
-    tile = tile_of(
+def test_a_new_loadings_band_is_t_times_what_the_estimate_takes_as_its_sigma() -> None:
+    tile = newton_tile(
         "T01",
         covariance=((0.001, 0.0001, 0.0), (0.0001, 0.0002, 0.0), (0.0, 0.0, 0.0001)),
         relative_misfit=0.03,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from service.estimation.bench.indentation import Indentation
 from service.estimation.bench.model import pressed
 from service.estimation.effects import WALL_PER_KPA, EffectName, Effects
 from service.estimation.models.hysteresis import WIDTHS_N
+from tests.builders.calibrations import make_calibration
 
 STEP_S = 0.00184
 FULL_N, SCALE_KPA, BASE_KPA = 30.0, 16.0, 100.3
@@ -184,14 +184,12 @@ def test_the_curve_of_forces_that_have_lasted_lies_beneath_creep_and_loop(
         assert found_n == pytest.approx(x * (22 + x * (5 + x * 5)), rel=0.03)
 
 
-def test_the_same_recording_gives_the_same_calibration(
-    known: list[Effects], calibration_of: Callable[..., Any]
-) -> None:
+def test_the_same_recording_gives_the_same_calibration(known: list[Effects]) -> None:
     recording = recorded(seed=0)
     tile = fit_tile(recording)
     one = tile.model_copy(update={"effects": known[0]})
     two = tile.model_copy(update={"effects": fit_effects([recording], tile)})
-    assert calibration_of(one).id == calibration_of(two).id
+    assert make_calibration(one).id == make_calibration(two).id
 
 
 def test_without_holds_releases_and_taps_there_is_no_gas_and_a_reason() -> None:

@@ -6,7 +6,6 @@ minute, a silent tile, a saturated one, warmth, water. Windows are chosen by the
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,16 +13,19 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
-from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.effects import Effects
-from service.estimation.estimates import Estimates, EstimateStatus
+from devices.frames import NOT_READ, FrameBatch, TileStatus
+from service.estimation.calibration import TileCalibration
+from service.estimation.estimates import EstimateStatus
 from service.estimation.ladder import MODELS
 from service.estimation.models.outliers import FAR
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare.tare import Tare
+from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
+from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
+from tests.builders.estimates import estimate
+from tests.builders.frames import loaded_frames
+from tests.service.estimation.exact import equations
 
-PARTS = [(0x3ECE, 0xB3F9, 0xC517, 0x33C8), (0x3591, 0xC0A2, 0xC625, 0x2C18)] * 2
+PARTS = [DATA_SHEET_CHIP, FORUM_CHIP] * 2
 UNLOADED_COUNTS = (380, 287, 369, 302)
 POSITIONS_M = [(-0.02, 0.011, -0.15), (0.0, -0.007, -0.15), (0.02, 0.01, -0.15), (0.1, 0.0, -0.1)]
 LAG_MS = 10.0
@@ -32,19 +34,7 @@ ROWS = 70
 Exact = Any
 
 
-def kpa_of(words: tuple[int, ...], padc: int, tadc: int) -> Exact:
-    """Data sheet 8.1 and 8.2; what reads below 50 kPa fell through zero."""
-    a0, b1, b2, c12 = (word - 65536 if word >= 32768 else word for word in words)
-
-    def at(counts: int) -> Exact:
-        slope = mpf(b1) / 2**13 + mpf(c12 >> 2) / 2**22 * tadc
-        pcomp = mpf(a0) / 2**3 + slope * counts + mpf(b2) / 2**14 * tadc
-        return pcomp * 65 / 1023 + 50
-
-    return at(padc) if at(padc) >= 50 else at(padc - 1024)
-
-
-def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNamespace) -> Any:
+def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
     """Everything at fifty digits: lists over tiles of lists over frames."""
     n, domes = len(frames), range(3)
     tare = plan.tare
@@ -63,7 +53,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
         tadc.append(held)
         kpa.append(
             [
-                None if status else kpa_of(words, int(p), c)
+                None if status else equations.pressure_kpa(words, int(p), c)
                 for p, c, status in zip(frames.padc[:, i], held, frames.status[:, i], strict=True)
             ]
         )
@@ -75,7 +65,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
     gauge: list[list[Exact]] = [
         [None if p is None else p - base[i] for p in kpa[i]] for i in range(4)
     ]
-    around = eq.ambient(gauge[3], frame_ns)
+    around = equations.smoothed(gauge[3], frame_ns)
     effects = [plan.calibration.of(plan.info.tiles[i].serial).effects for i in domes]
     walls = [e.temperature.wall_per_kpa for e in effects]
     doubt = max(mpf(w.sigma) / mpf(w.value) for w in walls)
@@ -83,7 +73,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
     for i in domes:
         warm, curve = effects[i].temperature, effects[i].rubber
         counts = [mpf(c) for c in tadc[i]]
-        of_gas = eq.temperature(counts, t_ns[i], mpf(warm.lag_s.value))
+        of_gas = equations.temperature(counts, t_ns[i], mpf(warm.lag_s.value))
         kpa_per_count = mpf(warm.kpa_per_k.value) / mpf(-5.35)
         lag_ns = mpf(warm.lag_s.value) * 10**9
         away = counts[0] - mpf(float(tare.tadc_counts[i]))
@@ -110,28 +100,30 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
         # A reading beyond the range is a bound, which the gas is not told of.
         bound = [p is not None and p - base[i] > mpf(entry.range_kpa[1]) for p in dry]
         told = [None if b else p for p, b in zip(dry, bound, strict=True)]
-        settled = eq.gas(told, t_ns[i], mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i])
+        settled = equations.gas(
+            told, t_ns[i], mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i]
+        )
         settled = [p if b else s for p, b, s in zip(dry, bound, settled, strict=True)]
         memory_ns = 5 * mpf(hot.gamma.value) * mpf(hot.tau_s.value) * 10**9
-        felt, single, beyond, own = [], [], [], []
+        apparent, single, beyond, own = [], [], [], []
         heat_n: list[Exact] = [None] * n
         for k in range(n):
             p = settled[k]
             if p is None:
-                felt.append(None)
+                apparent.append(None)
                 single.append(None)
                 beyond.append(False)
                 own.append(None)
                 continue
             force, slope, fit = _static(entry, p - base[i])
-            felt.append(force)
+            apparent.append(force)
             single.append(abs(slope) * noise[i])
             lately = any(bound[m] and t_ns[i][k] - t_ns[i][m] < memory_ns for m in range(k))
             beyond.append(p - base[i] > mpf(entry.range_kpa[1]) or lately)
             heat_n[k] = slope * mpf(hot.misfit) * (p - dry[k])
             own.append(slope**2 * variance[k] + fit)
-        averaged = eq.denoise(
-            [None if b else f for f, b in zip(felt, beyond, strict=True)],
+        averaged = equations.denoised(
+            [None if b else f for f, b in zip(apparent, beyond, strict=True)],
             single,
             t_ns[i],
             frame_ns,
@@ -139,11 +131,11 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int], eq: SimpleNa
             run,
             plan.lag_ns - 1,
         )
-        smooth = [f if a is None else a[0] for f, a in zip(felt, averaged, strict=True)]
+        smooth = [f if a is None else a[0] for f, a in zip(apparent, averaged, strict=True)]
         loop = [mpf(w.value) for w in effects[i].hysteresis.part]
-        unlooped = eq.hysteresis(smooth, loop)
+        unlooped = equations.hysteresis(smooth, loop)
         parts, taus_s = ([mpf(p.value) for p in x] for x in (curve.part, curve.tau_s))
-        force_n = eq.rubber(unlooped, frame_ns, parts, taus_s)
+        force_n = equations.rubber(unlooped, frame_ns, parts, taus_s)
         forces.append(force_n)
         known = [force_n[k] is not None and not beyond[k] for k in range(n)]
         rubber_n = [
@@ -198,15 +190,10 @@ def _static(entry: TileCalibration, gauge: Exact) -> tuple[Exact, Exact, Exact]:
 
 
 @pytest.fixture(scope="module")
-def plan(
-    info_of: Callable[..., ArrayInfo],
-    tile_of: Callable[..., TileCalibration],
-    calibration_of: Callable[..., Calibration],
-    effects_of: Callable[..., Effects],
-) -> EstimationPlan:
+def plan() -> EstimationPlan:
     """Every dome with effects of its own; nothing is a round number."""
-    info = info_of(POSITIONS_M, references=[3], chips=PARTS)
-    known = effects_of()
+    info = array_at(POSITIONS_M, references=[3], chips=PARTS)
+    known = make_effects()
     assert known.gas is not None
     assert known.rubber is not None
     tiles = []
@@ -217,7 +204,7 @@ def plan(
         rubber = known.rubber.model_copy(update={"coefficients": curve, "covariance": covariance})
         gas = known.gas.model_copy(update={"tau_s": tau_s})
         tiles.append(
-            tile_of(
+            newton_tile(
                 info.serials[i],
                 coefficients=curve,
                 p_offset_kpa=9.37,
@@ -226,21 +213,17 @@ def plan(
                 effects=known.model_copy(update={"gas": gas, "rubber": rubber}),
             )
         )
-    tare = Tare(
-        baseline_kpa=np.array([100.30127, 99.87654321, 101.7, 98.0 + 1 / 3]),
-        baseline_sigma_kpa=np.array([0.0071, 0.0073, 0.007, 0.0069]),
-        noise_kpa=np.array([0.165, 0.171, 0.163, 0.168]),
-        tadc_counts=np.array([507.3, 506.7, 507.0, 1522 / 3]),
-        t_ns=1_577_836_800_000_000_000,
-        begin_s=0.0,
-        end_s=1.0,
-        frames=500,
-        source="lead",
+    tare = make_tare(
+        4,
+        baseline_kpa=[100.30127, 99.87654321, 101.7, 98.0 + 1 / 3],
+        baseline_sigma_kpa=[0.0071, 0.0073, 0.007, 0.0069],
+        noise_kpa=[0.165, 0.171, 0.163, 0.168],
+        tadc_counts=[507.3, 506.7, 507.0, 1522 / 3],
     )
-    return make_plan(info, calibration_of(*tiles), tare, models=MODELS, lag_ms=LAG_MS)
+    return make_plan(info, make_calibration(*tiles), tare, models=MODELS, lag_ms=LAG_MS)
 
 
-def eventful(frames_of: Callable[..., FrameBatch], seed: int) -> tuple[FrameBatch, list[int]]:
+def eventful(seed: int) -> tuple[FrameBatch, list[int]]:
     """The recording, and the number of the unbroken run that each frame is in."""
     rng = np.random.default_rng(seed)
     load = np.zeros((ROWS, 4))
@@ -257,7 +240,7 @@ def eventful(frames_of: Callable[..., FrameBatch], seed: int) -> tuple[FrameBatc
     padc[25, 0], tadc[25, 0], status[25, 0] = NOT_READ, NOT_READ, TileStatus.NO_ANSWER
     steps_ns = np.full(ROWS, 1_838_235)
     steps_ns[38] = 60 * 10**9
-    frames = frames_of(
+    frames = loaded_frames(
         np.zeros(padc.shape),
         padc=padc,
         tadc=tadc,
@@ -269,16 +252,10 @@ def eventful(frames_of: Callable[..., FrameBatch], seed: int) -> tuple[FrameBatc
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_full_ladder_is_within_a_nanonewton(
-    plan: EstimationPlan,
-    frames_of: Callable[..., FrameBatch],
-    estimate: Callable[..., Estimates],
-    equations: SimpleNamespace,
-    seed: int,
-) -> None:
-    frames, run = eventful(frames_of, seed)
+def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int) -> None:
+    frames, run = eventful(seed)
     e = estimate(plan, *(frames.rows(i, i + 11) for i in range(0, ROWS, 11)))
-    exact = chain(plan, frames, run, equations)
+    exact = chain(plan, frames, run)
     for i in range(4):
         assert equations.apart(e.gauge_kpa[:, i], exact.gauge_kpa[i]) < 1e-10
     one = [mpf(1)]

@@ -5,8 +5,6 @@ The same float64 readings go in. Goal of the design: less than 1e-9 N apart.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +13,7 @@ from mpmath import mpf
 
 from service.estimation.models import ambient, denoise, gas, rubber, temperature
 from service.estimation.models.hysteresis import Hysteresis
+from tests.service.estimation.exact import equations
 
 GOAL = 1e-9
 NAN = float("nan")
@@ -45,9 +44,7 @@ seeds = st.integers(0, 2**32 - 1)
     tau_s=st.sampled_from([1e-9, 0.0005, 0.012, 0.042, 100.0]),
     seed=seeds,
 )
-def test_gas_is_within_a_micropascal(
-    equations: SimpleNamespace, gamma: float, tau_s: float, seed: int
-) -> None:
+def test_gas_is_within_a_micropascal(gamma: float, tau_s: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     kpa = with_holes(rng, 100.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = wild_instants(rng, 40)
@@ -68,18 +65,18 @@ def test_gas_is_within_a_micropascal(
     seed=seeds,
 )
 def test_rubber_is_within_a_nanonewton(
-    equations: SimpleNamespace, parts: tuple[float, float], taus_s: tuple[float, float], seed: int
+    parts: tuple[float, float], taus_s: tuple[float, float], seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    felt_n = with_holes(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
+    apparent_n = with_holes(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = wild_instants(rng, 40)
     model = rubber.Rubber(np.array([parts]), np.array([taus_s]))
     state, out = model.at_rest(), []
     for rows in in_two_parts(40):
-        force_n, state = model.unfelt(felt_n[rows, None], t_ns[rows, None], state)
+        force_n, state = model.compensated(apparent_n[rows, None], t_ns[rows, None], state)
         out.append(force_n)
     expected = equations.rubber(
-        equations.exact(felt_n),
+        equations.exact(apparent_n),
         t_ns.tolist(),
         [mpf(g) for g in parts],
         [mpf(tau) for tau in taus_s],
@@ -94,24 +91,24 @@ def test_rubber_is_within_a_nanonewton(
     seed=seeds,
 )
 def test_hysteresis_is_within_a_nanonewton(
-    equations: SimpleNamespace, parts: tuple[float, float, float], swing_n: float, seed: int
+    parts: tuple[float, float, float], swing_n: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    felt_n = with_holes(rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40)))
+    apparent_n = with_holes(
+        rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40))
+    )
     model = Hysteresis(np.array([parts], dtype=float))
     plays_n, out = model.at_rest(), []
     for rows in in_two_parts(40):
-        force_n, plays_n = model.unfelt(felt_n[rows, None], plays_n)
+        force_n, plays_n = model.compensated(apparent_n[rows, None], plays_n)
         out.append(force_n)
-    expected = equations.hysteresis(equations.exact(felt_n), [mpf(w) for w in parts])
+    expected = equations.hysteresis(equations.exact(apparent_n), [mpf(w) for w in parts])
     assert equations.apart(np.concatenate(out), expected) < GOAL * max(1.0, swing_n)
 
 
 @settings(max_examples=15)
 @given(lag_s=st.sampled_from([1e-9, 0.3, 3.3, 30.0, 1e9]), seed=seeds)
-def test_temperature_is_within_a_billionth_of_a_count(
-    equations: SimpleNamespace, lag_s: float, seed: int
-) -> None:
+def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     tadc = with_holes(rng, 480.0 - rng.integers(0, 40, 60))
     t_ns = wild_instants(rng, 60)
@@ -132,25 +129,23 @@ def test_temperature_is_within_a_billionth_of_a_count(
 
 @settings(max_examples=15)
 @given(seed=seeds)
-def test_ambient_is_within_a_micropascal(equations: SimpleNamespace, seed: int) -> None:
+def test_ambient_is_within_a_micropascal(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kpa = with_holes(rng, rng.normal(0, 1.0, 60))
     t_ns = wild_instants(rng, 60)
     model = ambient.Ambient(passed=np.array([0.11]), relative_sigma=0.1)
     state, out = ambient.AT_REST, []
     for rows in in_two_parts(60):
-        felt_kpa, _, state = model.felt(kpa[rows], t_ns[rows], state)
-        out.append(felt_kpa)
-    averaged = equations.ambient(equations.exact(kpa), t_ns.tolist())
+        passed_kpa, _, state = model.passed_on(kpa[rows], t_ns[rows], state)
+        out.append(passed_kpa)
+    averaged = equations.smoothed(equations.exact(kpa), t_ns.tolist())
     expected = [None if x is None else mpf(0.11) * x for x in averaged]
     assert equations.apart(np.concatenate(out), expected) < GOAL
 
 
 @pytest.mark.parametrize("look_ms", [0, 3, 10, 100])
 @pytest.mark.parametrize("kind", ["still", "moving", "uneven", "few", "crowded"])
-def test_denoise_is_within_a_nanonewton(
-    equations: SimpleNamespace, look_ms: int, kind: str
-) -> None:
+def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str) -> None:
     rng = np.random.default_rng([look_ms, len(kind)])
     n = 90
     swing_n = {"still": 0.0, "moving": 25.0, "uneven": 5.0, "few": 1.0, "crowded": 0.0}[kind]
@@ -179,7 +174,7 @@ def test_denoise_is_within_a_nanonewton(
         denoise.REACHES,
         denoise.AGREE,
     )
-    found = equations.denoise(
+    found = equations.denoised(
         equations.exact(column),
         [mpf(0.3)] * n,
         t_ns.tolist(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus, ServoInfo
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.foot.kinematics import Readings, counts_at, readings_of
-
-FramesOf = Callable[..., FrameBatch]
+from tests.builders.arrays import array_at
+from tests.builders.estimates import newton_plan
+from tests.builders.frames import loaded_frames
 
 TURN = 4096
 MS = 1_000_000
@@ -23,7 +24,6 @@ STALE = FrameStatus.SERVO_STALE
 
 
 def carried(
-    frames_of: FramesOf,
     t_ns: Sequence[int],
     readings: Sequence[tuple[int, int] | None],
     status: Sequence[int] | None = None,
@@ -39,7 +39,7 @@ def carried(
         ],
         "frame_status": [0] * n if status is None else status,
     }
-    return frames_of(np.zeros((n, tiles)), **columns)
+    return loaded_frames(np.zeros((n, tiles)), **columns)
 
 
 def positions(
@@ -55,10 +55,8 @@ T_NS = [1 * MS, 3 * MS, 5 * MS, 7 * MS, 9 * MS, 11 * MS]
 SLOW = [(0, 100)] * 4 + [(8 * MS, 900)] * 2
 
 
-def test_between_two_readings_the_position_is_on_the_line_that_joins_them(
-    frames_of: FramesOf,
-) -> None:
-    frames = carried(frames_of, T_NS, SLOW)
+def test_between_two_readings_the_position_is_on_the_line_that_joins_them() -> None:
+    frames = carried(T_NS, SLOW)
     assert positions(frames, 100) == pytest.approx([200, 400, 600, 800, 900, 900])
 
 
@@ -72,54 +70,54 @@ def test_between_two_readings_the_position_is_on_the_line_that_joins_them(
     ],
 )
 def test_a_reading_beyond_the_look_ahead_is_not_known_and_the_one_before_is_held(
-    frames_of: FramesOf, lag_ms: float, expected: list[float]
+    lag_ms: float, expected: list[float]
 ) -> None:
-    assert positions(carried(frames_of, T_NS, SLOW), lag_ms) == pytest.approx(expected)
+    assert positions(carried(T_NS, SLOW), lag_ms) == pytest.approx(expected)
 
 
-def test_a_reading_that_was_on_its_way_is_the_one_before(frames_of: FramesOf) -> None:
+def test_a_reading_that_was_on_its_way_is_the_one_before() -> None:
     # The frame at 5 ms still carries the reading of 0, but that of 4 ms was sampled before it.
     t_ns = [3 * MS, 5 * MS, 7 * MS, 9 * MS]
-    frames = carried(frames_of, t_ns, [(0, 0), (0, 0), (4 * MS, 400), (8 * MS, 1200)])
+    frames = carried(t_ns, [(0, 0), (0, 0), (4 * MS, 400), (8 * MS, 1200)])
     assert positions(frames, 100) == pytest.approx([300, 600, 1000, 1200])
     assert positions(frames, 2) == pytest.approx([0, 400, 1000, 1200])
 
 
-def test_a_stale_position_is_unknown_and_nothing_reaches_across_it(frames_of: FramesOf) -> None:
-    frames = carried(frames_of, T_NS, SLOW, status=[0, 0, STALE, STALE, 0, 0])
+def test_a_stale_position_is_unknown_and_nothing_reaches_across_it() -> None:
+    frames = carried(T_NS, SLOW, status=[0, 0, STALE, STALE, 0, 0])
     expected = [100, 100, np.nan, np.nan, 900, 900]
     assert positions(frames, 100) == pytest.approx(expected, nan_ok=True)
 
 
-def test_no_reading_is_unknown_and_nothing_reaches_across_it(frames_of: FramesOf) -> None:
-    frames = carried(frames_of, T_NS, [SLOW[0], SLOW[1], None, *SLOW[3:]])
+def test_no_reading_is_unknown_and_nothing_reaches_across_it() -> None:
+    frames = carried(T_NS, [SLOW[0], SLOW[1], None, *SLOW[3:]])
     expected = [100, 100, np.nan, 800, 900, 900]
     assert positions(frames, 100) == pytest.approx(expected, nan_ok=True)
 
 
 @pytest.mark.parametrize("gap_at", [2, 3, 4])
-def test_nothing_reaches_across_a_gap(frames_of: FramesOf, gap_at: int) -> None:
-    frames = carried(frames_of, T_NS, SLOW)
+def test_nothing_reaches_across_a_gap(gap_at: int) -> None:
+    frames = carried(T_NS, SLOW)
     broken = [i == gap_at for i in range(6)]
     line = [200, 400, 600, 800]
     expected = [100.0] * gap_at + line[gap_at:] + [900, 900]
     assert positions(frames, 100, broken) == pytest.approx(expected)
 
 
-def test_a_turn_that_ends_is_not_a_way_back(frames_of: FramesOf) -> None:
+def test_a_turn_that_ends_is_not_a_way_back() -> None:
     # A single-turn servo goes from 4095 to 0; the line between them would be half a turn off.
-    frames = carried(frames_of, T_NS, [(0, 4090)] * 4 + [(8 * MS, 6)] * 2)
+    frames = carried(T_NS, [(0, 4090)] * 4 + [(8 * MS, 6)] * 2)
     assert positions(frames, 100) == [4090] * 4 + [6] * 2
 
 
-def test_a_position_of_unknown_age_is_held(frames_of: FramesOf) -> None:
-    frames = frames_of(np.zeros((3, 1)), servo_counts=[7, 70, 700])
+def test_a_position_of_unknown_age_is_held() -> None:
+    frames = loaded_frames(np.zeros((3, 1)), servo_counts=[7, 70, 700])
     assert positions(frames, 100) == [7, 70, 700]
 
 
-def test_ages_cut_to_microseconds_make_no_new_readings(frames_of: FramesOf) -> None:
+def test_ages_cut_to_microseconds_make_no_new_readings() -> None:
     t_ns = [1_000_000, 3_000_999, 5_000_500, 7_000_001, 9_000_000]
-    frames = carried(frames_of, t_ns, [(123, 100)] * 4 + [(8_000_123, 900)])
+    frames = carried(t_ns, [(123, 100)] * 4 + [(8_000_123, 900)])
     readings = readings_of(frames, np.zeros(5, bool), None, TURN)
     assert readings.begins.tolist() == [True, False, False, False, True]
     assert readings.joins.tolist() == [False, False, False, False, True]
@@ -154,7 +152,7 @@ def loop(readings: Readings, lag_ns: int) -> list[float]:
 @settings(max_examples=300, deadline=None)
 @given(data=st.data(), lag_ms=st.sampled_from([0, 3, 10, 100]))
 def test_any_readings_give_what_a_loop_over_the_frames_gives(
-    frames_of: FramesOf, data: st.DataObject, lag_ms: int
+    data: st.DataObject, lag_ms: int
 ) -> None:
     n = data.draw(st.integers(1, 30))
 
@@ -162,7 +160,7 @@ def test_any_readings_give_what_a_loop_over_the_frames_gives(
         return data.draw(st.lists(values, min_size=n, max_size=n))
 
     t_ns = np.cumsum(drawn(st.integers(1, 4_000_000)))
-    frames = frames_of(
+    frames = loaded_frames(
         np.zeros((n, 1)),
         t_mono_ns=t_ns,
         servo_counts=drawn(st.sampled_from([NO_SERVO_COUNTS, -5, 0, 7, 7, 7, 900, 4095])),
@@ -185,7 +183,7 @@ def test_any_readings_give_what_a_loop_over_the_frames_gives(
     seed=st.integers(0, 2**32 - 1),
 )
 def test_a_steady_turn_is_followed_to_a_count_over_any_number_of_turns(
-    frames_of: FramesOf, start: int, counts_per_s: int, period_us: int, seed: int
+    start: int, counts_per_s: int, period_us: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     t_ns = 20 * MS + np.cumsum(rng.integers(1_800_000, 3_200_000, 60))
@@ -193,16 +191,14 @@ def test_a_steady_turn_is_followed_to_a_count_over_any_number_of_turns(
     known_ns = t_ns - 700 * US  # an answer takes so long
     sampled_ns = known_ns // (period_us * US) * period_us * US
     counts = np.floor(start + counts_per_s * sampled_ns * 1e-9).astype(np.int64)
-    frames = carried(
-        frames_of, t_ns.tolist(), list(zip(sampled_ns.tolist(), counts.tolist(), strict=True))
-    )
+    frames = carried(t_ns.tolist(), list(zip(sampled_ns.tolist(), counts.tolist(), strict=True)))
     at = positions(frames, 100)
     followed = t_ns < sampled_ns[-1]
     assert np.abs(at - true)[followed].max(initial=0.0) <= 1.01
 
 
-def test_batches_do_not_change_where_a_reading_begins(frames_of: FramesOf) -> None:
-    frames = carried(frames_of, T_NS, SLOW)
+def test_batches_do_not_change_where_a_reading_begins() -> None:
+    frames = carried(T_NS, SLOW)
     whole = readings_of(frames, np.zeros(6, bool), None, TURN)
     before, pieces = None, []
     for i in range(6):
@@ -213,9 +209,7 @@ def test_batches_do_not_change_where_a_reading_begins(frames_of: FramesOf) -> No
         assert joined.tolist() == getattr(whole, name).tolist()
 
 
-def test_an_estimate_turns_with_the_servo_between_its_readings(
-    info_of: Callable[..., Any], plan_of: Callable[..., Any], frames_of: FramesOf
-) -> None:
+def test_an_estimate_turns_with_the_servo_between_its_readings() -> None:
     servo = ServoInfo(
         model="MX-28",
         counts_per_turn=TURN,
@@ -224,8 +218,8 @@ def test_an_estimate_turns_with_the_servo_between_its_readings(
         ratio=0.1,
         ankle_travel_m_per_rad=0.15,
     )
-    plan = plan_of(info_of([(0.0, 0.0, -0.15), (0.02, 0.0, -0.15)], servo=servo), lag_ms=6)
-    frames = carried(frames_of, T_NS, SLOW, tiles=2)
+    plan = newton_plan(array_at([(0.0, 0.0, -0.15), (0.02, 0.0, -0.15)], servo=servo), lag_ms=6)
+    frames = carried(T_NS, SLOW, tiles=2)
     estimates, state = step(plan, frames, EstimationState())
     last = finish(plan, state)
     assert last is not None

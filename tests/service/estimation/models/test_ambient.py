@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from devices.frames import ArrayInfo
-from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.effects import Effects
 from service.estimation.models.ambient import AT_REST, SMOOTHING_S, Ambient
-from service.estimation.plan import EstimationPlan
+from tests.builders.arrays import array_at
+from tests.builders.calibrations import make_effects, newton_tile
+from tests.builders.estimates import newton_plan
 
 MODEL = Ambient(passed=np.array([1.0, 0.1]), relative_sigma=0.2)
 
@@ -24,10 +22,10 @@ MODEL = Ambient(passed=np.array([1.0, 0.1]), relative_sigma=0.2)
 def head(kpa: Any, t_s: Any) -> np.ndarray:
     """Averaged pressure around the foot."""
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    felt_kpa, sigma_kpa, _ = MODEL.felt(np.asarray(kpa, dtype=float), t_ns, AT_REST)
-    np.testing.assert_array_equal(felt_kpa[:, 1], 0.1 * felt_kpa[:, 0])
-    np.testing.assert_array_equal(sigma_kpa, np.abs(0.2 * felt_kpa))
-    return felt_kpa[:, 0]
+    passed_kpa, sigma_kpa, _ = MODEL.passed_on(np.asarray(kpa, dtype=float), t_ns, AT_REST)
+    np.testing.assert_array_equal(passed_kpa[:, 1], 0.1 * passed_kpa[:, 0])
+    np.testing.assert_array_equal(sigma_kpa, np.abs(0.2 * passed_kpa))
+    return passed_kpa[:, 0]
 
 
 def test_water_that_comes_at_once_is_known_after_thirty_milliseconds_to_two_thirds() -> None:
@@ -57,30 +55,26 @@ def test_it_is_never_outside_what_was_read(kpa: list[float], step_s: float) -> N
     assert (out <= max(kpa) + 1e-12).all()
 
 
-def test_a_dome_passes_on_what_its_wall_gives_way_to(
-    info_of: Callable[..., ArrayInfo],
-    tile_of: Callable[..., TileCalibration],
-    effects_of: Callable[..., Effects],
-    plan_of: Callable[..., EstimationPlan],
-    calibration_of: Callable[..., Calibration],
-) -> None:
+def test_a_dome_passes_on_what_its_wall_gives_way_to() -> None:
     # hardware.md 9: c p/(1 + c p), a ninth of it with 0.00124 per kPa at 100 kPa
-    tiles = [tile_of("T01", effects=effects_of())]
-    bare = info_of([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)], references=[1])
-    plan = plan_of(bare, models=("static", "ambient"), tiles=tiles)
+    tiles = [newton_tile("T01", effects=make_effects())]
+    bare = array_at([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0)], references=[1])
+    plan = newton_plan(bare, models=("static", "ambient"), tiles=tiles)
     assert plan.ladder.ambient is not None
     give = 0.0013 * plan.baseline_kpa[0]
     assert plan.ladder.ambient.passed == pytest.approx([give / (1 + give)])
     assert plan.ladder.ambient.relative_sigma == pytest.approx(0.0002 / 0.0013)
     with pytest.raises(UsageError, match="bare reference tile"):
-        plan_of(info_of([(0.0, 0.0, 0.0)]), models=("static", "ambient"), tiles=tiles)
+        newton_plan(array_at([(0.0, 0.0, 0.0)]), models=("static", "ambient"), tiles=tiles)
 
 
 def test_a_bare_tile_that_falls_silent_is_believed_for_a_fifth_of_a_second() -> None:
     t_ns = np.arange(300, dtype=np.int64) * 2_000_000
     kpa = np.where(np.arange(300) < 100, 1.0, np.nan)
-    felt_kpa, _, state = Ambient(np.array([0.1]), 0.1).felt(kpa, t_ns, AT_REST)
-    assert felt_kpa[:200, 0] == pytest.approx(0.1)
-    assert np.isnan(felt_kpa[200:, 0]).all()
-    later, _, _ = Ambient(np.array([0.1]), 0.1).felt(np.full(9, 2.0), t_ns[-1] + t_ns[1:10], state)
+    passed_kpa, _, state = Ambient(np.array([0.1]), 0.1).passed_on(kpa, t_ns, AT_REST)
+    assert passed_kpa[:200, 0] == pytest.approx(0.1)
+    assert np.isnan(passed_kpa[200:, 0]).all()
+    later, _, _ = Ambient(np.array([0.1]), 0.1).passed_on(
+        np.full(9, 2.0), t_ns[-1] + t_ns[1:10], state
+    )
     assert np.isfinite(later).all(), "and again as soon as it speaks"

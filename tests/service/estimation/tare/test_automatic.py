@@ -1,7 +1,7 @@
 """The automatic tare: it follows a dome that warms up, and tares no load away.
 
-A count is 130/1023 kPa or one newton (see conftest). A sealed bubble of 100 kPa gains 0.336 kPa or
-2.64 counts a kelvin, while `tadc` falls by 5.35.
+A count is 130/1023 kPa or one newton (see tests/builders). A sealed bubble of 100 kPa gains
+0.336 kPa or 2.64 counts a kelvin, while `tadc` falls by 5.35.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import pytest
 
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
-from devices.frames import ArrayInfo, FrameBatch
-from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
+from devices.frames import NOT_READ, ArrayInfo, FrameBatch
+from service.estimation.calibration import Calibration, paper_eq2_shape
 from service.estimation.tare.automatic import (
     APART_NS,
     CONFIRM_NS,
@@ -30,16 +30,12 @@ from service.estimation.tare.automatic import (
 )
 from service.estimation.tare.flight import WINDOW_NS
 from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded import TareFrames
+from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, UTC_NS, make_array
+from tests.builders.calibrations import make_calibration, make_tare
+from tests.builders.frames import loaded_frames
 
-InfoOf = Callable[..., ArrayInfo]
-FramesOf = Callable[..., FrameBatch]
-TileOf = Callable[..., TileCalibration]
-CalibrationOf = Callable[..., Calibration]
-
-COUNT_KPA = 130 / 1023
-UNLOADED_KPA = 787 * 65 / 1023 + 50  # at 500 counts
 COUNTS_PER_K = UNLOADED_KPA / 298.0 / COUNT_KPA
-BEGIN_NS = 1_577_836_800_000_000_000
 PERIOD_NS = 10_000_000
 SECOND_NS = 1_000_000_000
 TILES = 2
@@ -48,11 +44,10 @@ TILES = 2
 class Bench:
     """Frames of the last seconds at some instant, and what a look at them finds."""
 
-    def __init__(self, info: ArrayInfo, calibration: Calibration, frames_of: FramesOf) -> None:
+    def __init__(self, info: ArrayInfo, calibration: Calibration) -> None:
         self.info = info
         self.calibration = calibration
         self._compensation = Compensation(info.tiles)
-        self._frames_of = frames_of
 
     def frames(
         self, at_s: float, counts: Any = 0.0, *, warmer_k: float = 0.0, seconds: float = 5.0
@@ -63,7 +58,7 @@ class Bench:
         t_mono_ns = round(at_s * SECOND_NS) + PERIOD_NS * np.arange(1 - n, 1)
         tadc = np.rint(480 + TADC_PER_KELVIN * warmer_k + rng.normal(0.0, 0.3, (n, TILES)))
         forces_n = rng.normal(0.0, 0.9, (n, TILES)) + np.asarray(counts)
-        return self._frames_of(forces_n, t_mono_ns=t_mono_ns, tadc=tadc)
+        return loaded_frames(forces_n, t_mono_ns=t_mono_ns, tadc=tadc)
 
     def look(
         self,
@@ -76,10 +71,7 @@ class Bench:
     ) -> Look:
         """A look at frames of a foot that has had no contact for `free_s`."""
         return look_in_flight(
-            frames,
-            self._compensation,
-            self.calibration,
-            self.info.serials,
+            self._seen(frames),
             present=present,
             anchor=present if anchor is None else anchor,
             free_since_t_ns=int(frames.t_ns[-1]) - round(free_s * SECOND_NS),
@@ -88,25 +80,25 @@ class Bench:
 
     def first(self, frames: FrameBatch) -> Look:
         """A look at frames of a foot that was never tared."""
-        return first_in_flight(frames, self._compensation, self.calibration, self.info.serials)
+        return first_in_flight(self._seen(frames))
+
+    def _seen(self, frames: FrameBatch) -> TareFrames:
+        return TareFrames(frames, self._compensation, self.calibration, self.info.serials)
 
 
 @pytest.fixture(scope="module")
-def bench(
-    info_of: InfoOf, tile_of: TileOf, calibration_of: CalibrationOf, frames_of: FramesOf
-) -> Bench:
-    info = info_of([(0.014 * i, 0.0, -0.15) for i in range(TILES)])
-    return Bench(info, calibration_of(*(tile_of(s) for s in info.serials)), frames_of)
+def bench() -> Bench:
+    info = make_array(TILES)
+    return Bench(info, make_calibration(*info.serials))
 
 
 def by_hand(at_s: float = 0.0, counts: float = 0.0) -> Tare:
-    return Tare(
-        baseline_kpa=np.full(TILES, UNLOADED_KPA + counts * COUNT_KPA),
-        baseline_sigma_kpa=np.full(TILES, 0.01),
-        noise_kpa=np.full(TILES, COUNT_KPA),
-        tadc_counts=np.full(TILES, 480.0),
-        t_ns=BEGIN_NS + round(at_s * SECOND_NS),
-        begin_s=0.0,
+    return make_tare(
+        TILES,
+        baseline_kpa=UNLOADED_KPA + counts * COUNT_KPA,
+        baseline_sigma_kpa=0.01,
+        noise_kpa=COUNT_KPA,
+        t_ns=UTC_NS + round(at_s * SECOND_NS),
         end_s=0.25,
         frames=25,
         source="unloaded",
@@ -135,7 +127,7 @@ def test_a_dome_that_has_warmed_up_in_the_air_is_tared_anew_and_the_history_says
     assert found.doubt is None
     assert found.tare is not None
     assert found.tare.source == "flight"
-    assert found.tare.t_ns == BEGIN_NS + 300 * SECOND_NS
+    assert found.tare.t_ns == UTC_NS + 300 * SECOND_NS
     assert found.tare.baseline_kpa == pytest.approx([UNLOADED_KPA + 0.336] * 2, abs=0.1)
     assert "in flight" in found.reason
     assert "kPa in 5 min" in found.reason
@@ -151,9 +143,9 @@ def test_a_dome_that_warms_for_an_hour_is_followed(bench: Bench) -> None:
     for before, after in pairwise(tares):
         assert after.t_ns - before.t_ns >= APART_NS
     for tare in tares[1:]:
-        truth_kpa = UNLOADED_KPA * (1 + warmer_at((tare.t_ns - BEGIN_NS) * 1e-9) / 298.0)
+        truth_kpa = UNLOADED_KPA * (1 + warmer_at((tare.t_ns - UTC_NS) * 1e-9) / 298.0)
         assert tare.baseline_kpa == pytest.approx([truth_kpa] * 2, abs=0.12)
-    assert BEGIN_NS + 3600 * SECOND_NS - tares[-1].t_ns < CONFIRM_NS + 60 * SECOND_NS
+    assert UTC_NS + 3600 * SECOND_NS - tares[-1].t_ns < CONFIRM_NS + 60 * SECOND_NS
 
 
 def test_a_baseline_that_stays_is_confirmed_now_and_then_so_it_is_never_called_old(
@@ -278,6 +270,14 @@ def test_a_foot_that_steps_is_tared_between_two_steps(bench: Bench) -> None:
     assert "between two steps" in found.reason
 
 
+def test_a_step_counts_however_seldom_the_temperature_is_read(bench: Bench) -> None:
+    counts = np.zeros((500, 1))
+    counts[100:120] = 40.0  # 0.2 s, of which every fourth frame reads the temperature
+    frames = bench.frames(20.0, counts)
+    tadc = np.where(np.arange(500)[:, None] % 4 == 0, frames.tadc, NOT_READ).astype(np.uint16)
+    assert bench.first(replace(frames, tadc=tadc)).tare is not None
+
+
 @pytest.mark.parametrize("counts", [0.0, 3.0, 11.0], ids=["hangs", "stands light", "stands"])
 def test_a_foot_that_never_steps_is_not_tared_unasked(bench: Bench, counts: float) -> None:
     assert bench.first(bench.frames(20.0, counts)) == Look()
@@ -288,7 +288,7 @@ def test_a_foot_that_rests_far_from_the_bench_is_not_tared_unasked(bench: Bench)
 
 
 def test_without_a_bench_nobody_knows_what_unloaded_is(bench: Bench) -> None:
-    preset = Bench(bench.info, paper_eq2_shape(), bench._frames_of)
+    preset = Bench(bench.info, paper_eq2_shape())
     assert preset.first(preset.frames(20.0, stepping(0.0))) == Look()
 
 

@@ -18,6 +18,8 @@ from service.estimation.tare.drift import (
     warmer_k,
 )
 from service.estimation.tare.tare import Tare
+from tests.builders.arrays import UTC_NS
+from tests.builders.calibrations import make_tare
 
 HOUR_NS = 3_600_000_000_000
 
@@ -29,15 +31,12 @@ def tare(
     tadc: Sequence[float] = (480.0, 500.0),
     sigma_kpa: float = 0.01,
 ) -> Tare:
-    return Tare(
-        baseline_kpa=np.array(kpa),
-        baseline_sigma_kpa=np.full(len(kpa), sigma_kpa),
-        noise_kpa=np.full(len(kpa), 0.165),
-        tadc_counts=np.array(tadc),
-        t_ns=10**18 + round(hours * HOUR_NS),
-        begin_s=0.0,
-        end_s=0.25,
-        frames=125,
+    return make_tare(
+        len(kpa),
+        baseline_kpa=kpa,
+        baseline_sigma_kpa=sigma_kpa,
+        tadc_counts=tadc,
+        t_ns=UTC_NS + round(hours * HOUR_NS),
         source="unloaded",
     )
 

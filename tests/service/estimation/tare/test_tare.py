@@ -1,11 +1,10 @@
 """The tare: which interval is taken, what is computed from it, and when there is none.
 
-Chips read one count per 130/1023 kPa (see conftest), so baselines are worked out in counts.
+Chips read one count per 130/1023 kPa (see tests/builders), so baselines are worked out in counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,41 +15,32 @@ from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus, TileStatus
-from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
-from service.estimation.tare.tare import Tare, take_tare
+from devices.frames import FrameBatch, FrameStatus, TileStatus
+from service.estimation.calibration import Calibration, paper_eq2_shape
+from service.estimation.tare.recorded import take_tare
+from service.estimation.tare.tare import Tare
+from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, UNLOADED_KPA, array_at, make_array
+from tests.builders.calibrations import make_calibration, newton_tile
+from tests.builders.frames import loaded_frames
 
-InfoOf = Callable[..., ArrayInfo]
-FramesOf = Callable[..., FrameBatch]
-TileOf = Callable[..., TileCalibration]
-CalibrationOf = Callable[..., Calibration]
-TareOf = Callable[..., Tare]
-
-COUNT_KPA = 130 / 1023
-UNLOADED_KPA = 787 * 65 / 1023 + 50  # at 500 counts
 PAIR = [(0.0, 0.0, -0.15), (0.014, 0.0, -0.15)]
 NOISE_KPA = 0.165
 
 
-@pytest.fixture(scope="session")
-def tare_of(info_of: InfoOf, tile_of: TileOf, calibration_of: CalibrationOf) -> TareOf:
+def tare_of(
+    frames: FrameBatch,
+    interval_s: tuple[float, float] | None = None,
+    *,
+    calibration: Calibration | None = None,
+    **bench: Any,
+) -> Tare:
     """The tare of frames; the bench saw every tile at 500 counts with one count of noise."""
-
-    def take(
-        frames: FrameBatch,
-        interval_s: tuple[float, float] | None = None,
-        *,
-        calibration: Calibration | None = None,
-        **bench: Any,
-    ) -> Tare:
-        info = info_of([(0.014 * i, 0.0, -0.15) for i in range(frames.tile_count)])
-        if calibration is None:
-            calibration = calibration_of(*(tile_of(s, **bench) for s in info.serials))
-        return take_tare(
-            frames, Compensation(info.tiles), calibration, info.serials, interval_s=interval_s
-        )
-
-    return take
+    info = make_array(frames.tile_count)
+    if calibration is None:
+        calibration = make_calibration(*(newton_tile(s, **bench) for s in info.serials))
+    return take_tare(
+        frames, Compensation(info.tiles), calibration, info.serials, interval_s=interval_s
+    )
 
 
 def noise_counts(n: int, tiles: int, seed: int = 0) -> np.ndarray:
@@ -61,11 +51,9 @@ def noise_counts(n: int, tiles: int, seed: int = 0) -> np.ndarray:
 # --- what is computed -----------------------------------------------------------------------------
 
 
-def test_baseline_and_noise_are_mean_and_standard_deviation_of_the_interval(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
+def test_baseline_and_noise_are_mean_and_standard_deviation_of_the_interval() -> None:
     # 40 readings of 497 and 503 counts in turn: mean 500, deviation 3, times sqrt(40 / 39)
-    frames = frames_of(np.tile([[3.0, 3.0], [-3.0, -3.0]], (20, 1)))
+    frames = loaded_frames(np.tile([[3.0, 3.0], [-3.0, -3.0]], (20, 1)))
     tare = tare_of(frames, (0.0, 1.0))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=1e-12)
     noise_kpa = 3 * COUNT_KPA * np.sqrt(40 / 39)
@@ -73,11 +61,11 @@ def test_baseline_and_noise_are_mean_and_standard_deviation_of_the_interval(
     assert tare.baseline_sigma_kpa == pytest.approx([noise_kpa / np.sqrt(40)] * 2, rel=1e-12)
 
 
-def test_only_the_interval_counts_and_it_is_described(frames_of: FramesOf, tare_of: TareOf) -> None:
+def test_only_the_interval_counts_and_it_is_described() -> None:
     # 500 frames/s; unloaded from 0.2 s (frame 100) to 0.4 s (frame 200), both ends included
     forces_n = np.full((500, 2), 20.0)
     forces_n[100:201] = 0.0
-    frames = frames_of(forces_n)
+    frames = loaded_frames(forces_n)
     tare = tare_of(frames, (0.2, 0.4))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=1e-12)
     assert (tare.frames, tare.source) == (101, "interval")
@@ -85,23 +73,19 @@ def test_only_the_interval_counts_and_it_is_described(frames_of: FramesOf, tare_
     assert tare.t_ns == frames.t_ns[200]
 
 
-def test_a_reading_that_never_moves_still_has_the_noise_of_rounding(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
-    tare = tare_of(frames_of(np.zeros((100, 2))), (0.0, 1.0))
+def test_a_reading_that_never_moves_still_has_the_noise_of_rounding() -> None:
+    tare = tare_of(loaded_frames(np.zeros((100, 2))), (0.0, 1.0))
     assert tare.noise_kpa == pytest.approx([COUNT_KPA / np.sqrt(12)] * 2, rel=1e-12)
     assert tare.baseline_sigma_kpa == pytest.approx([COUNT_KPA / np.sqrt(1200)] * 2, rel=1e-12)
 
 
-def test_the_temperature_is_the_mean_of_the_readings_that_count(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
+def test_the_temperature_is_the_mean_of_the_readings_that_count() -> None:
     # T01 warms by two counts halfway; T02 does so too, but was not readable before
     tadc = np.full((100, 2), 480)
     tadc[50:] = 478
     forces_n = noise_counts(100, 2)
     forces_n[:50, 1] = np.nan
-    tare = tare_of(frames_of(forces_n, tadc=tadc), (0.0, 1.0))
+    tare = tare_of(loaded_frames(forces_n, tadc=tadc), (0.0, 1.0))
     assert tare.tadc_counts == pytest.approx([479.0, 478.0], abs=1e-12)
 
 
@@ -109,38 +93,32 @@ def test_the_temperature_is_the_mean_of_the_readings_that_count(
     "bit",
     [TileStatus.NO_ANSWER, TileStatus.STALE, TileStatus.IMPLAUSIBLE, TileStatus.NOT_CONVERTED],
 )
-def test_readings_of_a_faulty_tile_are_left_out(
-    frames_of: FramesOf, tare_of: TareOf, bit: TileStatus
-) -> None:
+def test_readings_of_a_faulty_tile_are_left_out(bit: TileStatus) -> None:
     forces_n, status = np.zeros((100, 2)), np.zeros((100, 2))
     forces_n[::4, 1], status[::4, 1] = 400.0, bit
-    tare = tare_of(frames_of(forces_n, status=status), (0.0, 1.0))
+    tare = tare_of(loaded_frames(forces_n, status=status), (0.0, 1.0))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=1e-12)
     assert tare.baseline_sigma_kpa[1] == pytest.approx(COUNT_KPA / np.sqrt(12 * 75))
 
 
-def test_counts_that_were_not_read_are_left_out_whatever_their_status_says(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
+def test_counts_that_were_not_read_are_left_out_whatever_their_status_says() -> None:
     # A file from elsewhere may have a null count and no flag; the estimate calls such a tile
     # missing, so it must not be in the baseline either.
     forces_n = np.zeros((100, 2))
     forces_n[::4, 1] = np.nan
-    frames = frames_of(forces_n)
+    frames = loaded_frames(forces_n)
     tare = tare_of(replace(frames, status=np.zeros_like(frames.status)), (0.0, 1.0))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=1e-12)
 
 
-def test_a_tile_that_is_silent_half_of_the_time_has_the_noise_of_its_other_half(
-    info_of: InfoOf, frames_of: FramesOf, calibration_of: CalibrationOf, tile_of: TileOf
-) -> None:
+def test_a_tile_that_is_silent_half_of_the_time_has_the_noise_of_its_other_half() -> None:
     # The data sheet's part: a count is 0.1255 kPa at tadc 500, c12 makes it depend on tadc.
-    info = info_of(PAIR[:1], chips=[(0x3ECE, 0xB3F9, 0xC517, 0x33C8)])
+    info = array_at(PAIR[:1], chips=[DATA_SHEET_CHIP])
     forces_n = np.tile([[1.0], [np.nan], [-1.0], [np.nan]], (50, 1))
     tare = take_tare(
-        frames_of(forces_n),
+        loaded_frames(forces_n),
         Compensation(info.tiles),
-        calibration_of(tile_of("T01")),
+        make_calibration(newton_tile("T01")),
         info.serials,
         interval_s=(0.0, 1.0),
     )
@@ -149,32 +127,26 @@ def test_a_tile_that_is_silent_half_of_the_time_has_the_noise_of_its_other_half(
 
 
 @pytest.mark.parametrize("readable", [0, 19])
-def test_fewer_than_twenty_readings_of_a_tile_are_refused_with_its_serial(
-    frames_of: FramesOf, tare_of: TareOf, readable: int
-) -> None:
+def test_fewer_than_twenty_readings_of_a_tile_are_refused_with_its_serial(readable: int) -> None:
     forces_n = np.zeros((200, 2))
     forces_n[readable:, 1] = np.nan
     with pytest.raises(TareError, match=rf"T02 has {readable} .*--tare-s"):
-        tare_of(frames_of(forces_n), (0.0, 1.0))
+        tare_of(loaded_frames(forces_n), (0.0, 1.0))
 
 
-def test_twenty_readings_will_do(frames_of: FramesOf, tare_of: TareOf) -> None:
-    assert tare_of(frames_of(np.zeros((200, 2))), (0.0, 0.038)).frames == 20
+def test_twenty_readings_will_do() -> None:
+    assert tare_of(loaded_frames(np.zeros((200, 2))), (0.0, 0.038)).frames == 20
 
 
 @pytest.mark.parametrize("interval_s", [(0.0, 0.03), (5.0, 6.0), (-2.0, -1.0)])
-def test_an_interval_with_too_few_frames_is_refused(
-    frames_of: FramesOf, tare_of: TareOf, interval_s: tuple[float, float]
-) -> None:
+def test_an_interval_with_too_few_frames_is_refused(interval_s: tuple[float, float]) -> None:
     with pytest.raises(TareError, match="at least 20"):
-        tare_of(frames_of(np.zeros((200, 2))), interval_s)
+        tare_of(loaded_frames(np.zeros((200, 2))), interval_s)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9))
-def test_a_tare_does_not_depend_on_how_frames_lie_in_memory(
-    frames_of: FramesOf, tare_of: TareOf, seed: int, tiles: int
-) -> None:
-    frames = frames_of(noise_counts(99, tiles, seed))
+def test_a_tare_does_not_depend_on_how_frames_lie_in_memory(seed: int, tiles: int) -> None:
+    frames = loaded_frames(noise_counts(99, tiles, seed))
     other = replace(
         frames,
         **{name: np.asfortranarray(getattr(frames, name)) for name in ("padc", "tadc", "status")},
@@ -192,45 +164,41 @@ def lead(n: int, first: int) -> np.ndarray:
     return np.where(np.arange(n) < first, FrameStatus.LEAD, 0) | FrameStatus.SERVO_STALE
 
 
-def test_the_lead_is_the_tare_if_no_interval_is_named(frames_of: FramesOf, tare_of: TareOf) -> None:
+def test_the_lead_is_the_tare_if_no_interval_is_named() -> None:
     forces_n = np.full((300, 2), 20.0)
     forces_n[:120] = 5.0  # wherever the tile lies in the lead, that is its baseline
     forces_n[:2] += [[1.0], [-1.0]]
-    tare = tare_of(frames_of(forces_n, frame_status=lead(300, 120)))
+    tare = tare_of(loaded_frames(forces_n, frame_status=lead(300, 120)))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA + 5 * COUNT_KPA] * 2, abs=1e-12)
     assert (tare.source, tare.frames) == ("lead", 120)
 
 
 @pytest.mark.parametrize("readings", [20, 120])
-def test_a_tile_that_hangs_is_not_tared_by_itself(
-    frames_of: FramesOf, tare_of: TareOf, readings: int
-) -> None:
+def test_a_tile_that_hangs_is_not_tared_by_itself(readings: int) -> None:
     # The same count again and again, in the lead: the part is stuck, and says nothing of a load.
     forces_n = noise_counts(300, 2)
     forces_n[:readings, 1] = 2.0
     forces_n[readings:120, 1] = np.nan
-    frames = frames_of(forces_n, frame_status=lead(300, 120))
+    frames = loaded_frames(forces_n, frame_status=lead(300, 120))
     with pytest.raises(TareError, match=rf"T02 gave 498 counts {readings} times") as caught:
         tare_of(frames)
     assert "plug" in caught.value.remedy
     assert tare_of(frames, (0.0, 0.2)).source == "interval"  # who names one answers for it
 
 
-def test_a_tile_without_noise_on_the_bench_may_stand_still_in_the_lead(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
-    frames = frames_of(np.zeros((120, 2)), frame_status=lead(120, 120))
+def test_a_tile_without_noise_on_the_bench_may_stand_still_in_the_lead() -> None:
+    frames = loaded_frames(np.zeros((120, 2)), frame_status=lead(120, 120))
     assert tare_of(frames, noise_kpa=0.29 * COUNT_KPA).source == "lead"
     with pytest.raises(TareError, match="nothing else"):
         tare_of(frames, calibration=paper_eq2_shape())
 
 
-def test_frames_marked_as_lead_later_on_are_none(frames_of: FramesOf, tare_of: TareOf) -> None:
+def test_frames_marked_as_lead_later_on_are_none() -> None:
     # A lead is what a recording begins with. Two recordings that were joined have one in the
     # middle, and whoever looks at the first minute only must come to the same tare.
     forces_n = noise_counts(1000, 2)
     forces_n[300:500] += 30.0
-    first, status = frames_of(forces_n), lead(1000, 200)
+    first, status = loaded_frames(forces_n), lead(1000, 200)
     again = np.where((np.arange(1000) >= 300) & (np.arange(1000) < 500), FrameStatus.LEAD, 0)
     tare = tare_of(replace(first, frame_status=(status | again).astype(np.uint8)))
     assert (tare.source, tare.frames) == ("lead", 200)
@@ -238,18 +206,16 @@ def test_frames_marked_as_lead_later_on_are_none(frames_of: FramesOf, tare_of: T
     assert (tare.source, tare.begin_s) == ("recognised", 0.0)
 
 
-def test_a_named_interval_wins_over_the_lead(frames_of: FramesOf, tare_of: TareOf) -> None:
-    frames = frames_of(np.zeros((300, 2)), frame_status=lead(300, 120))
+def test_a_named_interval_wins_over_the_lead() -> None:
+    frames = loaded_frames(np.zeros((300, 2)), frame_status=lead(300, 120))
     assert tare_of(frames, (0.3, 0.5)).source == "interval"
 
 
-def test_without_either_the_first_unloaded_half_second_is_recognised(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
+def test_without_either_the_first_unloaded_half_second_is_recognised() -> None:
     # 2 s on the ground, then 1.5 s in flight: the first window of flight begins at 2.0 s
     forces_n = noise_counts(1750, 2)
     forces_n[:1000] += 30.0
-    frames = frames_of(forces_n)
+    frames = loaded_frames(forces_n)
     tare = tare_of(frames)
     assert tare.source == "recognised"
     assert (tare.begin_s, tare.end_s) == pytest.approx((2.0, 2.498))
@@ -258,14 +224,12 @@ def test_without_either_the_first_unloaded_half_second_is_recognised(
 
 
 @pytest.mark.parametrize("how", ["interval", "lead"])
-def test_a_tile_that_seems_loaded_is_no_tare_even_if_somebody_says_so(
-    frames_of: FramesOf, tare_of: TareOf, how: str
-) -> None:
+def test_a_tile_that_seems_loaded_is_no_tare_even_if_somebody_says_so(how: str) -> None:
     # 3 kPa are 23.6 counts; far below the bench's baseline it may be, for a colder tile is
     def take(*counts: float) -> Tare:
         forces_n = np.tile(counts, (100, 1))
         forces_n[:2] += [[1.0], [-1.0]]
-        frames = frames_of(forces_n, frame_status=lead(100, 100))
+        frames = loaded_frames(forces_n, frame_status=lead(100, 100))
         return tare_of(frames, (0.0, 0.1) if how == "interval" else None)
 
     assert take(23.0, -60.0).source == how
@@ -273,10 +237,8 @@ def test_a_tile_that_seems_loaded_is_no_tare_even_if_somebody_says_so(
         take(0.0, 24.0)
 
 
-def test_a_preset_does_not_know_what_an_unloaded_tile_reads(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
-    loaded = frames_of(np.full((100, 2), 60.0))
+def test_a_preset_does_not_know_what_an_unloaded_tile_reads() -> None:
+    loaded = loaded_frames(np.full((100, 2), 60.0))
     assert tare_of(loaded, (0.0, 0.1), calibration=paper_eq2_shape()).source == "interval"
 
 
@@ -311,10 +273,8 @@ def stretches(kinds: list[str]) -> np.ndarray:
         max_size=6,
     )
 )
-def test_no_loaded_moving_or_faulty_stretch_is_recognised_as_unloaded(
-    frames_of: FramesOf, tare_of: TareOf, kinds: list[str]
-) -> None:
-    frames = frames_of(stretches(kinds))
+def test_no_loaded_moving_or_faulty_stretch_is_recognised_as_unloaded(kinds: list[str]) -> None:
+    frames = loaded_frames(stretches(kinds))
     if "unloaded" not in kinds:
         with pytest.raises(TareError, match=r"no interval can be recognised.*--tare-s"):
             tare_of(frames)
@@ -325,7 +285,7 @@ def test_no_loaded_moving_or_faulty_stretch_is_recognised_as_unloaded(
     assert first == kinds.index("unloaded")
 
 
-def test_a_leg_that_stands_still_is_not_in_flight(frames_of: FramesOf, tare_of: TareOf) -> None:
+def test_a_leg_that_stands_still_is_not_in_flight() -> None:
     # The paper's leg weighs 8.92 N (0.909 kg): 2.23 N on each of four tiles, which by eq. 2 at the
     # assumed scale is 1.41 kPa, 11 counts. It stands for two seconds, then is lifted for two.
     paper = paper_eq2_shape().tiles[0]
@@ -333,78 +293,62 @@ def test_a_leg_that_stands_still_is_not_in_flight(frames_of: FramesOf, tare_of: 
     counts = 8.92 / 4 / slope_n_per_kpa / COUNT_KPA
     forces_n = noise_counts(2000, 4)
     forces_n[:1000] += counts
-    tare = tare_of(frames_of(forces_n))
+    tare = tare_of(loaded_frames(forces_n))
     assert tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 4, abs=0.05)
 
 
-def test_a_foot_that_is_slowly_let_down_is_not_unloaded(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
+def test_a_foot_that_is_slowly_let_down_is_not_unloaded() -> None:
     # From the first frame on, a newton a second on each tile, 0.63 kPa/s; flight only at the end.
     forces_n = noise_counts(1500, 2)
     forces_n[:1000] += np.linspace(0.0, 2.0 * 0.63 / COUNT_KPA, 1000)[:, None]
-    tare = tare_of(frames_of(forces_n))
+    tare = tare_of(loaded_frames(forces_n))
     off_kpa = np.abs(tare.baseline_kpa - UNLOADED_KPA)
     assert (off_kpa < 6 * tare.baseline_sigma_kpa).all()
 
 
 @pytest.mark.parametrize("newtons_per_second", [1.0, -1.0])
-def test_a_load_that_moves_slowly_all_the_time_is_refused(
-    frames_of: FramesOf, tare_of: TareOf, newtons_per_second: float
-) -> None:
+def test_a_load_that_moves_slowly_all_the_time_is_refused(newtons_per_second: float) -> None:
     # No window is unloaded, and half a newton in one hides in the noise of single readings.
     forces_n = noise_counts(1000, 2)
     forces_n += np.linspace(0.0, newtons_per_second * 2.0 * 0.63 / COUNT_KPA, 1000)[:, None]
     with pytest.raises(TareError, match="no interval can be recognised"):
-        tare_of(frames_of(forces_n))
+        tare_of(loaded_frames(forces_n))
 
 
-def test_an_interval_of_half_a_second_is_found_at_every_quarter_of_a_second(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
+def test_an_interval_of_half_a_second_is_found_at_every_quarter_of_a_second() -> None:
     forces_n = noise_counts(750, 2) + 30.0
     forces_n[125:376] -= 30.0  # 0.25 to 0.75 s
-    assert tare_of(frames_of(forces_n)).begin_s == pytest.approx(0.25)
+    assert tare_of(loaded_frames(forces_n)).begin_s == pytest.approx(0.25)
 
 
-def test_a_tile_that_is_noisier_than_on_the_bench_is_not_quiet(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
+def test_a_tile_that_is_noisier_than_on_the_bench_is_not_quiet() -> None:
     # one count on the bench; up to one and a half is let pass
     noise = np.random.default_rng(8).normal(0.0, 1.0, (500, 2))
-    assert tare_of(frames_of(1.3 * noise)).source == "recognised"
+    assert tare_of(loaded_frames(1.3 * noise)).source == "recognised"
     with pytest.raises(TareError):
-        tare_of(frames_of(noise * [1.0, 1.75]))
+        tare_of(loaded_frames(noise * [1.0, 1.75]))
 
 
-def test_one_tile_without_a_bench_baseline_is_enough_to_recognise_nothing(
-    frames_of: FramesOf, tare_of: TareOf, tile_of: TileOf, calibration_of: CalibrationOf
-) -> None:
+def test_one_tile_without_a_bench_baseline_is_enough_to_recognise_nothing() -> None:
     for missing in ("baseline_kpa", "noise_kpa"):
-        mixed = calibration_of(tile_of("T01"), tile_of("T02", **{missing: None}))
+        mixed = make_calibration(newton_tile("T01"), newton_tile("T02", **{missing: None}))
         with pytest.raises(TareError, match="does not say where an unloaded tile lies"):
-            tare_of(frames_of(noise_counts(500, 2)), calibration=mixed)
+            tare_of(loaded_frames(noise_counts(500, 2)), calibration=mixed)
 
 
-def test_a_calibration_without_bench_baselines_cannot_recognise_anything(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
+def test_a_calibration_without_bench_baselines_cannot_recognise_anything() -> None:
     with pytest.raises(TareError, match=r"paper-eq2-shape .*--tare-s"):
-        tare_of(frames_of(np.zeros((500, 2))), calibration=paper_eq2_shape())
+        tare_of(loaded_frames(np.zeros((500, 2))), calibration=paper_eq2_shape())
 
 
-def test_a_baseline_may_have_drifted_by_some_kelvin_since_the_bench(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
-    frames = frames_of(noise_counts(500, 2))
+def test_a_baseline_may_have_drifted_by_some_kelvin_since_the_bench() -> None:
+    frames = loaded_frames(noise_counts(500, 2))
     assert tare_of(frames, baseline_kpa=UNLOADED_KPA + 1.4).source == "recognised"
     with pytest.raises(TareError):
         tare_of(frames, baseline_kpa=UNLOADED_KPA + 1.6)
 
 
-def test_a_recording_of_too_few_frames_for_a_window_is_refused(
-    frames_of: FramesOf, tare_of: TareOf
-) -> None:
+def test_a_recording_of_too_few_frames_for_a_window_is_refused() -> None:
     with pytest.raises(TareError, match="no interval can be recognised"):
-        tare_of(frames_of(noise_counts(19, 2)))
-    assert tare_of(frames_of(noise_counts(20, 2))).frames == 20
+        tare_of(loaded_frames(noise_counts(19, 2)))
+    assert tare_of(loaded_frames(noise_counts(20, 2))).frames == 20

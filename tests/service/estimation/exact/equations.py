@@ -6,12 +6,9 @@ None stands for none.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 from mpmath import mp, mpf
 
 from service.estimation.models import ambient, denoise
@@ -21,26 +18,7 @@ Exact = Any
 """A number of fifty digits, or None."""
 
 
-@pytest.fixture(autouse=True, scope="session")
-def fifty_digits() -> Iterator[None]:
-    before, mp.dps = mp.dps, 50
-    yield
-    mp.dps = before
-
-
-@pytest.fixture(scope="session")
-def equations() -> SimpleNamespace:
-    """All of the functions below, by their names."""
-    return SimpleNamespace(
-        gas=gas,
-        rubber=rubber,
-        hysteresis=hysteresis,
-        temperature=temperature,
-        ambient=around,
-        denoise=averaged,
-        exact=exact,
-        apart=apart,
-    )
+mp.dps = 50  # only the tests of this folder use mpmath
 
 
 def exact(values: Any) -> list[Exact]:
@@ -54,6 +32,22 @@ def apart(estimated: Any, expected: list[Exact]) -> float:
         assert np.isnan(e) == (x is None)
         worst = worst if x is None else max(worst, float(abs(mpf(float(e)) - x)))
     return worst
+
+
+def pressure_kpa(words: tuple[int, ...], padc: int, tadc: int) -> Exact:
+    """Data sheet 8.1 and 8.2; what reads below 50 kPa fell through zero and counts as negative.
+
+    None if it is below the chip's range even so: then it is no pressure at all.
+    """
+    a0, b1, b2, c12 = (word - 65536 if word >= 32768 else word for word in words)
+
+    def kpa(counts: int) -> Exact:
+        slope = mpf(b1) / 2**13 + mpf(c12 >> 2) / 2**22 * tadc
+        pcomp = mpf(a0) / 2**3 + slope * counts + mpf(b2) / 2**14 * tadc
+        return pcomp * mpf(115 - 50) / 1023 + 50
+
+    pressure = kpa(padc) if kpa(padc) >= 50 else kpa(padc - 1024)
+    return pressure if pressure >= 50 else None
 
 
 def gas(
@@ -83,13 +77,13 @@ def gas(
 
 
 def rubber(
-    felt: list[Exact], t_ns: list[int], parts: list[Exact], taus_s: list[Exact]
+    apparent: list[Exact], t_ns: list[int], parts: list[Exact], taus_s: list[Exact]
 ) -> list[Exact]:
-    """`felt = F - sum g (F - z)`, `tau z' = F - z`, F linear between readings, from 0 at first."""
+    """`apparent = F - sum g (F - z)`, `tau z' = F - z`, F linear between readings, 0 at first."""
     z = [mpf(0) for _ in parts]
     before, before_ns = mpf(0), None
     out: list[Exact] = []
-    for value, now_ns in zip(felt, t_ns, strict=True):
+    for value, now_ns in zip(apparent, t_ns, strict=True):
         if value is None:
             out.append(None)
             continue
@@ -110,8 +104,8 @@ def rubber(
     return out
 
 
-def hysteresis(felt: list[Exact], parts: list[Exact]) -> list[Exact]:
-    """`felt = F + sum w (y - F)` solved on the pieces of the broken line that it is."""
+def hysteresis(apparent: list[Exact], parts: list[Exact]) -> list[Exact]:
+    """`apparent = F + sum w (y - F)` solved on the pieces of the broken line that it is."""
     opens, widths = mpf(OPENS), [mpf(float(w)) for w in WIDTHS_N]
 
     def play(force: Exact, width: Exact, before: Exact) -> Exact:
@@ -120,7 +114,7 @@ def hysteresis(felt: list[Exact], parts: list[Exact]) -> list[Exact]:
 
     plays = [mpf(0) for _ in widths]
     out: list[Exact] = []
-    for value in felt:
+    for value in apparent:
         if value is None:
             out.append(None)
             continue
@@ -164,7 +158,7 @@ def temperature(counts: list[Exact], t_ns: list[int], lag_s: Exact) -> list[Exac
     return out
 
 
-def around(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:
+def smoothed(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:
     """A low-pass of 30 ms that holds for a while where there is no reading."""
     out: list[Exact] = []
     value, last_ns = None, 0
@@ -206,7 +200,7 @@ def curve_at_zero(x: list[Exact], y: list[Exact], degree: int) -> tuple[Exact, E
     return value, sum(q0**2 / mp.fdot(q, q) for q, q0 in pairs)
 
 
-def averaged(
+def denoised(
     values: list[Exact],
     sigmas: list[Exact],
     t_ns: list[int],

@@ -7,7 +7,6 @@ Goal of the design: less than 1e-9 N apart.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,23 +16,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
-from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
-from service.estimation.calibration import Calibration, TileCalibration, paper_eq2_shape
+from devices.frames import NOT_READ, FrameBatch, TileStatus
+from service.estimation.calibration import TileCalibration, paper_eq2_shape
 from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare.tare import Tare
-
-InfoOf = Callable[..., ArrayInfo]
-TileOf = Callable[..., TileCalibration]
-CalibrationOf = Callable[..., Calibration]
-FramesOf = Callable[..., FrameBatch]
-Estimate = Callable[..., Estimates]
+from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
+from tests.builders.calibrations import make_calibration, make_tare, newton_tile
+from tests.builders.estimates import estimate
+from tests.builders.frames import loaded_frames
+from tests.service.estimation.exact.equations import apart, pressure_kpa
 
 GOAL_N = 1e-9
 GOAL_M = 1e-11
 
-DATA_SHEET_PART = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
-FORUM_PART = (0x3591, 0xC0A2, 0xC625, 0x2C18)
 STEEPEST_PART = (0x7FFF, 0x8000, 0x8000, 0x7FFC)
 """The greatest a0 and c12 and the least b1 and b2 that the registers hold."""
 FLATTEST_PART = (0x0001, 0xFFFF, 0xFFFF, 0x0004)
@@ -56,26 +51,6 @@ class Reference:
     sigma_n: list[Any]
     grf_n: Any
     cop_m: list[Any]
-
-
-def signed(word: int) -> int:
-    return word - 65536 if word >= 32768 else word
-
-
-def pressure_kpa(words: tuple[int, ...], padc: int, tadc: int) -> Any:
-    """Data sheet 8.1 and 8.2; what reads below 50 kPa fell through zero and counts as negative.
-
-    None if it is below the chip's range even so: then it is no pressure at all.
-    """
-    a0, b1 = mpf(signed(words[0])) / 2**3, mpf(signed(words[1])) / 2**13
-    b2, c12 = mpf(signed(words[2])) / 2**14, mpf(signed(words[3]) >> 2) / 2**22
-
-    def kpa(counts: int) -> Any:
-        pcomp = a0 + (b1 + c12 * tadc) * counts + b2 * tadc
-        return pcomp * mpf(115 - 50) / 1023 + 50
-
-    pressure = kpa(padc) if kpa(padc) >= 50 else kpa(padc - 1024)
-    return pressure if pressure >= 50 else None
 
 
 def tile_force(entry: TileCalibration, gauge_kpa: Any) -> tuple[Any, Any, Any]:
@@ -144,21 +119,12 @@ def reference(plan: EstimationPlan, frames: FrameBatch, row: int) -> Reference:
     return Reference(gauges, forces, sigmas, grf, cop)
 
 
-def apart(estimated: float, expected: Any) -> float:
-    """Distance; undefined must meet undefined."""
-    if expected is None:
-        assert np.isnan(estimated)
-        return 0.0
-    assert not np.isnan(estimated)
-    return float(abs(mpf(float(estimated)) - expected))
-
-
-def entries(tile_of: TileOf) -> list[TileCalibration]:
+def entries() -> list[TileCalibration]:
     """The paper's preset, a fit as the bench makes it, one as fitted, and a hard one."""
     covariance = ((4e-3, 1e-3, -2e-3), (1e-3, 2e-3, 0.0), (-2e-3, 0.0, 3e-3))
     return [
         paper_eq2_shape().tiles[0].model_copy(update={"serial": "T01"}),
-        tile_of(
+        newton_tile(
             "T02",
             coefficients=(0.0, 13.25, 1.0 / 3.0, 4.7),
             p_offset_kpa=9.37,
@@ -168,7 +134,7 @@ def entries(tile_of: TileOf) -> list[TileCalibration]:
             relative_misfit=0.017,
             loop_misfit_n=0.21,
         ),
-        tile_of(
+        newton_tile(
             "T03",
             coefficients=(0.1309, 0.5702, 0.02354, 0.13),
             p_offset_kpa=1.7,
@@ -179,7 +145,7 @@ def entries(tile_of: TileOf) -> list[TileCalibration]:
             range_kpa=(0.0, 30.0),
             covariance=((1e-6,) * 3,) * 3,
         ),
-        tile_of(
+        newton_tile(
             "T04",
             coefficients=(1e6, 1.0, 100.0, 1e4),
             p_offset_kpa=-100.0,
@@ -190,38 +156,27 @@ def entries(tile_of: TileOf) -> list[TileCalibration]:
     ]
 
 
-@pytest.fixture(scope="session")
-def plan_with(
-    info_of: InfoOf, tile_of: TileOf, calibration_of: CalibrationOf
-) -> Callable[..., EstimationPlan]:
+def plan_with(*chips: tuple[int, int, int, int]) -> EstimationPlan:
     """A plan with these chips, tared as a real session is: baselines are no round numbers."""
-
-    def build(*chips: tuple[int, int, int, int]) -> EstimationPlan:
-        info = info_of(POSITIONS_M, chips=chips)
-        tare = Tare(
-            baseline_kpa=np.array([100.30127, 99.87654321, 101.7, 98.0 + 1 / 3]),
-            baseline_sigma_kpa=np.array([0.0071, 0.0073, 0.007, 0.0069]),
-            noise_kpa=np.array([0.165, 0.171, 0.163, 0.168]),
-            tadc_counts=np.array([480.3, 481.7, 479.0, 500 / 3]),
-            t_ns=1_577_836_800_000_000_000,
-            begin_s=0.0,
-            end_s=1.0,
-            frames=500,
-            source="lead",
-        )
-        calibration = calibration_of(*entries(tile_of))
-        plan = make_plan(info, calibration, tare, models=("unwrap", "static"))
-        return replace(plan, cop_sigma_max_m=1.0)
-
-    return build
+    info = array_at(POSITIONS_M, chips=chips)
+    tare = make_tare(
+        4,
+        baseline_kpa=[100.30127, 99.87654321, 101.7, 98.0 + 1 / 3],
+        baseline_sigma_kpa=[0.0071, 0.0073, 0.007, 0.0069],
+        noise_kpa=[0.165, 0.171, 0.163, 0.168],
+        tadc_counts=[480.3, 481.7, 479.0, 500 / 3],
+    )
+    calibration = make_calibration(*entries())
+    plan = make_plan(info, calibration, tare, models=("unwrap", "static"))
+    return replace(plan, cop_sigma_max_m=1.0)
 
 
-def counts(rows: list[tuple[Any, Any, Any]], frames_of: FramesOf) -> FrameBatch:
+def counts(rows: list[tuple[Any, Any, Any]]) -> FrameBatch:
     """Frames of (padc, tadc, status) rows; single numbers hold for all four tiles."""
     padc, tadc, status = (
         np.array([np.broadcast_to(row[k], 4) for row in rows], dtype=np.int64) for k in range(3)
     )
-    return frames_of(np.zeros((len(rows), 4)), padc=padc, tadc=tadc, status=status)
+    return loaded_frames(np.zeros((len(rows), 4)), padc=padc, tadc=tadc, status=status)
 
 
 def worst(plan: EstimationPlan, frames: FrameBatch, e: Estimates) -> dict[str, float]:
@@ -235,20 +190,13 @@ def worst(plan: EstimationPlan, frames: FrameBatch, e: Estimates) -> dict[str, f
                 ("force_n", exact.force_n),
                 ("force_sigma_n", exact.sigma_n),
             ):
-                out[name] = max(out[name], apart(getattr(e, name)[row, i], values[i]))
-        out["grf_n"] = max(out["grf_n"], apart(e.grf_n[row], exact.grf_n))
+                out[name] = max(out[name], apart(getattr(e, name)[row, i], [values[i]]))
+        out["grf_n"] = max(out["grf_n"], apart(e.grf_n[row], [exact.grf_n]))
         for axis, name in enumerate(("cop_x_m", "cop_y_m")):
             stated = getattr(e, name)[row]
             if not np.isnan(stated):
-                out["cop_m"] = max(out["cop_m"], apart(stated, exact.cop_m[axis]))
+                out["cop_m"] = max(out["cop_m"], apart(stated, [exact.cop_m[axis]]))
     return out
-
-
-@pytest.fixture(autouse=True, scope="module")
-def fifty_digits() -> Any:
-    before, mp.dps = mp.dps, 50
-    yield
-    mp.dps = before
 
 
 def pressed(*counts_of_load: int) -> tuple[int, ...]:
@@ -282,11 +230,9 @@ HARD_CASES: dict[str, list[tuple[Any, Any, Any]]] = {
 
 
 @pytest.mark.parametrize("case", HARD_CASES)
-def test_a_hard_case_is_within_a_nanonewton(
-    plan_with: Callable[..., EstimationPlan], frames_of: FramesOf, estimate: Estimate, case: str
-) -> None:
-    plan = plan_with(DATA_SHEET_PART, FORUM_PART, DATA_SHEET_PART, FORUM_PART)
-    frames = counts(HARD_CASES[case], frames_of)
+def test_a_hard_case_is_within_a_nanonewton(case: str) -> None:
+    plan = plan_with(DATA_SHEET_CHIP, FORUM_CHIP, DATA_SHEET_CHIP, FORUM_CHIP)
+    frames = counts(HARD_CASES[case])
     errors = worst(plan, frames, estimate(plan, frames))
     assert max(errors[name] for name in ("force_n", "force_sigma_n", "grf_n")) < GOAL_N
     assert errors["gauge_kpa"] < 1e-10
@@ -294,46 +240,32 @@ def test_a_hard_case_is_within_a_nanonewton(
 
 @pytest.mark.parametrize("padc", [0, 1, 300, 511, 512, 777, 1022])
 @pytest.mark.parametrize("tadc", [0, 511, 512, 1023])
-def test_extreme_coefficients_are_within_a_nanonewton(
-    plan_with: Callable[..., EstimationPlan],
-    frames_of: FramesOf,
-    estimate: Estimate,
-    padc: int,
-    tadc: int,
-) -> None:
+def test_extreme_coefficients_are_within_a_nanonewton(padc: int, tadc: int) -> None:
     plan = plan_with(STEEPEST_PART, FLATTEST_PART, FLATTEST_PART, STEEPEST_PART)
-    frames = counts([(padc, tadc, 0)], frames_of)
+    frames = counts([(padc, tadc, 0)])
     errors = worst(plan, frames, estimate(plan, frames))
     assert max(errors[name] for name in ("force_n", "force_sigma_n", "grf_n")) < GOAL_N
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_any_counts_are_within_a_nanonewton(
-    plan_with: Callable[..., EstimationPlan], frames_of: FramesOf, estimate: Estimate, seed: int
-) -> None:
+def test_any_counts_are_within_a_nanonewton(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    plan = plan_with(DATA_SHEET_PART, FORUM_PART, FORUM_PART, DATA_SHEET_PART)
+    plan = plan_with(DATA_SHEET_CHIP, FORUM_CHIP, FORUM_CHIP, DATA_SHEET_CHIP)
     frames = counts(
         [
             (rng.integers(0, 1024, 4), rng.integers(0, 1024, 4), rng.choice([0, 0, 4, 16, 1], 4))
             for _ in range(5)
-        ],
-        frames_of,
+        ]
     )
     errors = worst(plan, frames, estimate(plan, frames))
     assert max(errors[name] for name in ("force_n", "force_sigma_n", "grf_n")) < GOAL_N
 
 
-def test_the_centre_of_pressure_is_within_ten_picometres_wherever_it_is_stated(
-    plan_with: Callable[..., EstimationPlan], frames_of: FramesOf, estimate: Estimate
-) -> None:
+def test_the_centre_of_pressure_is_within_ten_picometres_wherever_it_is_stated() -> None:
     rng = np.random.default_rng(7)
-    plan = plan_with(DATA_SHEET_PART, FORUM_PART, DATA_SHEET_PART, FORUM_PART)
-    frames = counts(
-        [(pressed(*rng.integers(0, 115, 4).tolist()), 507, 0) for _ in range(60)],
-        frames_of,
-    )
+    plan = plan_with(DATA_SHEET_CHIP, FORUM_CHIP, DATA_SHEET_CHIP, FORUM_CHIP)
+    frames = counts([(pressed(*rng.integers(0, 115, 4).tolist()), 507, 0) for _ in range(60)])
     e = estimate(plan, frames)
     assert np.isfinite(e.cop_x_m).sum() > 30
     assert worst(plan, frames, e)["cop_m"] < GOAL_M
@@ -341,8 +273,8 @@ def test_the_centre_of_pressure_is_within_ten_picometres_wherever_it_is_stated(
 
 def test_the_reference_knows_the_data_sheets_own_example() -> None:
     # hardware.md 1.2: 96.587326 kPa with exact coefficients; a real part of a forum: 100.8227 kPa
-    assert abs(pressure_kpa(DATA_SHEET_PART, 410, 507) - mpf("96.587326")) < 1e-6
-    assert abs(pressure_kpa(FORUM_PART, 272, 521) - mpf("100.8227")) < 1e-4
+    assert abs(pressure_kpa(DATA_SHEET_CHIP, 410, 507) - mpf("96.587326")) < 1e-6
+    assert abs(pressure_kpa(FORUM_CHIP, 272, 521) - mpf("100.8227")) < 1e-4
 
 
 def test_a_faulty_tile_is_faulty_for_the_reference_by_the_same_bits() -> None:
