@@ -11,12 +11,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
 
-import numpy as np
 import pytest
 import typer.main
 from pydantic import BaseModel
 
-from devices.frames import FRAME_COLUMNS, FrameBatch
 from devices.scene.emulation import EmulationScene
 from devices.scene.faults import FaultScene
 from devices.scene.file import Scene, builtin_scenes
@@ -31,6 +29,7 @@ from service.link import Close
 from service.server.live import Encoder, sum_up
 from service.server.server import Server
 from storage.schema import KNOWN
+from tests.builders.frames import make_frames
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = (ROOT / "docs" / "scenes.md").read_text("utf-8")
@@ -167,11 +166,7 @@ def test_every_route_is_documented() -> None:
 
 
 def test_every_live_message_field_is_documented() -> None:
-    one_tile = {
-        name: np.zeros((1, 1) if per_tile else 1, dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-    }
-    piece = sum_up(None, FrameBatch(**one_tile), {})
+    piece = sum_up(None, make_frames(1, 1), {})
     frame = json.loads(Encoder().encode("node", piece, 1.0))
     for name in frame:
         assert f"`{name}`" in API, name

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders.calibrations import make_calibration
+
 STANDING = (resources.files("devices.scene") / "builtin" / "standing.toml").read_text("utf-8")
 GOOD_TRACE = "time_s,fz_n,cop_x_m,cop_y_m\n" + "".join(
     f"{0.01 * i:.2f},{10 + i},0.0,0.0\n" for i in range(50)
@@ -150,17 +152,9 @@ def bench(run, kept) -> bytes:
     ],
 )
 def test_estimate_refuses(run, tmp_path, session, arguments, code, says):
-    from service.estimation.calibration import Calibration, paper_eq2_shape
-
-    preset = paper_eq2_shape()
-    other = Calibration(
-        name="other",
-        reference="none",
-        date=preset.date,
-        tiles=(preset.tiles[0].model_copy(update={"serial": "T09"}),),
-    )
-    (tmp_path / "other.json").write_text(other.to_json())
-    (tmp_path / "broken.json").write_text(other.to_json().replace("15.0", "16.0"))
+    other = make_calibration("T09").to_json()
+    (tmp_path / "other.json").write_text(other)
+    (tmp_path / "broken.json").write_text(other.replace("by hand", "by foot"))
     outcome = run("estimate", session, "--out", "e.parquet", *arguments)
     assert outcome.code == code, outcome.err
     for word in says:

@@ -8,39 +8,28 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.file import SessionReader, SessionWriter
 from storage.sessions.folder import Part, Session, SessionFolder
+from tests.builders.arrays import UTC_NS, make_array
+from tests.builders.frames import make_frames
 
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
 BOOT = "a" * 32
-UTC_NS = 10**18
-
-
-def frames(first: int, last: int) -> FrameBatch:
-    seq = np.arange(first, last + 1, dtype=np.uint64)
-    columns = {
-        name: np.full((len(seq), 2) if per_tile else len(seq), 7, dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-    }
-    t_mono_ns = 2_000_000 * seq.astype(np.int64)
-    return FrameBatch(**columns | {"seq": seq, "t_mono_ns": t_mono_ns, "t_ns": t_mono_ns + UTC_NS})
 
 
 @pytest.fixture
-def data(tmp_path: Path, array_of: Callable[..., ArrayInfo]) -> Path:
+def data(tmp_path: Path) -> Path:
     """A node's folder after a crash: a session was being recorded, frames 0 to 99 are there."""
-    root, info = tmp_path / "data", array_of("bench", BOOT, UTC_NS)
+    root, info = tmp_path / "data", make_array(boot_id=BOOT)
     folder = root / "journal" / "bench" / BOOT
     journal = Journal(folder, info)
-    journal.append(frames(0, 99))
+    journal.append(make_frames(100, status=7))
     journal.close()
     StreamNotes(array_info=info, next_seq=100).save(folder)
     begun(root)
