@@ -1,6 +1,10 @@
-"""Names for the numpy arrays that pass between modules; shapes are in each docstring."""
+"""Numpy arrays as they pass between modules: their types, and records of columns of one length."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -10,3 +14,34 @@ Ints = npt.NDArray[np.int64]
 Times = npt.NDArray[np.int64]
 """Instants or durations in nanoseconds: int64, because float64 rounds UTC to 200 ns."""
 Bools = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Base of records whose fields are all arrays with the same first axis."""
+
+    def rows(self, start: int, stop: int) -> Self:
+        """Rows `start` to `stop` as views, nothing copied."""
+        return type(self)(**{f.name: getattr(self, f.name)[start:stop] for f in fields(self)})
+
+    def select(self, which: Bools | Ints) -> Self:
+        """The rows that a mask marks, or those of these numbers, copied."""
+        return type(self)(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+    def copy(self) -> Self:
+        """The same, in arrays of its own that may be written to."""
+        return type(self)(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """One record of all `parts`, in their order.
+
+        Raises:
+            ValueError: no part, or columns of different width.
+        """
+        return cls(
+            **{
+                f.name: np.concatenate([getattr(part, f.name) for part in parts])
+                for f in fields(cls)
+            }
+        )

@@ -35,6 +35,14 @@ status bit and a NaN (see `devices.frames`); these errors stop a command, never 
 
 from __future__ import annotations
 
+from typing import ClassVar, TypedDict, Unpack
+
+
+class _Facts(TypedDict, total=False):
+    where: str
+    expected: str
+    remedy: str
+
 
 class FootTileError(Exception):
     """Base of all errors; composes its text from the facts it keeps.
@@ -43,6 +51,7 @@ class FootTileError(Exception):
     """
 
     exit_code = 1
+    fact_names: ClassVar[tuple[str, ...]] = ("what", "where", "expected", "remedy")
 
     def __init__(self, what: str, *, where: str = "", expected: str = "", remedy: str = "") -> None:
         super().__init__(what)
@@ -65,16 +74,21 @@ class FootTileError(Exception):
 
     def facts(self) -> dict[str, object]:
         """The facts of this error by name."""
-        return {
-            "what": self.what,
-            "where": self.where,
-            "expected": self.expected,
-            "remedy": self.remedy,
-        }
+        return {name: getattr(self, name) for name in self.fact_names}
 
 
 def _rebuild(kind: type[FootTileError], facts: dict[str, str]) -> FootTileError:
     return kind(facts.pop("what"), **facts)
+
+
+class _SystemError(FootTileError, OSError):
+    """What the operating system refused; `errno` is its number, None where it gave none."""
+
+    fact_names = (*FootTileError.fact_names, "errno")
+
+    def __init__(self, what: str, *, errno: int | None = None, **facts: Unpack[_Facts]) -> None:
+        super().__init__(what, **facts)
+        self.errno = errno
 
 
 class SceneError(FootTileError, ValueError):
@@ -97,24 +111,8 @@ class LoadTraceError(FootTileError, ValueError):
     """A load trace is unreadable or cannot be pressed on this array."""
 
 
-class I2cError(FootTileError, OSError):
+class I2cError(_SystemError):
     """A transfer on the I2C bus failed; `errno` is the adapter's (hardware.md 3.2, 3.3)."""
-
-    def __init__(
-        self,
-        what: str,
-        *,
-        where: str = "",
-        expected: str = "",
-        remedy: str = "",
-        errno: int | None = None,
-    ) -> None:
-        super().__init__(what, where=where, expected=expected, remedy=remedy)
-        self.errno = errno
-
-    def facts(self) -> dict[str, object]:
-        """The facts of this error by name, errno among them."""
-        return super().facts() | {"errno": self.errno}
 
 
 class NoAcknowledgeError(I2cError):
@@ -176,43 +174,18 @@ class FileFormatError(FootTileError, ValueError):
 class DamagedFramesError(FileFormatError):
     """Frames `seq_first` to `seq_last` on disk do not agree with their checksum."""
 
+    fact_names = (*FootTileError.fact_names, "seq_first", "seq_last")
+
     def __init__(
-        self,
-        what: str,
-        *,
-        where: str = "",
-        expected: str = "",
-        remedy: str = "",
-        seq_first: int = 0,
-        seq_last: int = 0,
+        self, what: str, *, seq_first: int = 0, seq_last: int = 0, **facts: Unpack[_Facts]
     ) -> None:
-        super().__init__(what, where=where, expected=expected, remedy=remedy)
+        super().__init__(what, **facts)
         self.seq_first = seq_first
         self.seq_last = seq_last
 
-    def facts(self) -> dict[str, object]:
-        """The facts of this error by name, the numbers among them."""
-        return super().facts() | {"seq_first": self.seq_first, "seq_last": self.seq_last}
 
-
-class StorageError(FootTileError, OSError):
+class StorageError(_SystemError):
     """A file cannot be written: the disk is full, read-only, or gone; `errno` is the system's."""
-
-    def __init__(
-        self,
-        what: str,
-        *,
-        where: str = "",
-        expected: str = "",
-        remedy: str = "",
-        errno: int | None = None,
-    ) -> None:
-        super().__init__(what, where=where, expected=expected, remedy=remedy)
-        self.errno = errno
-
-    def facts(self) -> dict[str, object]:
-        """The facts of this error by name, errno among them."""
-        return super().facts() | {"errno": self.errno}
 
 
 class CalibrationError(FootTileError, ValueError):

@@ -7,15 +7,14 @@ columns, time first. There is no single-frame class. Counts are kept as read; wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
-from devices.arrays import Times
+from devices.arrays import Columns, Times
 
 NOT_READ = 65535
 NO_SERVO_COUNTS = -(2**31)
@@ -59,7 +58,7 @@ class FrameStatus(IntFlag):
 
 
 @dataclass(frozen=True)
-class FrameBatch:
+class FrameBatch(Columns):
     """n frames of an array of tiles, in the order they were taken.
 
     Attributes:
@@ -106,24 +105,6 @@ class FrameBatch:
     def tile_count(self) -> int:
         """Number of tiles of the array."""
         return int(self.padc.shape[1])
-
-    def rows(self, start: int, stop: int) -> FrameBatch:
-        """Frames `start` to `stop` as views, nothing copied."""
-        return FrameBatch(**{f.name: getattr(self, f.name)[start:stop] for f in fields(self)})
-
-    @staticmethod
-    def concatenate(batches: Sequence[FrameBatch]) -> FrameBatch:
-        """One batch of all `batches`, in their order.
-
-        Raises:
-            ValueError: no batch, or arrays of different size.
-        """
-        return FrameBatch(
-            **{
-                f.name: np.concatenate([getattr(batch, f.name) for batch in batches])
-                for f in fields(FrameBatch)
-            }
-        )
 
 
 FRAME_COLUMNS: dict[str, tuple[type[np.generic], bool]] = {

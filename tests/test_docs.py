@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import json
 import os
@@ -228,3 +229,52 @@ def test_every_link_between_documents_leads_somewhere(document: Path) -> None:
         target = (document.parent / path).resolve() if path else document
         assert target.exists(), link
         assert not anchor or anchor in anchors(target), link
+
+
+def packages() -> list[str]:
+    return [
+        str(folder.relative_to(ROOT))
+        for top in ("devices", "storage", "service")
+        for folder in sorted({path.parent for path in (ROOT / top).rglob("*.py")})
+    ]
+
+
+def sign(package: str) -> str:
+    """What stands over the door of a package: the first paragraph of its docstring."""
+    init = ROOT / package / "__init__.py"
+    text = ast.get_docstring(ast.parse(init.read_text("utf-8"))) if init.exists() else None
+    return " ".join((text or "").split("\n\n")[0].split())
+
+
+@pytest.mark.parametrize("package", packages())
+def test_every_package_has_a_sign(package: str) -> None:
+    assert sign(package).endswith(".")
+
+
+def test_the_map_says_what_the_signs_say() -> None:
+    # After a package has moved: FOOTTILE_WRITE_MAP=1 sh scripts/test tests/test_docs.py
+    page = ROOT / "CONTRIBUTING.md"
+    text = page.read_text("utf-8")
+    rows = ["| package | what lives there |", "|---|---|"]
+    rows += [f"| `{package}/` | {sign(package)} |" for package in packages()]
+    head, old = text.split("writes it -->\n", 1)
+    tail = old[old.index("<!-- end of map -->") :]
+    drawn = head + "writes it -->\n" + "\n".join(rows) + "\n" + tail
+    if os.environ.get("FOOTTILE_WRITE_MAP"):
+        page.write_text(drawn, "utf-8")
+    assert page.read_text("utf-8") == drawn
+
+
+PATH = re.compile(
+    r"`((?:devices|storage|service|web|tests|benchmarks|docs|scripts|\.ci)/[\w./-]*)`?"
+)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [d for d in DOCUMENTS if d.name != "CHANGELOG.md" and d.parent.name != "results"],
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
+def test_every_path_in_a_document_exists(document: Path) -> None:
+    for path in PATH.findall(document.read_text("utf-8")):
+        assert (ROOT / path).exists(), path

@@ -121,8 +121,8 @@ class Domes:
         """Compute one more block; keep it and the one before."""
         t_s: Floats = GRID_S * np.arange(self._next, self._next + _BLOCK, dtype=np.float64)
         force_n = self._load.forces_n(t_s)
-        felt_n = self._hysteresis(self._creeping(force_n))
-        lost = self._stiffening * np.log1p(felt_n / self._knee_n) * self._loading_gains(force_n)
+        apparent_n = self._hysteresis(self._creeping(force_n))
+        lost = self._stiffening * np.log1p(apparent_n / self._knee_n) * self._loading_gains(force_n)
         kpa = self._gas(t_s, 1.0 - lost)
         around_kpa = self._surroundings.bare_kpa(t_s)
         kpa[:, self._bare] = np.broadcast_to(around_kpa, kpa.shape)[:, self._bare]
@@ -132,10 +132,10 @@ class Domes:
         self._next += _BLOCK
 
     def _creeping(self, force_n: Floats) -> Floats:
-        """Creep: part of the force is felt only after each term's time; statically all of it is."""
+        """Creep: part of the force appears only after each term's time, statically all of it."""
         if not self._scene.rubber:
             return force_n
-        felt = force_n.copy()
+        apparent = force_n.copy()
         for dome, part in enumerate(self._parts):
             f = np.concatenate([[self._last_force_n[dome]], force_n[:, dome]])
             for term, (share, tau_s) in enumerate(zip(part.creep_parts, part.creep_s, strict=True)):
@@ -145,8 +145,8 @@ class Domes:
                 drive = (mean - decay) * f[:-1] + (1 - mean) * f[1:]
                 slow, _ = lfilter([1], [1, -decay], drive, zi=[decay * self._creep[dome, term]])
                 self._creep[dome, term] = slow[-1]
-                felt[:, dome] += share * (slow - f[1:])
-        return np.maximum(felt, 0.0)
+                apparent[:, dome] += share * (slow - f[1:])
+        return np.maximum(apparent, 0.0)
 
     def _hysteresis(self, force_n: Floats) -> Floats:
         """Generalised play: each operator lags between two branches that meet at zero load."""

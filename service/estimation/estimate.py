@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from devices.arrays import Bools, Floats, Ints, Times
+from devices.arrays import Bools, Floats
 from devices.frames import FrameBatch
 from devices.temperature import HeldTemperature, hold_temperature
 from service.estimation.estimates import COP_COLUMNS, Estimates, EstimateStatus
@@ -27,83 +26,19 @@ from service.estimation.foot.contact import (
 )
 from service.estimation.foot.geometry import angle_rad, to_ground_x_m
 from service.estimation.foot.kinematics import Readings, counts_at, readings_of
-from service.estimation.lower import Felt, LowerState, felt, tile_kpa
-from service.estimation.models import denoise
+from service.estimation.lower import LowerState, apparent_forces, tile_kpa
+from service.estimation.pending import Pending, PendingFrames
 from service.estimation.plan import SIGMAS, EstimationPlan
-from service.estimation.upper import (
-    Foot,
-    UpperState,
-    foot_of,
-    forces,
-    grid_index,
-    summed,
-)
+from service.estimation.upper import Foot, UpperState, foot_of, grid_index, summed, tile_forces
 
 HULL_SIGMAS = 3.0
-
-
-@dataclass(frozen=True)
-class _Known:
-    """Frames whose look-ahead is not complete, after those that their averages reach back to.
-
-    `felt`, `t_mono_ns` and `run` begin with the latter, all else with the first that is to come.
-    """
-
-    felt: Felt
-    t_mono_ns: Times
-    run: Times
-    seq: npt.NDArray[np.uint64]
-    t_ns: Times
-    readings: Readings | None
-    """None without a servo."""
-    loaded: Ints
-    since_ns: Times
-
-    @property
-    def before(self) -> int:
-        """How many frames are only there to be reached back to."""
-        return len(self.t_mono_ns) - len(self.seq)
-
-    def followed_by(self, later: _Known) -> _Known:
-        readings = later.readings
-        if readings is not None and self.readings is not None:
-            readings = self.readings.followed_by(readings)
-        return _Known(
-            self.felt.followed_by(later.felt),
-            readings=readings,
-            **{
-                name: np.concatenate([getattr(self, name), getattr(later, name)])
-                for name in ("t_mono_ns", "run", "seq", "t_ns", "loaded", "since_ns")
-            },
-        )
-
-    def after(self, given: int, *, reach_back: bool) -> _Known:
-        """Without the first `given` frames, but for what averages will reach back to."""
-        keep = first = self.before + given
-        end = len(self.t_mono_ns)
-        if reach_back:
-            # The next one may not be here yet; it will be no earlier than the last that is.
-            oldest_ns = self.t_mono_ns[min(first, end - 1)] - denoise.PAST_NS
-            keep = max(
-                int(np.searchsorted(self.t_mono_ns, oldest_ns)), first - int(denoise.REACHES[-1])
-            )
-        return _Known(
-            felt=self.felt.rows(keep, end),
-            t_mono_ns=self.t_mono_ns[keep:],
-            run=self.run[keep:],
-            seq=self.seq[given:],
-            t_ns=self.t_ns[given:],
-            readings=None if self.readings is None else self.readings.rows(given, len(self.seq)),
-            loaded=self.loaded[given:],
-            since_ns=self.since_ns[given:],
-        )
 
 
 @dataclass(frozen=True)
 class EstimationState:
     """What `step` hands on to the next `step`. Begin with `EstimationState()`."""
 
-    known: _Known | None = None
+    pending: Pending | None = None
     waiting: FrameBatch | None = None
     """The last frame, if it has to wait for the next one to be told from an outlier."""
     before_kpa: Floats | None = None
@@ -145,28 +80,29 @@ def step(
         state = _taken(plan, frames, len(frames) - 1, state)
     else:
         state = _taken(plan, frames, len(frames), state)
-    if state.known is None:
+    pending = state.pending
+    if pending is None:
         return _no_estimates(plan), state
-    t_mono_ns = state.known.t_mono_ns[state.known.before :]
+    t_mono_ns = pending.forces.t_mono_ns[pending.first :]
     due = int(np.searchsorted(t_mono_ns, newest_ns - plan.lag_ns, side="right"))
-    return _release(plan, state.known, due, state)
+    return _release(plan, pending, due, state)
 
 
 def finish(plan: EstimationPlan, state: EstimationState) -> Estimates | None:
     """The estimates that still wait for a look-ahead that will not come; None if none do."""
     if state.waiting is not None:
         state = _taken(plan, state.waiting, 1, state)
-    known = state.known
-    if known is None or not len(known.seq):
+    pending = state.pending
+    if pending is None or not len(pending.frames.seq):
         return None
-    estimates, _ = _release(plan, known, len(known.seq), state)
+    estimates, _ = _release(plan, pending, len(pending.frames.seq), state)
     return estimates
 
 
 def _taken(
     plan: EstimationPlan, frames: FrameBatch, n: int, state: EstimationState
 ) -> EstimationState:
-    """The first `n` of `frames` become known; what comes after tells outliers among them."""
+    """Add the first `n` of `frames` to those pending; what comes after tells their outliers."""
     broken = _after_gap(plan, frames, state)
     kpa = tile_kpa(plan, frames)
     neighbours = None
@@ -179,10 +115,11 @@ def _taken(
     if not n:
         return state
     frames, broken = frames.rows(0, n), broken[:n]
-    now, lower = felt(plan, frames, kpa[:n], neighbours, broken, state.lower)
+    run = state.runs + np.cumsum(broken)
+    forces, lower = apparent_forces(plan, frames, kpa[:n], neighbours, broken, run, state.lower)
     loaded, since_ns, contact_run = seeming(
         plan.contact,
-        summed(now.felt_n),
+        summed(forces.apparent_n),
         frames.t_mono_ns,
         _unseen(frames, state),
         state.contact_run,
@@ -191,12 +128,10 @@ def _taken(
     if plan.info.servo is not None:
         turn = plan.info.servo.counts_per_turn
         readings = readings_of(frames, broken, state.last_reading, turn)
-    run = state.runs + np.cumsum(broken)
-    t_mono_ns = np.array(frames.t_mono_ns)  # owned, as what is compiled wants it
-    new = _Known(now, t_mono_ns, run, frames.seq, frames.t_ns, readings, loaded, since_ns)
+    new = Pending(forces, PendingFrames(frames.seq, frames.t_ns, loaded, since_ns), readings)
     return replace(
         state,
-        known=new if state.known is None else state.known.followed_by(new),
+        pending=new if state.pending is None else state.pending.followed_by(new),
         before_kpa=kpa[n - 1 : n],
         lower=lower,
         contact_run=contact_run,
@@ -208,27 +143,32 @@ def _taken(
 
 
 def _release(
-    plan: EstimationPlan, known: _Known, due: int, state: EstimationState
+    plan: EstimationPlan, pending: Pending, due: int, state: EstimationState
 ) -> tuple[Estimates, EstimationState]:
-    """Give away the next `due` frames of `known`, now that their look-ahead is there."""
+    """Estimate the next `due` frames of `pending`, now that their look-ahead is there."""
     if not due:
         return _no_estimates(plan), state
-    first = known.before
+    forces, frames, first = pending.forces, pending.frames, pending.first
     stop = first + due
-    t_mono_ns = known.t_mono_ns[first:]
-    tiles, upper = forces(plan, known.felt, known.t_mono_ns, known.run, first, stop, state.upper)
+    tiles, upper = tile_forces(plan, forces, first, stop, state.upper)
     foot = foot_of(plan, tiles)
     contact = believed(
-        plan.contact, plan.look_ns, due, known.loaded, known.since_ns, t_mono_ns, state.contact
+        plan.contact,
+        plan.look_ns,
+        due,
+        frames.loaded,
+        frames.since_ns,
+        forces.t_mono_ns[first:],
+        state.contact,
     )
     masked = _cop_masked(plan, foot) | (contact == 0)
-    gauge_kpa = known.felt.gauge_kpa[first:stop]
+    gauge_kpa = forces.gauge_kpa[first:stop]
     index_x, index_y = grid_index(plan, gauge_kpa)
     x_m, y_m, z_m = foot.cop_m
     ground_x_m = ground_y_m = angle = np.full(due, np.nan)
     servo = plan.info.servo
-    if servo is not None and known.readings is not None:
-        angle = angle_rad(servo, counts_at(known.readings, due, plan.look_ns))
+    if servo is not None and pending.readings is not None:
+        angle = angle_rad(servo, counts_at(pending.readings, due, plan.look_ns))
         travel = servo.ankle_travel_m_per_rad
         ground_x_m = to_ground_x_m(x_m, z_m, angle, travel)
         ground_y_m = y_m if travel is not None else ground_y_m
@@ -242,8 +182,8 @@ def _release(
         return of_all
 
     out = Estimates(
-        seq=known.seq[:due],
-        t_ns=known.t_ns[:due],
+        seq=frames.seq[:due],
+        t_ns=frames.t_ns[:due],
         gauge_kpa=gauge_kpa,
         force_n=by_tile(tiles.force_n),
         force_sigma_n=by_tile(tiles.sigma_n),
@@ -259,12 +199,12 @@ def _release(
         cop_ground_y_m=shown(ground_y_m),
         angle_rad=angle,
         contact=np.where(np.isnan(foot.grf_n), UNKNOWN, contact).astype(np.uint8),
-        estimate_status=known.felt.status[first:stop]
+        estimate_status=forces.status[first:stop]
         | np.where(masked, EstimateStatus.COP_MASKED, 0).astype(np.uint16),
     )
     return out, replace(
         state,
-        known=known.after(due, reach_back=plan.ladder.denoise),
+        pending=pending.after(due, reach_back=plan.ladder.denoise),
         upper=upper,
         contact=int(contact[-1]),
     )

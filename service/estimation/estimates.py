@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats, Times
+from devices.arrays import Columns, Floats, Times
 
 COP_COLUMNS = (
     "cop_x_m",
@@ -46,7 +46,7 @@ class EstimateStatus(IntFlag):
 
 
 @dataclass(frozen=True)
-class Estimates:
+class Estimates(Columns):
     """Estimates of n frames; the columns of `storage.schema.ESTIMATES` in float64.
 
     Arrays are (n,), those of tiles (n, tiles). Undefined is NaN, contact 255.
@@ -73,7 +73,3 @@ class Estimates:
 
     def __len__(self) -> int:
         return len(self.seq)
-
-    def rows(self, start: int, stop: int) -> Estimates:
-        """Rows `start` to `stop` as views."""
-        return Estimates(**{f.name: getattr(self, f.name)[start:stop] for f in fields(self)})

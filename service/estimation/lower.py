@@ -1,13 +1,16 @@
-"""The lower part of the ladder: counts to the force that every dome feels, reading by reading."""
+"""The lower part of the ladder: counts to the apparent force on every dome, reading by reading.
+
+Apparent is what the static curve gives, before hysteresis and creep of the rubber are undone.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Bools, Floats, Ints, Times
+from devices.arrays import Bools, Columns, Floats, Ints, Times
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.estimates import EstimateStatus
@@ -21,42 +24,33 @@ NEVER_NS = -(1 << 62)
 
 
 @dataclass(frozen=True)
-class Felt:
-    """What the domes feel in n frames; arrays (n, bearing tiles) unless said otherwise.
+class ApparentForces(Columns):
+    """Forces as they appear in n frames; arrays (n, bearing tiles) unless said otherwise.
 
     Attributes:
         gauge_kpa: (n, all tiles), pressure above the baseline.
-        felt_n: force by the static curve.
+        apparent_n: force by the static curve.
         noise_n: standard deviation that a single reading's noise gives it; averages away.
         sigma_n: standard uncertainty from all else but the gas; does not.
         gas_n: standard uncertainty that the gas' correction leaves, with the correction's sign: all
             tiles err to the same side.
-        t_mono_ns: when it was sampled.
+        sampled_ns: when each tile was sampled, on the monotonic clock.
         beyond: beyond the calibrated range: a lower bound.
+        t_mono_ns: (n,), instants of the frames.
+        run: (n,), number of the unbroken run that each frame belongs to.
         status: (n,), bits of `EstimateStatus` that these frames have by themselves.
     """
 
     gauge_kpa: Floats
-    felt_n: Floats
+    apparent_n: Floats
     noise_n: Floats
     sigma_n: Floats
     gas_n: Floats
-    t_mono_ns: Times
+    sampled_ns: Times
     beyond: Bools
+    t_mono_ns: Times
+    run: Ints
     status: npt.NDArray[np.uint16]
-
-    def rows(self, start: int, stop: int) -> Felt:
-        """Rows `start` to `stop` as views."""
-        return Felt(**{f.name: getattr(self, f.name)[start:stop] for f in fields(self)})
-
-    def followed_by(self, later: Felt) -> Felt:
-        """These frames and later ones."""
-        return Felt(
-            **{
-                f.name: np.concatenate([getattr(self, f.name), getattr(later, f.name)])
-                for f in fields(self)
-            }
-        )
 
 
 @dataclass(frozen=True)
@@ -79,15 +73,16 @@ def tile_kpa(plan: EstimationPlan, frames: FrameBatch) -> Floats:
     return np.where(kpa >= PRESSURE_MIN_KPA, kpa, np.nan)
 
 
-def felt(
+def apparent_forces(
     plan: EstimationPlan,
     frames: FrameBatch,
     kpa: Floats,
     neighbours: tuple[Floats, Floats] | None,
     broken: Bools,
+    run: Ints,
     state: LowerState,
-) -> tuple[Felt, LowerState]:
-    """The force that every dome feels.
+) -> tuple[ApparentForces, LowerState]:
+    """Force on every dome by its static curve.
 
     Args:
         plan: constants of the estimate.
@@ -95,6 +90,7 @@ def felt(
         kpa: their absolute pressures (n, all tiles), from `tile_kpa`.
         neighbours: those of the frames before and after each; None without look-ahead.
         broken: (n,), frames after a gap.
+        run: (n,), number of the unbroken run that each frame belongs to.
         state: from the frames before.
     """
     ladder, columns = plan.ladder, plan.bearing
@@ -103,9 +99,9 @@ def felt(
         kpa, replaced = despiked(kpa, *neighbours, plan.tare.noise_kpa)
         status[replaced[:, columns].any(axis=1)] |= np.uint16(EstimateStatus.OUTLIER_REPLACED)
     # Owned, in row order: what is compiled is compiled for that.
-    frame_t_ns = np.array(frames.t_mono_ns)
+    t_mono_ns = np.array(frames.t_mono_ns)
     offset_ns = 1000 * frames.sample_offset_us[:, columns].astype(np.int64, order="C")
-    t_mono_ns = frame_t_ns[:, None] + offset_ns
+    sampled_ns = t_mono_ns[:, None] + offset_ns
     gauge_kpa = kpa - plan.tare.baseline_kpa
     bearing_kpa = np.ascontiguousarray(kpa[:, columns])
     baseline_variance = np.broadcast_to(plan.baseline_sigma_kpa**2, bearing_kpa.shape)
@@ -113,7 +109,7 @@ def felt(
         before = state.temperature or temperature.at_rest(len(columns))
         tadc = np.where(frames.tadc == NOT_READ, np.nan, frames.tadc.astype(np.float64))
         bearing_kpa, sigma_kpa, after = ladder.temperature.at_tare(
-            bearing_kpa, tadc[:, columns], t_mono_ns, before
+            bearing_kpa, tadc[:, columns], sampled_ns, before
         )
         baseline_variance = baseline_variance + sigma_kpa**2
         state = replace(state, temperature=after)
@@ -121,10 +117,10 @@ def felt(
         # A bare tile beyond the chip's range tells of itself, not of what is around the foot.
         beyond_chip = (frames.status & np.uint8(TileStatus.OVER_RANGE)) != 0
         outside_kpa = np.where(beyond_chip, np.nan, gauge_kpa)
-        felt_kpa, sigma_kpa, outside = ladder.ambient.felt(
-            _mean_of(outside_kpa, plan.references), frame_t_ns, state.ambient
+        passed_kpa, sigma_kpa, outside = ladder.ambient.passed_on(
+            _mean_of(outside_kpa, plan.references), t_mono_ns, state.ambient
         )
-        bearing_kpa = bearing_kpa - felt_kpa
+        bearing_kpa = bearing_kpa - passed_kpa
         baseline_variance = baseline_variance + sigma_kpa**2
         state = replace(state, ambient=outside)
     if ladder.temperature is not None or ladder.ambient is not None:
@@ -136,39 +132,45 @@ def felt(
         bound = bearing_kpa - plan.baseline_kpa > ladder.curves.high_kpa
         settled_kpa, warm = ladder.gas.settled(
             np.where(bound, np.nan, bearing_kpa),
-            t_mono_ns,
+            sampled_ns,
             state.gas or gas.at_rest(len(columns)),
         )
         settled_kpa = np.where(bound, bearing_kpa, settled_kpa)
-        uncertain, last_ns = _since(bound, t_mono_ns, state.bound_ns, ladder.gas.memory_ns)
+        uncertain, last_ns = _since(bound, sampled_ns, state.bound_ns, ladder.gas.memory_ns)
         state = replace(state, gas=warm, bound_ns=last_ns)
     static_kpa = settled_kpa - plan.baseline_kpa
     static = ladder.curves.force(static_kpa)
     status[np.isnan(static.force_n).any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
-    # After a bound the gas is as warm as nobody knows, until it has cooled.
+    # After a bound the gas' temperature is unknown until it has cooled.
     beyond = (static_kpa > ladder.curves.high_kpa) | uncertain
     status[beyond.any(axis=1)] |= np.uint16(EstimateStatus.SATURATED)
     low_kpa = ladder.curves.low_kpa - SIGMAS * plan.still_kpa
     status[(static_kpa < low_kpa).any(axis=1)] |= np.uint16(EstimateStatus.EXTRAPOLATED)
     over = (kpa[:, columns] > PRESSURE_MAX_KPA) & ~beyond
     status[over.any(axis=1)] |= np.uint16(EstimateStatus.OVER_RATED)
-    felt_n = static.force_n
+    apparent_n = static.force_n
     if ladder.skew and not ladder.denoise:
-        felt_n, row = skew.aligned(
-            felt_n, t_mono_ns, frames.t_mono_ns, broken, state.skew or skew.at_rest(len(columns))
+        apparent_n, row = skew.aligned(
+            apparent_n,
+            sampled_ns,
+            t_mono_ns,
+            broken,
+            state.skew or skew.at_rest(len(columns)),
         )
         state = replace(state, skew=row)
-    now = Felt(
+    forces = ApparentForces(
         gauge_kpa=gauge_kpa,
-        felt_n=felt_n,
+        apparent_n=apparent_n,
         noise_n=np.abs(static.slope_n_per_kpa) * plan.noise_kpa,
         sigma_n=np.sqrt(static.slope_n_per_kpa**2 * baseline_variance + static.fit_sigma_n**2),
         gas_n=static.slope_n_per_kpa * ladder.gas_misfit * (settled_kpa - bearing_kpa),
-        t_mono_ns=t_mono_ns,
+        sampled_ns=sampled_ns,
         beyond=beyond,
+        t_mono_ns=t_mono_ns,
+        run=run,
         status=status,
     )
-    return now, state
+    return forces, state
 
 
 def _since(

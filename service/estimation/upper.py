@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from devices.arrays import Floats, Ints, Times
+from devices.arrays import Floats
 from service.estimation.compiled import compiled
-from service.estimation.lower import Felt
+from service.estimation.lower import ApparentForces
 from service.estimation.models import denoise
 from service.estimation.models.rubber import RubberState
 from service.estimation.plan import EstimationPlan
@@ -28,7 +28,7 @@ class UpperState:
 
 
 @dataclass(frozen=True)
-class Forces:
+class TileForces:
     """Force on the bearing tiles and its standard uncertainty, (n, bearing tiles).
 
     Attributes:
@@ -44,43 +44,34 @@ class Forces:
     common_n: tuple[Floats, Floats]
 
 
-def forces(
-    plan: EstimationPlan,
-    known: Felt,
-    frame_t_ns: Times,
-    run: Ints,
-    first: int,
-    stop: int,
-    state: UpperState,
-) -> tuple[Forces, UpperState]:
-    """Forces in frames `first` to `stop` of those known.
+def tile_forces(
+    plan: EstimationPlan, apparent: ApparentForces, first: int, stop: int, state: UpperState
+) -> tuple[TileForces, UpperState]:
+    """Forces in frames `first` to `stop`.
 
     Args:
         plan: constants of the estimate.
-        known: these frames, those before them that are still needed, and those ahead.
-        frame_t_ns: (n,), instants of all of them on the monotonic clock.
-        run: (n,), number of the unbroken run that each belongs to.
+        apparent: in these frames, in those before them that are still needed, and in those ahead.
         first: row.
         stop: row after the last.
         state: from the frames before.
     """
-    ladder, now = plan.ladder, known.rows(first, stop)
-    felt_n, noise_n = now.felt_n, now.noise_n
-    t_mono_ns = now.t_mono_ns
+    ladder, now = plan.ladder, apparent.rows(first, stop)
+    force_n, noise_n, at_ns = now.apparent_n, now.noise_n, now.sampled_ns
     if ladder.denoise:
         # A lower bound would be averaged with what is no bound.
-        usable_n = np.where(known.beyond, np.nan, known.felt_n)
-        at_ns = known.t_mono_ns
+        usable_n = np.where(apparent.beyond, np.nan, apparent.apparent_n)
+        asked_ns = apparent.sampled_ns
         if ladder.skew:
-            at_ns = np.broadcast_to(frame_t_ns[:, None], at_ns.shape)
-            t_mono_ns = at_ns[first:stop]
+            asked_ns = np.broadcast_to(apparent.t_mono_ns[:, None], asked_ns.shape)
+            at_ns = asked_ns[first:stop]
         averaged_n, left = denoise.denoised(
             np.ascontiguousarray(usable_n),
-            np.ascontiguousarray(known.noise_n),
-            np.ascontiguousarray(known.t_mono_ns),
-            np.ascontiguousarray(frame_t_ns),
-            np.ascontiguousarray(at_ns),
-            np.ascontiguousarray(run),
+            np.ascontiguousarray(apparent.noise_n),
+            np.ascontiguousarray(apparent.sampled_ns),
+            np.ascontiguousarray(apparent.t_mono_ns),
+            np.ascontiguousarray(asked_ns),
+            np.ascontiguousarray(apparent.run),
             first,
             stop,
             plan.look_ns,
@@ -88,23 +79,23 @@ def forces(
             denoise.REACHES,
             denoise.AGREE,
         )
-        felt_n = np.where(np.isnan(averaged_n), felt_n, averaged_n)
+        force_n = np.where(np.isnan(averaged_n), force_n, averaged_n)
         noise_n = noise_n * np.sqrt(np.where(np.isnan(left), 1.0, left))
     own_n = np.sqrt(noise_n**2 + now.sigma_n**2)
-    averaged_n = felt_n
+    averaged_n = force_n
     if ladder.hysteresis is not None:
         plays_n = ladder.hysteresis.at_rest() if state.plays_n is None else state.plays_n
-        felt_n, plays_n = ladder.hysteresis.unfelt(felt_n, plays_n)
+        force_n, plays_n = ladder.hysteresis.compensated(force_n, plays_n)
         state = replace(state, plays_n=plays_n)
     if ladder.rubber is not None:
         before = ladder.rubber.at_rest() if state.rubber is None else state.rubber
-        felt_n, crept = ladder.rubber.unfelt(felt_n, t_mono_ns, before)
+        force_n, crept = ladder.rubber.compensated(force_n, at_ns, before)
         state = replace(state, rubber=crept)
-    rubber_n = ladder.rubber_misfit * (felt_n - averaged_n)
+    rubber_n = ladder.rubber_misfit * (force_n - averaged_n)
     # A lower bound has no standard uncertainty.
     own_n = np.where(now.beyond, np.nan, own_n)
     sigma_n = np.sqrt(own_n**2 + now.gas_n**2 + rubber_n**2)
-    return Forces(felt_n, sigma_n, own_n, (now.gas_n, rubber_n)), state
+    return TileForces(force_n, sigma_n, own_n, (now.gas_n, rubber_n)), state
 
 
 @dataclass(frozen=True)
@@ -117,7 +108,7 @@ class Foot:
     cop_sigma_m: tuple[Floats, Floats]
 
 
-def foot_of(plan: EstimationPlan, tiles: Forces) -> Foot:
+def foot_of(plan: EstimationPlan, tiles: TileForces) -> Foot:
     """Sum of the tile forces, and the force-weighted mean of the tiles' places."""
     columns = _foot(tiles.force_n, tiles.own_n, *tiles.common_n, plan.bearing_m)
     grf_n, sigma_n, x_m, y_m, z_m, sigma_x_m, sigma_y_m = columns.T

@@ -102,7 +102,7 @@ class Hopping:
         for hop in range(HOPS):
             place = SoftGround.of(ground, float(firmness[hop]))
             hopping.fall(place, self._angle)
-            # Its force has been felt for a step, and rises from nothing during the one before.
+            # Its force has acted for a step, and rises from nothing during the one before.
             self.touch_s.append(hopping.motion.t_s - 2.0 * STEP_S)
             self._turn(hopping.motion.t_s, ground.stand_s + _STANCE_S, pitches_rad[hop])
             hopping.stand(place, self._angle, hopping.motion.t_s + ground.stand_s)

@@ -94,7 +94,7 @@ def refuse_saturated_reference(recordings: Sequence[Indentation], blocks: Stroke
     where = place(recordings[0])
     remedy = "Press less, or turn the amplifier's gain down"
     for repeat in np.unique(blocks.repeat):
-        rows = blocks.rows((blocks.repeat == repeat) & blocks.loading)
+        rows = blocks.select((blocks.repeat == repeat) & blocks.loading)
         if not len(rows.force_n):
             continue
         top_n, full_kpa = float(rows.force_n.max()), float(np.ptp(rows.gauge_kpa))
@@ -135,7 +135,7 @@ def before_saturation(
     limit_kpa = np.inf
     full_n = float(blocks.force_n.max())
     for repeat in np.unique(blocks.repeat):
-        rows = blocks.rows((blocks.repeat == repeat) & blocks.loading)
+        rows = blocks.select((blocks.repeat == repeat) & blocks.loading)
         if not len(rows.force_n):
             continue
         top_kpa = float(rows.gauge_kpa.max())
@@ -143,7 +143,7 @@ def before_saturation(
         if np.ptp(rows.force_n[rows.gauge_kpa > flat_kpa]) > _MOVING_PART * full_n:
             limit_kpa = min(limit_kpa, flat_kpa)
     if np.isfinite(limit_kpa):
-        return blocks.rows(blocks.gauge_kpa <= limit_kpa), True
+        return blocks.select(blocks.gauge_kpa <= limit_kpa), True
     return blocks, wrapped
 
 

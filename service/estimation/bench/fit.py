@@ -32,12 +32,7 @@ from service.estimation.bench.indentation import (
     unloaded,
 )
 from service.estimation.bench_facts import BandPoint, BenchFacts
-from service.estimation.calibration import (
-    LOOP_OPENS_N,
-    TileCalibration,
-    is_monotonic,
-    loop_share,
-)
+from service.estimation.calibration import LOOP_OPENS_N, TileCalibration, is_monotonic, loop_share
 
 BAND_STEPS = 10
 MEAN_STEPS = 30
@@ -95,7 +90,7 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
     r2 = float(1 - (residual_n**2).sum() / (spread_n**2).sum())
     refuse_poor_fit(r2, where)
     left_out = _left_out(cubic, blocks)
-    loop = cubic.solve(blocks.rows(blocks.loading)) - cubic.solve(blocks.rows(~blocks.loading))
+    loop = cubic.solve(blocks.select(blocks.loading)) - cubic.solve(blocks.select(~blocks.loading))
     relative_misfit, loop_misfit_n = _misfit(left_out.force_n, left_out.residual_n)
     baseline_kpa = float(np.mean([zero.baseline_kpa for zero in zeros]))
     tile = TileCalibration(
@@ -152,8 +147,8 @@ class _LeftOut:
 def _left_out(cubic: _Cubic, blocks: Strokes) -> _LeftOut:
     # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
     repeats = np.unique(blocks.repeat)
-    without = np.stack([cubic.solve(blocks.rows(blocks.repeat != r)) for r in repeats])
-    parts = [blocks.rows(blocks.repeat == r) for r in repeats]
+    without = np.stack([cubic.solve(blocks.select(blocks.repeat != r)) for r in repeats])
+    parts = [blocks.select(blocks.repeat == r) for r in repeats]
     deviation = without - without.mean(axis=0)
     return _LeftOut(
         force_n=np.concatenate([part.force_n for part in parts]),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Bools, Floats, Ints, Times
+from devices.arrays import Bools, Columns, Floats, Ints, Times
 from devices.errors import CalibrationError
 from service.estimation.bench.soak import Soak
 
@@ -50,7 +50,7 @@ class Indentation:
 
 
 @dataclass(frozen=True)
-class Strokes:
+class Strokes(Columns):
     """Block averages of all slow strokes of a tile, m blocks.
 
     Attributes:
@@ -64,12 +64,6 @@ class Strokes:
     force_n: Floats
     repeat: Ints
     loading: Bools
-
-    def rows(self, mask: Bools) -> Strokes:
-        """The blocks in `mask`."""
-        return Strokes(
-            self.gauge_kpa[mask], self.force_n[mask], self.repeat[mask], self.loading[mask]
-        )
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,8 @@ def pressed(
         widths: (plays,) their half widths.
 
     Returns:
-        (n, 3): pressure, pressure without the gas' heat, and force felt without creep and loop's
-        lag taken away, that is the force less what is felt of it.
+        (n, 3): pressure, pressure without the gas' heat, and the part of the force that creep and
+        loop hide: the force less what appears of it.
     """
     n = len(t_s)
     out = np.empty((n, 3))
@@ -69,21 +69,21 @@ def pressed(
     ln_p = math.log(baseline_kpa)
     for i in range(n):
         dt = t_s[i] - time
-        felt = force_n[i]
+        apparent = force_n[i]
         for m in range(len(part)):
             decay, of_before, of_now = crept_parts(dt / creep_s[m])
             crept[m] = decay * crept[m] + of_before * force + of_now * force_n[i]
-            felt -= part[m] * (force_n[i] - crept[m])
+            apparent -= part[m] * (force_n[i] - crept[m])
         lag = 0.0
         for m in range(len(loop)):
-            plays[m] = played(felt, widths[m], plays[m])
-            lag += loop[m] * (plays[m] - felt)
-        felt += lag
+            plays[m] = played(apparent, widths[m], plays[m])
+            lag += loop[m] * (plays[m] - apparent)
+        apparent += lag
         for _ in range(_NEWTON_STEPS):
             inside = min(max(x, 0.0), 1.0)
             slope = max(flattest, c1 + inside * (2.0 * c2 + 3.0 * c3 * inside))
             value = inside * (c1 + inside * (c2 + inside * c3)) + (x - inside) * slope
-            step = (felt - value) / slope
+            step = (apparent - value) / slope
             x += step
             if abs(step) < 1e-10:
                 break
@@ -96,6 +96,6 @@ def pressed(
                 iso = p / warm
                 give = (1.0 + wall * (iso - baseline_kpa)) / (1.0 + wall * (p - baseline_kpa))
                 p = static * give * warm
-        out[i, 0], out[i, 1], out[i, 2] = p, static, force_n[i] - felt
+        out[i, 0], out[i, 1], out[i, 2] = p, static, force_n[i] - apparent
         ln_p, force, time = math.log(p), force_n[i], t_s[i]
     return out

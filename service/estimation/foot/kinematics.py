@@ -7,12 +7,12 @@ taken from the straight line between the two, else the reading before is held.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Bools, Floats, Ints, Times
+from devices.arrays import Bools, Columns, Floats, Ints, Times
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
 
 _AGE_UNIT_NS = 1000
@@ -20,7 +20,7 @@ _AGE_UNIT_NS = 1000
 
 
 @dataclass(frozen=True)
-class Readings:
+class Readings(Columns):
     """The servo's readings as n frames carry them, one row per frame.
 
     Attributes:
@@ -40,19 +40,6 @@ class Readings:
     dated: Bools
     begins: Bools
     joins: Bools
-
-    def rows(self, start: int, stop: int) -> Readings:
-        """Rows `start` to `stop` as views."""
-        return Readings(**{f.name: getattr(self, f.name)[start:stop] for f in fields(self)})
-
-    def followed_by(self, later: Readings) -> Readings:
-        """These rows and then those of `later`."""
-        return Readings(
-            **{
-                f.name: np.concatenate([getattr(self, f.name), getattr(later, f.name)])
-                for f in fields(self)
-            }
-        )
 
 
 def readings_of(

@@ -1,7 +1,7 @@
-"""`ambient`: weather and water around the domes, told by bare reference tiles.
+"""`ambient`: weather and water around the domes, measured by bare reference tiles.
 
 A dome's wall passes on a part of a pressure around it, c p/(1 + c p) with the wall's give c
-(hardware.md 9: a tenth). A bare chip feels all of it; its noise is averaged over 30 ms, because it
+(hardware.md 9: a tenth). A bare chip reads all of it; its noise is averaged over 30 ms, because it
 would stand in the forces of all tiles at once.
 """
 
@@ -37,14 +37,14 @@ class Ambient:
     """Parameters over bearing tiles.
 
     Attributes:
-        passed: part of a pressure around the dome that its gas feels.
+        passed: part of a pressure around the dome that reaches its gas.
         relative_sigma: its standard uncertainty, relative.
     """
 
     passed: Floats
     relative_sigma: float
 
-    def felt(
+    def passed_on(
         self, reference_gauge_kpa: Floats, t_ns: Times, state: AmbientState
     ) -> tuple[Floats, Floats, AmbientState]:
         """Pressure in each dome that comes from around it.
@@ -62,8 +62,8 @@ class Ambient:
         value, last_ns = _averaged(
             np.ascontiguousarray(reference_gauge_kpa), t_ns, state.head_kpa, state.t_ns, head_kpa
         )
-        felt_kpa = head_kpa[:, None] * self.passed
-        return felt_kpa, np.abs(self.relative_sigma * felt_kpa), AmbientState(value, last_ns)
+        passed_kpa = head_kpa[:, None] * self.passed
+        return passed_kpa, np.abs(self.relative_sigma * passed_kpa), AmbientState(value, last_ns)
 
 
 @compiled

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Floats, Times
+from devices.arrays import Columns, Floats, Times
 from service.estimation.compiled import compiled
 
 RESTART = 5.0
@@ -28,7 +28,7 @@ RESTART = 5.0
 
 
 @dataclass(frozen=True)
-class GasState:
+class GasState(Columns):
     """Of every tile: temperature over the wall's, and the reading before (NaN: none)."""
 
     temperature: Floats
@@ -71,8 +71,7 @@ class Gas:
             state: from the readings before.
         """
         out = np.empty_like(kpa)
-        temperature, ln_kpa, last_ns = state.temperature.copy(), state.ln_kpa.copy(), state.t_ns
-        last_ns = last_ns.copy()
+        after = state.copy()
         _settle(
             np.ascontiguousarray(kpa),
             np.ascontiguousarray(t_ns),
@@ -80,12 +79,12 @@ class Gas:
             self.tau_s,
             self.wall_per_kpa,
             self.baseline_kpa,
-            temperature,
-            ln_kpa,
-            last_ns,
+            after.temperature,
+            after.ln_kpa,
+            after.t_ns,
             out,
         )
-        return out, GasState(temperature, ln_kpa, last_ns)
+        return out, after
 
 
 @compiled

@@ -1,8 +1,8 @@
 """`hysteresis`: the rubber's loop, which does not depend on speed (hardware.md 9).
 
-The force that the bubble feels lags behind F by the sum of a few play operators::
+The force that appears in the bubble lags behind F by the sum of a few play operators::
 
-    felt = F + sum w (y - F),  y kept within F -+ min(r, OPENS F)
+    apparent = F + sum w (y - F),  y kept within F -+ min(r, OPENS F)
 
 each a part w of the force with a play of half width r; near zero load the branches meet. Solved for
 F at every sample. A play operator moves with every reversal, and so with noise: that is why this
@@ -37,16 +37,16 @@ class Hysteresis:
         """State before the first reading: plays (tiles, plays) at zero load."""
         return np.zeros(self.part.shape)
 
-    def unfelt(self, felt_n: Floats, plays_n: Floats) -> tuple[Floats, Floats]:
-        """Forces of which these are felt, and the plays after them.
+    def compensated(self, apparent_n: Floats, plays_n: Floats) -> tuple[Floats, Floats]:
+        """Forces that appear as these, and the plays after them.
 
         Args:
-            felt_n: (n, tiles); NaN stays NaN and changes nothing after it.
+            apparent_n: (n, tiles); NaN stays NaN and changes nothing after it.
             plays_n: state from the readings before.
         """
-        out = np.empty_like(felt_n)
+        out = np.empty_like(apparent_n)
         plays_n = plays_n.copy()
-        _unfelt(np.ascontiguousarray(felt_n), self.part, WIDTHS_N, plays_n, out)
+        _compensate(np.ascontiguousarray(apparent_n), self.part, WIDTHS_N, plays_n, out)
         return out, plays_n
 
 
@@ -58,25 +58,25 @@ def played(force: float, width: float, before: float) -> float:
 
 
 @compiled
-def _unplayed(felt: float, part: Floats, widths: Floats, plays: Floats) -> float:
-    """The force of which `felt` is felt by these plays.
+def _inverted(apparent: float, part: Floats, widths: Floats, plays: Floats) -> float:
+    """The force that these plays show as `apparent`.
 
-    What is felt is a broken line over the force and rises with it: Newton's steps end on the right
-    piece after a few, and halving an interval around the force keeps them from going in circles.
+    It is piecewise linear over the force and rises with it: Newton's steps end on the right piece
+    after a few, and halving an interval around the force keeps them from going in circles.
     """
-    if felt <= 0.0:  # all plays are closed
-        return felt
-    low, high, force = 0.0, math.inf, felt
+    if apparent <= 0.0:  # all plays are closed
+        return apparent
+    low, high, force = 0.0, math.inf, apparent
     for _ in range(_ITERATIONS):
         value, slope = force, 1.0
         for m in range(len(widths)):
             value += part[m] * (played(force, widths[m], plays[m]) - force)
             slope += part[m] * _play_slope(force, widths[m], plays[m])
-        if value > felt:
+        if value > apparent:
             high = force
         else:
             low = force
-        better = force - (value - felt) / slope
+        better = force - (value - apparent) / slope
         if abs(better - force) <= _CLOSE * force:
             return better
         force = better if low < better < high else 0.5 * (low + min(high, 2.0 * force))
@@ -94,20 +94,20 @@ def _play_slope(force: float, width: float, before: float) -> float:
 
 
 @compiled
-def _unfelt(
-    felt_n: Floats,
+def _compensate(
+    apparent_n: Floats,
     part: Floats,
     widths: Floats,
     plays: Floats,
     out: Floats,
 ) -> None:
-    n, tiles = felt_n.shape
+    n, tiles = apparent_n.shape
     for j in range(tiles):
         for i in range(n):
-            if not math.isfinite(felt_n[i, j]):
+            if not math.isfinite(apparent_n[i, j]):
                 out[i, j] = math.nan
                 continue
-            force = _unplayed(felt_n[i, j], part[j], widths, plays[j])
+            force = _inverted(apparent_n[i, j], part[j], widths, plays[j])
             for m in range(len(widths)):
                 plays[j, m] = played(force, widths[m], plays[j, m])
             out[i, j] = force

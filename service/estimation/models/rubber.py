@@ -1,12 +1,12 @@
 """`rubber`: creep of the dome, whose rubber gives way to a force within seconds (hardware.md 9).
 
-Of a force F the bubble feels a part at once and the rest later; two Prony terms with the parts g
-and times tau::
+Of a force F a part appears in the bubble at once and the rest later; two Prony terms with the parts
+g and times tau::
 
-    felt = F - sum g (F - z),  tau dz/dt = F - z
+    apparent = F - sum g (F - z),  tau dz/dt = F - z
 
 Inverted for F with F linear between samples, which is exact and stable for any step. A force that
-has lasted is felt whole, so the static curve is untouched.
+has lasted appears whole, so the static curve is untouched.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Floats, Times
+from devices.arrays import Columns, Floats, Times
 from service.estimation.compiled import compiled
 
 
 @dataclass(frozen=True)
-class RubberState:
+class RubberState(Columns):
     """Of every tile: crept parts (tiles, terms), and the force before (NaN: none)."""
 
     crept_n: Floats
@@ -31,7 +31,7 @@ class RubberState:
 
 @dataclass(frozen=True)
 class Rubber:
-    """Parameters (tiles, terms): parts of the force that are felt later, and after what time."""
+    """Parameters (tiles, terms): parts of the force that appear later, and after what time."""
 
     part: Floats
     tau_s: Floats
@@ -43,27 +43,29 @@ class Rubber:
             np.zeros(self.part.shape), np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64)
         )
 
-    def unfelt(self, felt_n: Floats, t_ns: Times, state: RubberState) -> tuple[Floats, RubberState]:
-        """Forces of which these are felt.
+    def compensated(
+        self, apparent_n: Floats, t_ns: Times, state: RubberState
+    ) -> tuple[Floats, RubberState]:
+        """Forces that appear as these.
 
         Args:
-            felt_n: (n, tiles); NaN stays NaN and changes nothing after it.
+            apparent_n: (n, tiles); NaN stays NaN and changes nothing after it.
             t_ns: instants (n, tiles).
             state: from the readings before.
         """
-        out = np.empty_like(felt_n)
-        crept, force, last_ns = state.crept_n.copy(), state.force_n.copy(), state.t_ns.copy()
-        _unfelt(
-            np.ascontiguousarray(felt_n),
+        out = np.empty_like(apparent_n)
+        after = state.copy()
+        _compensate(
+            np.ascontiguousarray(apparent_n),
             np.ascontiguousarray(t_ns),
             self.part,
             self.tau_s,
-            crept,
-            force,
-            last_ns,
+            after.crept_n,
+            after.force_n,
+            after.t_ns,
             out,
         )
-        return out, RubberState(crept, force, last_ns)
+        return out, after
 
 
 @compiled
@@ -75,8 +77,8 @@ def crept_parts(h: float) -> tuple[float, float, float]:
 
 
 @compiled
-def _unfelt(
-    felt_n: Floats,
+def _compensate(
+    apparent_n: Floats,
     t_ns: Times,
     part: Floats,
     tau_s: Floats,
@@ -85,20 +87,20 @@ def _unfelt(
     last_ns: Times,
     out: Floats,
 ) -> None:
-    n, tiles = felt_n.shape
+    n, tiles = apparent_n.shape
     terms = part.shape[1]
     carried = np.empty(terms)
     share = np.empty(terms)
     for j in range(tiles):
         before, before_ns = force[j], last_ns[j]
         for i in range(n):
-            felt = felt_n[i, j]
-            if not math.isfinite(felt):
+            apparent = apparent_n[i, j]
+            if not math.isfinite(apparent):
                 out[i, j] = math.nan
                 continue
             if math.isnan(before):  # the first reading: at rest without a force
                 before, before_ns = 0.0, t_ns[i, j]
-            left, known = 1.0, felt
+            left, known = 1.0, apparent
             for m in range(terms):
                 h = max(0.0, (t_ns[i, j] - before_ns) * 1e-9 / tau_s[j, m])
                 decay, of_before, of_now = crept_parts(h)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Floats, Times
+from devices.arrays import Columns, Floats, Times
 from service.estimation.compiled import compiled
 
 SETTLE_S = 0.5
@@ -24,7 +24,7 @@ NEAR_COUNTS = 2.0
 
 
 @dataclass(frozen=True)
-class TemperatureState:
+class TemperatureState(Columns):
     """Of every tile: counts of its gas, its chip, the first ones and when, and when the last.
 
     NaN before the first reading.
@@ -78,13 +78,7 @@ class Temperature:
             The pressures, their standard uncertainty from temperature, and the next state.
         """
         gas, chip = np.empty(kpa.shape), np.empty(kpa.shape)
-        after = TemperatureState(
-            state.gas_counts.copy(),
-            state.chip_counts.copy(),
-            state.first_counts.copy(),
-            state.first_ns.copy(),
-            state.t_ns.copy(),
-        )
+        after = state.copy()
         _follow(
             np.ascontiguousarray(tadc),
             np.ascontiguousarray(t_ns),
@@ -97,7 +91,7 @@ class Temperature:
             gas,
             chip,
         )
-        # Where the chip began away from the tare's temperature, nobody knows how far the gas had
+        # Where the chip began away from the tare's temperature, it is not known how far the gas had
         # followed: all of that is uncertain, and less so with every lag that passes.
         since_s = np.maximum(t_ns - after.first_ns, 0) * 1e-9
         away = after.first_counts - self.tare_counts

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,7 +39,7 @@ class Endless:
         """Frames `begin` to `end` of the stream; `seq` and time rise throughout."""
         n = len(self._frames)
         lap, at = np.divmod(np.arange(begin, end), n)
-        once = FrameBatch(**{f.name: getattr(self._frames, f.name)[at] for f in fields(FrameBatch)})
+        once = self._frames.select(at)
         span_ns = int(self._frames.t_mono_ns[-1] - self._frames.t_mono_ns[0]) + self._period_ns
         return replace(
             once,

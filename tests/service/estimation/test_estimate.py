@@ -27,7 +27,7 @@ from devices.frames import (
 from service.estimation.calibration import paper_eq2_shape
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates, EstimateStatus
-from service.estimation.lower import Felt
+from service.estimation.lower import ApparentForces
 from service.estimation.models.temperature import Temperature
 from service.estimation.plan import make_plan
 from service.estimation.tare.tare import take_tare
@@ -189,10 +189,13 @@ def test_a_step_changes_neither_its_frames_nor_its_state() -> None:
     finish(plan, state)
     again, after_again = step(plan, frames.rows(30, 60), state)
     assert_same_bits(first, again)
-    assert state.known is not None
-    assert before.known is not None
-    for f in fields(Felt):
-        kept_values, values = getattr(before.known.felt, f.name), getattr(state.known.felt, f.name)
+    assert state.pending is not None
+    assert before.pending is not None
+    for f in fields(ApparentForces):
+        kept_values, values = (
+            getattr(before.pending.forces, f.name),
+            getattr(state.pending.forces, f.name),
+        )
         assert values.tobytes() == kept_values.tobytes(), f.name
     assert (state.contact_run, state.contact, state.last_seq, state.last_t_ns) == (
         before.contact_run,

@@ -43,7 +43,7 @@ def modelled(
     )
 
 
-def felt_n(kpa: np.ndarray) -> np.ndarray:
+def apparent_n(kpa: np.ndarray) -> np.ndarray:
     """What the curve says of a pressure."""
     x = (kpa - BASE_KPA) / SCALE_KPA
     c1, c2, c3 = CURVE
@@ -64,11 +64,13 @@ def strides(seed: int, n: int = 120) -> tuple[np.ndarray, np.ndarray]:
 def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
     t_ns, force_n = strides(seed)
     out = modelled(t_ns, force_n, part=PART, loop=LOOP)
-    unlooped, _ = (loop := Hysteresis(np.array([LOOP]))).unfelt(felt_n(out[:, :1]), loop.at_rest())
+    unlooped, _ = (loop := Hysteresis(np.array([LOOP]))).compensated(
+        apparent_n(out[:, :1]), loop.at_rest()
+    )
     rubber = Rubber(np.array([PART]), np.array([CREEP_S]))
-    found, _ = rubber.unfelt(unlooped, t_ns[:, None], rubber.at_rest())
+    found, _ = rubber.compensated(unlooped, t_ns[:, None], rubber.at_rest())
     assert found[:, 0] == pytest.approx(force_n, abs=1e-9)
-    assert out[:, 2] == pytest.approx(force_n - felt_n(out[:, 0]), abs=1e-9)
+    assert out[:, 2] == pytest.approx(force_n - apparent_n(out[:, 0]), abs=1e-9)
 
 
 @settings(max_examples=20)
@@ -93,7 +95,7 @@ def test_without_effects_it_is_the_curve_turned_round() -> None:
     force_n = np.linspace(-2.0, 40.0, 100)
     out = modelled(np.arange(100) * 10**6, force_n)
     inside = (force_n >= 0.0) & (force_n <= CURVE.sum())
-    assert felt_n(out[inside, 0]) == pytest.approx(force_n[inside], abs=1e-9)
+    assert apparent_n(out[inside, 0]) == pytest.approx(force_n[inside], abs=1e-9)
     assert out[:, 0].tolist() == out[:, 1].tolist()
     assert (np.diff(out[:, 0]) > 0.0).all()
 

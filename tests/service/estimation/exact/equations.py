@@ -77,13 +77,13 @@ def gas(
 
 
 def rubber(
-    felt: list[Exact], t_ns: list[int], parts: list[Exact], taus_s: list[Exact]
+    apparent: list[Exact], t_ns: list[int], parts: list[Exact], taus_s: list[Exact]
 ) -> list[Exact]:
-    """`felt = F - sum g (F - z)`, `tau z' = F - z`, F linear between readings, from 0 at first."""
+    """`apparent = F - sum g (F - z)`, `tau z' = F - z`, F linear between readings, 0 at first."""
     z = [mpf(0) for _ in parts]
     before, before_ns = mpf(0), None
     out: list[Exact] = []
-    for value, now_ns in zip(felt, t_ns, strict=True):
+    for value, now_ns in zip(apparent, t_ns, strict=True):
         if value is None:
             out.append(None)
             continue
@@ -104,8 +104,8 @@ def rubber(
     return out
 
 
-def hysteresis(felt: list[Exact], parts: list[Exact]) -> list[Exact]:
-    """`felt = F + sum w (y - F)` solved on the pieces of the broken line that it is."""
+def hysteresis(apparent: list[Exact], parts: list[Exact]) -> list[Exact]:
+    """`apparent = F + sum w (y - F)` solved on the pieces of the broken line that it is."""
     opens, widths = mpf(OPENS), [mpf(float(w)) for w in WIDTHS_N]
 
     def play(force: Exact, width: Exact, before: Exact) -> Exact:
@@ -114,7 +114,7 @@ def hysteresis(felt: list[Exact], parts: list[Exact]) -> list[Exact]:
 
     plays = [mpf(0) for _ in widths]
     out: list[Exact] = []
-    for value in felt:
+    for value in apparent:
         if value is None:
             out.append(None)
             continue

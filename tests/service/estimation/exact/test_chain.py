@@ -105,25 +105,25 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         )
         settled = [p if b else s for p, b, s in zip(dry, bound, settled, strict=True)]
         memory_ns = 5 * mpf(hot.gamma.value) * mpf(hot.tau_s.value) * 10**9
-        felt, single, beyond, own = [], [], [], []
+        apparent, single, beyond, own = [], [], [], []
         heat_n: list[Exact] = [None] * n
         for k in range(n):
             p = settled[k]
             if p is None:
-                felt.append(None)
+                apparent.append(None)
                 single.append(None)
                 beyond.append(False)
                 own.append(None)
                 continue
             force, slope, fit = _static(entry, p - base[i])
-            felt.append(force)
+            apparent.append(force)
             single.append(abs(slope) * noise[i])
             lately = any(bound[m] and t_ns[i][k] - t_ns[i][m] < memory_ns for m in range(k))
             beyond.append(p - base[i] > mpf(entry.range_kpa[1]) or lately)
             heat_n[k] = slope * mpf(hot.misfit) * (p - dry[k])
             own.append(slope**2 * variance[k] + fit)
         averaged = equations.denoised(
-            [None if b else f for f, b in zip(felt, beyond, strict=True)],
+            [None if b else f for f, b in zip(apparent, beyond, strict=True)],
             single,
             t_ns[i],
             frame_ns,
@@ -131,7 +131,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             run,
             plan.lag_ns - 1,
         )
-        smooth = [f if a is None else a[0] for f, a in zip(felt, averaged, strict=True)]
+        smooth = [f if a is None else a[0] for f, a in zip(apparent, averaged, strict=True)]
         loop = [mpf(w.value) for w in effects[i].hysteresis.part]
         unlooped = equations.hysteresis(smooth, loop)
         parts, taus_s = ([mpf(p.value) for p in x] for x in (curve.part, curve.tau_s))

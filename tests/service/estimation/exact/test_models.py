@@ -68,15 +68,15 @@ def test_rubber_is_within_a_nanonewton(
     parts: tuple[float, float], taus_s: tuple[float, float], seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    felt_n = with_holes(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
+    apparent_n = with_holes(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = wild_instants(rng, 40)
     model = rubber.Rubber(np.array([parts]), np.array([taus_s]))
     state, out = model.at_rest(), []
     for rows in in_two_parts(40):
-        force_n, state = model.unfelt(felt_n[rows, None], t_ns[rows, None], state)
+        force_n, state = model.compensated(apparent_n[rows, None], t_ns[rows, None], state)
         out.append(force_n)
     expected = equations.rubber(
-        equations.exact(felt_n),
+        equations.exact(apparent_n),
         t_ns.tolist(),
         [mpf(g) for g in parts],
         [mpf(tau) for tau in taus_s],
@@ -94,13 +94,15 @@ def test_hysteresis_is_within_a_nanonewton(
     parts: tuple[float, float, float], swing_n: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    felt_n = with_holes(rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40)))
+    apparent_n = with_holes(
+        rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40))
+    )
     model = Hysteresis(np.array([parts], dtype=float))
     plays_n, out = model.at_rest(), []
     for rows in in_two_parts(40):
-        force_n, plays_n = model.unfelt(felt_n[rows, None], plays_n)
+        force_n, plays_n = model.compensated(apparent_n[rows, None], plays_n)
         out.append(force_n)
-    expected = equations.hysteresis(equations.exact(felt_n), [mpf(w) for w in parts])
+    expected = equations.hysteresis(equations.exact(apparent_n), [mpf(w) for w in parts])
     assert equations.apart(np.concatenate(out), expected) < GOAL * max(1.0, swing_n)
 
 
@@ -134,8 +136,8 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
     model = ambient.Ambient(passed=np.array([0.11]), relative_sigma=0.1)
     state, out = ambient.AT_REST, []
     for rows in in_two_parts(60):
-        felt_kpa, _, state = model.felt(kpa[rows], t_ns[rows], state)
-        out.append(felt_kpa)
+        passed_kpa, _, state = model.passed_on(kpa[rows], t_ns[rows], state)
+        out.append(passed_kpa)
     averaged = equations.smoothed(equations.exact(kpa), t_ns.tolist())
     expected = [None if x is None else mpf(0.11) * x for x in averaged]
     assert equations.apart(np.concatenate(out), expected) < GOAL

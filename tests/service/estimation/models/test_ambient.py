@@ -22,10 +22,10 @@ MODEL = Ambient(passed=np.array([1.0, 0.1]), relative_sigma=0.2)
 def head(kpa: Any, t_s: Any) -> np.ndarray:
     """Averaged pressure around the foot."""
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    felt_kpa, sigma_kpa, _ = MODEL.felt(np.asarray(kpa, dtype=float), t_ns, AT_REST)
-    np.testing.assert_array_equal(felt_kpa[:, 1], 0.1 * felt_kpa[:, 0])
-    np.testing.assert_array_equal(sigma_kpa, np.abs(0.2 * felt_kpa))
-    return felt_kpa[:, 0]
+    passed_kpa, sigma_kpa, _ = MODEL.passed_on(np.asarray(kpa, dtype=float), t_ns, AT_REST)
+    np.testing.assert_array_equal(passed_kpa[:, 1], 0.1 * passed_kpa[:, 0])
+    np.testing.assert_array_equal(sigma_kpa, np.abs(0.2 * passed_kpa))
+    return passed_kpa[:, 0]
 
 
 def test_water_that_comes_at_once_is_known_after_thirty_milliseconds_to_two_thirds() -> None:
@@ -71,8 +71,10 @@ def test_a_dome_passes_on_what_its_wall_gives_way_to() -> None:
 def test_a_bare_tile_that_falls_silent_is_believed_for_a_fifth_of_a_second() -> None:
     t_ns = np.arange(300, dtype=np.int64) * 2_000_000
     kpa = np.where(np.arange(300) < 100, 1.0, np.nan)
-    felt_kpa, _, state = Ambient(np.array([0.1]), 0.1).felt(kpa, t_ns, AT_REST)
-    assert felt_kpa[:200, 0] == pytest.approx(0.1)
-    assert np.isnan(felt_kpa[200:, 0]).all()
-    later, _, _ = Ambient(np.array([0.1]), 0.1).felt(np.full(9, 2.0), t_ns[-1] + t_ns[1:10], state)
+    passed_kpa, _, state = Ambient(np.array([0.1]), 0.1).passed_on(kpa, t_ns, AT_REST)
+    assert passed_kpa[:200, 0] == pytest.approx(0.1)
+    assert np.isnan(passed_kpa[200:, 0]).all()
+    later, _, _ = Ambient(np.array([0.1]), 0.1).passed_on(
+        np.full(9, 2.0), t_ns[-1] + t_ns[1:10], state
+    )
     assert np.isfinite(later).all(), "and again as soon as it speaks"
