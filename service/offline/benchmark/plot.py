@@ -5,18 +5,14 @@ A panel has a half for each mode: their times lie two decades apart, with nothin
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from service.offline.benchmark.draws import LAGS_MS
 from service.offline.benchmark.figures import SceneFigures, Spread, pareto
 from service.offline.benchmark.goals import GRF_MAE_N
-from service.offline.benchmark.placing import Box, free_place
 from service.offline.benchmark.report import draws_text
 from service.offline.benchmark.rungs import Rung
 from service.offline.plots import DPI, new_figure, png_of
@@ -30,7 +26,6 @@ STYLES = {"live": ("#0072B2", "o"), "offline": ("#D55E00", "s")}
 HALVES = ("offline", "live")
 GREY = "#595959"
 GOAL_DASHES = (0, (5, 4))
-_NEAR_PX = 14
 
 
 @dataclass(frozen=True)
@@ -54,10 +49,11 @@ def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
     """
     figure = new_figure(9.0, 1.4 + 5.0 * len(scenes))
     panels = figure.subplots(len(scenes), 2, squeeze=False)
-    to_label: list[tuple[Axes, str, list[_Mark]]] = []
+    to_label: list[tuple[Axes, str, float | None, list[_Mark]]] = []
     for figures, (left, right) in zip(scenes, panels, strict=True):
         for mode, axes in zip(HALVES, (left, right), strict=True):
-            to_label.append((axes, mode, _half(axes, figures, mode)))
+            goal_n = GRF_MAE_N.get(figures.scene, {}).get(mode)
+            to_label.append((axes, mode, goal_n, _half(axes, figures, mode, goal_n)))
         left.set_ylabel("GRF error, mean absolute, N")
         right.tick_params(axis="y", length=0, labelleft=False)
         right.spines["left"].set_visible(False)
@@ -75,12 +71,12 @@ def plot_bench(scenes: Sequence[SceneFigures]) -> bytes:
     engine.set(wspace=0.02, hspace=0.05)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    for axes, mode, marks in to_label:
-        _label(axes, mode, marks)
+    for of_half in to_label:
+        _label(*of_half)
     return png_of(figure)
 
 
-def _half(axes: Axes, figures: SceneFigures, mode: str) -> list[_Mark]:
+def _half(axes: Axes, figures: SceneFigures, mode: str, goal_n: float | None) -> list[_Mark]:
     """Marks, bars, front and goal of one mode."""
     colour, shape = STYLES[mode]
     marks = []
@@ -107,7 +103,6 @@ def _half(axes: Axes, figures: SceneFigures, mode: str) -> list[_Mark]:
     points = [(mark.ns, mark.error_n.median) for mark in marks]
     front = [points[i] for i in pareto(points)]
     axes.plot([x for x, _ in front], [y for _, y in front], color=colour, linewidth=1.5, zorder=2)
-    goal_n = GRF_MAE_N.get(figures.scene, {}).get(mode)
     if goal_n is not None:
         axes.axhline(goal_n, color=GREY, linewidth=1.0, linestyle=GOAL_DASHES, zorder=1)
     _scales(axes, figures, [x for x, _ in points])
@@ -192,58 +187,31 @@ def _legend(figure: Figure) -> None:
     )
 
 
-def _label(axes: Axes, mode: str, marks: Sequence[_Mark]) -> None:
+def _label(axes: Axes, mode: str, goal_n: float | None, marks: Sequence[_Mark]) -> None:
     """Write every name where nothing is yet, as near to its mark as there is room."""
-    from matplotlib.patheffects import withStroke
+    from textalloc import allocate
 
-    canvas: Any = axes.figure.canvas
-    renderer = canvas.get_renderer()
-    colour, _ = STYLES[mode]
-    window = axes.get_window_extent(renderer)
-    inside = (window.x0, window.y0, window.x1, window.y1)
-    taken: list[Box] = []
-    places: list[tuple[float, float]] = []
-    for mark in marks:
-        ends = [(mark.ns, y) for y in (mark.error_n.low, mark.error_n.median, mark.error_n.high)]
-        (x, low), (_, y), (_, high) = axes.transData.transform(np.array(ends)).tolist()
-        places.append((x, y))
-        half = 12.0 if mark.rung.is_default else 8.0
-        taken += [(x - half, y - half, x + half, y + half), (x - 1.5, low, x + 1.5, high)]
-    taken += _along([places[i] for i in pareto([(m.ns, m.error_n.median) for m in marks])])
+    if not marks:
+        return
     # The scene's own ladder first, then what is built up: they get the best places.
-    order = sorted(
-        zip(places, marks, strict=True),
-        key=lambda pair: (not pair[1].rung.is_default, not pair[1].rung.is_built_up),
+    marks = sorted(marks, key=lambda m: (not m.rung.is_default, not m.rung.is_built_up))
+    ns, errors_n = [m.ns for m in marks], [m.error_n.median for m in marks]
+    front = pareto(list(zip(ns, errors_n, strict=True)))
+    bars = [([m.ns, m.ns], [m.error_n.low, m.error_n.high]) for m in marks]
+    along = ([ns[i] for i in front], [errors_n[i] for i in front])
+    goal = (list(axes.get_xlim()), [goal_n or 0.0] * 2)
+    x_lines, y_lines = zip(*bars, along, goal, strict=True)
+    colour, _ = STYLES[mode]
+    allocate(
+        *(axes, ns, errors_n, [m.name for m in marks]),
+        x_scatter=ns,
+        y_scatter=errors_n,
+        x_lines=list(x_lines),
+        y_lines=list(y_lines),
+        min_distance=0.018,
+        textsize=[9.5 if m.rung.is_default else 8.5 for m in marks],
+        fontweight=["bold" if m.rung.is_default else "normal" for m in marks],
+        textcolor=["black" if m.rung.is_default else colour for m in marks],
+        linecolor=colour,
+        linewidth=0.6,
     )
-    for (x, y), mark in order:
-        text = axes.annotate(
-            mark.name,
-            (mark.ns, mark.error_n.median),
-            xytext=(0, 0),
-            textcoords="offset pixels",
-            fontsize=9.5 if mark.rung.is_default else 8.5,
-            fontweight="bold" if mark.rung.is_default else "normal",
-            color="black" if mark.rung.is_default else colour,
-            path_effects=[withStroke(linewidth=2.0, foreground="white")],
-            zorder=6,
-        )
-        size = text.get_window_extent(renderer)
-        dx, dy = free_place((x, y), (size.width, size.height), taken, inside)
-        text.set_position((dx, dy))
-        left, bottom = x + dx, y + dy
-        right, top = left + size.width, bottom + size.height
-        taken.append((left, bottom, right, top))
-        nearest = (min(max(x, left), right), min(max(y, bottom), top))
-        if math.dist((x, y), nearest) > _NEAR_PX:
-            ends_of = axes.transData.inverted().transform(np.array([(x, y), nearest]))
-            axes.plot(*ends_of.T, color=colour, linewidth=0.6, alpha=0.8, zorder=2.5)
-
-
-def _along(line: Sequence[tuple[float, float]]) -> list[Box]:
-    """Small boxes along a line of points in pixels."""
-    boxes: list[Box] = []
-    for begin, end in itertools.pairwise(line):
-        steps = max(1, round(math.dist(begin, end) / 6.0))
-        for x, y in np.linspace(begin, end, steps + 1).tolist():
-            boxes.append((x - 2.0, y - 2.0, x + 2.0, y + 2.0))
-    return boxes

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,9 @@ from service.api.app import make_app
 from service.api.guard import BODY_BYTES_MAX
 from service.server.server import Server
 from storage.sessions.folder import Part, Session, new_session_id
-
-Running = Any
-FakeNode = Any
-Until = Callable[..., Any]
+from tests.service.fake_node import FakeNode
+from tests.service.running import Running
+from tests.waiting import until
 
 UNKNOWN_ID = "20200101T000000Z-000000"
 
@@ -142,7 +142,7 @@ def test_a_full_disk_is_a_problem_that_says_so(
 
 
 @pytest.fixture
-def many(running: Running, node: FakeNode, until: Until) -> list[str]:
+def many(running: Running, node: FakeNode) -> list[str]:
     """Ids of 23 sessions, newest first; several began at the same instant."""
     node.connect()
     node.send(10)
@@ -161,7 +161,7 @@ def many(running: Running, node: FakeNode, until: Until) -> list[str]:
         for i in range(23)
     ]
     for session in sessions:
-        running.call(lambda session=session: running.server.recorder._keep(session))
+        running.call(partial(running.server.recorder._keep, session))
     sessions.sort(key=lambda s: (s.started_t_ns, s.id), reverse=True)
     return [session.id for session in sessions]
 
@@ -221,13 +221,13 @@ def test_every_operation_is_described(tmp_path: Path) -> None:
 
 
 def test_the_history_of_tares_says_why_and_where_the_baselines_are_going(
-    running: Running, node: FakeNode, until: Until
+    running: Running, node: FakeNode
 ) -> None:
     node.connect()
     node.tared()
     node.next_t_mono_ns += 900_000_000_000  # a quarter of an hour later, one count more
     node.send(300, 1.0, alive=True)
-    until(lambda: running.node()["last_seq"] == node.seq - 1)
+    node.taken_in()
     answer = running.http.post("/nodes/bench/tare", json={"reason": "  new shoe "})
     assert answer.status_code == 201, answer.text
     assert answer.json()["reason"] == "new shoe"
@@ -258,19 +258,19 @@ def test_a_node_without_a_tare_has_no_drift(running: Running, node: FakeNode) ->
     assert shown["drift"]["kelvin_since_tare"] == [None, None]
 
 
-def test_no_get_changes_anything(running: Running, node: FakeNode, until: Until) -> None:
+def test_no_get_changes_anything(running: Running, node: FakeNode) -> None:
     node.connect()
     node.tared()
-    until(lambda: running.node()["last_seq"] == node.seq - 1)
+    node.taken_in()
     node.acknowledged(node.seq - 1)
-    session = running.http.post("/sessions", json={"node": "bench", "name": "x"}).json()
+    session = node.record()
     schema = make_app(running.server).openapi_schema  # made without asking for it
     assert schema is None
     paths = [
         *("/health", "/ready", "/version", "/nodes", "/nodes/bench", "/nodes/bench/scene"),
-        *("/nodes/bench/tares", "/nodes/bench/tare", "/sessions", f"/sessions/{session['id']}"),
-        *(f"/sessions/{session['id']}/{rest}" for rest in ("events", "ledger", "data?format=csv")),
-        *(f"/sessions/{session['id']}/{rest}" for rest in ("stop", "data")),
+        *("/nodes/bench/tares", "/nodes/bench/tare", "/sessions", session.url),
+        *(f"{session.url}/{rest}" for rest in ("events", "ledger", "data?format=csv")),
+        *(f"{session.url}/{rest}" for rest in ("stop", "data")),
     ]
 
     def state() -> object:
@@ -282,7 +282,7 @@ def test_no_get_changes_anything(running: Running, node: FakeNode, until: Until)
             and path.suffix not in (".arrows", ".idx", ".tmp")
             and path.name not in ("stream.json", "clock.jsonl")
         }
-        return files, running.node(), running.session(session["id"])
+        return files, running.node(), session.now()
 
     before = state()
     for path in paths:

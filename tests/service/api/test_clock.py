@@ -6,92 +6,66 @@ import io
 import json
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
-import service.api.routes.sessions
 from service.cli.main import main
-from service.link import ClockRow
 from service.offline.client import Client
-
-Running = Any
-FakeNode = Any
-Until = Callable[..., Any]
+from tests.service.fake_node import FakeNode, NodeOf
+from tests.service.recording import Recording
+from tests.service.running import Running
+from tests.waiting import until
 
 HOUR_NS = 3_600_000_000_000
 HALF_NS = 400_000
 
 
-@pytest.fixture(autouse=True)
-def _stop_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.02)
-
-
-def say_clock(node: FakeNode, t_mono_ns: int, offset_ns: int, half_ns: int = HALF_NS) -> None:
-    row = ClockRow(t_mono_ns=t_mono_ns, server_minus_node_ns=offset_ns, uncertainty_ns=half_ns)
-    node.socket.send(row.model_dump_json())
-
-
-def measured(node: FakeNode, offset_ns: int, until: Until) -> None:
+def measured(node: FakeNode, offset_ns: int) -> None:
     """Tell the clock as it was at the newest frame."""
-    say_clock(node, node.next_t_mono_ns, offset_ns)
+    node.say_clock(offset_ns, uncertainty_ns=HALF_NS)
     shown = {"server_minus_node_ns": offset_ns, "uncertainty_ns": HALF_NS}
     until(lambda: node.running.node(node.name)["clock"] == shown)
 
 
-def connect_unmeasured(node: FakeNode, **changes: Any) -> None:
-    """As `FakeNode.connect`, without a word about clocks."""
-    node.open()
-    node.socket.send(node.hello(**changes).model_dump_json())
-    node.receive("welcome")
+def recorded(node: FakeNode, offset_ns: int | None) -> Recording:
+    """A sealed session of 200 frames, its clock measured in the middle and at its end."""
+    session = node.record()
+    for later_ns in (0, 1):
+        node.send(100, [20.0, 60.0])
+        if offset_ns is not None:
+            measured(node, offset_ns + later_ns)
+    node.taken_in()
+    node.finish(session)
+    return session
 
 
-def recorded(node: FakeNode, until: Until, offset_ns: int | None, n: int = 200) -> str:
-    """A sealed session of `n` frames, its clock measured in the middle and at its end."""
-    running = node.running
-    body = {"node": node.name, "name": "x"}
-    session_id: str = running.http.post("/sessions", json=body).json()["id"]
-    node.send(n // 2, [20.0, 60.0])
-    if offset_ns is not None:
-        measured(node, offset_ns, until)
-    node.send(n - n // 2, [20.0, 60.0])
-    if offset_ns is not None:
-        measured(node, offset_ns + 1, until)
-    until(lambda: running.node(node.name)["last_seq"] == node.seq - 1)
-    running.http.post(f"/sessions/{session_id}/stop")
-    node.send(10, now=True)
-    until(lambda: running.session(session_id)["state"] == "sealed")
-    return session_id
-
-
-def begun(node: FakeNode, until: Until, offset_ns: int | None, **changes: Any) -> None:
+def begun(node: FakeNode, offset_ns: int | None, **changes: Any) -> None:
     """Connect a node whose clock is `offset_ns` behind, and tare it."""
     node.utc_offset_ns -= offset_ns or 0
-    connect_unmeasured(node, **changes)
+    node.greet(**changes)
     if offset_ns is not None:
-        measured(node, offset_ns, until)
+        measured(node, offset_ns)
     node.tared()
-    until(lambda: node.running.node(node.name)["last_seq"] == node.seq - 1)
+    node.taken_in()
 
 
-def data(running: Running, session_id: str, **query: object) -> Any:
-    answer = running.http.get(f"/sessions/{session_id}/data", params=query)
-    assert answer.status_code == 200, answer.text
-    return answer
+def parquet_of(answer: httpx.Response) -> pa.Table:
+    return pq.read_table(io.BytesIO(answer.content))
 
 
-def clock(running: Running, session_id: str) -> dict[str, Any]:
-    answer = running.http.get(f"/sessions/{session_id}/clock")
-    assert answer.status_code == 200, answer.text
-    content: dict[str, Any] = answer.json()
-    return content
+def arrow_of(answer: httpx.Response) -> pa.Table:
+    return pa.ipc.open_stream(answer.content).read_all()
+
+
+def csv_of(answer: httpx.Response) -> pa.Table:
+    return pacsv.read_csv(io.BytesIO(answer.content))
 
 
 def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
@@ -104,22 +78,16 @@ def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 
 def test_every_format_can_have_the_servers_time_beside_the_nodes(
-    running: Running, node: FakeNode, until: Until
+    running: Running, node: FakeNode
 ) -> None:
-    begun(node, until, HOUR_NS)
-    session_id = recorded(node, until, HOUR_NS)
+    begun(node, HOUR_NS)
+    session = recorded(node, HOUR_NS)
     tables = {
-        "parquet": pq.read_table(
-            io.BytesIO(data(running, session_id, clock="server", format="parquet").content)
-        ),
-        "arrow": pa.ipc.open_stream(
-            data(running, session_id, clock="server", format="arrow").content
-        ).read_all(),
-        "csv": pacsv.read_csv(
-            io.BytesIO(data(running, session_id, clock="server", format="csv").content)
-        ),
+        "parquet": parquet_of(session.data(clock="server", format="parquet")),
+        "arrow": arrow_of(session.data(clock="server", format="arrow")),
+        "csv": csv_of(session.data(clock="server", format="csv")),
     }
-    raw = pq.read_table(io.BytesIO(data(running, session_id).content))
+    raw = parquet_of(session.data())
     assert "t_server_ns" not in raw.column_names
     for table in tables.values():
         assert table["t_ns"].to_pylist() == raw["t_ns"].to_pylist()
@@ -129,26 +97,24 @@ def test_every_format_can_have_the_servers_time_beside_the_nodes(
         assert (bound_ns < 2 * HALF_NS).all()
         assert table["t_server_ns"].to_pylist() == tables["arrow"]["t_server_ns"].to_pylist()
     notes = json.loads(tables["parquet"].schema.metadata[b"foottile.notes"])
-    assert notes["clock"] == clock(running, session_id)
-    assert notes["session"]["id"] == session_id
+    assert notes["clock"] == session.clock()
+    assert notes["session"]["id"] == session.id
 
 
-def test_the_tag_of_a_download_depends_on_the_clock(
-    running: Running, node: FakeNode, until: Until
-) -> None:
-    begun(node, until, HOUR_NS)
-    session_id = recorded(node, until, HOUR_NS)
+def test_the_tag_of_a_download_depends_on_the_clock(running: Running, node: FakeNode) -> None:
+    begun(node, HOUR_NS)
+    session = recorded(node, HOUR_NS)
     query = {"format": "csv", "clock": "server"}
     tags = [
-        data(running, session_id, **q).headers["etag"]
+        session.data(**q).headers["etag"]
         for q in ({"format": "csv"}, query, {"clock": "server"}, {})
     ]
     assert len(set(tags)) == 4
-    assert data(running, session_id, format="csv", clock="node").headers["etag"] == tags[0]
-    url = f"/sessions/{session_id}/data"
+    assert session.data(format="csv", clock="node").headers["etag"] == tags[0]
+    url = f"{session.url}/data"
     seen = {"If-None-Match": tags[1]}
     assert running.http.get(url, params=query, headers=seen).status_code == 304
-    path = running.data / "sessions" / session_id / "clock.parquet"
+    path = session.folder / "clock.parquet"
     table = pq.read_table(path)
     pq.write_table(table.slice(0, 1), path)
     assert running.http.get(url, params=query, headers=seen).status_code == 200
@@ -156,65 +122,58 @@ def test_the_tag_of_a_download_depends_on_the_clock(
     assert answer.status_code == 422
 
 
-def test_a_slice_has_the_servers_time_of_its_own_rows(
-    running: Running, node: FakeNode, until: Until
-) -> None:
-    begun(node, until, HOUR_NS)
-    session_id = recorded(node, until, HOUR_NS)
+def test_a_slice_has_the_servers_time_of_its_own_rows(running: Running, node: FakeNode) -> None:
+    begun(node, HOUR_NS)
+    session = recorded(node, HOUR_NS)
     query = {"format": "csv", "clock": "server", "columns": "t_server_ns,t_ns"}
-    whole = pacsv.read_csv(io.BytesIO(data(running, session_id, **query).content))
-    part = pacsv.read_csv(
-        io.BytesIO(data(running, session_id, **query, start_s=0.1, end_s=0.2).content)
-    )
+    whole = csv_of(session.data(**query))
+    part = csv_of(session.data(**query, start_s=0.1, end_s=0.2))
     assert part.column_names == ["t_server_ns", "t_ns"]
     assert part.to_pylist() == whole.to_pylist()[50:100]
 
 
 def test_a_recording_session_has_the_clock_as_it_is_so_far(
-    running: Running, node: FakeNode, until: Until
+    running: Running, node: FakeNode
 ) -> None:
-    begun(node, until, HOUR_NS)
-    body = {"node": "bench", "name": "x"}
-    session_id = running.http.post("/sessions", json=body).json()["id"]
+    begun(node, HOUR_NS)
+    session = node.record()
     node.send(50)
-    until(lambda: running.session(session_id)["frames"] == 50)
+    until(lambda: session.now()["frames"] == 50)
     query = {"format": "arrow", "clock": "server"}
-    before = data(running, session_id, **query)
-    table = pa.ipc.open_stream(before.content).read_all()
+    before = session.data(**query)
+    table = arrow_of(before)
     off_ns = table["t_server_ns"].to_numpy() - table["t_ns"].to_numpy()
     assert (np.abs(off_ns - HOUR_NS) <= table["t_server_uncertainty_ns"].to_numpy()).all()
-    (stream,) = clock(running, session_id)["streams"]
+    (stream,) = session.clock()["streams"]
     assert (stream["state"], stream["rows"]) == ("measured", 1)
     assert stream["stretches"][0]["drift_ppm"] is None
-    answer = running.http.get(f"/sessions/{session_id}/clock?format=parquet")
+    answer = running.http.get(f"{session.url}/clock?format=parquet")
     assert answer.status_code == 409
-    measured(node, HOUR_NS + 5, until)
-    after = data(running, session_id, **query)
+    measured(node, HOUR_NS + 5)
+    after = session.data(**query)
     assert after.headers["etag"] != before.headers["etag"]
 
 
 def test_a_node_that_was_switched_on_anew_has_a_clock_for_each_start(
-    running: Running, node: FakeNode, until: Until
+    running: Running, node: FakeNode
 ) -> None:
-    begun(node, until, 0)
-    session_id = running.http.post("/sessions", json={"node": "bench", "name": "x"}).json()["id"]
+    begun(node, 0)
+    session = node.record()
     node.send(50)
-    until(lambda: running.node()["last_seq"] == node.seq - 1)
+    node.taken_in()
     first = node.boot_id
     node.leave()
     node.reboot()
-    begun(node, until, HOUR_NS)
+    begun(node, HOUR_NS)
     node.send(50)
-    until(lambda: running.node()["last_seq"] == node.seq - 1)
-    running.http.post(f"/sessions/{session_id}/stop")
-    node.send(10, now=True)
-    running.sealed(session_id)
-    streams = clock(running, session_id)["streams"]
+    node.taken_in()
+    node.finish(session)
+    streams = session.clock()["streams"]
     assert [stream["boot_id"] for stream in streams] == [first, node.boot_id]
     assert [stream["stretches"][0]["offset_ns"] for stream in streams] == [0, HOUR_NS]
     begins = [stream["stretches"][0]["begin_t_ns"] for stream in streams]
     assert begins[0] - begins[1] > HOUR_NS / 2
-    table = pq.read_table(io.BytesIO(data(running, session_id, clock="server").content))
+    table = parquet_of(session.data(clock="server"))
     off_ns = table["t_server_ns"].to_numpy() - table["t_ns"].to_numpy()
     part = table["part"].to_numpy()
     assert np.abs(off_ns[part == 0]).max() < 2 * HALF_NS
@@ -223,11 +182,11 @@ def test_a_node_that_was_switched_on_anew_has_a_clock_for_each_start(
 
 @pytest.mark.parametrize(("clock_set", "state"), [(True, "unmeasured"), (False, "unsynchronised")])
 def test_a_node_nobody_measured_has_no_servers_time(
-    running: Running, node: FakeNode, until: Until, clock_set: bool, state: str
+    running: Running, node: FakeNode, clock_set: bool, state: str
 ) -> None:
-    begun(node, until, None, array_info=node.info.model_copy(update={"clock_set": clock_set}))
-    session_id = recorded(node, until, None)
-    (stream,) = clock(running, session_id)["streams"]
+    begun(node, None, array_info=node.info.model_copy(update={"clock_set": clock_set}))
+    session = recorded(node, None)
+    (stream,) = session.clock()["streams"]
     assert stream == {
         "boot_id": node.boot_id,
         "state": state,
@@ -235,30 +194,30 @@ def test_a_node_nobody_measured_has_no_servers_time(
         "stretches": [],
         "steps": [],
     }
-    table = pq.read_table(io.BytesIO(data(running, session_id, clock="server").content))
+    table = parquet_of(session.data(clock="server"))
     assert table["t_server_ns"].null_count == len(table) == 200
     assert table["t_server_uncertainty_ns"].null_count == 200
     assert table["t_ns"].null_count == 0
 
 
 def test_the_servers_clock_set_by_an_hour_is_a_step_of_the_session(
-    running: Running, node: FakeNode, until: Until
+    running: Running, node: FakeNode
 ) -> None:
-    begun(node, until, 0)
-    session_id = running.http.post("/sessions", json={"node": "bench", "name": "x"}).json()["id"]
+    begun(node, 0)
+    session = node.record()
     node.send(50)
-    measured(node, 0, until)
+    measured(node, 0)
     node.send(50)
-    measured(node, HOUR_NS, until)
+    measured(node, HOUR_NS)
     node.send(50)
-    until(lambda: running.session(session_id)["frames"] == 150)
-    (stream,) = clock(running, session_id)["streams"]
+    until(lambda: session.now()["frames"] == 150)
+    (stream,) = session.clock()["streams"]
     assert [stretch["rows"] for stretch in stream["stretches"]] == [2, 1]
     (step,) = stream["steps"]
     assert abs(step["jump_ns"] - HOUR_NS) <= step["jump_uncertainty_ns"] < 4 * HALF_NS
     assert step["before_t_ns"] - step["after_t_ns"] == 50 * 2_000_000
     query = {"format": "arrow", "clock": "server"}
-    table = pa.ipc.open_stream(data(running, session_id, **query).content).read_all()
+    table = arrow_of(session.data(**query))
     bound_ns = table["t_server_uncertainty_ns"].to_numpy()
     assert (bound_ns[:51] < 2 * HALF_NS).all()
     assert (bound_ns[51:100] > HOUR_NS // 2).all()
@@ -268,20 +227,19 @@ def test_the_servers_clock_set_by_an_hour_is_a_step_of_the_session(
 def test_a_pulled_session_is_exported_with_the_servers_time_and_a_lone_file_is_not(
     running: Running,
     node: FakeNode,
-    until: Until,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    begun(node, until, HOUR_NS)
-    session_id = recorded(node, until, HOUR_NS)
+    begun(node, HOUR_NS)
+    session = recorded(node, HOUR_NS)
     with Client(running.url) as client:
-        client.pull(session_id, tmp_path)
-    folder = tmp_path / session_id
+        client.pull(session.id, tmp_path)
+    folder = tmp_path / session.id
     out = tmp_path / "out.parquet"
     options = ("--format", "parquet", "--clock", "server", "--out", out)
     assert export(monkeypatch, folder, *options) == 0
-    served = data(running, session_id, clock="server").content
+    served = session.data(clock="server").content
     assert pq.read_table(out).equals(pq.read_table(io.BytesIO(served)))
     out.unlink()
     lone = tmp_path / "lone.parquet"
@@ -296,41 +254,41 @@ def test_a_pulled_session_is_exported_with_the_servers_time_and_a_lone_file_is_n
 
 
 def test_a_table_that_was_taken_away_is_said_to_be(
-    running: Running, node: FakeNode, until: Until, tmp_path: Path
+    running: Running, node: FakeNode, tmp_path: Path
 ) -> None:
-    begun(node, until, HOUR_NS)
-    session_id = recorded(node, until, HOUR_NS)
-    (running.data / "sessions" / session_id / "clock.parquet").unlink()
+    begun(node, HOUR_NS)
+    session = recorded(node, HOUR_NS)
+    (session.folder / "clock.parquet").unlink()
     for url in ("clock", "clock?format=parquet"):
-        answer = running.http.get(f"/sessions/{session_id}/{url}")
+        answer = running.http.get(f"{session.url}/{url}")
         assert answer.status_code == 404
         assert "clock.parquet" in answer.json()["detail"]
-    answer = running.http.get(f"/sessions/{session_id}/data?clock=server")
+    answer = running.http.get(f"{session.url}/data?clock=server")
     assert answer.status_code == 422
     assert "clock.parquet" in answer.json()["detail"]
     with Client(running.url) as client:
-        client.pull(session_id, tmp_path)
-    assert not (tmp_path / session_id / "clock.parquet").exists()
+        client.pull(session.id, tmp_path)
+    assert not (tmp_path / session.id / "clock.parquet").exists()
     assert running.http.get("/sessions/20200101T000000Z-000000/clock").status_code == 404
 
 
 def test_numbers_that_no_clock_has_are_refused_and_the_raw_data_stays(
-    running: Running, node: FakeNode, until: Until
+    running: Running, node: FakeNode
 ) -> None:
-    begun(node, until, 0)
-    session_id = recorded(node, until, 0)
-    path = running.data / "sessions" / session_id / "clock.parquet"
+    begun(node, 0)
+    session = recorded(node, 0)
+    path = session.folder / "clock.parquet"
     table = pq.read_table(path)
     offsets = pa.array([2**63 - 1] * len(table), pa.int64())
     pq.write_table(table.set_column(2, table.schema.field(2), offsets), path)
-    assert data(running, session_id, format="csv").status_code == 200
-    answer = running.http.get(f"/sessions/{session_id}/data?clock=server")
+    assert session.data(format="csv").status_code == 200
+    answer = running.http.get(f"{session.url}/data?clock=server")
     assert answer.status_code == 500
     assert "server_minus_node_ns" in answer.json()["detail"]
 
 
 def test_two_nodes_that_saw_the_same_event_are_put_on_one_axis(
-    running: Running, node_of: Callable[..., FakeNode], until: Until
+    running: Running, node_of: NodeOf
 ) -> None:
     """One is an hour behind, the other was never set; both saw the same hop."""
     offsets = {"left": HOUR_NS, "right": time.time_ns() - 40_000_000_000}
@@ -338,22 +296,20 @@ def test_two_nodes_that_saw_the_same_event_are_put_on_one_axis(
     seen = {}
     for name, offset_ns in offsets.items():
         node = node_of(running, name)
-        begun(node, until, offset_ns)
-        measured(node, offset_ns - 300_000, until)  # as lopsided as its round trip allows
-        session_id = running.http.post("/sessions", json={"node": name, "name": "x"}).json()["id"]
+        begun(node, offset_ns)
+        measured(node, offset_ns - 300_000)  # as lopsided as its round trip allows
+        session = node.record()
         node.send(100, [20.0, 60.0])
         if event_t_ns is None:
             event_t_ns = node.next_t_mono_ns + node.utc_offset_ns + offset_ns
         else:
             node.next_t_mono_ns = event_t_ns - node.utc_offset_ns - offset_ns
         node.send(1, [90.0, 90.0])
-        measured(node, offset_ns + 300_000, until)
+        measured(node, offset_ns + 300_000)
         node.send(99, [20.0, 60.0])
-        until(lambda n=node: running.node(n.name)["last_seq"] == n.seq - 1)
-        running.http.post(f"/sessions/{session_id}/stop")
-        node.send(10, now=True)
-        running.sealed(session_id)
-        table = pq.read_table(io.BytesIO(data(running, session_id, clock="server").content))
+        node.taken_in()
+        node.finish(session)
+        table = parquet_of(session.data(clock="server"))
         hop = int(np.argmin(table["padc_0"].to_numpy()))
         seen[name] = [
             table[column][hop].as_py() for column in ("t_server_ns", "t_server_uncertainty_ns")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 from base64 import b64encode
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +17,11 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
-import service.api.routes.sessions
 from devices.errors import LinkError, StateError
 from service.offline.client import Client
-
-Running = Any
-FakeNode = Any
-Until = Callable[..., Any]
+from tests.service.fake_node import FakeNode
+from tests.service.recording import Recording
+from tests.service.running import Running
 
 
 @dataclass(frozen=True)
@@ -32,47 +29,37 @@ class Sealed:
     """A sealed session of 300 frames at 20 and 60 N, and one that is still recorded."""
 
     running: Running
-    id: str
+    session: Recording
     content: bytes
-    recording: str
+    recording: Recording
+
+    @property
+    def id(self) -> str:
+        return self.session.id
 
     @property
     def sha256(self) -> str:
         return hashlib.sha256(self.content).hexdigest()
 
     def get(self, method: str = "GET", **headers: str) -> httpx.Response:
-        answer: httpx.Response = self.running.http.request(
-            method, f"/sessions/{self.id}/data", headers={"Accept-Encoding": "identity"} | headers
+        return self.running.http.request(
+            method, f"{self.session.url}/data", headers={"Accept-Encoding": "identity"} | headers
         )
-        return answer
 
-    def made(self, session_id: str | None = None, **query: object) -> httpx.Response:
-        answer: httpx.Response = self.running.http.get(
-            f"/sessions/{session_id or self.id}/data", params=query
-        )
-        return answer
+    def made(self, session: Recording | None = None, **query: Any) -> httpx.Response:
+        url = f"{(session or self.session).url}/data"
+        return self.running.http.get(url, params=query)
 
 
 @pytest.fixture
-def sealed(
-    running: Running, node: FakeNode, until: Until, monkeypatch: pytest.MonkeyPatch
-) -> Sealed:
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.02)
-    node.connect()
-    node.tared()
-    until(lambda: running.node()["last_seq"] == node.seq - 1)
-    body = {"node": "bench", "name": "x"}
-    session_id = running.http.post("/sessions", json=body).json()["id"]
-    node.send(300, [20.0, 60.0])
-    until(lambda: running.node()["last_seq"] == node.seq - 1)
-    running.http.post(f"/sessions/{session_id}/stop")
-    node.send(10, now=True)
-    running.sealed(session_id)
-    recording = running.http.post("/sessions", json=body).json()["id"]
-    node.send(50, [5.0, 0.0])
-    until(lambda: running.session(recording)["frames"] == 50)
-    content = (running.data / "sessions" / session_id / "frames.parquet").read_bytes()
-    return Sealed(running, session_id, content, recording)
+def sealed(running: Running, tared: FakeNode) -> Sealed:
+    session = tared.record()
+    tared.deliver(300, [20.0, 60.0])
+    tared.finish(session)
+    recording = tared.record()
+    tared.deliver(50, [5.0, 0.0])
+    content = (session.folder / "frames.parquet").read_bytes()
+    return Sealed(running, session, content, recording)
 
 
 def table_of(answer: httpx.Response, to: str) -> pa.Table:
@@ -99,7 +86,7 @@ def test_the_whole_file_comes_as_it_is_stored(sealed: Sealed) -> None:
     assert answer.headers["content-type"] == "application/vnd.apache.parquet"
     assert f'filename="{sealed.id}.parquet"' in answer.headers["content-disposition"]
     assert "immutable" in answer.headers["cache-control"]
-    assert sealed.running.session(sealed.id)["sha256"] == sealed.sha256
+    assert sealed.session.now()["sha256"] == sealed.sha256
 
 
 def test_one_range_is_that_part_of_the_file(sealed: Sealed) -> None:
@@ -287,7 +274,7 @@ def test_a_recording_session_gives_what_there_is(sealed: Sealed, to: str) -> Non
     ],
     ids=str,
 )
-def test_a_query_that_is_none_is_refused(sealed: Sealed, query: dict[str, str]) -> None:
+def test_a_query_that_is_none_is_refused(sealed: Sealed, query: dict[str, Any]) -> None:
     answer = sealed.made(**query)
     assert answer.status_code == 422
     assert answer.headers["content-type"] == "application/problem+json"
@@ -312,7 +299,7 @@ def test_an_odd_id_is_not_found(sealed: Sealed) -> None:
 
 
 def test_a_file_that_was_taken_away_is_said_to_be(sealed: Sealed) -> None:
-    path = sealed.running.data / "sessions" / sealed.id / "frames.parquet"
+    path = sealed.session.folder / "frames.parquet"
     path.unlink()
     answer = sealed.get()
     assert answer.status_code == 404
@@ -323,7 +310,7 @@ def test_a_file_that_was_taken_away_is_said_to_be(sealed: Sealed) -> None:
 
 def test_the_client_pulls_a_session_whole(sealed: Sealed, tmp_path: Path) -> None:
     with Client(sealed.running.url) as client:
-        assert {s["id"] for s in client.sessions()} == {sealed.id, sealed.recording}
+        assert {s["id"] for s in client.sessions()} == {sealed.id, sealed.recording.id}
         pulled = client.pull(sealed.id, tmp_path / "out")
         assert Path(pulled["path"]).read_bytes() == sealed.content
         assert pulled["resumed_bytes"] == 0
@@ -383,7 +370,7 @@ def test_the_client_says_that_a_session_is_not_sealed(sealed: Sealed, tmp_path: 
         Client(sealed.running.url) as client,
         pytest.raises(StateError, match=r"is recording.*Stop it"),
     ):
-        client.pull(sealed.recording, tmp_path / "out")
+        client.pull(sealed.recording.id, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import stat
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,11 @@ from websockets.exceptions import InvalidStatus
 from service.api.guard import is_loopback
 from service.api.serve import token_for
 from service.link import INGEST_PATH
+from tests.service.fake_node import NodeOf
+from tests.service.running import Running, ServeWith
 
 LIVE = "/api/v1/live"
 TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
-
-Running = Any
-FakeNode = Any
 
 
 def test_a_host_of_another_name_is_refused(running: Running) -> None:
@@ -43,7 +41,7 @@ def test_localhost_and_addresses_pass(running: Running) -> None:
         assert answer.status_code == 200, host
 
 
-def test_a_name_that_was_allowed_passes(serve_with: Callable[..., Running]) -> None:
+def test_a_name_that_was_allowed_passes(serve_with: ServeWith) -> None:
     running = serve_with(hosts=["Robot.local"])
     for host, status in (("robot.local:8000", 200), ("ROBOT.LOCAL", 200), ("robot", 403)):
         assert running.http.get("/health", headers={"Host": host}).status_code == status, host
@@ -116,9 +114,7 @@ CHANGES = (
     "given",
     [None, "", "Bearer", f"Bearer {TOKEN}x", f"Bearer {TOKEN[:-1]}", "Basic eDp5", "\xe9"],
 )
-def test_a_change_without_the_token_is_refused(
-    serve_with: Callable[..., Running], given: str | None
-) -> None:
+def test_a_change_without_the_token_is_refused(serve_with: ServeWith, given: str | None) -> None:
     running = serve_with(token=TOKEN)
     headers: Any = {} if given is None else {"Authorization": given.encode("latin-1")}
     for method, path in CHANGES:
@@ -136,9 +132,7 @@ def test_a_change_without_the_token_is_refused(
     assert refused.value.response.headers["www-authenticate"] == "Bearer"
 
 
-def test_a_change_with_the_token_passes(
-    serve_with: Callable[..., Running], node_of: Callable[..., FakeNode]
-) -> None:
+def test_a_change_with_the_token_passes(serve_with: ServeWith, node_of: NodeOf) -> None:
     running = serve_with(token=TOKEN)
     for method, path in CHANGES:
         answer = running.http.request(
@@ -147,11 +141,10 @@ def test_a_change_with_the_token_passes(
         assert answer.status_code in (404, 422), path
     node = node_of(running, token=TOKEN)
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
 
 
-def test_reading_and_watching_need_no_token(serve_with: Callable[..., Running]) -> None:
+def test_reading_and_watching_need_no_token(serve_with: ServeWith) -> None:
     running = serve_with(token=TOKEN)
     for path in ("/health", "/ready", "/version", "/nodes", "/sessions", "/openapi.json"):
         assert running.http.get(path).status_code == 200, path
@@ -207,7 +200,7 @@ def test_a_token_file_that_is_empty_is_no_token(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", ["/api/v1/ingest%0A", "/api/v1/ingest/", "/api/v1//ingest", "/x"])
 def test_no_other_way_of_writing_the_path_gets_past_the_token(
-    serve_with: Callable[..., Running], path: str
+    serve_with: ServeWith, path: str
 ) -> None:
     running = serve_with(token=TOKEN)
     with pytest.raises(InvalidStatus) as refused, running.socket(path):

@@ -5,19 +5,16 @@ from __future__ import annotations
 import json
 import socket as sockets
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 import service.api.routes.live
+from tests.service.fake_node import FakeNode, NodeOf, Play
+from tests.service.running import Running, closed
+from tests.waiting import until
 
 LIVE = "/api/v1/live"
-
-Running = Any
-FakeNode = Any
-Closing = Callable[..., tuple[int, str]]
-Until = Callable[..., Any]
 
 
 def next_of(socket: Any, kind: str, timeout_s: float = 5.0) -> dict[str, Any]:
@@ -36,24 +33,15 @@ def next_frame_from(socket: Any, seq: int) -> dict[str, Any]:
     return frame
 
 
-@pytest.fixture
-def tared(running: Running, node: FakeNode, until: Until) -> FakeNode:
-    node.connect()
-    node.tared()
-    until(lambda: running.node()["last_seq"] == node.seq - 1)
-    return node
-
-
 def test_hello_comes_first_and_says_who_is_there(running: Running, tared: FakeNode) -> None:
-    body = {"node": "bench", "name": "x"}
-    session = running.http.post("/sessions", json=body).json()
+    session = tared.record()
     with running.socket(LIVE) as live:
         assert live.subprotocol == "foottile.v1"
         hello = json.loads(live.recv(timeout=5.0))
     assert hello["type"] == "hello"
     assert hello["protocol"] == 1
     assert [node["node"] for node in hello["nodes"]] == ["bench"]
-    assert [recording["id"] for recording in hello["recording"]] == [session["id"]]
+    assert [recording["id"] for recording in hello["recording"]] == [session.id]
     assert abs(hello["t_ns"] - time.time_ns()) < 10e9
 
 
@@ -82,12 +70,8 @@ def test_a_frame_has_what_the_contract_says(running: Running, tared: FakeNode) -
     assert frame["age_ms"] > 0
 
 
-def test_the_age_of_a_frame_is_known_once_the_clocks_are(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    tared.socket.send(
-        '{"type":"clock","t_mono_ns":5,"server_minus_node_ns":0,"uncertainty_ns":1000}'
-    )
+def test_the_age_of_a_frame_is_known_once_the_clocks_are(running: Running, tared: FakeNode) -> None:
+    tared.say_clock(0, uncertainty_ns=1000, t_mono_ns=5)
     with running.socket(f"{LIVE}?rate_hz=60") as live:
         tared.send(30, now=True)
         frame = next_frame_from(live, tared.seq - 15)
@@ -95,10 +79,8 @@ def test_the_age_of_a_frame_is_known_once_the_clocks_are(
 
 
 @pytest.mark.real_time
-def test_frames_come_at_the_rate_that_was_asked_for(
-    running: Running, tared: FakeNode, play: Callable[..., Any]
-) -> None:
-    with running.socket(f"{LIVE}?rate_hz=20") as live, play(tared, 10.0):
+def test_frames_come_at_the_rate_that_was_asked_for(running: Running, tared: FakeNode) -> None:
+    with running.socket(f"{LIVE}?rate_hz=20") as live, Play(tared, 10.0):
         next_frame_from(live, tared.seq)
         begin_s = time.monotonic()
         frames = [next_of(live, "frame") for _ in range(20)]
@@ -166,12 +148,10 @@ def test_a_ping_is_answered(running: Running) -> None:
     ],
     ids=lambda message: repr(message[:30]),
 )
-def test_anything_but_a_ping_closes(
-    running: Running, closing: Closing, message: str | bytes
-) -> None:
+def test_anything_but_a_ping_closes(running: Running, message: str | bytes) -> None:
     with running.socket(LIVE) as live, running.socket(LIVE) as other:
         live.send(message)
-        code, reason = closing(live)
+        code, reason = closed(live)
         assert code == 1008
         assert "ping" in reason
         other.send('{"type":"ping","t_ms":1}')
@@ -195,16 +175,16 @@ def test_anything_but_a_ping_closes(
     ],
 )
 def test_a_query_that_is_none_closes_with_the_reason(
-    running: Running, closing: Closing, query: str, said: str
+    running: Running, query: str, said: str
 ) -> None:
     with running.socket(f"{LIVE}?{query}") as live:
-        code, reason = closing(live)
+        code, reason = closed(live)
     assert code == 1008
     assert said in reason
 
 
 def test_only_the_node_that_was_asked_for_is_shown(
-    running: Running, tared: FakeNode, node_of: Callable[..., FakeNode], until: Until
+    running: Running, tared: FakeNode, node_of: NodeOf
 ) -> None:
     other = node_of(running, "other")
     other.connect()
@@ -222,8 +202,6 @@ def test_only_the_node_that_was_asked_for_is_shown(
 def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
     running: Running,
     tared: FakeNode,
-    play: Callable[..., Any],
-    until: Until,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(service.api.routes.live, "SEND_TIMEOUT_S", 1.0)
@@ -235,7 +213,7 @@ def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
         "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
     )
-    with slow, running.socket(f"{LIVE}?rate_hz=60") as live, play(tared, 10.0) as playing:
+    with slow, running.socket(f"{LIVE}?rate_hz=60") as live, Play(tared, 10.0) as playing:
         until(lambda: running.server.hub.subscribers == 2)
         # Buffers of the kernel and of the server fill first: give it more to say.
         notice = {"type": "node", "node": {"padding": "x" * 200_000}}
@@ -255,10 +233,8 @@ def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
 
 
 @pytest.mark.real_time
-def test_who_joins_late_sees_the_picture_at_once(
-    running: Running, tared: FakeNode, play: Callable[..., Any]
-) -> None:
-    with play(tared, 10.0):
+def test_who_joins_late_sees_the_picture_at_once(running: Running, tared: FakeNode) -> None:
+    with Play(tared, 10.0):
         with running.socket(LIVE) as early:
             next_frame_from(early, 100)
         with running.socket(LIVE) as late:
@@ -271,9 +247,7 @@ def test_who_joins_late_sees_the_picture_at_once(
         assert frame["force_n"] == pytest.approx([10.0, 10.0], abs=0.5)
 
 
-def test_a_node_that_leaves_and_returns_is_told(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
+def test_a_node_that_leaves_and_returns_is_told(running: Running, tared: FakeNode) -> None:
     with running.socket(LIVE) as live:
         json.loads(live.recv(timeout=5.0))
         tared.leave()
@@ -286,11 +260,10 @@ def test_a_node_that_leaves_and_returns_is_told(
 
 def test_a_session_is_told_from_start_to_stop(running: Running, tared: FakeNode) -> None:
     with running.socket(LIVE) as live:
-        body = {"node": "bench", "name": "x"}
-        session = running.http.post("/sessions", json=body).json()
+        session = tared.record()
         told = next_of(live, "session")["session"]
-        assert (told["id"], told["state"]) == (session["id"], "recording")
-        running.http.patch(f"/sessions/{session['id']}", json={"name": "y"})
+        assert (told["id"], told["state"]) == (session.id, "recording")
+        running.http.patch(session.url, json={"name": "y"})
         while next_of(live, "session")["session"]["name"] != "y":
             pass
 
@@ -319,9 +292,9 @@ def test_without_a_tare_a_frame_has_its_status_and_no_forces(
     assert frame["status"] == [0, 0]
 
 
-def test_a_server_that_ends_lets_its_screens_go(running: Running, closing: Closing) -> None:
+def test_a_server_that_ends_lets_its_screens_go(running: Running) -> None:
     with running.socket(LIVE) as live:
         next_of(live, "hello")
         running.stop()
-        code, _ = closing(live)
+        code, _ = closed(live)
     assert code in (1001, 1012)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,115 +13,57 @@ import pytest
 
 import service.api.routes.sessions
 import service.server.recorder
-from devices.frames import FRAME_COLUMNS, FrameBatch
-from storage.sessions.file import SessionReader
-
-COUNT_KPA = 130 / 1023
-
-Running = Any
-FakeNode = Any
-Until = Callable[..., Any]
-
-
-@pytest.fixture(autouse=True)
-def quick_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stop answers soon: the scripted node sends what passes it only afterwards."""
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.02)
-
-
-def start(running: Running, **body: object) -> dict[str, Any]:
-    answer = running.http.post("/sessions", json={"node": "bench", "name": "trial"} | body)
-    assert answer.status_code == 201, answer.text
-    session: dict[str, Any] = answer.json()
-    assert answer.headers["location"] == f"/api/v1/sessions/{session['id']}"
-    return session
-
-
-def stop(running: Running, session: dict[str, Any]) -> dict[str, Any]:
-    answer = running.http.post(f"/sessions/{session['id']}/stop")
-    assert answer.status_code == 200, answer.text
-    content: dict[str, Any] = answer.json()
-    return content
-
-
-def reader(running: Running, session: dict[str, Any]) -> SessionReader:
-    return SessionReader(running.data / "sessions" / session["id"] / "frames.parquet")
-
-
-def frames_of(running: Running, session: dict[str, Any]) -> FrameBatch:
-    with reader(running, session) as file:
-        return FrameBatch.concatenate([batch for batch, _ in file.batches()])
-
-
-def column(running: Running, session: dict[str, Any], name: str) -> np.ndarray:
-    path = running.data / "sessions" / session["id"] / "frames.parquet"
-    return pq.read_table(path, columns=[name])[name].to_numpy()
-
-
-def assert_same(found: FrameBatch, sent: FrameBatch) -> None:
-    for name in FRAME_COLUMNS:
-        np.testing.assert_array_equal(getattr(found, name), getattr(sent, name), err_msg=name)
-
-
-def taken_in(running: Running, node: FakeNode, until: Until) -> None:
-    until(lambda: running.node(node.name)["last_seq"] == node.seq - 1)
-
-
-@pytest.fixture
-def tared(running: Running, node: FakeNode, until: Until) -> FakeNode:
-    """A connected node with a tare, all of whose 70 frames have come."""
-    node.connect()
-    node.tared()
-    taken_in(running, node, until)
-    return node
+from devices.frames import FrameBatch
+from service.sessions.sealing import seal
+from tests.builders.arrays import COUNT_KPA
+from tests.builders.frames import assert_same_bits
+from tests.service.fake_node import FakeNode, NodeOf, Play
+from tests.service.running import Running
+from tests.waiting import until
 
 
 def test_a_session_has_exactly_the_frames_between_start_and_stop(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running, notes="wet", subject="A", tags=["mud", "slow"])
+    session = tared.record(notes="wet", subject="A", tags=["mud", "slow"])
     assert session["state"] == "recording"
-    tared.send(400, [20.0, 60.0], noise=1)
-    taken_in(running, tared, until)
-    assert running.node()["recording"] == [session["id"]]
-    assert running.session(session["id"])["frames"] == 400
-    marked = running.http.post(f"/sessions/{session['id']}/events", json={"label": "stone"})
+    tared.deliver(400, [20.0, 60.0], noise=1)
+    assert running.node()["recording"] == [session.id]
+    assert session.now()["frames"] == 400
+    marked = running.http.post(f"{session.url}/events", json={"label": "stone"})
     assert marked.status_code == 201
-    stopped = stop(running, session)
+    stopped = session.stop()
     assert stopped["state"] == "pending"
     tared.send(30, now=True)
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert sealed["complete"] is True
     assert sealed["frames"] == 400
     assert sealed["problem"] is None
     assert sealed["parts"] == [{"boot_id": tared.boot_id, "seq_first": 70, "seq_last": 469}]
-    assert_same(frames_of(running, session), tared.all_sent().rows(70, 470))
-    assert set(column(running, session, "part")) == {0}
+    assert_same_bits(session.frames(), tared.all_sent().rows(70, 470))
+    assert set(session.column("part")) == {0}
     assert running.node()["recording"] == []
     assert sealed["duration_s"] == pytest.approx(399 * 0.002)
-    path = running.data / "sessions" / session["id"] / "frames.parquet"
+    path = session.folder / "frames.parquet"
     assert sealed["bytes"] == path.stat().st_size
 
 
-def test_a_sealed_session_has_estimates_with_the_tare_in_force(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
-    tared.send(200, [20.0, 60.0])
-    taken_in(running, tared, until)
-    stop(running, session)
+def test_a_sealed_session_has_estimates_with_the_tare_in_force(tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(200, [20.0, 60.0])
+    session.stop()
     tared.send(30, now=True)
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     middle = slice(60, 140)
     for tile, force_n in enumerate((20.0, 60.0)):
-        found = column(running, session, f"force_n_{tile}")[middle]
+        found = session.column(f"force_n_{tile}")[middle]
         assert found == pytest.approx(np.full(80, force_n), abs=0.01)
-        found = column(running, session, f"gauge_kpa_{tile}")[middle]
+        found = session.column(f"gauge_kpa_{tile}")[middle]
         assert found == pytest.approx(np.full(80, force_n * COUNT_KPA), abs=0.001)
-    assert column(running, session, "grf_n")[middle] == pytest.approx(np.full(80, 80.0), abs=0.02)
-    with reader(running, session) as file:
+    assert session.column("grf_n")[middle] == pytest.approx(np.full(80, 80.0), abs=0.02)
+    with session.reader() as file:
         notes = file.notes
-    assert notes["session"]["id"] == session["id"]
+    assert notes["session"]["id"] == session.id
     assert notes["session"]["parts"] == sealed["parts"]
     assert notes["ledger"]["complete"] is True
     assert notes["ledger"]["parts"][0]["recorded"] == 200
@@ -137,30 +78,28 @@ def test_a_sealed_session_has_estimates_with_the_tare_in_force(
 def test_a_stop_answers_sealed_while_the_node_streams(
     running: Running,
     tared: FakeNode,
-    play: Callable[..., Any],
-    until: Until,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 5.0)
-    with play(tared, 10.0):
+    with Play(tared, 10.0):
         until(lambda: running.node()["last_seq"] > 100)
-        session = start(running)
-        until(lambda: running.session(session["id"])["frames"] > 100)
-        stopped = stop(running, session)
+        session = tared.record()
+        until(lambda: session.now()["frames"] > 100)
+        stopped = session.stop()
     assert stopped["state"] == "sealed"
     assert stopped["complete"] is True
-    found = frames_of(running, session)
+    found = session.frames()
     np.testing.assert_array_equal(np.diff(found.seq), 1)
     first, last = int(found.seq[0]), int(found.seq[-1])
-    assert_same(found, tared.all_sent().rows(first, last + 1))
+    assert_same_bits(found, tared.all_sent().rows(first, last + 1))
     assert int(found.t_ns[-1]) <= stopped["stopped_t_ns"]
     assert int(tared.all_sent().t_ns[last + 1]) > stopped["stopped_t_ns"]
 
 
 def test_a_session_is_stopped_once(running: Running, tared: FakeNode) -> None:
-    session = start(running)
-    stop(running, session)
-    answer = running.http.post(f"/sessions/{session['id']}/stop")
+    session = tared.record()
+    session.stop()
+    answer = running.http.post(f"{session.url}/stop")
     assert answer.status_code == 409
     assert "stopped already" in answer.json()["detail"]
 
@@ -197,213 +136,175 @@ def test_an_unknown_node_is_not_found(
 
 
 def test_a_session_that_is_stopped_while_the_node_is_away_completes_when_it_is_back(
-    running: Running, tared: FakeNode, until: Until
+    tared: FakeNode,
 ) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+    session = tared.record()
+    tared.deliver(50)
     tared.leave()
     tared.frames(80)  # taken before the stop, on the node only
-    assert stop(running, session)["state"] == "pending"
-    ledger = running.http.get(f"/sessions/{session['id']}/ledger").json()
+    assert session.stop()["state"] == "pending"
+    ledger = session.ledger()
     assert ledger["complete"] is False
     tared.frames(40, now=True)
     assert tared.connect() == [(120, None)]
     for batch in tared.sent[-2:]:
         tared.send_again(batch)
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert sealed["complete"] is True
-    assert_same(frames_of(running, session), tared.all_sent().rows(70, 200))
+    assert_same_bits(session.frames(), tared.all_sent().rows(70, 200))
 
 
-def test_a_gap_within_a_session_is_waited_for(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
+def test_a_gap_within_a_session_is_waited_for(tared: FakeNode) -> None:
+    session = tared.record()
     tared.send(50)
     gap = tared.frames(30)
-    tared.send(50)
-    taken_in(running, tared, until)
-    stop(running, session)
+    tared.deliver(50)
+    session.stop()
     tared.send(10, now=True)
-    until(lambda: running.session(session["id"])["parts"][0]["seq_last"] == 199)
-    ledger = running.http.get(f"/sessions/{session['id']}/ledger").json()
+    until(lambda: session.now()["parts"][0]["seq_last"] == 199)
+    ledger = session.ledger()
     assert ledger["parts"][0]["pending"] == 30
-    assert running.session(session["id"])["state"] == "pending"
+    assert session.now()["state"] == "pending"
     tared.send_again(gap)
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert sealed["complete"] is True
-    assert_same(frames_of(running, session), tared.all_sent().rows(70, 200))
+    assert_same_bits(session.frames(), tared.all_sent().rows(70, 200))
 
 
-def test_frames_that_the_node_has_evicted_are_lost_and_said_to_be(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
+def test_frames_that_the_node_has_evicted_are_lost_and_said_to_be(tared: FakeNode) -> None:
+    session = tared.record()
     tared.send(50)
     tared.frames(30)
-    tared.send(50)
-    taken_in(running, tared, until)
-    stop(running, session)
+    tared.deliver(50)
+    session.stop()
     tared.send(10, now=True)
-    tared.socket.send(
-        json.dumps({"type": "lost", "boot_id": tared.boot_id, "lost": {"evicted": [[0, 149]]}})
-    )
-    sealed = running.sealed(session["id"])
+    tared.say_lost(evicted=[[0, 149]])
+    sealed = session.sealed()
     assert sealed["complete"] == "lossy"
     assert sealed["frames"] == 100
-    ledger = running.http.get(f"/sessions/{session['id']}/ledger").json()
+    ledger = session.ledger()
     assert ledger["parts"][0]["lost"] == {"evicted": 30}
-    assert 120 not in frames_of(running, session).seq
+    assert 120 not in session.frames().seq
 
 
-def test_a_node_that_is_switched_on_anew_goes_on_in_a_second_part(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
-    first = tared.send(100, 10.0)
-    tared.acknowledged(169)
+def test_a_node_that_is_switched_on_anew_goes_on_in_a_second_part(tared: FakeNode) -> None:
+    session = tared.record()
+    first = tared.deliver(100, 10.0)
     first_boot_id = tared.boot_id
     tared.leave()
     tared.reboot()
     assert tared.connect() == [(0, None)]
-    second = tared.send(60, 10.0)
-    taken_in(running, tared, until)
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
+    second = tared.deliver(60, 10.0)
+    sealed = tared.finish(session)
     assert sealed["complete"] == "lossy"
     assert [part["boot_id"] for part in sealed["parts"]] == [first_boot_id, tared.boot_id]
-    found = frames_of(running, session)
-    assert_same(found, FrameBatch.concatenate([first, second]))
-    np.testing.assert_array_equal(column(running, session, "part"), [0] * 100 + [1] * 60)
-    ledger = running.http.get(f"/sessions/{session['id']}/ledger").json()
+    found = session.frames()
+    assert_same_bits(found, FrameBatch.concatenate([first, second]))
+    np.testing.assert_array_equal(session.column("part"), [0] * 100 + [1] * 60)
+    ledger = session.ledger()
     assert [part["recorded"] for part in ledger["parts"]] == [100, 60]
     assert ledger["parts"][0]["unsynced_tail_max"] >= 1
     assert ledger["lossy"] is True
 
 
 def test_a_node_that_comes_back_with_other_tiles_ends_its_recording(
-    running: Running, tared: FakeNode, node_of: Callable[..., FakeNode], until: Until
+    running: Running, tared: FakeNode, node_of: NodeOf
 ) -> None:
-    session = start(running)
-    first = tared.send(100, 10.0)
-    tared.acknowledged(169)
+    session = tared.record()
+    first = tared.deliver(100, 10.0)
     tared.leave()
     other = node_of(running, tiles=3)
     other.connect()
     other.send(30)
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert len(sealed["parts"]) == 1
-    assert_same(frames_of(running, session), first)
+    assert_same_bits(session.frames(), first)
 
 
 def test_another_session_takes_up_a_recording_whose_node_came_back_with_other_tiles(
-    running: Running, tared: FakeNode, node_of: Callable[..., FakeNode], until: Until
+    running: Running, tared: FakeNode, node_of: NodeOf
 ) -> None:
-    session = start(running, name="mud", subject="leg 2", tags=["wet"])
-    tared.send(100, 10.0)
-    tared.acknowledged(169)
+    session = tared.record(name="mud", subject="leg 2", tags=["wet"])
+    tared.deliver(100, 10.0)
     tared.leave()
     other = node_of(running, tiles=3)
     other.connect()
     new = other.send(30)
-    sessions = running.http.get("/sessions").json()["items"]
-    (taken_up,) = [s for s in sessions if s["id"] != session["id"]]
+    taken_up = running.only_session(but=session)
     assert taken_up["state"] == "recording"
-    assert (taken_up["name"], taken_up["subject"], taken_up["tags"]) == (
-        "mud (2)",
-        "leg 2",
-        ["wet"],
-    )
-    taken_in(running, other, until)
-    stop(running, taken_up)
-    other.send(10, now=True)
-    sealed = running.sealed(taken_up["id"])
-    assert sealed["complete"] is True
-    frames = frames_of(running, taken_up)
-    assert_same(frames.rows(0, 30), new)
+    kept = {"name": "mud (2)", "subject": "leg 2", "tags": ["wet"]}
+    assert {name: taken_up[name] for name in kept} == kept
+    other.taken_in()
+    assert other.finish(taken_up)["complete"] is True
+    assert_same_bits(taken_up.frames().rows(0, 30), new)
 
 
 def test_a_stream_that_ended_in_order_leaves_no_doubt_about_its_end(
-    running: Running, tared: FakeNode, node_of: Callable[..., FakeNode]
+    running: Running, tared: FakeNode, node_of: NodeOf
 ) -> None:
-    session = start(running)
-    tared.send(100, 10.0)
-    tared.acknowledged(169)
+    session = tared.record()
+    tared.deliver(100, 10.0)
     tared.leave()
     other = node_of(running, tiles=3)
     tared.reboot()
     other.connect(earlier=(tared.before[0].said(held=()),))
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert sealed["parts"][0]["seq_last"] == 169
     assert sealed["complete"] is True, "nothing can be missing behind an end that was told"
 
 
 def test_a_recording_goes_on_over_a_restart_of_the_server(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
-    tared.send(50, 10.0)
-    tared.acknowledged(119)
+    session = tared.record()
+    tared.deliver(50, 10.0)
     running.restart()
-    assert running.session(session["id"])["state"] == "recording"
+    assert session.now()["state"] == "recording"
     tared.frames(20, 10.0)
     [(first, _)] = tared.connect()
     assert first == 120
     tared.send_again(tared.sent[-1])
-    tared.send(30, 10.0)
-    taken_in(running, tared, until)
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
+    tared.deliver(30, 10.0)
+    sealed = tared.finish(session)
     assert sealed["complete"] is True
-    assert_same(frames_of(running, session), tared.all_sent().rows(70, 170))
-    assert len(running.http.get("/sessions").json()["items"]) == 1
-    assert column(running, session, "force_n_0")[30:70] == pytest.approx(np.full(40, 10.0), abs=0.1)
+    assert_same_bits(session.frames(), tared.all_sent().rows(70, 170))
+    assert len(running.sessions()) == 1
+    assert session.column("force_n_0")[30:70] == pytest.approx(np.full(40, 10.0), abs=0.1)
 
 
 def test_a_server_that_was_down_during_the_stop_of_a_session_seals_it_later(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
-    stop(running, session)
+    session = tared.record()
+    tared.deliver(50)
+    session.stop()
     running.restart()
-    assert running.session(session["id"])["state"] == "pending"
+    assert session.now()["state"] == "pending"
     tared.connect()
     tared.send(10, now=True)
-    assert running.sealed(session["id"])["frames"] == 50
+    assert session.sealed()["frames"] == 50
 
 
-def test_a_pre_roll_begins_earlier(running: Running, tared: FakeNode, until: Until) -> None:
-    tared.send(500)
-    taken_in(running, tared, until)
-    session = start(running, pre_roll_s=0.2)
+def test_a_pre_roll_begins_earlier(tared: FakeNode) -> None:
+    tared.deliver(500)
+    session = tared.record(pre_roll_s=0.2)
     first = session["parts"][0]["seq_first"]
     # Roughly: by whole messages of ten frames.
     assert 570 - 100 - 11 <= first <= 570 - 100
-    tared.send(50)
-    taken_in(running, tared, until)
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
+    tared.deliver(50)
+    sealed = tared.finish(session)
     assert sealed["complete"] is True
-    assert_same(frames_of(running, session), tared.all_sent().rows(first, 620))
+    assert_same_bits(session.frames(), tared.all_sent().rows(first, 620))
 
 
-def test_a_pre_roll_reaches_no_further_than_what_is_held(running: Running, tared: FakeNode) -> None:
-    assert start(running, pre_roll_s=600)["parts"][0]["seq_first"] == 0
+def test_a_pre_roll_reaches_no_further_than_what_is_held(tared: FakeNode) -> None:
+    assert tared.record(pre_roll_s=600)["parts"][0]["seq_first"] == 0
 
 
-def test_a_tare_under_load_is_refused_and_names_the_tile(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
+def test_a_tare_under_load_is_refused_and_names_the_tile(running: Running, tared: FakeNode) -> None:
     # Longer than the ten seconds that a tare looks back.
     tared.next_t_mono_ns += 11_000_000_000
-    tared.send(300, [0.0, 40.0])
-    taken_in(running, tared, until)
+    tared.deliver(300, [0.0, 40.0])
     answer = running.http.post("/nodes/bench/tare", json={})
     assert answer.status_code == 409
     assert "T02" in answer.json()["detail"]
@@ -412,7 +313,7 @@ def test_a_tare_under_load_is_refused_and_names_the_tile(
 
 
 def test_a_tare_without_load_is_in_force_until_it_is_undone(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
     def force_n() -> list[float]:
         with running.socket("/api/v1/live?rate_hz=60") as live:
@@ -426,7 +327,7 @@ def test_a_tare_without_load_is_in_force_until_it_is_undone(
     by_lead = running.node()["tare"]
     tared.next_t_mono_ns += 11_000_000_000
     tared.send(300, 2.0, alive=True)  # warmer by two counts
-    taken_in(running, tared, until)
+    tared.taken_in()
     answer = running.http.post("/nodes/bench/tare", json={})
     assert answer.status_code == 201, answer.text
     tare = answer.json()
@@ -456,87 +357,66 @@ def test_a_node_that_is_away_is_not_tared(running: Running, tared: FakeNode) -> 
     assert "away" in answer.json()["detail"]
 
 
-def test_a_tare_during_a_recording_serves_from_then_on(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
-    tared.send(300, 2.0, alive=True, now=True)
-    taken_in(running, tared, until)
+def test_a_tare_during_a_recording_serves_from_then_on(running: Running, tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(300, 2.0, alive=True, now=True)
     answer = running.http.post("/nodes/bench/tare", json={})
     assert answer.status_code == 201, answer.text
-    tared.send(100, 2.0)
-    taken_in(running, tared, until)
+    tared.deliver(100, 2.0)
     # The stop has to lie after them on the node's clock, too.
     until(lambda: time.monotonic_ns() > tared.next_t_mono_ns)
-    stop(running, session)
-    tared.send(10, now=True)
-    running.sealed(session["id"])
-    force_n = column(running, session, "force_n_0")
+    tared.finish(session)
+    force_n = session.column("force_n_0")
     assert len(force_n) == 400
     assert force_n[50:200] == pytest.approx(np.full(150, 2.0), abs=0.01)
     assert force_n[330:390] == pytest.approx(np.zeros(60), abs=0.01)
-    with reader(running, session) as file:
+    with session.reader() as file:
         assert [tare["source"] for tare in file.notes["tares"]] == ["lead", "unloaded"]
 
 
 def test_what_people_say_of_a_session_outlives_the_server(
     running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
+    session = tared.record()
     change = {"name": "new", "subject": "B", "notes": "zwei\nZeilen", "tags": ["a", "b"]}
-    answer = running.http.patch(f"/sessions/{session['id']}", json=change)
+    answer = running.http.patch(session.url, json=change)
     assert answer.status_code == 200
     running.restart()
-    found = running.session(session["id"])
+    found = session.now()
     assert {name: found[name] for name in change} == change
-    partly = running.http.patch(f"/sessions/{session['id']}", json={"notes": ""}).json()
+    partly = running.http.patch(session.url, json={"notes": ""}).json()
     assert (partly["name"], partly["notes"]) == ("new", "")
 
 
-def test_a_renamed_session_keeps_its_data(running: Running, tared: FakeNode, until: Until) -> None:
-    session = start(running)
-    tared.send(20)
-    taken_in(running, tared, until)
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
-    answer = running.http.patch(f"/sessions/{session['id']}", json={"name": "other"}).json()
+def test_a_renamed_session_keeps_its_data(running: Running, tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(20)
+    sealed = tared.finish(session)
+    answer = running.http.patch(session.url, json={"name": "other"}).json()
     assert answer["name"] == "other"
     assert answer["sha256"] == sealed["sha256"]
 
 
-def test_an_event_after_sealing_is_in_the_events_file(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
-    url = f"/sessions/{session['id']}/events"
+def test_an_event_after_sealing_is_in_the_events_file(running: Running, tared: FakeNode) -> None:
+    session = tared.record()
+    url = f"{session.url}/events"
     running.http.post(url, json={"label": "before", "t_ns": 2})
-    tared.send(20)
-    taken_in(running, tared, until)
-    stop(running, session)
-    tared.send(10, now=True)
-    running.sealed(session["id"])
-    path = running.data / "sessions" / session["id"] / "events.parquet"
+    tared.deliver(20)
+    tared.finish(session)
+    path = session.folder / "events.parquet"
     assert pq.read_table(path)["label"].to_pylist() == ["before"]
     running.http.post(url, json={"label": "after", "t_ns": 1})
-    assert sorted(pq.read_table(path)["label"].to_pylist()) == ["after", "before"]
+    assert sorted(map(str, pq.read_table(path)["label"].to_pylist())) == ["after", "before"]
     listed = running.http.get(url).json()["items"]
     assert [event["label"] for event in listed] == ["after", "before"]  # in order of time
 
 
-def test_clock_measurements_are_kept_beside_the_session(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
-    tared.socket.send(
-        '{"type":"clock","t_mono_ns":5,"server_minus_node_ns":1000,"uncertainty_ns":7}'
-    )
-    tared.send(20)
-    taken_in(running, tared, until)
-    stop(running, session)
-    tared.send(10, now=True)
-    running.sealed(session["id"])
-    path = running.data / "sessions" / session["id"] / "clock.parquet"
+def test_clock_measurements_are_kept_beside_the_session(tared: FakeNode) -> None:
+    session = tared.record()
+    tared.say_clock(1000, t_mono_ns=5)
+    tared.deliver(20)
+    tared.finish(session)
+    path = session.folder / "clock.parquet"
     at_connecting, later = pq.read_table(path).to_pylist()
     assert at_connecting["server_minus_node_ns"] == 0
     assert [later] == [
@@ -550,125 +430,95 @@ def test_clock_measurements_are_kept_beside_the_session(
 
 
 def test_clock_measurements_outlive_the_server_without_rewriting_the_session_each_time(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
-    written = (running.data / "sessions" / session["id"] / "session.json").read_bytes()
+    session = tared.record()
+    written = (session.folder / "session.json").read_bytes()
     for number in range(3):
-        row = {"t_mono_ns": 10**15 + number, "server_minus_node_ns": number, "uncertainty_ns": 7}
-        tared.socket.send(json.dumps({"type": "clock", **row}))
-    tared.send(20)
-    taken_in(running, tared, until)
-    assert (running.data / "sessions" / session["id"] / "session.json").read_bytes() == written
+        tared.say_clock(number, t_mono_ns=10**15 + number)
+    tared.deliver(20)
+    assert (session.folder / "session.json").read_bytes() == written
     running.restart()
     tared.connect()
-    stop(running, session)
-    tared.send(10, now=True)
-    running.sealed(session["id"])
-    path = running.data / "sessions" / session["id"] / "clock.parquet"
+    tared.finish(session)
+    path = session.folder / "clock.parquet"
     offsets = pq.read_table(path)["server_minus_node_ns"].to_pylist()
     assert offsets == [0, 0, 1, 2, 0]  # at connecting, three later, and after the restart
 
 
-def test_a_pre_roll_has_the_clock_measurements_of_its_time(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
+def test_a_pre_roll_has_the_clock_measurements_of_its_time(tared: FakeNode) -> None:
     begin_ns = int(tared.sent[0].t_mono_ns[0])
     for number, t_mono_ns in enumerate((-2000, -1000, 10_000_000, 20_000_000)):
-        row = {
-            "t_mono_ns": begin_ns + t_mono_ns,
-            "server_minus_node_ns": number,
-            "uncertainty_ns": 7,
-        }
-        tared.socket.send(json.dumps({"type": "clock", **row}))
-    tared.send(20)
-    taken_in(running, tared, until)
-    session = start(running, pre_roll_s=600)
-    found = json.loads((running.data / "sessions" / session["id"] / "session.json").read_bytes())
+        tared.say_clock(number, t_mono_ns=begin_ns + t_mono_ns)
+    tared.deliver(20)
+    session = tared.record(pre_roll_s=600)
+    found = json.loads((session.folder / "session.json").read_bytes())
     assert [row["server_minus_node_ns"] for row in found["clock"]] == [1, 2, 3]
 
 
-def test_a_session_ends_by_the_servers_clock(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
+def test_a_session_ends_by_the_servers_clock(tared: FakeNode) -> None:
     # The node's clock is an hour behind; it says so.
     hour_ns = 3_600_000_000_000
     tared.leave()
     tared.reboot()
     tared.utc_offset_ns -= hour_ns
     tared.connect()
-    row = {"t_mono_ns": 5, "server_minus_node_ns": hour_ns, "uncertainty_ns": 7}
-    tared.socket.send(json.dumps({"type": "clock", **row}))
-    tared.send(20)
-    taken_in(running, tared, until)
-    session = start(running)
-    tared.send(30)
-    taken_in(running, tared, until)
-    stop(running, session)
+    tared.say_clock(hour_ns, t_mono_ns=5)
+    tared.deliver(20)
+    session = tared.record()
+    tared.deliver(30)
+    session.stop()
     tared.send(10, now=True)
-    assert running.sealed(session["id"])["frames"] == 30
+    assert session.sealed()["frames"] == 30
 
 
 def test_a_session_without_calibration_is_sealed_raw_and_says_why(
-    running: Running, node_of: Callable[..., FakeNode], until: Until
+    running: Running, node_of: NodeOf
 ) -> None:
     node = node_of(running, calibration=None)
     node.connect()
-    node.send(10)
-    taken_in(running, node, until)
-    session = start(running)
-    node.send(50)
-    taken_in(running, node, until)
-    stop(running, session)
-    node.send(10, now=True)
-    sealed = running.sealed(session["id"])
+    node.deliver(10)
+    session = running.record()
+    node.deliver(50)
+    sealed = node.finish(session)
     assert sealed["complete"] is True
     assert sealed["calibration_id"] is None
     assert sealed["absolute_scale"] is None
     assert "no estimates" in sealed["problem"]
-    assert_same(frames_of(running, session), node.all_sent().rows(10, 60))
-    path = running.data / "sessions" / session["id"] / "frames.parquet"
+    assert_same_bits(session.frames(), node.all_sent().rows(10, 60))
+    path = session.folder / "frames.parquet"
     assert not any(name.startswith("force_n") for name in pq.read_schema(path).names)
-    with reader(running, session) as file:
+    with session.reader() as file:
         assert "no estimates" in file.notes["estimates"]
 
 
-def test_a_session_without_tare_is_sealed_raw_and_says_why(
-    running: Running, node: FakeNode, until: Until
-) -> None:
+def test_a_session_without_tare_is_sealed_raw_and_says_why(node: FakeNode) -> None:
     node.connect()
-    node.send(10, 50.0)
-    taken_in(running, node, until)
-    session = start(running)
-    node.send(50, 50.0)
-    taken_in(running, node, until)
-    stop(running, session)
+    node.deliver(10, 50.0)
+    session = node.record()
+    node.deliver(50, 50.0)
+    session.stop()
     node.send(10, 50.0, now=True)
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert "no estimates" in sealed["problem"]
     assert sealed["frames"] == 50
 
 
-def test_a_part_without_frames_has_lost_none(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
+def test_a_part_without_frames_has_lost_none(tared: FakeNode) -> None:
+    session = tared.record()
     tared.leave()
     tared.reboot()
     tared.connect()
-    tared.send(20)
-    taken_in(running, tared, until)
-    ledger = running.http.get(f"/sessions/{session['id']}/ledger").json()
+    tared.deliver(20)
+    ledger = session.ledger()
     assert ledger["parts"][0]["recorded"] == 0
     assert ledger["parts"][0]["lost"] == {}
     assert ledger["parts"][1]["recorded"] == 20
 
 
-def test_a_session_without_frames_says_so(running: Running, tared: FakeNode) -> None:
-    session = start(running)
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
+def test_a_session_without_frames_says_so(tared: FakeNode) -> None:
+    session = tared.record()
+    sealed = tared.finish(session)
     assert sealed["problem"] == "not one frame was recorded"
     assert sealed["frames"] == 0
     assert sealed["complete"] is True
@@ -680,8 +530,8 @@ def test_a_session_without_frames_says_so(running: Running, tared: FakeNode) -> 
 def test_what_people_write_comes_back_as_it_is(
     running: Running, tared: FakeNode, text: str
 ) -> None:
-    session = start(running, name=text, notes=text)
-    url = f"/sessions/{session['id']}"
+    session = tared.record(name=text, notes=text)
+    url = session.url
     running.http.post(f"{url}/events", json={"label": text})
     answer = running.http.get(url)
     assert answer.headers["content-type"] == "application/json"
@@ -692,12 +542,11 @@ def test_what_people_write_comes_back_as_it_is(
 
 
 def test_a_session_is_sealed_again_when_the_disk_was_full(
-    running: Running, tared: FakeNode, until: Until, monkeypatch: pytest.MonkeyPatch
+    tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import service.server.recorder
     from devices.errors import StorageError
 
-    seal = service.server.recorder.seal
     tried = threading.Event()
 
     def refusing(*arguments: Any) -> Any:
@@ -708,13 +557,12 @@ def test_a_session_is_sealed_again_when_the_disk_was_full(
 
     monkeypatch.setattr(service.server.recorder, "seal", refusing)
     monkeypatch.setattr(service.server.recorder, "_SEAL_AGAIN_S", 0.2)
-    session = start(running)
-    tared.send(20)
-    taken_in(running, tared, until)
-    stop(running, session)
+    session = tared.record()
+    tared.deliver(20)
+    session.stop()
     tared.send(10, now=True)
-    until(lambda: "No space left" in (running.session(session["id"])["problem"] or ""))
-    sealed = running.sealed(session["id"])
+    until(lambda: "No space left" in (session.now()["problem"] or ""))
+    sealed = session.sealed()
     assert sealed["frames"] == 20
     assert sealed["problem"] is None
 
@@ -722,44 +570,38 @@ def test_a_session_is_sealed_again_when_the_disk_was_full(
 # What a hostile tester found
 
 
-def test_tares_count_by_the_frames_own_time_however_wrong_the_nodes_date_is(
-    running: Running, node: FakeNode, until: Until
-) -> None:
+def test_tares_count_by_the_frames_own_time_however_wrong_the_nodes_date_is(node: FakeNode) -> None:
     years_ns = 4 * 365 * 86_400 * 1_000_000_000
     node.utc_offset_ns += years_ns
     node.connect()
-    row = {"type": "clock", "t_mono_ns": 5, "uncertainty_ns": 7}
-    node.socket.send(json.dumps(row | {"server_minus_node_ns": -years_ns}))
+    node.say_clock(-years_ns, t_mono_ns=5)
     node.tared()
-    taken_in(running, node, until)
-    session = start(running)
-    node.send(300, [10.0, 10.0])
-    taken_in(running, node, until)
+    node.taken_in()
+    session = node.record()
+    node.deliver(300, [10.0, 10.0])
     node.leave()
-    stop(running, session)
+    session.stop()
     node.reboot()  # and its clock's offset is not known when the session is sealed
     node.connect()
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert sealed["problem"] is None
-    np.testing.assert_allclose(column(running, session, "force_n_0"), 10.0, atol=0.1)
+    np.testing.assert_allclose(session.column("force_n_0"), 10.0, atol=0.1)
 
 
-def test_a_recording_keeps_the_calibration_it_was_begun_with(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
-    tared.send(200, [10.0, 10.0])
-    taken_in(running, tared, until)
+def test_a_recording_keeps_the_calibration_it_was_begun_with(tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(200, [10.0, 10.0])
     tared.leave()
-    stop(running, session)
+    session.stop()
     tared.reboot()
-    tripled = tared.hello().calibration.tiles
-    tripled = tuple(t.model_copy(update={"f_scale_n": 3.0 * t.f_scale_n}) for t in tripled)
-    tared.calibration = tared.hello().calibration.model_copy(update={"tiles": tripled})
+    before = tared.hello().calibration
+    assert before is not None
+    tripled = [t.model_copy(update={"f_scale_n": 3.0 * t.f_scale_n}) for t in before.tiles]
+    tared.calibration = before.model_copy(update={"tiles": tuple(tripled)})
     tared.connect()
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert sealed["calibration_id"] != tared.calibration.id
-    np.testing.assert_allclose(column(running, session, "force_n_0"), 10.0, atol=0.1)
+    np.testing.assert_allclose(session.column("force_n_0"), 10.0, atol=0.1)
 
 
 def test_a_node_that_is_still_catching_up_is_not_recorded(
@@ -772,19 +614,17 @@ def test_a_node_that_is_still_catching_up_is_not_recorded(
 
 
 def test_why_a_recording_ended_is_said_together_with_why_it_has_no_estimates(
-    running: Running, node_of: Callable[..., FakeNode], until: Until
+    running: Running, node_of: NodeOf
 ) -> None:
     node = node_of(running, calibration=None)
     node.connect()
-    node.send(50)
-    taken_in(running, node, until)
-    session = start(running)
-    node.send(50)
-    taken_in(running, node, until)
+    node.deliver(50)
+    session = running.record()
+    node.deliver(50)
     node.leave()
     node.reboot()
     node.tiles += 1
     node.connect()
-    problem = running.sealed(session["id"])["problem"]
+    problem = session.sealed()["problem"]
     assert "other tiles" in problem
     assert "no estimates" in problem

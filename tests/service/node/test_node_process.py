@@ -16,17 +16,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus, TileStatus
+from devices.frames import NO_SERVO_COUNTS, FrameStatus, TileStatus
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
-from storage.sessions.file import SessionReader
+from tests.service.process import Start
+from tests.service.running import Running
+from tests.waiting import until
 
 pytestmark = pytest.mark.real_time
-
-Running = Any
-Until = Callable[..., Any]
-Foottile = Callable[..., Any]
 
 
 @pytest.fixture
@@ -52,7 +50,7 @@ def is_alive(pid: int) -> bool:
 
 
 def test_an_emulated_node_streams_tares_and_ends_without_loss(
-    running: Running, foottile: Foottile, scene: Path, until: Until
+    running: Running, foottile: Start, scene: Path
 ) -> None:
     process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
     process.said("connected to")
@@ -76,7 +74,7 @@ def test_an_emulated_node_streams_tares_and_ends_without_loss(
 
 
 def test_a_servo_that_is_silent_from_the_start_is_said_and_the_tiles_stream(
-    running: Running, foottile: Foottile, scene: Path, until: Until
+    running: Running, foottile: Start, scene: Path
 ) -> None:
     master, slave = pty.openpty()
     try:
@@ -99,7 +97,7 @@ def test_a_servo_that_is_silent_from_the_start_is_said_and_the_tiles_stream(
 
 
 def test_a_tile_that_does_not_answer_is_named(
-    running: Running, foottile: Foottile, scene: Path
+    running: Running, foottile: Start, scene: Path
 ) -> None:
     fault = '\n[[fault]]\ntile = "T03"\nkind = "no_answer"\nt_s = 0.0\nduration_s = 1000.0\n'
     scene.write_text(scene.read_text() + fault)
@@ -118,9 +116,7 @@ def test_a_tile_that_does_not_answer_is_named(
     ],
     ids=str,
 )
-def test_a_node_that_cannot_be_started_says_so(
-    foottile: Foottile, arguments: tuple[str, ...]
-) -> None:
+def test_a_node_that_cannot_be_started_says_so(foottile: Start, arguments: tuple[str, ...]) -> None:
     process = foottile("node", *arguments)
     assert process.ended(20.0) == 2
     assert process.err
@@ -128,7 +124,7 @@ def test_a_node_that_cannot_be_started_says_so(
 
 
 def test_acquisition_ends_when_its_node_is_killed(
-    running: Running, foottile: Foottile, scene: Path, until: Until
+    running: Running, foottile: Start, scene: Path
 ) -> None:
     process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
     process.said("connected to")
@@ -142,7 +138,7 @@ def test_acquisition_ends_when_its_node_is_killed(
 
 
 def test_a_node_without_a_server_keeps_its_frames(
-    running: Running, foottile: Foottile, scene: Path, tmp_path: Path, until: Until
+    running: Running, foottile: Start, scene: Path, tmp_path: Path
 ) -> None:
     running.stop()
     process = foottile(
@@ -161,7 +157,7 @@ def test_a_node_without_a_server_keeps_its_frames(
 
 
 @pytest.fixture
-def leg(running: Running, foottile: Foottile, scene: Path, tmp_path: Path) -> Callable[..., Any]:
+def leg(running: Running, foottile: Start, scene: Path, tmp_path: Path) -> Callable[..., Any]:
     """A node with a journal that outlives it."""
 
     def start(*arguments: object) -> Any:
@@ -173,7 +169,7 @@ def leg(running: Running, foottile: Foottile, scene: Path, tmp_path: Path) -> Ca
     return start
 
 
-def streaming(running: Running, until: Until, more: int = 100) -> dict[str, Any]:
+def streaming(running: Running, more: int = 100) -> dict[str, Any]:
     """Wait until the server has seen this many frames of the node's present stream."""
     until(lambda: running.http.get("/nodes/leg").status_code == 200, 30.0)
     until(lambda: running.node("leg")["connected"], 30.0)
@@ -183,21 +179,20 @@ def streaming(running: Running, until: Until, more: int = 100) -> dict[str, Any]
 
 
 def test_a_killed_node_has_lost_nothing_and_its_session_goes_on(
-    running: Running, leg: Callable[..., Any], until: Until
+    running: Running, leg: Callable[..., Any]
 ) -> None:
     process = leg()
-    before = streaming(running, until)
-    session = running.http.post("/sessions", json={"node": "leg", "name": "killed"}).json()
+    before = streaming(running)
+    session = running.record("leg", name="killed")
     until(lambda: running.node("leg")["last_seq"] > before["last_seq"] + 200, 30.0)
     seen = running.node("leg")["last_seq"]
     process.process.kill()
     until(lambda: not running.node("leg")["connected"], 15.0)
     again = leg()
     until(lambda: running.node("leg")["boot_id"] != before["boot_id"], 30.0)
-    streaming(running, until)
-    running.http.post(f"/sessions/{session['id']}/stop")
-    until(lambda: running.session(session["id"])["state"] == "sealed", 40.0)
-    found = running.session(session["id"])
+    streaming(running)
+    session.stop()
+    found = session.sealed(40.0)
     assert (found["complete"], len(found["parts"])) == (True, 2)
     assert found["parts"][0]["seq_last"] >= seen
     again.process.send_signal(signal.SIGTERM)
@@ -205,28 +200,26 @@ def test_a_killed_node_has_lost_nothing_and_its_session_goes_on(
 
 
 def test_what_a_session_needs_waits_on_the_nodes_disk_until_both_are_back(
-    running: Running, leg: Callable[..., Any], until: Until
+    running: Running, leg: Callable[..., Any]
 ) -> None:
     process = leg()
-    streaming(running, until)
-    session = running.http.post("/sessions", json={"node": "leg", "name": "apart"}).json()
+    streaming(running)
+    session = running.record("leg", name="apart")
     running.stop()
     process.said("not connected to")
     process.process.send_signal(signal.SIGINT)
     assert process.ended(20.0) == 3
     assert any("wait on this disk" in line for line in process.err)
     running.start()
-    running.http.post(f"/sessions/{session['id']}/stop")
-    assert running.session(session["id"])["state"] == "pending"
+    assert session.stop()["state"] == "pending"
     again = leg()
-    until(lambda: running.session(session["id"])["state"] == "sealed", 40.0)
-    assert running.session(session["id"])["complete"] is True
+    assert session.sealed(40.0)["complete"] is True
     again.process.send_signal(signal.SIGTERM)
     assert again.ended(20.0) == 0, again.err
 
 
 def test_a_node_alone_leaves_a_complete_session_that_proves_itself(
-    leg: Callable[..., Any], foottile: Foottile, tmp_path: Path, until: Until
+    leg: Callable[..., Any], foottile: Start, tmp_path: Path
 ) -> None:
     process = leg("--record", "third trial")
     until(lambda: list((tmp_path / "node").glob("journal/leg/*/*.arrows")), 30.0)
@@ -244,43 +237,36 @@ def test_a_node_alone_leaves_a_complete_session_that_proves_itself(
     assert (session["complete"], len(session["parts"])) == (True, 2)
 
 
-def frames_of(running: Running, session_id: str) -> FrameBatch:
-    path = running.data / "sessions" / session_id / "frames.parquet"
-    with SessionReader(path) as file:
-        return file.frames()
-
-
 def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old_one(
-    running: Running, foottile: Foottile, scene: Path, until: Until
+    running: Running, foottile: Start, scene: Path
 ) -> None:
     swap = '\n[[fault]]\nkind = "replaced"\ntile = "T02"\nt_s = 6.0\nduration_s = 0.5\n'
     scene.write_text(scene.read_text() + swap)
     process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
     process.said("connected to")
     until(lambda: running.node("demo")["tare"], 40.0)
-    answer = running.http.post("/sessions", json={"node": "demo", "name": "swap"})
-    assert answer.status_code == 201, answer.text
+    session = running.record("demo", name="swap")
     process.said("a new stream begins", 40.0)
-    sealed = running.sealed(answer.json()["id"])
+    sealed = session.sealed()
     assert sealed["complete"] is True
     assert "other tiles" in sealed["problem"]
-    first = frames_of(running, sealed["id"])
+    first = session.frames()
     tile = first.status[-20:, 1]
     assert (tile & TileStatus.UNUSABLE != 0).all(), "of the other part nothing was believed"
     assert (first.status[:, 0] & TileStatus.UNUSABLE == 0).all()
     until(lambda: (running.node("demo")["last_seq"] or 0) > 200, 30.0)
-    (second,) = running.http.get("/sessions").json()["items"][:1]
+    second = running.only_session(but=session)
     assert (second["name"], second["state"]) == ("swap (2)", "recording")
-    running.http.post(f"/sessions/{second['id']}/stop")
-    running.sealed(second["id"])
-    again = frames_of(running, second["id"])
+    second.stop()
+    second.sealed()
+    again = second.frames()
     assert again.frame_status[0] & FrameStatus.NEW_ARRAY_INFO
     assert not (again.frame_status[1:] & FrameStatus.NEW_ARRAY_INFO).any()
     assert (again.status[20:, 1] & TileStatus.UNUSABLE == 0).mean() > 0.99
 
 
 def test_a_tile_that_dies_is_named_on_the_terminal_and_by_the_server_and_so_is_its_return(
-    running: Running, foottile: Foottile, scene: Path, until: Until
+    running: Running, foottile: Start, scene: Path
 ) -> None:
     death = '\n[[fault]]\nkind = "unplugged"\ntile = "T03"\nt_s = 1.0\nduration_s = 2.5\n'
     scene.write_text(scene.read_text() + death)

@@ -41,9 +41,8 @@ from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, decode
-
-Running = Any
-FakeNode = Any
+from tests.service.fake_node import FakeNode, NodeOf
+from tests.service.running import Running, ServeWith
 
 
 @pytest.fixture(autouse=True)
@@ -227,7 +226,7 @@ def test_a_server_that_comes_later_is_found(running: Running, node: FakeNode) ->
 
 
 def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
-    serve_with: Callable[..., Running], node_of: Callable[..., FakeNode]
+    serve_with: ServeWith, node_of: NodeOf
 ) -> None:
     running = serve_with(token="right")  # noqa: S106  # of this test
     node = node_of(running)
@@ -243,9 +242,7 @@ def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
     assert running.http.get("/nodes").json()["items"] == []
 
 
-def test_a_right_token_is_taken(
-    serve_with: Callable[..., Running], node_of: Callable[..., FakeNode]
-) -> None:
+def test_a_right_token_is_taken(serve_with: ServeWith, node_of: NodeOf) -> None:
     running = serve_with(token="right")  # noqa: S106  # of this test
     node = node_of(running)
 
@@ -259,7 +256,7 @@ def test_a_right_token_is_taken(
 
 
 def test_a_name_that_is_taken_is_reported(
-    running: Running, node: FakeNode, node_of: Callable[..., FakeNode]
+    running: Running, node: FakeNode, node_of: NodeOf
 ) -> None:
     node.connect()
     other = node_of(running)
@@ -577,9 +574,7 @@ def another_server(no_threads_left: None) -> Iterator[str]:
         thread.join(5.0)
 
 
-def test_a_server_that_is_not_ours_is_reported_once(
-    another_server: str, running: Running, node: FakeNode
-) -> None:
+def test_a_server_that_is_not_ours_is_reported_once(another_server: str, node: FakeNode) -> None:
     async def scenario() -> list[str]:
         async with Publishing(node, another_server) as publishing:
             await publishing.until(lambda: publishing.reports)

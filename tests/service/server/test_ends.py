@@ -2,66 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-import service.api.routes.sessions
-from devices.frames import FRAME_COLUMNS, FrameBatch
-from storage.sessions.file import SessionReader
-
-Running = Any
-FakeNode = Any
-Until = Callable[..., Any]
-
-
-@pytest.fixture(autouse=True)
-def quick_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stop answers soon: the scripted node sends what passes it only afterwards."""
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.02)
-
-
-def start(running: Running, **body: object) -> dict[str, Any]:
-    answer = running.http.post("/sessions", json={"node": "bench", "name": "trial"} | body)
-    assert answer.status_code == 201, answer.text
-    session: dict[str, Any] = answer.json()
-    return session
-
-
-def stop(running: Running, session: dict[str, Any]) -> dict[str, Any]:
-    answer = running.http.post(f"/sessions/{session['id']}/stop")
-    assert answer.status_code == 200, answer.text
-    content: dict[str, Any] = answer.json()
-    return content
-
-
-def ledger_of(running: Running, session: dict[str, Any]) -> dict[str, Any]:
-    content: dict[str, Any] = running.http.get(f"/sessions/{session['id']}/ledger").json()
-    return content
-
-
-def frames_of(running: Running, session: dict[str, Any]) -> FrameBatch:
-    with SessionReader(running.data / "sessions" / session["id"] / "frames.parquet") as file:
-        return FrameBatch.concatenate([batch for batch, _ in file.batches()])
-
-
-def parts_of(session: dict[str, Any]) -> list[tuple[str, int, int | None]]:
-    return [(part["boot_id"], part["seq_first"], part["seq_last"]) for part in session["parts"]]
-
-
-def assert_same(found: FrameBatch, *sent: FrameBatch) -> None:
-    whole = FrameBatch.concatenate(list(sent))
-    for name in FRAME_COLUMNS:
-        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name), err_msg=name)
-
-
-def taken_in(running: Running, node: FakeNode, until: Until) -> None:
-    until(lambda: running.node(node.name)["last_seq"] == node.seq - 1)
+from devices.frames import FrameBatch
+from tests.builders.frames import assert_same_bits
+from tests.service.fake_node import FakeNode
+from tests.service.recording import parts_of
+from tests.service.running import Running
+from tests.waiting import until
 
 
 def reboot_now(node: FakeNode) -> None:
@@ -70,28 +23,11 @@ def reboot_now(node: FakeNode) -> None:
     node.next_t_mono_ns = time.monotonic_ns()
 
 
-@pytest.fixture
-def tared(running: Running, node: FakeNode, until: Until) -> FakeNode:
-    """A connected node with a tare, all of whose 70 frames have come and are acknowledged."""
-    node.connect()
-    node.tared()
-    node.acknowledged(69)
-    return node
-
-
-def send_lacking(node: FakeNode) -> None:
-    """Send of earlier streams what the server asked for."""
-    for earlier in node.before:
-        for first, last in node.lacks.get(earlier.boot_id, []):
-            node.send_earlier(earlier, first, last)
-
-
 def test_streams_that_were_taken_while_the_link_was_down_are_parts_and_nothing_is_lost(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+    session = tared.record()
+    tared.deliver(50)
     tared.leave()
     tared.frames(30)
     tared.reboot()
@@ -101,13 +37,10 @@ def test_streams_that_were_taken_while_the_link_was_down_are_parts_and_nothing_i
     tared.connect(earlier=(first.said(), second.said()))
     assert tared.lacks[first.boot_id] == [(120, 149)]
     assert tared.lacks[second.boot_id] == [(0, 39)]
-    third = tared.send(20)
-    taken_in(running, tared, until)
-    assert ledger_of(running, session)["parts"][0]["pending"] == 30
-    send_lacking(tared)
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
+    third = tared.deliver(20)
+    assert session.ledger()["parts"][0]["pending"] == 30
+    tared.send_lacking()
+    sealed = tared.finish(session)
     assert sealed["complete"] is True
     assert parts_of(sealed) == [
         (first.boot_id, 70, 149),
@@ -115,178 +48,157 @@ def test_streams_that_were_taken_while_the_link_was_down_are_parts_and_nothing_i
         (tared.boot_id, 0, 19),
     ]
     old = FrameBatch.concatenate(first.sent)
-    assert_same(frames_of(running, session), old.rows(70, 150), *second.sent, third)
-    path = running.data / "sessions" / session["id"] / "frames.parquet"
+    assert_same_bits(
+        session.frames(), FrameBatch.concatenate([old.rows(70, 150), *second.sent, third])
+    )
+    path = session.folder / "frames.parquet"
     column = pq.read_table(path, columns=["part"])["part"].to_numpy()
     np.testing.assert_array_equal(column, [0] * 80 + [1] * 40 + [2] * 20)
     assert running.node()["lost_frames"] == 0
 
 
 def test_it_goes_on_so_although_the_server_is_restarted_between_any_two_steps(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+    session = tared.record()
+    tared.deliver(50)
     running.restart()
     tared.frames(30)
     tared.reboot()
     [first] = tared.before
     tared.connect(earlier=(first.said(held=((120, 149),)),))
-    tared.send(10)
-    tared.acknowledged(9)
+    tared.deliver(10)
     running.restart()
     tared.connect(earlier=(first.said(held=((120, 149),)),))
-    send_lacking(tared)
+    tared.send_lacking()
     while first.boot_id not in tared.acked_of or tared.acked_of[first.boot_id].last != 149:
         tared.receive("ack")
     running.restart()
     tared.connect(earlier=(first.said(held=()),))
-    taken_in(running, tared, until) if tared.seq > 10 else None
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
+    tared.taken_in() if tared.seq > 10 else None
+    sealed = tared.finish(session)
     assert sealed["complete"] is True
     assert parts_of(sealed) == [(first.boot_id, 70, 149), (tared.boot_id, 0, 9)]
 
 
 @pytest.mark.parametrize(("said", "open_tail"), [(250, 200), (30, 0), (50, 0)])
 def test_a_tail_that_a_power_cut_left_open_is_shorter_by_what_the_server_has_of_it(
-    running: Running, tared: FakeNode, said: int, open_tail: int
+    tared: FakeNode, said: int, open_tail: int
 ) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+    session = tared.record()
+    tared.deliver(50)
     tared.leave()
     tared.reboot()
     [first] = tared.before
     # The last fifty frames are here, and were lost there when the power failed.
     tared.connect(earlier=(first.said(held=((0, 69),), next_seq=70, unsynced_tail_max=said),))
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
+    sealed = tared.finish(session)
     assert parts_of(sealed)[0] == (first.boot_id, 70, 119)
-    part = ledger_of(running, session)["parts"][0]
+    part = session.ledger()["parts"][0]
     assert (part["recorded"], part["lost"], part["unsynced_tail_max"]) == (50, {}, open_tail)
     assert sealed["complete"] == ("lossy" if open_tail else True)
     assert sealed["tail_frames_max"] == open_tail
 
 
-def test_what_an_earlier_stream_lost_is_named(running: Running, tared: FakeNode) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+def test_what_an_earlier_stream_lost_is_named(tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(50)
     tared.leave()
     tared.frames(30)
     tared.reboot()
     [first] = tared.before
     lost = {"disk_full": ((120, 129),), "corrupt": ((130, 134),)}
     tared.connect(earlier=(first.said(held=((135, 149),), lost=lost, missed_slots=7),))
-    send_lacking(tared)
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
+    tared.send_lacking()
+    sealed = tared.finish(session)
     assert sealed["complete"] == "lossy"
     assert sealed["lost"] == {"corrupt": 5, "disk_full": 10}
-    ledger = ledger_of(running, session)
+    ledger = session.ledger()
     assert ledger["parts"][0]["recorded"] == 65
     assert ledger["missed_slots"] == 7
 
 
 def test_a_stop_while_the_node_was_away_falls_into_the_stream_that_was_taken_then(
-    running: Running, tared: FakeNode
+    tared: FakeNode,
 ) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+    session = tared.record()
+    tared.deliver(50)
     tared.leave()
     tared.frames(30)
     tared.reboot()
     tared.frames(40)  # long ago, as all before
-    stop(running, session)
+    session.stop()
     tared.frames(25, now=True)
     reboot_now(tared)
     tared.frames(10)
     first, second = tared.before
     tared.connect(earlier=(first.said(), second.said()))
-    send_lacking(tared)
-    sealed = running.sealed(session["id"])
+    tared.send_lacking()
+    sealed = session.sealed()
     assert sealed["complete"] is True
     assert parts_of(sealed) == [(first.boot_id, 70, 149), (second.boot_id, 0, 39)]
 
 
-def test_a_stop_between_two_streams_ends_with_the_first_one(
-    running: Running, tared: FakeNode
-) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+def test_a_stop_between_two_streams_ends_with_the_first_one(tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(50)
     tared.leave()
     tared.frames(30)
-    stop(running, session)
+    session.stop()
     reboot_now(tared)
     tared.frames(10)
     reboot_now(tared)
     first, second = tared.before
     tared.connect(earlier=(first.said(), second.said()))
-    send_lacking(tared)
-    sealed = running.sealed(session["id"])
+    tared.send_lacking()
+    sealed = session.sealed()
     assert sealed["complete"] is True
     assert parts_of(sealed) == [(first.boot_id, 70, 149)]
 
 
-def test_a_stop_that_falls_into_the_present_stream_makes_it_a_part(
-    running: Running, tared: FakeNode
-) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+def test_a_stop_that_falls_into_the_present_stream_makes_it_a_part(tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(50)
     tared.leave()
     tared.reboot()
     tared.frames(40)
-    stop(running, session)
+    session.stop()
     tared.frames(10, now=True)
     [first] = tared.before
     tared.connect(earlier=(first.said(),))
     # The newest first: from them alone nobody knows when the stream began.
     tared.send_again(tared.sent[-1])
-    assert running.session(session["id"])["state"] == "pending"
+    assert session.now()["state"] == "pending"
     tared.send_again(tared.sent[0])
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert sealed["complete"] is True
     assert parts_of(sealed) == [(first.boot_id, 70, 119), (tared.boot_id, 0, 39)]
 
 
-def test_a_stop_in_the_middle_of_what_has_not_come_yet_waits_for_it(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+def test_a_stop_in_the_middle_of_what_has_not_come_yet_waits_for_it(tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(50)
     tared.leave()
     tared.frames(30)
-    stop(running, session)
+    session.stop()
     tared.frames(30, now=True)
     tared.frames(10)
     tared.connect()
     tared.send_again(tared.sent[-1])  # newest first
-    taken_in(running, tared, until)
+    tared.taken_in()
     time.sleep(0.1)
-    assert parts_of(running.session(session["id"])) == [(tared.boot_id, 70, None)]
+    assert parts_of(session.now()) == [(tared.boot_id, 70, None)]
     tared.send_again(tared.sent[-3])
     tared.send_again(tared.sent[-2])
-    sealed = running.sealed(session["id"])
+    sealed = session.sealed()
     assert sealed["complete"] is True
     assert parts_of(sealed) == [(tared.boot_id, 70, 149)]
 
 
-def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
-    session = start(running)
-    tared.send(50)
-    taken_in(running, tared, until)
-    stop(running, session)
+def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tared: FakeNode) -> None:
+    session = tared.record()
+    tared.deliver(50)
+    session.stop()
     # From then on five hundred frames a second, the first ten thousand of which were lost.
     tared.next_t_mono_ns = time.monotonic_ns()
     lost = tared.frames(10_000)
@@ -294,21 +206,19 @@ def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(
     tared.next_t_mono_ns += 19_000_000_000
     tared.send(10)
     first, last = int(lost.seq[0]), int(lost.seq[-1])
-    said = {"type": "lost", "boot_id": tared.boot_id, "lost": {"disk_full": [[first, last]]}}
-    tared.socket.send(json.dumps(said))
-    sealed = running.sealed(session["id"])
-    [(_, _, end)] = parts_of(sealed)
+    tared.say_lost(disk_full=[[first, last]])
+    sealed = session.sealed()
+    end = sealed["parts"][0]["seq_last"]
     assert sealed["lost"] == {"disk_full": end - 119}
     # 19 of 20 seconds came after the stop.
     assert 0.03 * 10_000 < end - 119 < 0.07 * 10_000
 
 
 def test_other_tiles_begin_a_session_of_their_own_also_in_an_earlier_stream(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running, name="mud")
-    tared.send(50)
-    tared.acknowledged(119)
+    session = tared.record(name="mud")
+    tared.deliver(50)
     tared.leave()
     tared.reboot()
     tared.tiles = 3
@@ -316,87 +226,71 @@ def test_other_tiles_begin_a_session_of_their_own_also_in_an_earlier_stream(
     tared.reboot()
     first, second = tared.before
     tared.connect(earlier=(first.said(), second.said()))
-    send_lacking(tared)
-    tared.send(20)
-    taken_in(running, tared, until)
-    sealed = running.sealed(session["id"])
+    tared.send_lacking()
+    tared.deliver(20)
+    sealed = session.sealed()
     assert parts_of(sealed) == [(first.boot_id, 70, 119)]
     assert "other tiles" in sealed["problem"]
-    others = running.http.get("/sessions").json()["items"]
-    (other,) = [each for each in others if each["id"] != session["id"]]
+    other = running.only_session(but=session)
     assert (other["name"], other["state"]) == ("mud (2)", "recording")
-    stop(running, other)
-    tared.send(10, now=True)
-    assert parts_of(running.sealed(other["id"])) == [
-        (second.boot_id, 0, 39),
-        (tared.boot_id, 0, 19),
-    ]
-    assert running.sealed(other["id"])["complete"] is True
+    sealed = tared.finish(other)
+    assert parts_of(sealed) == [(second.boot_id, 0, 39), (tared.boot_id, 0, 19)]
+    assert sealed["complete"] is True
 
 
 def test_a_node_that_does_not_remember_its_stream_leaves_a_tail_that_is_bounded_by_its_silence(
-    running: Running, tared: FakeNode
+    tared: FakeNode,
 ) -> None:
-    session = start(running)
-    tared.send(50, now=True)
-    tared.acknowledged(119)
+    session = tared.record()
+    tared.deliver(50, now=True)
     tared.leave()
     reboot_now(tared)
     tared.connect()
-    tail = ledger_of(running, session)["parts"][0]["unsynced_tail_max"]
+    tail = session.ledger()["parts"][0]["unsynced_tail_max"]
     # Since its newest frame, at five hundred a second; a test that is slow takes some seconds.
     assert 1 <= tail <= 500 * 20
-    assert running.session(session["id"])["complete"] == "lossy"
+    assert session.now()["complete"] == "lossy"
 
 
 def test_two_sessions_of_one_node_overlap_and_each_has_its_own_frames(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
-    first = start(running, name="first")
-    tared.send(50)
-    taken_in(running, tared, until)
-    second = start(running, name="second")
-    tared.send(50)
-    taken_in(running, tared, until)
-    assert set(running.node()["recording"]) == {first["id"], second["id"]}
+    first = tared.record(name="first")
+    tared.deliver(50)
+    second = tared.record(name="second")
+    tared.deliver(50)
+    assert set(running.node()["recording"]) == {first.id, second.id}
     # The stop has to lie after them on the node's clock, too.
-    stop(running, first)
+    first.stop()
     tared.send(10, now=True)
-    until(lambda: running.session(first["id"])["state"] == "sealed")
-    assert running.node()["recording"] == [second["id"]]
-    taken_in(running, tared, until)
+    until(lambda: first.now()["state"] == "sealed")
+    assert running.node()["recording"] == [second.id]
+    tared.taken_in()
     until(lambda: time.monotonic_ns() > tared.next_t_mono_ns)
-    stop(running, second)
+    second.stop()
     tared.send(10, now=True)
-    assert parts_of(running.sealed(first["id"])) == [(tared.boot_id, 70, 169)]
-    assert parts_of(running.sealed(second["id"])) == [(tared.boot_id, 120, 179)]
-    assert running.sealed(first["id"])["complete"] is True
-    assert running.sealed(second["id"])["complete"] is True
-    assert_same(frames_of(running, second), tared.all_sent().rows(120, 180))
+    assert parts_of(first.sealed()) == [(tared.boot_id, 70, 169)]
+    assert parts_of(second.sealed()) == [(tared.boot_id, 120, 179)]
+    assert first.sealed()["complete"] is True
+    assert second.sealed()["complete"] is True
+    assert_same_bits(second.frames(), tared.all_sent().rows(120, 180))
 
 
-def test_the_node_is_told_what_sessions_need_whenever_that_changes(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
+def test_the_node_is_told_what_sessions_need_whenever_that_changes(tared: FakeNode) -> None:
     def told() -> tuple[list[tuple[str, list[Any]]], bool]:
         wanted = tared.wanted
         return [(each.boot_id, [*each.numbers]) for each in wanted.streams], wanted.recording
 
     assert told() == ([], False)
-    first = start(running)
+    first = tared.record()
     tared.receive("wanted")
     assert told() == ([(tared.boot_id, [(70, None)])], True)
-    tared.send(50)
-    taken_in(running, tared, until)
-    second = start(running, pre_roll_s=0.02)
-    stop(running, first)
-    tared.send(10, now=True)
-    running.sealed(first["id"])
-    stop(running, second)
-    tared.send(10, now=True)
-    running.sealed(second["id"])
+    tared.deliver(50)
+    second = tared.record(pre_roll_s=0.02)
+    tared.finish(first)
+    tared.finish(second)
     until(lambda: told() == ([], False) or (tared.receive("wanted") and False))
-    third = start(running)
+    third = tared.record()
     until(lambda: told()[1] or (tared.receive("wanted") and False))
     tared.leave()
     tared.reboot()
@@ -412,16 +306,15 @@ def test_the_node_is_told_what_sessions_need_whenever_that_changes(
 
 
 def test_while_it_is_not_known_which_stream_a_stop_fell_into_none_of_them_may_be_forgotten(
-    running: Running, tared: FakeNode
+    tared: FakeNode,
 ) -> None:
-    session = start(running)
-    tared.send(50)
-    tared.acknowledged(119)
+    session = tared.record()
+    tared.deliver(50)
     tared.leave()
     tared.frames(30)
     tared.reboot()
     tared.frames(40)
-    stop(running, session)
+    session.stop()
     tared.frames(10, now=True)
     [first] = tared.before
     tared.connect(earlier=(first.said(),))
@@ -430,23 +323,17 @@ def test_while_it_is_not_known_which_stream_a_stop_fell_into_none_of_them_may_be
     assert tared.wanted.recording is False
 
 
-def test_a_pre_roll_reaches_into_what_the_node_has_yet_to_send(
-    running: Running, tared: FakeNode, until: Until
-) -> None:
+def test_a_pre_roll_reaches_into_what_the_node_has_yet_to_send(tared: FakeNode) -> None:
     tared.leave()
     backlog = tared.frames(400)
     tared.connect()
-    tared.send(20)
-    taken_in(running, tared, until)
-    session = start(running, pre_roll_s=0.44)  # 220 frames, of which 20 are here
+    tared.deliver(20)
+    session = tared.record(pre_roll_s=0.44)  # 220 frames, of which 20 are here
     first = session["parts"][0]["seq_first"]
     assert 490 - 220 - 15 <= first <= 490 - 220 + 15
     tared.send_again(backlog)
-    tared.send(30)
-    taken_in(running, tared, until)
-    stop(running, session)
-    tared.send(10, now=True)
-    sealed = running.sealed(session["id"])
+    tared.deliver(30)
+    sealed = tared.finish(session)
     assert sealed["complete"] is True
     assert parts_of(sealed) == [(tared.boot_id, first, 519)]
 
@@ -454,16 +341,16 @@ def test_a_pre_roll_reaches_into_what_the_node_has_yet_to_send(
 def test_events_are_kept_by_their_instant_also_while_the_node_is_away_and_after_the_stop(
     running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
-    url = f"/sessions/{session['id']}/events"
+    session = tared.record()
+    url = f"{session.url}/events"
     tared.leave()
     assert running.http.post(url, json={"label": "away", "t_ns": 5}).status_code == 201
-    stop(running, session)
+    session.stop()
     assert running.http.post(url, json={"label": "pending", "t_ns": 7}).status_code == 201
     tared.connect()
     tared.send(10, now=True)
-    running.sealed(session["id"])
-    before = running.session(session["id"])
+    session.sealed()
+    before = session.now()
     assert running.http.post(url, json={"label": "sealed", "t_ns": 6}).status_code == 201
     events = running.http.get(url).json()["items"]
     assert [(e["label"], e["t_ns"]) for e in events] == [
@@ -471,13 +358,13 @@ def test_events_are_kept_by_their_instant_also_while_the_node_is_away_and_after_
         ("sealed", 6),
         ("pending", 7),
     ]
-    assert running.session(session["id"])["sha256"] == before["sha256"]
+    assert session.now()["sha256"] == before["sha256"]
 
 
 def test_a_mark_that_is_sent_twice_with_its_id_is_marked_once(
     running: Running, tared: FakeNode
 ) -> None:
-    url = f"/sessions/{start(running)['id']}/events"
+    url = f"/sessions/{tared.record()['id']}/events"
     for label in ("stone", "again"):
         answer = running.http.post(url, json={"label": label, "t_ns": 5, "id": "0123456789ab"})
         assert (answer.status_code, answer.json()["label"]) == (201, "stone")

@@ -24,20 +24,15 @@ import service.server.ingest
 import service.server.nodes
 import service.server.streams
 import storage.journal.segment
-from devices.frames import FRAME_COLUMNS, FrameBatch
+from devices.frames import FrameBatch
 from service.link import INGEST_PATH, MESSAGE_BYTES_MAX
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-
-Running = Any
-FakeNode = Any
-Closing = Callable[..., tuple[int, str]]
-Until = Callable[..., Any]
-
-
-def assert_same(found: FrameBatch, sent: FrameBatch) -> None:
-    for name in FRAME_COLUMNS:
-        np.testing.assert_array_equal(getattr(found, name), getattr(sent, name), err_msg=name)
+from tests.builders.frames import assert_same_bits
+from tests.service.fake_node import FakeNode, NodeOf, Play
+from tests.service.process import Start
+from tests.service.running import Running, closed
+from tests.waiting import until
 
 
 def read_all(journal: Journal) -> FrameBatch:
@@ -52,12 +47,11 @@ def assert_goes_on(running: Running, healthy: FakeNode) -> None:
 
 
 @pytest.fixture
-def healthy(running: Running, node_of: Callable[..., FakeNode]) -> FakeNode:
+def healthy(running: Running, node_of: NodeOf) -> FakeNode:
     """Another node, which does everything right."""
     node = node_of(running, "healthy")
     assert node.connect() == [(0, None)]
-    node.send(20)
-    node.acknowledged(19)
+    node.deliver(20)
     return node
 
 
@@ -71,14 +65,13 @@ def test_a_new_node_is_not_asked_for_what_it_has_forgotten(node: FakeNode) -> No
 
 def test_what_is_acknowledged_is_readable_from_disk(running: Running, node: FakeNode) -> None:
     node.connect()
-    sent = node.send(300)
-    node.acknowledged(299)
+    sent = node.deliver(300)
     assert node.acked == Intervals([(0, 299)])
-    assert_same(read_all(running.journal(node.boot_id)), sent)
+    assert_same_bits(read_all(running.journal(node.boot_id)), sent)
 
 
 def test_nothing_is_acknowledged_before_it_is_synced(
-    node: FakeNode, monkeypatch: pytest.MonkeyPatch, until: Until
+    node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked, may_sync = threading.Event(), threading.Event()
     sync = Journal.sync
@@ -102,7 +95,7 @@ def test_nothing_is_acknowledged_before_it_is_synced(
 
 
 def test_frames_that_come_during_a_sync_wait_for_the_next_one(
-    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, until: Until
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked, may_sync = threading.Event(), threading.Event()
     sync = Journal.sync
@@ -131,15 +124,13 @@ def test_a_node_that_comes_back_goes_on_where_the_server_is(
     running: Running, node: FakeNode
 ) -> None:
     node.connect()
-    node.send(100)
-    node.acknowledged(99)
+    node.deliver(100)
     node.leave()
     node.frames(50)  # taken while it was away
     assert node.connect() == [(100, None)]
     node.send_again(node.sent[1])
-    node.send(30)
-    node.acknowledged(179)
-    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
+    node.deliver(30)
+    assert_same_bits(read_all(running.journal(node.boot_id)), node.all_sent())
     assert running.node()["lost_frames"] == 0
 
 
@@ -147,12 +138,11 @@ def test_frames_that_are_sent_twice_are_held_once_and_acknowledged_again(
     running: Running, node: FakeNode
 ) -> None:
     node.connect()
-    sent = node.send(100)
-    node.acknowledged(99)
+    sent = node.deliver(100)
     node.acked = Intervals()
     node.send_again(sent.rows(55, 100))
     node.acknowledged(99, first=55)
-    assert_same(read_all(running.journal(node.boot_id)), sent)
+    assert_same_bits(read_all(running.journal(node.boot_id)), sent)
 
 
 def test_a_gap_is_asked_for_at_the_next_connection(running: Running, node: FakeNode) -> None:
@@ -165,46 +155,40 @@ def test_a_gap_is_asked_for_at_the_next_connection(running: Running, node: FakeN
     assert node.connect() == [(40, 64), (100, None)]
     node.send_again(gap)
     node.acknowledged(99)
-    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
+    assert_same_bits(read_all(running.journal(node.boot_id)), node.all_sent())
 
 
 def test_after_a_restart_the_server_lacks_exactly_the_rest(
     running: Running, node: FakeNode
 ) -> None:
     node.connect()
-    node.send(200)
-    node.acknowledged(199)
+    node.deliver(200)
     running.restart()
-    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
+    assert_same_bits(read_all(running.journal(node.boot_id)), node.all_sent())
     assert node.connect() == [(200, None)]
-    node.send(50)
-    node.acknowledged(249)
-    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
+    node.deliver(50)
+    assert_same_bits(read_all(running.journal(node.boot_id)), node.all_sent())
 
 
-def test_a_server_that_goes_down_says_so_to_its_nodes(
-    running: Running, node: FakeNode, closing: Closing
-) -> None:
+def test_a_server_that_goes_down_says_so_to_its_nodes(running: Running, node: FakeNode) -> None:
     node.connect()
     node.send(10)
     running.stop()
-    code, _ = closing(node.socket)
+    code, _ = closed(node.socket)
     assert code in (1001, 1012)
 
 
 def test_a_server_that_ends_closes_its_journals(running: Running, node: FakeNode) -> None:
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
     running.stop()
     assert running.open_journals == []
 
 
 def test_a_killed_server_has_every_frame_that_it_acknowledged(
     running: Running,
-    node_of: Callable[..., FakeNode],
-    foottile: Callable[..., Any],
-    play: Callable[..., Any],
+    node_of: NodeOf,
+    foottile: Start,
     tmp_path: Path,
 ) -> None:
     data = tmp_path / "killed"
@@ -216,7 +200,7 @@ def test_a_killed_server_has_every_frame_that_it_acknowledged(
     running.port = int(port[1])
     node = node_of(running)
     node.connect()
-    with play(node):
+    with Play(node):
         while node.acked.count < 400:
             node.receive("ack")
         os.kill(process.pid, signal.SIGKILL)
@@ -231,7 +215,7 @@ def test_a_killed_server_has_every_frame_that_it_acknowledged(
     held = journal.held.last
     assert held is not None
     found, sent = read_all(journal), node.all_sent()
-    assert_same(found, sent.rows(0, held + 1))
+    assert_same_bits(found, sent.rows(0, held + 1))
     # What it held is what it does not ask for when it runs again.
     running.port = 0
     running.data = data
@@ -248,13 +232,10 @@ def test_a_probe_is_answered_with_the_servers_clock(node: FakeNode) -> None:
     assert before_ns <= answer.server_t_ns <= time.time_ns()
 
 
-def test_a_clock_row_and_counts_of_a_node_are_shown(
-    running: Running, node: FakeNode, until: Until
-) -> None:
+def test_a_clock_row_and_counts_of_a_node_are_shown(running: Running, node: FakeNode) -> None:
     node.connect()
     node.send(10)
-    row = {"t_mono_ns": 5, "server_minus_node_ns": -77, "uncertainty_ns": 12}
-    node.socket.send(json.dumps({"type": "clock", **row}))
+    node.say_clock(-77, uncertainty_ns=12)
     node.socket.send('{"type":"status","missed_slots":4}')
     until(lambda: running.node()["missed_slots"] == 4)
     assert running.node()["clock"] == {"server_minus_node_ns": -77, "uncertainty_ns": 12}
@@ -262,21 +243,21 @@ def test_a_clock_row_and_counts_of_a_node_are_shown(
 
 @pytest.mark.parametrize("offered", [None, ["foottile.v2"], ["chat", "foottile.v0"]])
 def test_another_subprotocol_is_refused(
-    running: Running, healthy: FakeNode, closing: Closing, offered: list[str] | None
+    running: Running, healthy: FakeNode, offered: list[str] | None
 ) -> None:
     with running.socket(INGEST_PATH, subprotocols=offered) as socket:
         assert socket.subprotocol is None
-        code, reason = closing(socket)
+        code, reason = closed(socket)
     assert code == 4002
     assert "foottile.v1" in reason
     assert_goes_on(running, healthy)
 
 
 def test_another_protocol_number_is_refused(
-    running: Running, healthy: FakeNode, node: FakeNode, closing: Closing
+    running: Running, healthy: FakeNode, node: FakeNode
 ) -> None:
     node.open().send('{"type":"hello","protocol":1,"first_seq":0}')  # with fields of its own
-    code, reason = closing(node.socket)
+    code, reason = closed(node.socket)
     assert (code, reason) == (4002, "protocol 1; this server speaks 2: update the node")
     assert running.http.get("/nodes/bench").status_code == 404
     assert_goes_on(running, healthy)
@@ -300,10 +281,10 @@ def test_another_protocol_number_is_refused(
     ids=lambda first: repr(first[:30]),
 )
 def test_whoever_does_not_say_hello_first_is_let_go(
-    running: Running, healthy: FakeNode, node: FakeNode, closing: Closing, first: str | bytes
+    running: Running, healthy: FakeNode, node: FakeNode, first: str | bytes
 ) -> None:
     node.open().send(first)
-    code, reason = closing(node.socket)
+    code, reason = closed(node.socket)
     assert code == 4001
     assert reason
     assert_goes_on(running, healthy)
@@ -326,11 +307,11 @@ def test_whoever_does_not_say_hello_first_is_let_go(
     ids=str,
 )
 def test_a_malformed_hello_is_refused_with_the_place(
-    running: Running, healthy: FakeNode, node: FakeNode, closing: Closing, change: dict[str, Any]
+    running: Running, healthy: FakeNode, node: FakeNode, change: dict[str, Any]
 ) -> None:
     hello = json.loads(node.hello().model_dump_json()) | change
     node.open().send(json.dumps(hello))
-    code, reason = closing(node.socket)
+    code, reason = closed(node.socket)
     assert code == 4001
     assert next(iter(change)) in reason
     assert_goes_on(running, healthy)
@@ -340,11 +321,11 @@ def test_a_malformed_hello_is_refused_with_the_place(
     "name", ["../outside", "..", ".", "", "a/b", "a\\b", "a\0b", ".hidden", "x" * 65, "naïve"]
 )
 def test_a_name_that_is_no_folders_name_is_refused(
-    running: Running, node: FakeNode, closing: Closing, name: str
+    running: Running, node: FakeNode, name: str
 ) -> None:
     info = node.info.model_copy(update={"node": name})
     node.open().send(node.hello(array_info=info).model_dump_json())
-    code, _ = closing(node.socket)
+    code, _ = closed(node.socket)
     assert code == 4001
     assert running.http.get("/nodes").json()["items"] == []
     assert not (running.data / "outside").exists()
@@ -353,21 +334,19 @@ def test_a_name_that_is_no_folders_name_is_refused(
 
 @pytest.mark.parametrize("boot_id", ["../x", "", "0" * 31, "G" * 32, "0" * 32 + "/.."])
 def test_a_boot_id_that_is_no_folders_name_is_refused(
-    running: Running, node: FakeNode, closing: Closing, boot_id: str
+    running: Running, node: FakeNode, boot_id: str
 ) -> None:
     info = node.info.model_copy(update={"boot_id": boot_id})
     node.open().send(node.hello(array_info=info).model_dump_json())
-    code, _ = closing(node.socket)
+    code, _ = closed(node.socket)
     assert code == 4001
     assert running.http.get("/nodes").json()["items"] == []
 
 
-def test_a_node_without_tiles_is_refused(
-    running: Running, node: FakeNode, closing: Closing
-) -> None:
+def test_a_node_without_tiles_is_refused(running: Running, node: FakeNode) -> None:
     info = node.info.model_copy(update={"tiles": ()})
     node.open().send(node.hello(array_info=info).model_dump_json())
-    code, reason = closing(node.socket)
+    code, reason = closed(node.socket)
     assert code == 4001
     assert "no tiles" in reason
     assert running.http.get("/nodes").json()["items"] == []
@@ -402,14 +381,13 @@ def test_a_binary_message_that_is_no_frames_is_refused(
     running: Running,
     healthy: FakeNode,
     node: FakeNode,
-    closing: Closing,
     spoil: Callable[[FakeNode, bytes], bytes],
 ) -> None:
     node.connect()
     node.send(10)
     payload = node.payload(node.frames(10))
     node.socket.send(spoil(node, payload))
-    code, reason = closing(node.socket)
+    code, reason = closed(node.socket)
     assert code == 4004
     assert "bench" in reason
     assert_goes_on(running, healthy)
@@ -419,7 +397,7 @@ def test_a_binary_message_that_is_no_frames_is_refused(
 
 
 def test_a_binary_message_with_flipped_bits_harms_nobody(
-    running: Running, healthy: FakeNode, node: FakeNode, closing: Closing
+    running: Running, healthy: FakeNode, node: FakeNode
 ) -> None:
     random = np.random.default_rng(7)
     for _ in range(40):
@@ -430,51 +408,49 @@ def test_a_binary_message_with_flipped_bits_harms_nobody(
         node.socket.send(bytes(spoilt))
         with suppress(ConnectionClosed):
             node.socket.send("no JSON")  # it is hung up on in any case
-        code, _ = closing(node.socket)
+        code, _ = closed(node.socket)
         assert code == 4004
     assert_goes_on(running, healthy)
 
 
 @pytest.mark.parametrize("message", ["x" * (MESSAGE_BYTES_MAX + 1), b"x" * (MESSAGE_BYTES_MAX + 1)])
 def test_a_message_of_more_than_a_mebibyte_is_refused(
-    running: Running, healthy: FakeNode, node: FakeNode, closing: Closing, message: str | bytes
+    running: Running, healthy: FakeNode, node: FakeNode, message: str | bytes
 ) -> None:
     node.connect()
     node.socket.send(message)
-    code, _ = closing(node.socket)
+    code, _ = closed(node.socket)
     assert code == 1009
     assert_goes_on(running, healthy)
 
 
 @pytest.mark.parametrize("message", ["{", '{"type":"ack"}', '{"type":"probe","id":-1}', "\0"])
 def test_a_text_message_that_is_none_is_refused(
-    running: Running, healthy: FakeNode, node: FakeNode, closing: Closing, message: str
+    running: Running, healthy: FakeNode, node: FakeNode, message: str
 ) -> None:
     node.connect()
     node.socket.send(message)
-    code, _ = closing(node.socket)
+    code, _ = closed(node.socket)
     assert code == 4004
     assert_goes_on(running, healthy)
 
 
-def test_a_second_hello_is_refused(
-    running: Running, healthy: FakeNode, node: FakeNode, closing: Closing
-) -> None:
+def test_a_second_hello_is_refused(running: Running, healthy: FakeNode, node: FakeNode) -> None:
     node.connect()
     node.socket.send(node.hello().model_dump_json())
-    code, reason = closing(node.socket)
+    code, reason = closed(node.socket)
     assert (code, reason) == (4004, "hello was said before")
     assert_goes_on(running, healthy)
 
 
 def test_a_name_that_is_in_use_is_refused_by_name(
-    running: Running, node: FakeNode, node_of: Callable[..., FakeNode], closing: Closing
+    running: Running, node: FakeNode, node_of: NodeOf
 ) -> None:
     node.connect()
     node.send(10)
     other = node_of(running)  # the same name, another boot
     other.open().send(other.hello().model_dump_json())
-    code, reason = closing(other.socket)
+    code, reason = closed(other.socket)
     assert code == 4009
     assert "'bench'" in reason
     assert "--name" in reason
@@ -483,41 +459,35 @@ def test_a_name_that_is_in_use_is_refused_by_name(
 
 
 def test_the_same_stream_again_takes_the_place_of_its_older_connection(
-    running: Running, node: FakeNode, closing: Closing, until: Until
+    running: Running, node: FakeNode
 ) -> None:
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
     older = node.socket
     assert node.connect() == [(10, None)]
-    code, _ = closing(older)
+    code, _ = closed(older)
     assert code == 4010
-    node.send(10)
-    node.acknowledged(19)
+    node.deliver(10)
     assert running.node()["connected"]
 
 
 def test_a_node_that_has_left_may_come_back_with_another_boot(
-    running: Running, node: FakeNode, until: Until
+    running: Running, node: FakeNode
 ) -> None:
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
     node.leave()
     node.reboot()
     assert node.connect() == [(0, None)]
     assert running.node()["boot_id"] == node.boot_id
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
 
 
 @pytest.mark.parametrize("greeted", [False, True])
 def test_a_node_that_says_nothing_is_let_go(
     running: Running,
     node: FakeNode,
-    closing: Closing,
     monkeypatch: pytest.MonkeyPatch,
-    until: Until,
     greeted: bool,
 ) -> None:
     monkeypatch.setattr(service.server.ingest, "SILENCE_S", 0.3)
@@ -525,7 +495,7 @@ def test_a_node_that_says_nothing_is_let_go(
         node.connect()
     else:
         node.open()
-    code, reason = closing(node.socket)
+    code, reason = closed(node.socket)
     assert code == 4005
     assert "0.3 s" in reason
     if greeted:
@@ -533,10 +503,9 @@ def test_a_node_that_says_nothing_is_let_go(
     assert running.http.get("/health").status_code == 200
 
 
-def test_a_node_that_is_cut_off_is_away(running: Running, node: FakeNode, until: Until) -> None:
+def test_a_node_that_is_cut_off_is_away(running: Running, node: FakeNode) -> None:
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
     node.socket.socket.shutdown(2)
     until(lambda: not running.node()["connected"])
     assert node.connect() == [(10, None)]
@@ -545,9 +514,7 @@ def test_a_node_that_is_cut_off_is_away(running: Running, node: FakeNode, until:
 def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
     running: Running,
     node: FakeNode,
-    closing: Closing,
     monkeypatch: pytest.MonkeyPatch,
-    until: Until,
 ) -> None:
     write_all = storage.journal.segment.write_all
     check_storage = running.server.check_storage
@@ -585,29 +552,25 @@ def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
         assert node.acked == Intervals([(0, 69)])
         assert running.journal(node.boot_id).held == Intervals([(0, 69)])
     full.clear()
-    code, _ = closing(node.socket)
+    code, _ = closed(node.socket)
     assert code == 1012
     until(lambda: not running.node()["connected"])
     assert node.connect() == [(70, None)]
     node.send_again(lost)
-    node.send(10, 20.0)
-    node.acknowledged(109)
+    node.deliver(10, 20.0)
     assert running.node()["storage_problem"] is None
-    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
+    assert_same_bits(read_all(running.journal(node.boot_id)), node.all_sent())
 
 
 def test_one_message_that_a_full_disk_did_not_take_is_asked_for_again(
     running: Running,
     node: FakeNode,
-    closing: Closing,
     monkeypatch: pytest.MonkeyPatch,
-    until: Until,
 ) -> None:
     # Space is there again before the server's next tick has seen that there was none.
     write_all = storage.journal.segment.write_all
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
     lost = node.frames(10)
     refused = node.payload(lost)
 
@@ -624,7 +587,7 @@ def test_one_message_that_a_full_disk_did_not_take_is_asked_for_again(
     node.send(10)
     until(lambda: running.node()["last_seq"] == 39)
     monkeypatch.setattr(storage.journal.segment, "write_all", write_all)
-    code, _ = closing(node.socket)
+    code, _ = closed(node.socket)
     assert code == 1012
     assert node.connect() == [(10, 19), (40, None)]
 
@@ -632,9 +595,7 @@ def test_one_message_that_a_full_disk_did_not_take_is_asked_for_again(
 def test_a_disk_that_refuses_to_sync_acknowledges_nothing(
     running: Running,
     node: FakeNode,
-    closing: Closing,
     monkeypatch: pytest.MonkeyPatch,
-    until: Until,
 ) -> None:
     from devices.errors import StorageError
 
@@ -651,25 +612,23 @@ def test_a_disk_that_refuses_to_sync_acknowledges_nothing(
     node.connect()
     broken.set()
     node.send(20)
-    code, _ = closing(node.socket)
+    code, _ = closed(node.socket)
     assert code == 1012
     assert not node.acked
     # Whatever it is asked for now, in the end everything has to be acknowledged.
     for first, last in node.connect():
         if last is None:
             node.send_again(node.all_sent().rows(first, 20)) if first < 20 else None
-    node.send(10)
-    node.acknowledged(29)
-    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
+    node.deliver(10)
+    assert_same_bits(read_all(running.journal(node.boot_id)), node.all_sent())
 
 
 def test_what_was_held_and_not_acknowledged_is_so_at_the_next_connection(
-    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, until: Until
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A node forgets nothing that is not acknowledged, so it must not wait for it for ever.
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
     monkeypatch.setattr(service.server.server, "TICK_S", 0.5)
     node.send(10)
     node.acknowledged(19)  # the next tick is half a second away
@@ -681,8 +640,7 @@ def test_what_was_held_and_not_acknowledged_is_so_at_the_next_connection(
     for first, _ in node.connect():
         if first == 20:
             node.send_again(node.sent[-1])
-    node.send(10)
-    node.acknowledged(39)
+    node.deliver(10)
 
 
 def test_what_was_held_at_a_restart_is_acknowledged_at_the_next_connection(
@@ -696,15 +654,14 @@ def test_what_was_held_at_a_restart_is_acknowledged_at_the_next_connection(
     [(first, _)] = node.connect()
     if first < 20:
         node.send_again(node.sent[-1].rows(first, 20))
-    node.send(10)
-    node.acknowledged(29)
+    node.deliver(10)
 
 
 # What a hostile tester found
 
 
 def test_a_node_that_goes_before_it_is_welcomed_leaves_its_name_free(
-    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, until: Until
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from starlette.websockets import WebSocket
 
@@ -727,13 +684,12 @@ def test_a_node_that_goes_before_it_is_welcomed_leaves_its_name_free(
 
 
 def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
-    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, until: Until
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from devices.errors import StorageError
 
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
     node.leave()
     node.reboot()
     node.tiles += 1
@@ -741,7 +697,7 @@ def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
     full.set()
     keep = service.server.nodes.Node.keep
 
-    def refusing(kept: object) -> None:
+    def refusing(kept: service.server.nodes.Node) -> None:
         if full.is_set():
             raise StorageError("No space left on device")
         keep(kept)
@@ -750,16 +706,17 @@ def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
     node.connect()
     shown = running.node()
     assert len(shown["tiles"]) == node.tiles
-    assert shown["calibration"]["id"] == node.hello().calibration.id
+    calibration = node.hello().calibration
+    assert calibration is not None
+    assert shown["calibration"]["id"] == calibration.id
     full.clear()
 
 
 def test_what_could_not_be_synced_is_sent_again(
-    running: Running, node: FakeNode, closing: Closing, monkeypatch: pytest.MonkeyPatch
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
     broken = threading.Event()
     broken.set()
     fsync = os.fsync
@@ -772,20 +729,18 @@ def test_what_could_not_be_synced_is_sent_again(
 
     monkeypatch.setattr(os, "fsync", failing)
     lost = node.send(10)
-    assert closing(node.socket)[0] == 1012
+    assert closed(node.socket)[0] == 1012
     assert node.connect() == [(10, None)]
     node.send_again(lost)
     node.acknowledged(19)
     running.restart()
-    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
+    assert_same_bits(read_all(running.journal(node.boot_id)), node.all_sent())
 
 
 def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
     running: Running,
     node: FakeNode,
-    closing: Closing,
     monkeypatch: pytest.MonkeyPatch,
-    until: Until,
 ) -> None:
     from devices.errors import StorageError
 
@@ -799,7 +754,7 @@ def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
     until(lambda: running.node()["storage_problem"] is not None)
     monkeypatch.setattr(service.server.streams, "Journal", Journal)
     monkeypatch.setattr(running.server, "check_storage", lambda: None)
-    assert closing(node.socket)[0] == 1012
+    assert closed(node.socket)[0] == 1012
     assert node.connect() == [(0, None)]
 
 
@@ -807,8 +762,7 @@ def test_what_another_version_wrote_of_a_node_does_not_keep_the_server_from_star
     running: Running, node: FakeNode
 ) -> None:
     node.connect()
-    node.send(10)
-    node.acknowledged(9)
+    node.deliver(10)
     running.stop()
     path = running.data / "nodes" / "bench" / "hello.json"
     path.write_text('{"type":"hello","protocol":1,"first_seq":0}')
@@ -831,39 +785,37 @@ def test_a_stream_that_was_not_announced_is_refused(
     running: Running,
     healthy: FakeNode,
     node: FakeNode,
-    closing: Closing,
     message: dict[str, Any],
 ) -> None:
     node.connect()
-    if message["boot_id"] is None:
-        message["boot_id"] = node.boot_id
-    node.socket.send(json.dumps(message))
-    code, _ = closing(node.socket)
+    boot_id = message["boot_id"] or node.boot_id
+    node.socket.send(json.dumps(message | {"boot_id": boot_id}))
+    code, _ = closed(node.socket)
     assert code == 4004
     assert_goes_on(running, healthy)
 
 
 @pytest.mark.parametrize("what", ["name", "tiles", "twice", "held"])
 def test_earlier_streams_that_cannot_be_are_refused(
-    running: Running, healthy: FakeNode, node: FakeNode, closing: Closing, what: str
+    running: Running, healthy: FakeNode, node: FakeNode, what: str
 ) -> None:
     node.reboot()
     [before] = node.before
-    changed: dict[str, Any] = {
+    changes: dict[str, dict[str, Any]] = {
         "name": {"node": "other"},
         "tiles": {"tiles": ()},
         "twice": {"boot_id": node.boot_id},
         "held": {},
-    }[what]
+    }
     held = ((5, 4),) if what == "held" else ()
-    said = before.said(array_info=before.info.model_copy(update=changed), held=held)
+    said = before.said(array_info=before.info.model_copy(update=changes[what]), held=held)
     node.open().send(node.hello(earlier=(said,)).model_dump_json())
-    assert closing(node.socket)[0] == 4001
+    assert closed(node.socket)[0] == 4001
     assert_goes_on(running, healthy)
 
 
 def test_frames_of_an_earlier_stream_are_held_to_its_own_description(
-    running: Running, node: FakeNode, closing: Closing
+    running: Running, node: FakeNode
 ) -> None:
     node.frames(20)
     node.reboot()
@@ -872,11 +824,10 @@ def test_frames_of_an_earlier_stream_are_held_to_its_own_description(
     node.connect(earlier=(before.said(),))
     node.send(10)
     node.send_earlier(before, 0, 19)
-    node.send(10)
-    node.acknowledged(19)
-    assert_same(read_all(running.journal(node.boot_id)), node.all_sent())
-    assert_same(read_all(running.journal(before.boot_id)), before.sent[0])
+    node.deliver(10)
+    assert_same_bits(read_all(running.journal(node.boot_id)), node.all_sent())
+    assert_same_bits(read_all(running.journal(before.boot_id)), before.sent[0])
     assert running.node()["last_seq"] == 19
     node.socket.send(json.dumps({"type": "stream", "boot_id": before.boot_id}))
     node.socket.send(node.payload(node.frames(10)))  # of three tiles
-    assert closing(node.socket)[0] == 4004
+    assert closed(node.socket)[0] == 4004

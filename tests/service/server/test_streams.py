@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,9 +14,6 @@ from hypothesis import strategies as st
 
 from devices.frames import (
     FRAME_COLUMNS,
-    NO_SERVO_AGE,
-    NO_SERVO_COUNTS,
-    ArrayInfo,
     FrameBatch,
 )
 from service.link import PROTOCOL, EarlierStream, Hello
@@ -24,40 +21,28 @@ from service.server.nodes import Node
 from storage.intervals import NO_END, Intervals
 from storage.schema import wire_schema
 from storage.wire import encode
+from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
+from tests.builders.frames import make_frames
 
-PERIOD_NS = 2_000_000
-UTC_NS = 10**18
 PER_MESSAGE = 5
 OLD, NEW = "a" * 32, "b" * 32
-
-Array = Callable[..., ArrayInfo]
 
 
 def frames(first: int, last: int, boot: str) -> FrameBatch:
     seq = np.arange(first, last + 1)
-    n = len(seq)
-    t_mono_ns = seq * PERIOD_NS + (0 if boot == OLD else 10**12)
-    return FrameBatch(
-        seq=seq.astype(np.uint64),
-        t_mono_ns=t_mono_ns,
-        t_ns=t_mono_ns + UTC_NS,
-        padc=(300 + np.stack([seq % 97, seq % 89], axis=1)).astype(np.uint16),
-        tadc=np.full((n, 2), 480, dtype=np.uint16),
-        sample_offset_us=np.zeros((n, 2), dtype=np.int32),
-        servo_counts=np.full(n, NO_SERVO_COUNTS, dtype=np.int32),
-        servo_age_us=np.full(n, NO_SERVO_AGE, dtype=np.int32),
-        status=np.zeros((n, 2), dtype=np.uint8),
-        frame_status=np.zeros(n, dtype=np.uint8),
-        reference_force_n=np.full(n, np.nan, dtype=np.float32),
+    return make_frames(
+        seq,
+        t_mono_ns=seq * PERIOD_NS + (0 if boot == OLD else 10**12),
+        padc=300 + np.stack([seq % 97, seq % 89], axis=1),
     )
 
 
 class Told:
     """A node as the server knows it, told what a test wants without a socket."""
 
-    def __init__(self, folder: Path, array: Array) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.info = {boot: array("bench", boot, UTC_NS) for boot in (OLD, NEW)}
+        self.info = {boot: make_array(boot_id=boot) for boot in (OLD, NEW)}
         self.node: Node
         self.restart()
 
@@ -110,8 +95,8 @@ class Told:
 
 
 @pytest.fixture
-def told(tmp_path: Path, array_of: Array) -> Iterator[Told]:
-    one = Told(tmp_path, array_of)
+def told(tmp_path: Path) -> Iterator[Told]:
+    one = Told(tmp_path)
     yield one
     one.close()
 
@@ -131,10 +116,9 @@ def test_frames_of_two_streams_in_any_order_and_any_number_of_times_are_each_hel
     again: list[tuple[str, int]],
     breaks: set[int],
     restarts: set[int],
-    array_of: Array,
 ) -> None:
     with TemporaryDirectory() as folder:
-        told = Told(Path(folder), array_of)
+        told = Told(Path(folder))
         total = 8 * PER_MESSAGE
         whole = ((0, total - 1),)
         shown: list[int] = []
@@ -325,10 +309,10 @@ def test_frames_that_are_damaged_here_may_come_again_while_the_node_has_them(tol
     lost=st.integers(0, 7),
 )
 def test_what_is_held_next_to_an_instant_is_the_same_whether_it_was_asked_before_or_not(
-    order: list[int], at: int, at_least: int, lost: int, array_of: Array
+    order: list[int], at: int, at_least: int, lost: int
 ) -> None:
     with TemporaryDirectory() as folder:
-        told = Told(Path(folder), array_of)
+        told = Told(Path(folder))
         told.connect(held=((0, 8 * PER_MESSAGE - 1),), next_seq=8 * PER_MESSAGE)
         t_ns = UTC_NS + 10**12 + at * PERIOD_NS
         sent = Intervals()

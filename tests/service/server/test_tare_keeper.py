@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 
 from devices.errors import StorageError, TareError
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, FrameBatch, FrameStatus, TileStatus
+from devices.frames import FrameBatch, FrameStatus, TileStatus
 from service.link import PROTOCOL, Hello
 from service.server.nodes import Node
 from storage.intervals import Intervals
 from storage.schema import wire_schema
 from storage.wire import encode
+from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, UTC_NS, make_array
+from tests.builders.calibrations import make_calibration
+from tests.builders.frames import make_frames
 
-COUNT_KPA = 130 / 1023
-UTC_NS = 10**18
 PERIOD_NS = 10_000_000  # 100 Hz
 BATCH = 25
 COUNTS_PER_K = 2.64  # of a bubble of 100 kPa
@@ -28,11 +29,11 @@ COUNTS_PER_K = 2.64  # of a bubble of 100 kPa
 class Foot:
     """A node without a server: what it sends, and what became of it."""
 
-    def __init__(self, folder: Path, array: Any, calibration: Any, **scene: Any) -> None:
+    def __init__(self, folder: Path, **scene: Any) -> None:
         self._folder = folder
         self.seq = 0
         self.due: list[int] = []
-        info = array("bench", "0" * 32, UTC_NS).model_copy(update={"nominal_rate_hz": 100.0})
+        info = make_array(nominal_rate_hz=100.0)
         self.hello = Hello(
             protocol=PROTOCOL,
             array_info=info,
@@ -40,7 +41,7 @@ class Foot:
             next_seq=0,
             scene={"name": "test", **scene},
             emulated=True,
-            calibration=calibration(info.serials),
+            calibration=make_calibration(*info.serials),
             calibration_problem=None,
         )
         self.node: Node
@@ -70,26 +71,20 @@ class Foot:
         """The next frames, so many counts above 500, with noise."""
         n = round(seconds * 1e9 / PERIOD_NS)
         rng = np.random.default_rng(self.seq)
-        seq = np.arange(self.seq, self.seq + n, dtype=np.uint64)
-        t_mono_ns = (PERIOD_NS * seq).astype(np.int64)
+        noisy = rng.normal(0.0, 0.9, (n, 2)) + np.asarray(counts)
         status = np.zeros((n, 2), dtype=np.uint8)
         if silent is not None:
             status[:, silent] = TileStatus.NO_ANSWER
-        self.seq += n
-        noisy = rng.normal(0.0, 0.9, (n, 2)) + np.asarray(counts)
-        return FrameBatch(
-            seq=seq,
-            t_mono_ns=t_mono_ns,
-            t_ns=t_mono_ns + UTC_NS,
-            padc=(500 - np.rint(noisy)).astype(np.uint16),
-            tadc=np.full((n, 2), round(480 - 5.35 * warmer_k), dtype=np.uint16),
-            sample_offset_us=np.zeros((n, 2), dtype=np.int32),
-            servo_counts=np.full(n, NO_SERVO_COUNTS, dtype=np.int32),
-            servo_age_us=np.full(n, NO_SERVO_AGE, dtype=np.int32),
+        batch = make_frames(
+            np.arange(self.seq, self.seq + n),
+            period_ns=PERIOD_NS,
+            padc=500 - np.rint(noisy),
+            tadc=round(480 - 5.35 * warmer_k),
             status=status,
-            frame_status=np.full(n, FrameStatus.LEAD if lead else 0, dtype=np.uint8),
-            reference_force_n=np.full(n, np.nan, dtype=np.float32),
+            frame_status=FrameStatus.LEAD if lead else 0,
         )
+        self.seq += n
+        return batch
 
     def send(self, frames: FrameBatch) -> None:
         """Have the server take them."""
@@ -111,6 +106,10 @@ class Foot:
             self.live(1.0, rest)
 
     @property
+    def auto_tare(self) -> str:
+        return self.node.tare_keeper.auto_tare
+
+    @property
     def history(self) -> list[tuple[str, bool]]:
         return [(t.tare.source, t.undone) for t in self.node.tares.all]
 
@@ -118,16 +117,16 @@ class Foot:
     def offset_counts(self) -> list[float]:
         tare = self.node.live.tare
         assert tare is not None
-        return list((tare.baseline_kpa - 787 * 65 / 1023 - 50) / COUNT_KPA)
+        return list((tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA)
 
 
 @pytest.fixture
-def foot_of(tmp_path: Path, array_of: Any, newtons_of: Any) -> Iterator[Any]:
+def foot_of(tmp_path: Path) -> Iterator[Any]:
     """A foot; keys of its scene can be given."""
     with ExitStack() as stack:
 
         def make(**scene: Any) -> Foot:
-            foot = Foot(tmp_path, array_of, newtons_of, **scene)
+            foot = Foot(tmp_path, **scene)
             stack.callback(foot.close)
             return foot
 
@@ -311,7 +310,7 @@ def test_a_scene_can_turn_it_off(foot_of: Any) -> None:
     foot = foot_of(auto_tare=False)
     foot.live(1.0, lead=True, silent=1)
     foot.step(4)
-    assert foot.node.tare_keeper.auto_tare == "off"
+    assert foot.auto_tare == "off"
     assert foot.history == []
     foot.node.take_tare()
     foot.live(70.0, 1.0)
@@ -323,17 +322,17 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
 ) -> None:
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False), ("flight", False)]
-    assert foot.node.tare_keeper.auto_tare == "on"
+    assert foot.auto_tare == "on"
     foot.node.tare_keeper.undo(foot.node.tares.all[-1].id)
     assert foot.offset_counts == pytest.approx([0.0, 0.0], abs=0.4)
-    assert foot.node.tare_keeper.auto_tare == "paused"
+    assert foot.auto_tare == "paused"
     foot.live(200.0, 0.9)
     foot.restart()
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False), ("flight", True)]
     recorded = foot.node.take_tare("after the break")
     assert recorded.reason == "after the break"
-    assert foot.node.tare_keeper.auto_tare == "on"
+    assert foot.auto_tare == "on"
     foot.live(70.0, 0.0)
     assert [source for source, _ in foot.history] == ["lead", "flight", "unloaded", "flight"]
 

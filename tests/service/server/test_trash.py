@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -14,60 +13,29 @@ import pytest
 import service.api.routes.sessions
 import service.server
 import service.server.recorder
+from service.sessions.sealing import seal
 from storage.intervals import Intervals
 from storage.sessions.folder import DOOMED_PREFIX, SessionFolder
-
-Running = Any
-FakeNode = Any
-Until = Callable[..., Any]
-Closing = Callable[..., tuple[int, str]]
-
-
-@pytest.fixture(autouse=True)
-def quick_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stop answers soon: the scripted node sends what passes it only afterwards."""
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.02)
+from tests.service.fake_node import FakeNode
+from tests.service.recording import Recording
+from tests.service.running import Running, closed
+from tests.waiting import until
 
 
-@pytest.fixture
-def tared(running: Running, node: FakeNode) -> FakeNode:
-    """A connected node with a tare, all of whose 70 frames have come and are acknowledged."""
-    node.connect()
-    node.tared()
-    node.acknowledged(69)
-    return node
-
-
-def start(running: Running, **body: object) -> dict[str, Any]:
-    answer = running.http.post("/sessions", json={"node": "bench", "name": "trial"} | body)
-    assert answer.status_code == 201, answer.text
-    session: dict[str, Any] = answer.json()
+def sealed(node: FakeNode) -> Recording:
+    session = node.record()
+    node.deliver(20)
+    node.finish(session)
     return session
 
 
-def stop(running: Running, session: dict[str, Any]) -> None:
-    answer = running.http.post(f"/sessions/{session['id']}/stop")
-    assert answer.status_code == 200, answer.text
-
-
-def sealed(running: Running, node: FakeNode) -> dict[str, Any]:
-    session = start(running)
-    node.send(20)
-    node.acknowledged(node.seq - 1)
-    stop(running, session)
-    node.send(10, now=True)
-    done: dict[str, Any] = running.sealed(session["id"])
-    return done
-
-
-def pending(running: Running, node: FakeNode) -> dict[str, Any]:
+def pending(node: FakeNode) -> Recording:
     """A session whose node has gone with its last thirty frames."""
-    session = start(running)
-    node.send(50)
-    node.acknowledged(node.seq - 1)
+    session = node.record()
+    node.deliver(50)
     node.leave()
     node.frames(30)
-    stop(running, session)
+    session.stop()
     return session
 
 
@@ -81,59 +49,59 @@ def ids(running: Running, path: str) -> list[str]:
 def test_a_deleted_session_is_in_the_trash_and_can_be_had_back_as_it_was(
     running: Running, tared: FakeNode
 ) -> None:
-    session = sealed(running, tared)
-    answer = running.http.delete(f"/sessions/{session['id']}")
+    session = sealed(tared)
+    kept = session.now()
+    answer = running.http.delete(session.url)
     assert (answer.status_code, answer.content) == (204, b"")
     assert ids(running, "/sessions") == []
-    assert running.http.get("/trash").json()["items"] == [session]
-    gone = running.http.get(f"/sessions/{session['id']}")
+    assert running.http.get("/trash").json()["items"] == [kept]
+    gone = running.http.get(session.url)
     assert gone.status_code == 404
     assert "trash" in gone.json()["detail"]
-    assert running.http.get(f"/sessions/{session['id']}/data").status_code == 404
-    answer = running.http.post(f"/trash/{session['id']}/restore")
+    assert running.http.get(f"{session.url}/data").status_code == 404
+    answer = running.http.post(f"/trash/{session.id}/restore")
     assert answer.status_code == 200
-    assert answer.json() == session
+    assert answer.json() == kept
     assert ids(running, "/trash") == []
-    assert running.http.get(f"/sessions/{session['id']}/data").status_code == 200
+    assert running.http.get(f"{session.url}/data").status_code == 200
 
 
 def test_what_is_in_the_trash_is_so_after_a_restart(running: Running, tared: FakeNode) -> None:
-    kept, deleted = sealed(running, tared), sealed(running, tared)
-    running.http.delete(f"/sessions/{deleted['id']}")
+    kept, deleted = sealed(tared), sealed(tared)
+    running.http.delete(deleted.url)
     running.restart()
-    assert ids(running, "/sessions") == [kept["id"]]
-    assert ids(running, "/trash") == [deleted["id"]]
+    assert ids(running, "/sessions") == [kept.id]
+    assert ids(running, "/trash") == [deleted.id]
 
 
 def test_emptying_the_trash_deletes_for_good_and_says_how_much(
     running: Running, tared: FakeNode
 ) -> None:
-    kept = sealed(running, tared)
+    kept = sealed(tared)
     size = 0
     for _ in range(2):
-        session = sealed(running, tared)
-        folder = running.data / "sessions" / session["id"]
+        session = sealed(tared)
+        folder = session.folder
         size += sum(path.stat().st_size for path in folder.iterdir())
-        running.http.delete(f"/sessions/{session['id']}")
+        running.http.delete(session.url)
     assert running.http.delete("/trash").json() == {"sessions": 2, "bytes": size}
     assert running.http.delete("/trash").json() == {"sessions": 0, "bytes": 0}
     assert ids(running, "/trash") == []
     assert list((running.data / "trash").iterdir()) == []
-    assert ids(running, "/sessions") == [kept["id"]]
+    assert ids(running, "/sessions") == [kept.id]
 
 
 def test_a_session_that_is_recorded_is_not_deleted(running: Running, tared: FakeNode) -> None:
-    session = start(running)
-    answer = running.http.delete(f"/sessions/{session['id']}")
+    session = tared.record()
+    answer = running.http.delete(session.url)
     assert answer.status_code == 409
     assert "Stop it first" in answer.json()["detail"]
-    assert running.session(session["id"])["state"] == "recording"
+    assert session.now()["state"] == "recording"
 
 
 def test_a_session_that_is_being_sealed_is_not_deleted(
-    running: Running, tared: FakeNode, until: Until, monkeypatch: pytest.MonkeyPatch
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seal = service.server.recorder.seal
     may_seal = threading.Event()
 
     def slow(*arguments: Any) -> Any:
@@ -142,18 +110,17 @@ def test_a_session_that_is_being_sealed_is_not_deleted(
 
     monkeypatch.setattr(service.server.recorder, "seal", slow)
     try:
-        session = start(running)
-        tared.send(20)
-        tared.acknowledged(89)
-        stop(running, session)
+        session = tared.record()
+        tared.deliver(20)
+        session.stop()
         tared.send(10, now=True)
-        until(lambda: running.session(session["id"])["state"] == "sealing")
-        answer = running.http.delete(f"/sessions/{session['id']}")
+        until(lambda: session.now()["state"] == "sealing")
+        answer = running.http.delete(session.url)
         assert answer.status_code == 409
         assert "sealed" in answer.json()["detail"]
     finally:
         may_seal.set()
-    running.sealed(session["id"])
+    session.sealed()
 
 
 @pytest.mark.parametrize(
@@ -173,8 +140,8 @@ def test_what_is_not_there_is_not_found(running: Running, method: str, path: str
 def test_a_pending_session_in_the_trash_keeps_its_frames_until_the_trash_is_emptied(
     running: Running, tared: FakeNode
 ) -> None:
-    session = pending(running, tared)
-    running.http.delete(f"/sessions/{session['id']}")
+    session = pending(tared)
+    running.http.delete(session.url)
     running.restart()
     tared.connect()
     [wanted] = tared.wanted.streams
@@ -183,10 +150,10 @@ def test_a_pending_session_in_the_trash_keeps_its_frames_until_the_trash_is_empt
     tared.send(10, now=True)
     tared.acknowledged(tared.seq - 1, first=120)
     assert running.http.get("/trash").json()["items"][0]["state"] == "pending"
-    running.http.post(f"/trash/{session['id']}/restore")
-    assert running.sealed(session["id"])["complete"] is True
-    again = pending(running, tared)
-    running.http.delete(f"/sessions/{again['id']}")
+    running.http.post(f"/trash/{session.id}/restore")
+    assert session.sealed()["complete"] is True
+    again = pending(tared)
+    running.http.delete(again.url)
     tared.connect()
     assert tared.wanted.streams
     running.http.delete("/trash")
@@ -199,15 +166,15 @@ def test_a_session_is_in_one_place_however_a_delete_was_cut_off(
 ) -> None:
     from devices.errors import StorageError
 
-    session = sealed(running, tared)
+    session = sealed(tared)
 
     def cut_off(*_: object) -> None:
         raise StorageError("No space left on device")
 
     move = SessionFolder.move
     monkeypatch.setattr(SessionFolder, "move", cut_off)
-    assert running.http.delete(f"/sessions/{session['id']}").status_code == 507
-    assert ids(running, "/sessions") == [session["id"]]
+    assert running.http.delete(session.url).status_code == 507
+    assert ids(running, "/sessions") == [session.id]
     assert ids(running, "/trash") == []
     monkeypatch.setattr(SessionFolder, "move", move)
 
@@ -216,22 +183,22 @@ def test_a_session_is_in_one_place_however_a_delete_was_cut_off(
         cut_off()  # the folder was renamed, and the process ends before it knows
 
     monkeypatch.setattr(SessionFolder, "move", then_killed)
-    assert running.http.delete(f"/sessions/{session['id']}").status_code == 507
+    assert running.http.delete(session.url).status_code == 507
     monkeypatch.setattr(SessionFolder, "move", move)
     running.restart()
     assert ids(running, "/sessions") == []
-    assert ids(running, "/trash") == [session["id"]]
+    assert ids(running, "/trash") == [session.id]
 
 
 def test_what_was_half_deleted_is_no_session_and_gone_at_the_next_start(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    session = sealed(running, tared)
-    running.http.delete(f"/sessions/{session['id']}")
+    session = sealed(tared)
+    running.http.delete(session.url)
     monkeypatch.setattr(service.server.server, "destroy", lambda folders: 0)  # killed before
     running.http.delete("/trash")
     assert [path.name for path in (running.data / "trash").iterdir()] == [
-        DOOMED_PREFIX + session["id"]
+        DOOMED_PREFIX + session.id
     ]
     running.restart()
     assert ids(running, "/trash") == []
@@ -241,13 +208,13 @@ def test_what_was_half_deleted_is_no_session_and_gone_at_the_next_start(
 def test_screens_are_told_of_a_deletion(running: Running, tared: FakeNode) -> None:
     import json
 
-    session = sealed(running, tared)
+    session = sealed(tared)
     with running.socket("/api/v1/live") as live:
         assert json.loads(live.recv(timeout=5.0))["type"] == "hello"
-        running.http.delete(f"/sessions/{session['id']}")
+        running.http.delete(session.url)
         while (message := json.loads(live.recv(timeout=5.0)))["type"] != "deleted":
             pass
-    assert message["session_id"] == session["id"]
+    assert message["session_id"] == session.id
 
 
 # --- giving up ------------------------------------------------------------------------------------
@@ -256,10 +223,10 @@ def test_screens_are_told_of_a_deletion(running: Running, tared: FakeNode) -> No
 def test_a_session_whose_node_never_comes_back_can_be_sealed_without_it(
     running: Running, tared: FakeNode
 ) -> None:
-    session = pending(running, tared)
-    answer = running.http.post(f"/sessions/{session['id']}/seal")
+    session = pending(tared)
+    answer = running.http.post(f"{session.url}/seal")
     assert answer.status_code == 200, answer.text
-    done = running.sealed(session["id"])
+    done = session.sealed()
     assert (done["complete"], done["frames"]) == ("lossy", 50)
     assert done["parts"] == [{"boot_id": tared.boot_id, "seq_first": 70, "seq_last": 119}]
     # Nobody knows how many there were: at most as many as fit between the last one and the stop.
@@ -268,33 +235,31 @@ def test_a_session_whose_node_never_comes_back_can_be_sealed_without_it(
 
 
 def test_what_is_given_up_within_a_session_is_lost_for_that_reason(
-    running: Running, tared: FakeNode, until: Until
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
+    session = tared.record()
     tared.send(50)
     tared.frames(30)
     tared.send(20)
     until(lambda: running.node()["last_seq"] == 169)
-    stop(running, session)
+    session.stop()
     tared.send(10, now=True)
-    until(lambda: running.session(session["id"])["parts"][0]["seq_last"] == 169)
-    assert running.session(session["id"])["pending_frames"] == 30
-    running.http.post(f"/sessions/{session['id']}/seal")
-    done = running.sealed(session["id"])
+    until(lambda: session.now()["parts"][0]["seq_last"] == 169)
+    assert session.now()["pending_frames"] == 30
+    running.http.post(f"{session.url}/seal")
+    done = session.sealed()
     assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 70, {"given_up": 30})
-    ledger = running.http.get(f"/sessions/{session['id']}/ledger").json()
+    ledger = session.ledger()
     assert ledger["parts"][0]["unsynced_tail_max"] == 0
 
 
 def test_only_a_pending_session_can_be_given_up(running: Running, tared: FakeNode) -> None:
-    recording = start(running)
-    answer = running.http.post(f"/sessions/{recording['id']}/seal")
+    recording = tared.record()
+    answer = running.http.post(f"{recording.url}/seal")
     assert answer.status_code == 409
     assert "Stop it first" in answer.json()["detail"]
-    stop(running, recording)
-    tared.send(10, now=True)
-    running.sealed(recording["id"])
-    assert running.http.post(f"/sessions/{recording['id']}/seal").status_code == 409
+    tared.finish(recording)
+    assert running.http.post(f"{recording.url}/seal").status_code == 409
 
 
 # --- damage ---------------------------------------------------------------------------------------
@@ -310,37 +275,35 @@ def damage(running: Running, node: FakeNode, at: float = 0.5) -> None:
 
 
 def test_frames_that_are_found_damaged_are_asked_for_again_and_the_session_is_complete(
-    running: Running, tared: FakeNode, closing: Closing
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
-    tared.send(200)
-    tared.acknowledged(269)
+    session = tared.record()
+    tared.deliver(200)
     damage(running, tared)
-    stop(running, session)
+    session.stop()
     tared.send(10, now=True)
-    code, reason = closing(tared.socket)
+    code, reason = closed(tared.socket)
     assert (code, "damaged" in reason) == (1012, True)
     lacks = tared.connect()
     first, last = lacks[0]
     assert last is not None
     assert 70 <= first <= last <= 269
     tared.send_again(tared.all_sent().rows(first, last + 1))
-    done = running.sealed(session["id"])
+    done = session.sealed()
     assert (done["complete"], done["frames"], done["lost"]) == (True, 200, {})
 
 
 def test_frames_that_are_found_damaged_and_nobody_has_are_lost_and_said_to_be(
-    running: Running, tared: FakeNode, closing: Closing
+    running: Running, tared: FakeNode
 ) -> None:
-    session = start(running)
-    tared.send(200)
-    tared.acknowledged(269)
+    session = tared.record()
+    tared.deliver(200)
     damage(running, tared)
-    stop(running, session)
+    session.stop()
     tared.send(10, now=True)
-    closing(tared.socket)
+    closed(tared.socket)
     tared.connect(held=((270, 279),))  # the rest it has forgotten, as it may
-    done = running.sealed(session["id"])
+    done = session.sealed()
     assert (done["complete"], done["frames"], done["lost"]) == ("lossy", 190, {"corrupt": 10})
 
 
@@ -349,36 +312,34 @@ def test_frames_that_are_found_damaged_and_nobody_has_are_lost_and_said_to_be(
 
 @pytest.mark.parametrize("state", ["sealing", "pending"])
 def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_the_next(
-    running: Running, tared: FakeNode, until: Until, state: str, monkeypatch: pytest.MonkeyPatch
+    running: Running, tared: FakeNode, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from devices.errors import StorageError
 
     def refusing(*_: object) -> None:
         raise StorageError("No space left on device")
 
-    seal = service.server.recorder.seal
     monkeypatch.setattr(service.server.recorder, "seal", refusing)
-    session = start(running)
-    tared.send(20)
-    tared.acknowledged(89)
-    stop(running, session)
+    session = tared.record()
+    tared.deliver(20)
+    session.stop()
     if state == "sealing":
         tared.send(10, now=True)
-        until(lambda: "No space" in (running.session(session["id"])["problem"] or ""))
-    assert running.session(session["id"])["state"] == state
+        until(lambda: "No space" in (session.now()["problem"] or ""))
+    assert session.now()["state"] == state
     monkeypatch.setattr(service.server.recorder, "seal", seal)
     running.restart()
     if state == "pending":
         tared.connect()
         tared.send(10, now=True)
-    assert running.sealed(session["id"])["frames"] == 20
+    assert session.sealed()["frames"] == 20
 
 
 def test_what_killed_processes_left_half_written_is_removed_at_the_start(
     running: Running, tared: FakeNode
 ) -> None:
-    session = sealed(running, tared)
-    folder = running.data / "sessions" / session["id"]
+    session = sealed(tared)
+    folder = session.folder
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait(20)
     stale = [
@@ -402,7 +363,7 @@ def test_frames_of_an_unsealed_session_are_never_pruned(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("service.server.nodes.RING_NS", 0)
-    pending(running, tared)
+    pending(tared)
     node = running.server.nodes.get("bench")
     running.call(lambda: node.prune(running.server.recorder.needed("bench")))
     assert not (Intervals([(70, 119)]) - node.present.held)

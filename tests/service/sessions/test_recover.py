@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from devices.errors import StorageError
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, FrameStatus
+from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from service.sessions import recover as recover_module
 from service.sessions.recover import Recovery, recover
+from service.sessions.sealing import seal
 from storage.clock.offset import ClockOffset
 from storage.folder_lock import locked
 from storage.journal.in_flight import InFlight
@@ -27,44 +28,31 @@ from storage.losses import Losses
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event, Part, Session, SessionFolder
 from storage.verify.data import as_dict, verdict_of, verify
+from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
+from tests.builders.calibrations import make_calibration
+from tests.builders.frames import make_frames
 
 ID = "20200101T000000Z-00000a"
 BOOT = "a" * 32
 OTHER_BOOT = "b" * 32
-UTC_NS = 10**18
-PERIOD_NS = 2_000_000
 LEAD = 400
 TAIL = unsynced_tail_max(500.0)
 
 Frames = Callable[..., FrameBatch]
 
 
-@pytest.fixture
-def info_of(array_of: Callable[..., ArrayInfo]) -> Callable[[str], ArrayInfo]:
-    def make(boot_id: str = BOOT) -> ArrayInfo:
-        return array_of("bench", boot_id, UTC_NS)
-
-    return make
+def info_of(boot_id: str = BOOT) -> ArrayInfo:
+    return make_array(boot_id=boot_id)
 
 
 def frames(first: int, last: int) -> FrameBatch:
     """Unloaded for the lead, then ten counts, which are ten newtons; the last digit is noise."""
-    seq = np.arange(first, last + 1, dtype=np.uint64)
-    t_mono_ns = PERIOD_NS * seq.astype(np.int64)
-    shape = (len(seq), 2)
+    seq = np.arange(first, last + 1)
     lead = seq < LEAD
-    return FrameBatch(
-        seq=seq,
-        t_mono_ns=t_mono_ns,
-        t_ns=t_mono_ns + UTC_NS,
-        padc=(np.where(lead, 500, 490) + seq % 2)[:, None].repeat(2, axis=1).astype(np.uint16),
-        tadc=np.full(shape, 480, np.uint16),
-        sample_offset_us=np.zeros(shape, np.int32),
-        servo_counts=np.full(len(seq), NO_SERVO_COUNTS, np.int32),
-        servo_age_us=np.full(len(seq), NO_SERVO_AGE, np.int32),
-        status=np.zeros(shape, np.uint8),
-        frame_status=np.where(lead, int(FrameStatus.LEAD), 0).astype(np.uint8),
-        reference_force_n=np.full(len(seq), np.nan, np.float32),
+    return make_frames(
+        seq,
+        padc=(np.where(lead, 500, 490) + seq % 2)[:, None],
+        frame_status=np.where(lead, FrameStatus.LEAD, 0),
     )
 
 
@@ -132,13 +120,11 @@ def outcomes(recovery: Recovery) -> list[str]:
 # --- a node alone ---------------------------------------------------------------------------------
 
 
-def test_a_node_that_died_while_recording_leaves_a_sealed_session(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo], newtons_of: Callable[..., Any]
-) -> None:
+def test_a_node_that_died_while_recording_leaves_a_sealed_session(tmp_path: Path) -> None:
     folder = stream(tmp_path, info_of(), (0, 999), closed=False)
     (segment,) = folder.glob("*.arrows")
     segment.write_bytes(segment.read_bytes() + b"half a batch")
-    session(tmp_path, calibration=newtons_of(("T01", "T02")).model_dump(mode="json"))
+    session(tmp_path, calibration=make_calibration("T01", "T02").model_dump(mode="json"))
     recovery = recover(tmp_path)
     assert (outcomes(recovery), recovery.problems) == (["sealed"], [])
     assert recovery.sessions[0].problem == ""
@@ -159,9 +145,7 @@ def test_a_node_that_died_while_recording_leaves_a_sealed_session(
     assert columns["grf_n"][batch.seq >= 500].mean() == pytest.approx(20.0, abs=0.1)
 
 
-def test_a_second_run_finds_nothing_and_changes_nothing(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_a_second_run_finds_nothing_and_changes_nothing(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), closed=False)
     session(tmp_path)
     assert not recover(tmp_path, streams=True).is_nothing
@@ -172,9 +156,7 @@ def test_a_second_run_finds_nothing_and_changes_nothing(
     assert state_of(tmp_path) == before
 
 
-def test_without_tare_or_calibration_raw_frames_are_kept_and_it_says_so(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_without_tare_or_calibration_raw_frames_are_kept_and_it_says_so(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99))
     session(tmp_path)
     (one,) = recover(tmp_path).sessions
@@ -182,9 +164,7 @@ def test_without_tare_or_calibration_raw_frames_are_kept_and_it_says_so(
     assert loaded(tmp_path).frames == 100
 
 
-def test_a_process_that_was_killed_on_a_machine_that_stayed_up_lost_nothing(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_a_process_that_was_killed_on_a_machine_that_stayed_up_lost_nothing(tmp_path: Path) -> None:
     folder = stream(tmp_path, info_of(), (0, 99), closed=False)
     InFlight(folder, info_of()).close()
     session(tmp_path)
@@ -196,7 +176,7 @@ def test_a_process_that_was_killed_on_a_machine_that_stayed_up_lost_nothing(
 
 
 def test_after_another_start_of_the_machine_what_was_in_flight_is_gone(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = stream(tmp_path, info_of(), (0, 99), closed=False)
     InFlight(folder, info_of()).close()
@@ -208,9 +188,7 @@ def test_after_another_start_of_the_machine_what_was_in_flight_is_gone(
     assert ledger.parts[0].unsynced_tail_max == TAIL
 
 
-def test_a_stream_whose_end_is_known_is_counted_to_it(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_a_stream_whose_end_is_known_is_counted_to_it(tmp_path: Path) -> None:
     lost = {"disk_full": ((100, 119),)}
     stream(tmp_path, info_of(), (0, 99), next_seq=120, lost=lost, missed_slots=3)
     session(tmp_path, missed_slots_at_start=1)
@@ -222,9 +200,7 @@ def test_a_stream_whose_end_is_known_is_counted_to_it(
         assert reader.notes["lost"] == {BOOT: {"disk_full": [[100, 119]]}}
 
 
-def test_a_session_that_was_stopped_ends_where_it_was_stopped(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_a_session_that_was_stopped_ends_where_it_was_stopped(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 199), closed=False)
     session(tmp_path, state="pending", stopped_t_ns=t_ns(150) + 1)
     (one,) = recover(tmp_path).sessions
@@ -233,7 +209,7 @@ def test_a_session_that_was_stopped_ends_where_it_was_stopped(
     assert one.ledger.complete
 
 
-def test_several_parts_become_one_file(tmp_path: Path, info_of: Callable[..., ArrayInfo]) -> None:
+def test_several_parts_become_one_file(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     stream(tmp_path, info_of(OTHER_BOOT), (0, 49), closed=False)
     parts = (
@@ -246,9 +222,7 @@ def test_several_parts_become_one_file(tmp_path: Path, info_of: Callable[..., Ar
     assert as_dict(verify(tmp_path))["problems"] == []
 
 
-def test_frames_that_are_damaged_are_lost_and_the_others_kept(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) -> None:
     folder = stream(tmp_path, info_of(), (0, 99), next_seq=100)
     (segment,) = folder.glob("*.arrows")
     content = bytearray(segment.read_bytes())
@@ -278,9 +252,7 @@ def test_a_session_of_which_nothing_reached_the_disk_is_sealed_as_that(tmp_path:
 # --- a server -------------------------------------------------------------------------------------
 
 
-def test_what_a_node_may_still_bring_is_waited_for(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_what_a_node_may_still_bring_is_waited_for(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
     session(tmp_path)
     parts = (Part(boot_id=BOOT, seq_first=50, seq_last=150),)
@@ -295,9 +267,7 @@ def test_what_a_node_may_still_bring_is_waited_for(
     assert recover(tmp_path).is_nothing
 
 
-def test_what_is_given_up_is_lost_and_says_so(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_what_is_given_up_is_lost_and_says_so(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
     session(tmp_path)
     (one,) = recover(tmp_path, give_up=True).sessions
@@ -307,9 +277,7 @@ def test_what_is_given_up_is_lost_and_says_so(
     assert loaded(tmp_path).frames == 180
 
 
-def test_a_stop_that_was_never_reached_bounds_what_is_given_up(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_a_stop_that_was_never_reached_bounds_what_is_given_up(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99))
     clock = ClockOffset(boot_id=BOOT, t_mono_ns=0, server_minus_node_ns=10**9, uncertainty_ns=1)
     stopped_t_ns = t_ns(99) + 10**9 + 4 * 10**9
@@ -319,9 +287,7 @@ def test_a_stop_that_was_never_reached_bounds_what_is_given_up(
     assert one.session.unsynced_tail_max == {BOOT: 2000}
 
 
-def test_a_session_that_was_stopped_is_ended_by_its_clock(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_a_session_that_was_stopped_is_ended_by_its_clock(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99))
     clock = ClockOffset(boot_id=BOOT, t_mono_ns=0, server_minus_node_ns=10**9, uncertainty_ns=1)
     session(tmp_path, state="pending", stopped_t_ns=t_ns(50) + 10**9, clock=(clock,))
@@ -332,9 +298,7 @@ def test_a_session_that_was_stopped_is_ended_by_its_clock(
 # --- streams of no session ------------------------------------------------------------------------
 
 
-def test_frames_of_no_session_become_one_if_asked(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_frames_of_no_session_become_one_if_asked(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 199), next_seq=200)
     session(
         tmp_path,
@@ -356,9 +320,7 @@ def test_frames_of_no_session_become_one_if_asked(
     assert verdict_of(verify(tmp_path)) == "complete"
 
 
-def test_what_was_deleted_is_not_brought_back(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_what_was_deleted_is_not_brought_back(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path, state="sealed")
     (tmp_path / "trash").mkdir()
@@ -369,9 +331,7 @@ def test_what_was_deleted_is_not_brought_back(
 # --- what else a crash leaves ---------------------------------------------------------------------
 
 
-def test_what_dead_processes_left_half_written_is_removed(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_what_dead_processes_left_half_written_is_removed(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
     dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], stdout=-1)
@@ -381,9 +341,7 @@ def test_what_dead_processes_left_half_written_is_removed(
     assert not stale.exists()
 
 
-def test_events_that_were_not_written_in_time_are_written_anew(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_events_that_were_not_written_in_time_are_written_anew(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
     recover(tmp_path)
@@ -398,9 +356,7 @@ def test_events_that_were_not_written_in_time_are_written_anew(
     assert recover(tmp_path).is_nothing
 
 
-def test_what_cannot_be_read_is_named_and_holds_up_nothing_else(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo]
-) -> None:
+def test_what_cannot_be_read_is_named_and_holds_up_nothing_else(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
     bad = tmp_path / "sessions" / (ID[:-1] + "b")
@@ -417,14 +373,13 @@ def test_what_cannot_be_read_is_named_and_holds_up_nothing_else(
 
 
 def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
-    real = recover_module.seal
 
     def careless(*arguments: Any) -> Session:
-        done = real(*arguments)
+        done = seal(*arguments)
         path = tmp_path / "sessions" / ID / "frames.parquet"
         content = bytearray(path.read_bytes())
         content[100] ^= 1
@@ -441,7 +396,7 @@ def test_a_file_that_does_not_prove_itself_is_not_called_recovered(
 
 
 def test_a_full_disk_leaves_the_session_for_the_next_run(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
@@ -461,7 +416,7 @@ class Killed(BaseException):
 
 
 def test_killed_at_any_write_the_next_run_comes_to_the_same(
-    tmp_path: Path, info_of: Callable[..., ArrayInfo], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun = tmp_path / "begun"
     stream(begun, info_of(), (0, 99), closed=False)

@@ -1,0 +1,366 @@
+"""A scripted node at the other end of the link, whose counts are newtons."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+import time
+import uuid
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection
+
+from devices.frames import (
+    ArrayInfo,
+    FrameBatch,
+    FrameStatus,
+)
+from service.estimation.calibration import Calibration
+from service.link import (
+    INGEST_PATH,
+    PROTOCOL,
+    ClockRow,
+    EarlierStream,
+    FramesOf,
+    FromServer,
+    Hello,
+    Wanted,
+    heard,
+    with_check,
+)
+from storage.intervals import Intervals
+from storage.schema import wire_schema
+from storage.wire import encode
+from tests.builders.arrays import PERIOD_NS, UNLOADED_COUNTS, make_array
+from tests.builders.calibrations import make_calibration
+from tests.builders.frames import make_frames
+from tests.service.recording import Recording
+from tests.service.running import Running
+from tests.waiting import until
+
+LONG_AGO_NS = 20_000_000_000
+"""A node's frames begin so long before now, so that `now=True` is a leap past what was asked."""
+
+
+@dataclass
+class Earlier:
+    """A stream that a node took before it was switched on anew."""
+
+    info: ArrayInfo
+    next_seq: int
+    sent: list[FrameBatch]
+
+    @property
+    def boot_id(self) -> str:
+        return self.info.boot_id
+
+    def said(self, **changes: Any) -> EarlierStream:
+        """As a hello mentions it: the node has all of it."""
+        content: dict[str, Any] = {
+            "array_info": self.info,
+            "held": ((0, self.next_seq - 1),) if self.next_seq else (),
+            "next_seq": self.next_seq,
+            "t_ns_first": int(self.sent[0].t_ns[0]) if self.sent else 0,
+        }
+        return EarlierStream(**content | changes)
+
+
+class Spoken:
+    """A node's end of the link: what it sends has its checksum, whatever it is."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._socket, name)
+
+    def send(self, message: str | bytes) -> None:
+        """Send something, with the checksum that fits it."""
+        if isinstance(message, bytes):
+            self.send_raw(with_check(message))
+        elif message.endswith("}"):
+            body = message[:-1]
+            self.send_raw(f'{body},"crc32":"{zlib.crc32(body.encode()):08x}"}}')
+        else:
+            self.send_raw(message)
+
+    def send_raw(self, message: str | bytes) -> None:
+        """Send these bytes."""
+        self._socket.send(message)
+
+    def recv(self, timeout: float | None = None) -> str:
+        """The next message, without its checksum, which has to be right."""
+        return heard(self._socket.recv(timeout=timeout))
+
+
+class FakeNode:
+    """A node that says what a test has it say."""
+
+    def __init__(
+        self,
+        running: Running,
+        name: str = "bench",
+        *,
+        calibration: Calibration | str | None = "by hand",
+        tiles: int = 2,
+        token: str | None = None,
+    ) -> None:
+        self.running = running
+        self.name = name
+        self.token = token
+        self.calibration = calibration
+        self.tiles = tiles
+        self.acked = Intervals()
+        """Of the present stream."""
+        self.acked_of: dict[str, Intervals] = {}
+        self.lacks: dict[str, list[tuple[int, int | None]]] = {}
+        """What the server asked for at the last connection, by stream."""
+        self.wanted: Wanted
+        self.boot_id = ""
+        self.seq = 0
+        self.sent: list[FrameBatch] = []
+        self.before: list[Earlier] = []
+        """Its streams before the present one."""
+        self.socket: Spoken
+        self._sockets = contextlib.ExitStack()
+        self.reboot()
+
+    def reboot(self) -> None:
+        """Begin a new stream, with the clock where it was before or long ago."""
+        if self.boot_id:
+            self.before.append(Earlier(self.info, self.seq, self.sent))
+        self.boot_id = uuid.uuid4().hex
+        self.utc_offset_ns = time.time_ns() - time.monotonic_ns()
+        self.next_t_mono_ns = time.monotonic_ns() - LONG_AGO_NS
+        self.seq = 0
+        self.sent = []
+        self.acked = Intervals()
+
+    @property
+    def info(self) -> ArrayInfo:
+        return make_array(
+            self.tiles, node=self.name, boot_id=self.boot_id, utc_offset_ns=self.utc_offset_ns
+        )
+
+    def hello(self, **changes: Any) -> Hello:
+        calibration: Any = self.calibration
+        if calibration == "by hand":
+            calibration = make_calibration(*self.info.serials)
+        content: dict[str, Any] = {
+            "protocol": PROTOCOL,
+            "array_info": self.info,
+            "held": ((0, self.seq - 1),) if self.seq else (),
+            "next_seq": self.seq,
+            "scene": {"name": "test"},
+            "emulated": False,
+            "calibration": calibration,
+            "calibration_problem": None if calibration else "for this test",
+        }
+        return Hello(**(content | changes))
+
+    def connect(self, **changes: Any) -> list[tuple[int, int | None]]:
+        """Connect and say hello, then how the clocks differ; gives what the server lacks."""
+        lacks = self.greet(**changes)
+        self.say_clock(0, uncertainty_ns=9, t_mono_ns=time.monotonic_ns())
+        return lacks
+
+    def greet(self, **changes: Any) -> list[tuple[int, int | None]]:
+        """As `connect`, without a word about clocks."""
+        self.open()
+        self.socket.send(self.hello(**changes).model_dump_json())
+        welcome = self.receive("welcome")
+        self.wanted = welcome.wanted
+        self.lacks = {each.boot_id: [*each.numbers] for each in welcome.lacks}
+        return self.lacks[self.boot_id]
+
+    def say_clock(
+        self, server_minus_node_ns: int, *, uncertainty_ns: int = 7, t_mono_ns: int | None = None
+    ) -> None:
+        """Tell how the clocks differed at this instant, or at the newest frame."""
+        row = ClockRow(
+            t_mono_ns=self.next_t_mono_ns if t_mono_ns is None else t_mono_ns,
+            server_minus_node_ns=server_minus_node_ns,
+            uncertainty_ns=uncertainty_ns,
+        )
+        self.socket.send(row.model_dump_json())
+
+    def say_lost(self, **lost: list[list[int]]) -> None:
+        """Tell which numbers of the present stream are lost, by reason."""
+        self.socket.send(json.dumps({"type": "lost", "boot_id": self.boot_id, "lost": lost}))
+
+    def open(self) -> Spoken:
+        """Connect and say nothing."""
+        headers = {"Authorization": f"Bearer {self.token}"} if self.token else None
+        self.socket = Spoken(
+            self._sockets.enter_context(
+                self.running.socket(INGEST_PATH, additional_headers=headers)
+            )
+        )
+        return self.socket
+
+    def receive(self, kind: str, timeout_s: float = 8.0) -> Any:
+        """The next message of a kind; acknowledgements on the way are noted."""
+        end_s = time.monotonic() + timeout_s
+        while True:
+            message = FromServer.validate_json(
+                self.socket.recv(timeout=max(0.0, end_s - time.monotonic()))
+            )
+            if message.type == "ack":
+                acked = self.acked_of.setdefault(message.boot_id, Intervals())
+                acked.add(message.seq_first, message.seq_last)
+                if message.boot_id == self.boot_id:
+                    self.acked.add(message.seq_first, message.seq_last)
+            if message.type == "wanted":
+                self.wanted = message
+            if message.type == kind:
+                return message
+
+    def acknowledged(self, last: int, first: int = 0) -> None:
+        """Wait until all of this was acknowledged."""
+        while self.acked.missing(first, last):
+            self.receive("ack")
+
+    def frames(
+        self,
+        n: int,
+        force_n: float | Sequence[float] = 0.0,
+        *,
+        lead: bool = False,
+        now: bool = False,
+        noise: int = 0,
+        alive: bool = False,
+    ) -> FrameBatch:
+        """The next `n` frames under a force; `now`: leaping to this instant.
+
+        Readings that are all the same are those of a part that hangs, so in a lead, and in frames
+        that are `alive`, one is a count higher and one a count lower: the mean stays exact.
+        """
+        if now:
+            self.next_t_mono_ns = max(self.next_t_mono_ns, time.monotonic_ns())
+        shape = (n, self.tiles)
+        t_mono_ns = self.next_t_mono_ns + PERIOD_NS * np.arange(n, dtype=np.int64)
+        random = np.random.default_rng(self.seq)
+        counts = UNLOADED_COUNTS - np.broadcast_to(np.asarray(force_n), shape)
+        counts = counts + random.integers(-noise, noise + 1, shape)
+        if lead or alive:
+            counts[-30:-28] += [[1], [-1]]
+        batch = make_frames(
+            np.arange(self.seq, self.seq + n),
+            self.tiles,
+            utc_offset_ns=self.utc_offset_ns,
+            t_mono_ns=t_mono_ns,
+            padc=counts,
+            sample_offset_us=np.arange(self.tiles),
+            frame_status=FrameStatus.LEAD if lead else 0,
+        )
+        self.seq += n
+        self.next_t_mono_ns += n * PERIOD_NS
+        self.sent.append(batch)
+        return batch
+
+    def send(self, n: int, force_n: float | Sequence[float] = 0.0, **how: Any) -> FrameBatch:
+        """Take frames, and send them ten in a message as nodes do."""
+        batch = self.frames(n, force_n, **how)
+        self.send_again(batch)
+        return batch
+
+    def send_again(self, batch: FrameBatch) -> None:
+        """Send frames, perhaps for the second time."""
+        for begin in range(0, len(batch), 10):
+            self.socket.send(self.payload(batch.rows(begin, begin + 10)))
+
+    def send_lacking(self) -> None:
+        """Send what the server asked for of streams before this one."""
+        for earlier in self.before:
+            for first, last in self.lacks.get(earlier.boot_id, []):
+                self.send_earlier(earlier, first, earlier.next_seq - 1 if last is None else last)
+
+    def send_earlier(self, stream: Earlier, seq_first: int, seq_last: int) -> None:
+        """Send frames of a stream before this one, then go on with this one."""
+        self.socket.send(FramesOf(boot_id=stream.info.boot_id).model_dump_json())
+        rows = FrameBatch.concatenate(stream.sent).rows(seq_first, seq_last + 1)
+        for begin in range(0, len(rows), 10):
+            batch = rows.rows(begin, begin + 10)
+            self.socket.send(encode(batch, wire_schema(stream.info)))
+        self.socket.send(FramesOf(boot_id=self.boot_id).model_dump_json())
+
+    def payload(self, batch: FrameBatch) -> bytes:
+        return encode(batch, wire_schema(self.info))
+
+    def all_sent(self) -> FrameBatch:
+        """Every frame of this stream, in order."""
+        return FrameBatch.concatenate(self.sent)
+
+    def deliver(self, n: int, force_n: float | Sequence[float] = 0.0, **how: Any) -> FrameBatch:
+        """Take frames and send them, and wait until they are acknowledged."""
+        batch = self.send(n, force_n, **how)
+        self.acknowledged(int(batch.seq[-1]), first=int(batch.seq[0]))
+        return batch
+
+    def record(self, **body: object) -> Recording:
+        """Begin a session of this node."""
+        return self.running.record(self.name, **body)
+
+    def taken_in(self) -> None:
+        """Wait until the server has the newest frame, be it on its disk or not."""
+        until(lambda: self.running.node(self.name)["last_seq"] == self.seq - 1)
+
+    def finish(self, recording: Recording) -> dict[str, Any]:
+        """Stop a session, send frames of after the stop, and wait until it is sealed."""
+        recording.stop()
+        self.send(10, now=True)
+        return recording.sealed()
+
+    def tared(self) -> FrameBatch:
+        """Send a lead that the server tares from."""
+        lead = self.send(60, lead=True)
+        self.send(10)
+        until(lambda: self.running.node(self.name)["tare"])
+        return lead
+
+    def leave(self) -> None:
+        """Go away, and wait until the server has seen it."""
+        self.socket.close()
+        until(lambda: not self.running.node(self.name)["connected"])
+
+    def close(self) -> None:
+        self._sockets.close()
+
+
+NodeOf = Callable[..., FakeNode]
+
+
+class Play:
+    """A node that streams in real time until it is told to stop."""
+
+    def __init__(self, node: FakeNode, force_n: float = 0.0) -> None:
+        self.node = node
+        self.force_n = force_n
+        self.problem: BaseException | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="play")
+
+    def __enter__(self) -> Play:
+        self.node.next_t_mono_ns = time.monotonic_ns()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(5.0)
+        assert not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.wait(0.02):
+                due = (time.monotonic_ns() - self.node.next_t_mono_ns) // PERIOD_NS
+                if due > 0:
+                    self.node.send(int(due), self.force_n)
+        except ConnectionClosed as end:
+            self.problem = end

@@ -1,0 +1,91 @@
+"""`foottile` as a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.waiting import until
+
+Start = Callable[..., "Process"]
+
+
+class Process:
+    """`foottile` as a process; its output is read as it comes."""
+
+    def __init__(self, *arguments: object, folder: Path, **environment: str) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        # The package is found by where it is installed, not by the working directory.
+        self.process = subprocess.Popen(
+            [str(Path(sys.executable).parent / "foottile"), *map(str, arguments)],
+            cwd=folder,
+            env={
+                **os.environ,
+                "COLUMNS": "200",
+                "PYTHONUNBUFFERED": "1",
+                "XDG_STATE_HOME": str(folder.parent / "state"),  # journals of nodes
+                **environment,
+            },
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.out: list[str] = []
+        self.err: list[str] = []
+        self._readers = [
+            threading.Thread(target=self._read, args=(stream, lines), name="reader")
+            for stream, lines in (
+                (self.process.stdout, self.out),
+                (self.process.stderr, self.err),
+            )
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    def said(self, text: str, timeout_s: float = 20.0) -> str:
+        """The first line of either stream with this text."""
+
+        def found() -> str | None:
+            lines = [line for line in (*self.out, *self.err) if text in line]
+            if not lines and self.process.poll() is not None:
+                pytest.fail(f"ended with {self.process.returncode}: {self.out} {self.err}")
+            return lines[0] if lines else None
+
+        line = until(found, timeout_s)
+        assert line is not None
+        return line
+
+    def ended(self, timeout_s: float) -> int:
+        """Its exit code, once it has ended."""
+        code = self.process.wait(timeout_s)
+        for reader in self._readers:
+            reader.join(10.0)
+        return code
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait(5.0)
+        for reader, stream in zip(
+            self._readers, (self.process.stdout, self.process.stderr), strict=True
+        ):
+            reader.join(5.0)
+            assert stream is not None
+            stream.close()
+
+    def _read(self, stream: Any, lines: list[str]) -> None:
+        with contextlib.suppress(ValueError):  # closed
+            lines.extend(line.rstrip("\n") for line in iter(stream.readline, ""))

@@ -1,0 +1,88 @@
+"""A session as those who record it see it: over REST, and in the server's folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import httpx
+import numpy as np
+import pyarrow.parquet as pq
+
+from devices.frames import FrameBatch
+from storage.sessions.file import SessionReader
+from tests.waiting import until
+
+if TYPE_CHECKING:
+    from tests.service.running import Running
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A session of a server; `begun` is what the server said when it began."""
+
+    running: Running
+    begun: dict[str, Any]
+
+    def __getitem__(self, name: str) -> Any:
+        """A fact of the session as it began."""
+        return self.begun[name]
+
+    @property
+    def id(self) -> str:
+        return str(self.begun["id"])
+
+    @property
+    def url(self) -> str:
+        return f"/sessions/{self.id}"
+
+    @property
+    def folder(self) -> Path:
+        return self.running.data / "sessions" / self.id
+
+    def now(self) -> dict[str, Any]:
+        """The session as the server describes it now."""
+        return self._answered(self.running.http.get(self.url))
+
+    def ledger(self) -> dict[str, Any]:
+        return self._answered(self.running.http.get(f"{self.url}/ledger"))
+
+    def stop(self) -> dict[str, Any]:
+        return self._answered(self.running.http.post(f"{self.url}/stop"))
+
+    def sealed(self, timeout_s: float = 8.0) -> dict[str, Any]:
+        """The session once it is sealed."""
+        until(lambda: self.now()["state"] == "sealed", timeout_s)
+        return self.now()
+
+    def reader(self) -> SessionReader:
+        return SessionReader(self.folder / "frames.parquet")
+
+    def frames(self) -> FrameBatch:
+        with self.reader() as file:
+            return FrameBatch.concatenate([batch for batch, _ in file.batches()])
+
+    def column(self, name: str) -> np.ndarray:
+        path = self.folder / "frames.parquet"
+        return pq.read_table(path, columns=[name])[name].to_numpy()
+
+    def clock(self) -> dict[str, Any]:
+        return self._answered(self.running.http.get(f"{self.url}/clock"))
+
+    def data(self, **query: Any) -> httpx.Response:
+        """A download."""
+        answer = self.running.http.get(f"{self.url}/data", params=query)
+        assert answer.status_code == 200, answer.text
+        return answer
+
+    @staticmethod
+    def _answered(answer: httpx.Response) -> dict[str, Any]:
+        assert answer.status_code == 200, answer.text
+        content: dict[str, Any] = answer.json()
+        return content
+
+
+def parts_of(session: dict[str, Any]) -> list[tuple[str, int, int | None]]:
+    """Stream, first and last number of every part."""
+    return [(part["boot_id"], part["seq_first"], part["seq_last"]) for part in session["parts"]]

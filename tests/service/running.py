@@ -1,0 +1,185 @@
+"""A real server on a real socket, in a thread of the test's process."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import threading
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from service.api.app import make_app
+from service.api.serve import listen, serving, urls_of
+from service.link import SUBPROTOCOL
+from service.server.server import Server
+from storage.journal.journal import Journal
+from tests.service.recording import Recording
+
+T = TypeVar("T")
+
+
+class Running:
+    """A server in a thread with an event loop of its own."""
+
+    def __init__(self, data: Path, *, token: str | None = None, hosts: Sequence[str] = ()) -> None:
+        self.data = data
+        self.server: Server
+        self.http: httpx.Client
+        self.port = 0
+        self._token = token
+        self._hosts = tuple(hosts)
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop
+        self._stop: asyncio.Event
+        self._problem: BaseException | None = None
+        self.open_journals: list[Path] = []
+        """Journals that the server left open when it ended."""
+        self._left_over: list[str] = []
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        assert self._thread is None
+        ready = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(ready,), name="server")
+        self._thread.start()
+        assert ready.wait(10.0)
+        if self._problem is not None:
+            self._thread.join()
+            self._thread = None
+            raise self._problem
+        self.http = httpx.Client(base_url=self.url + "/api/v1", timeout=10.0, trust_env=False)
+
+    def stop(self) -> None:
+        if self._thread is None:
+            return
+        self.http.close()
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(15.0)
+        assert not self._thread.is_alive(), "the server does not end"
+        self._thread = None
+        assert not self._left_over, self._left_over
+        if self._problem is not None:
+            raise self._problem
+
+    def restart(self) -> None:
+        """Stop, and start again on the same port and folder."""
+        self.stop()
+        self.start()
+
+    def call(self, function: Callable[[], T]) -> T:
+        """Run a function in the server's loop."""
+
+        async def run() -> T:
+            return function()
+
+        return asyncio.run_coroutine_threadsafe(run(), self._loop).result(10.0)
+
+    def socket(self, path: str, *, small: bool = False, **options: Any) -> ClientConnection:
+        """A websocket to the server."""
+        options.setdefault("subprotocols", [SUBPROTOCOL])
+        if not small:
+            options.setdefault("max_queue", None)
+        connection: ClientConnection = connect(
+            self.url.replace("http", "ws") + path,
+            proxy=None,
+            compression=None,
+            ping_interval=None,
+            close_timeout=2.0,
+            **options,
+        )
+        return connection
+
+    def node(self, name: str = "bench") -> dict[str, Any]:
+        answer = self.http.get(f"/nodes/{name}")
+        assert answer.status_code == 200, answer.text
+        content: dict[str, Any] = answer.json()
+        return content
+
+    def record(self, node: str = "bench", **body: object) -> Recording:
+        """Begin a session."""
+        answer = self.http.post("/sessions", json={"node": node, "name": "trial"} | body)
+        assert answer.status_code == 201, answer.text
+        recording = Recording(self, answer.json())
+        assert answer.headers["location"] == f"/api/v1{recording.url}"
+        return recording
+
+    def session(self, session_id: str) -> Recording:
+        """A session that has begun already."""
+        return Recording(self, {"id": session_id})
+
+    def only_session(self, *, but: Recording | None = None) -> Recording:
+        """The one session that there is, but for this one."""
+        (found,) = [s for s in self.sessions() if but is None or s["id"] != but.id]
+        return Recording(self, found)
+
+    def sessions(self) -> list[dict[str, Any]]:
+        """Every session that is not in the trash, the newest first."""
+        items: list[dict[str, Any]] = self.http.get("/sessions").json()["items"]
+        return items
+
+    def journal(self, boot_id: str, name: str = "bench") -> Journal:
+        """A journal as another process would find it now: opened from a copy of its files."""
+        copy = self.data.with_name(f"copy-{uuid.uuid4().hex}")
+        shutil.copytree(self.data / "journal" / name / boot_id, copy)
+        return Journal.open(copy)
+
+    def _run(self, ready: threading.Event) -> None:
+        try:
+            asyncio.run(self._serve(ready))
+        except BaseException as error:
+            self._problem = error
+        finally:
+            ready.set()
+
+    async def _serve(self, ready: threading.Event) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._stop = asyncio.Event()
+        with listen("127.0.0.1", self.port) as listening:
+            self.server = Server(self.data)
+            app = make_app(self.server, hosts=self._hosts, token=self._token)
+            async with serving(app, listening):
+                self.port = int(urls_of(listening, "127.0.0.1")[-1].rsplit(":", 1)[1])
+                ready.set()
+                await self._stop.wait()
+        self.open_journals = []
+        for node in self.server.nodes:
+            for journal in node.journals.values():
+                if journal._open:
+                    self.open_journals.append(journal.folder)
+                    journal.close()
+        self._left_over = await _left_over()
+
+
+ServeWith = Callable[..., Running]
+
+
+async def _left_over() -> list[str]:
+    """Tasks that go on although everything has ended."""
+    end_s = time.monotonic() + 3.0
+    while True:
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        if not tasks or time.monotonic() > end_s:
+            return [repr(task) for task in tasks]
+        await asyncio.sleep(0.01)
+
+
+def closed(socket: Any, timeout_s: float = 5.0) -> tuple[int, str]:
+    """Code and reason with which the server closes a websocket."""
+    try:
+        while True:
+            socket.recv(timeout=timeout_s)
+    except ConnectionClosed as end:
+        if end.rcvd is None:
+            pytest.fail("it was cut off without a close frame")
+        return int(end.rcvd.code), end.rcvd.reason
