@@ -26,6 +26,8 @@ from service.estimation.plan import EstimationPlan, make_plan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from functools import partial
+
 from tests.builders.arrays import DATA_SHEET_CHIP, make_array, make_tile
 from tests.builders.calibrations import make_tare
 from tests.builders.frames import make_frames
@@ -124,9 +126,9 @@ def main() -> None:
         frames = frames_of(n)
         a, b, c = interleaved(
             [
-                lambda f=frames, b=batch: bare(f, b),
-                lambda f=frames, b=batch: estimate(static, f, b),
-                lambda f=frames, b=batch: estimate(both, f, b),
+                partial(bare, frames, batch),
+                partial(estimate, static, frames, batch),
+                partial(estimate, both, frames, batch),
             ],
             n,
         )
@@ -143,8 +145,8 @@ def main() -> None:
         kernel = StaticKernel(plan, batch)
         a, b = interleaved(
             [
-                lambda k=kernel, f=frames, b=batch: by_hand(k, f, b),
-                lambda p=plan, f=frames, b=batch: estimate(p, f, b),
+                partial(by_hand, kernel, frames, batch),
+                partial(estimate, plan, frames, batch),
             ],
             n,
         )

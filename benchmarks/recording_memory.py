@@ -110,7 +110,7 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
         write_file_hash(path)
         hash_s += time.perf_counter() - begin
 
-    session_file.ContentDigest, session_file.write_file_hash = Timed, timed
+    vars(session_file).update(ContentDigest=Timed, write_file_hash=timed)
     info = array(asked.tiles, asked.rate)
     journal = Journal(folder / "journal" / "bench" / BOOT_ID, info)
     last = journal.held.last

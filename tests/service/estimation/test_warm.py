@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import service.estimation
 from service.estimation import warm
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.ladder import MODELS
-from service.estimation.plan import make_plan
+from service.estimation.plan import EstimationPlan, make_plan
 from storage.schema import wire_schema
 from storage.wire import decode, encode
 from tests.builders.calibrations import make_tare
@@ -36,12 +35,16 @@ def test_nothing_is_compiled_after_the_warm_up(
     models: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Any] = []
-    original: Callable[..., Any] = make_plan
-    monkeypatch.setattr(warm, "make_plan", lambda *a, **k: made.append((a, k)) or original(*a, **k))
+
+    def noted(*arguments: Any, **options: Any) -> EstimationPlan:
+        made.append(arguments)
+        return make_plan(*arguments, **options)
+
+    monkeypatch.setattr(warm, "make_plan", noted)
     warm.warm_up()
     before = compiled_for()
     assert before["service.estimation.models.denoise.denoised"] >= 1
-    ((info, calibration, _), _) = made[0]
+    info, calibration, _ = made[0]
     tare = make_tare(
         3, baseline_kpa=97.0, baseline_sigma_kpa=0.01, noise_kpa=0.1, tadc_counts=507.0
     )
