@@ -111,9 +111,10 @@ def batches(frames: FrameBatch) -> Iterator[FrameBatch]:
 
 def _simulated(title: str, scene: Scene, seconds: float, load: LoadTrace | None) -> Recording:
     from service.offline.simulate import SimulateOptions, Simulation
+    from service.rig.emulated import EmulatedFoot
 
     with ExitStack() as stack:
-        simulation = Simulation(SimulateOptions(scene, seconds, load=load), stack)
+        simulation = Simulation(SimulateOptions(scene, seconds, foot=EmulatedFoot(load)), stack)
         frames = FrameBatch.concatenate([frames for frames, _ in simulation.pieces()])
     return Recording(title, simulation.info, frames)
 

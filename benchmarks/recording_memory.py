@@ -88,12 +88,14 @@ def generate(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     from service.offline.calibrations import find_calibration
-    from service.sessions.sealing import Sources, seal
+    from service.sessions.sealing import seal
+    from service.sessions.sources import Sources
     from storage.journal.journal import Journal
     from storage.sessions import file as session_file
     from storage.sessions.content_hash import ContentDigest, write_file_hash
     from storage.sessions.folder import Part, Session, SessionFolder
-    from storage.sessions.ledger import StreamState, ledger_of
+    from storage.sessions.ledger import ledger_of
+    from storage.sessions.states import StreamState
 
     hash_s = 0.0
 

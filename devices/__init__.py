@@ -1,1 +1,1 @@
-"""What the hardware is and how it is asked, and its register-level emulation."""
+"""What the hardware is, how it is asked, and its emulation. No network, no Arrow, no commands."""

@@ -1,4 +1,4 @@
-"""Numpy arrays as they pass between modules: their types, and records of columns of one length."""
+"""Numpy arrays as they pass between modules: their types, and records of arrays of one length."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Bools = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Columns:
+class Arrays:
     """Base of records whose fields are all arrays with the same first axis."""
 
     def rows(self, start: int, stop: int) -> Self:
@@ -37,7 +37,7 @@ class Columns:
         """One record of all `parts`, in their order.
 
         Raises:
-            ValueError: no part, or columns of different width.
+            ValueError: no part, or arrays of different width.
         """
         return cls(
             **{

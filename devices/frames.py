@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
-from devices.arrays import Columns, Times
+from devices.arrays import Arrays, Times
 
 NOT_READ = 65535
 NO_SERVO_COUNTS = -(2**31)
@@ -58,7 +58,7 @@ class FrameStatus(IntFlag):
 
 
 @dataclass(frozen=True)
-class FrameBatch(Columns):
+class FrameBatch(Arrays):
     """n frames of an array of tiles, in the order they were taken.
 
     Attributes:

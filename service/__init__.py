@@ -1,1 +1,1 @@
-"""Estimation, recording and command line: what runs on a laptop beside the robot."""
+"""What runs: node, server, API, desk work, commands; and the pure estimation that all ask."""

@@ -1,1 +1,1 @@
-"""Frames on the wire and on disk: one schema, and the files it is kept in."""
+"""Frames on the wire and on disk: one schema, and the files it is kept in. No network."""

@@ -20,6 +20,9 @@ class Intervals:
 
     def __init__(self, intervals: Iterable[tuple[int, int]] = ()) -> None:
         self._intervals: list[tuple[int, int]] = []
+        if isinstance(intervals, Intervals):  # at once: another thread may be adding to it
+            self._intervals = list(intervals)
+            return
         for first, last in intervals:
             self.add(first, last)
 

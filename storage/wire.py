@@ -7,18 +7,20 @@ IPC stream that any tool can read.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 
 from devices.errors import FileFormatError
-from devices.frames import FrameBatch
+from devices.frames import ArrayInfo, FrameBatch
 from storage.intervals import Intervals
-from storage.schema import from_record_batch, to_record_batch
+from storage.schema import from_record_batch, to_record_batch, wire_schema
 
 FRAMES_MAX = 4096
 """Frames in one message; a node sends some ten. More is not what a node sends."""
+_MESSAGE_FRAMES = 64
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,14 @@ class EncodedBatch:
 def encode(batch: FrameBatch, schema: pa.Schema) -> bytes:
     """Frames as one message of a stream with this schema (`storage.schema.wire_schema`)."""
     return to_record_batch(batch, schema).serialize().to_pybytes()
+
+
+def messages_of(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
+    """Frames as messages of the size that nodes send."""
+    schema = wire_schema(info)
+    for begin in range(0, len(frames), _MESSAGE_FRAMES):
+        rows = frames.rows(begin, min(begin + _MESSAGE_FRAMES, len(frames)))
+        yield EncodedBatch.of(rows, encode(rows, schema))
 
 
 def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:

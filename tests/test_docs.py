@@ -280,3 +280,14 @@ PATH = re.compile(
 def test_every_path_in_a_document_exists(document: Path) -> None:
     for path in PATH.findall(document.read_text("utf-8")):
         assert (ROOT / path).exists(), path
+
+
+def test_every_decision_is_in_the_list_and_says_what_would_change_our_mind() -> None:
+    folder = ROOT / "docs" / "decisions"
+    listed = LINK.findall((folder / "README.md").read_text("utf-8"))
+    records = sorted(folder.glob("0*.md"))
+    assert listed == [record.name for record in records]
+    for record in records:
+        text = record.read_text("utf-8")
+        for word in ("Context", "Decision", "Consequences", "What would change our mind"):
+            assert f"\n**{word}.** " in text, record.name

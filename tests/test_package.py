@@ -17,7 +17,9 @@ def test_a_wheel_holds_the_scenes_and_the_packages_and_no_tests(tmp_path: Path) 
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    for scene in (ROOT / "devices" / "scenes").glob("*.toml"):
+    scenes = sorted((ROOT / "devices" / "scene" / "builtin").glob("*.toml"))
+    assert scenes
+    for scene in scenes:
         assert f"devices/scene/builtin/{scene.name}" in names
     for path in (ROOT / "web").rglob("*.*"):
         assert f"service/web/{path.relative_to(ROOT / 'web')}" in names

@@ -1,1 +1,1 @@
-"""Wires to chips, each as one small protocol: I2C, SPI, serial line, GPIO. No chip here."""
+"""Wires to chips, each as one small protocol: I2C, SPI, serial line. No chip here."""

@@ -1,1 +1,1 @@
-"""Register-level and byte-level models of the hardware, and the world they stand in."""
+"""Models of the hardware at registers and bytes, and their world. Drivers never ask it."""

@@ -1,1 +1,1 @@
-"""Freeing an I2C bus that somebody holds: clocks on its wires, and the multiplexers' RESET."""
+"""Freeing an I2C bus that a chip holds: clocks on its wires, the multiplexers' RESET."""

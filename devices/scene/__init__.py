@@ -1,1 +1,1 @@
-"""Scene files: which tiles hang where, what the ground does, and what the estimate needs."""
+"""Scene files: which tiles hang where, what the ground does, which models. Opens nothing."""

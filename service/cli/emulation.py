@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,22 +17,84 @@ from devices.scene.hardware import EMULATED
 from service.cli.options import pair
 
 if TYPE_CHECKING:
-    from service.rig.rig import RigOptions
+    from service.rig.emulated import EmulatedFoot
 
-LoadOption = Annotated[
-    Path | None, typer.Option(help="Recorded load to press instead of the scene's ground.")
-]
-LoadScaleOption = Annotated[float, typer.Option(help="Factor on every force of the load.")]
-CopScaleOption = Annotated[float, typer.Option(help="Factor on the load's COP about its mean.")]
-CopOffsetOption = Annotated[
-    str, typer.Option(metavar="X,Y", help="Where the load's mean COP comes to lie.")
-]
-CopAxesOption = Annotated[
-    str, typer.Option(help="Axes of the load that become x and y: xy, yx, -yx, ...")
-]
-LeadOption = Annotated[float, typer.Option(help="Seconds without load first: the tare.")]
-SeedOption = Annotated[int, typer.Option(min=0, help="Draws noise and ground, not the parts.")]
-PartsSeedOption = Annotated[int, typer.Option(min=0, help="Draws other parts.")]
+
+@dataclass(frozen=True)
+class FootOptions:
+    """An emulated foot, as options of a command that is decorated by `with_foot_options`."""
+
+    load: Annotated[
+        Path | None, typer.Option(help="Recorded load to press instead of the scene's ground.")
+    ] = None
+    load_scale: Annotated[float, typer.Option(help="Factor on every force of the load.")] = 1.0
+    cop_scale: Annotated[float, typer.Option(help="Factor on the load's COP about its mean.")] = 1.0
+    cop_offset_m: Annotated[
+        str, typer.Option(metavar="X,Y", help="Where the load's mean COP comes to lie.")
+    ] = "0,0"
+    cop_axes: Annotated[
+        str, typer.Option(help="Axes of the load that become x and y: xy, yx, -yx, ...")
+    ] = "xy"
+    lead_s: Annotated[float, typer.Option(help="Seconds without load first: the tare.")] = 1.0
+    seed: Annotated[int, typer.Option(min=0, help="Draws noise and ground, not the parts.")] = 0
+    parts_seed: Annotated[int, typer.Option(min=0, help="Draws other parts.")] = 0
+
+    def foot(self, scene: Scene) -> EmulatedFoot:
+        """What they ask for, in a scene.
+
+        Raises:
+            UsageError: options that do not fit, or a number that cannot be meant.
+            LoadTraceError: the load is not readable.
+        """
+        from devices.emulation.ground.load_trace import CopTransform
+        from service.rig.emulated import EmulatedFoot
+        from storage.formats.load_trace import read_load_trace
+
+        for option, value, least in (
+            ("--load-scale", self.load_scale, 0.0),
+            ("--cop-scale", self.cop_scale, None),
+            ("--lead-s", self.lead_s, -1e-9),
+        ):
+            if not abs(value) < 1e9 or (least is not None and value <= least):
+                raise UsageError(f"{option} {value:g}", expected="a sensible positive number")
+        if self.load is not None and scene.array.bus != EMULATED:
+            raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
+        if scene.array.bus == EMULATED and scene.ground.kind == "trace" and self.load is None:
+            raise UsageError(
+                f"scene {scene.name!r} presses a recorded load, and none was given",
+                remedy="Add --load FILE",
+            )
+        offset_m = pair(self.cop_offset_m, "--cop-offset-m") or (0.0, 0.0)
+        return EmulatedFoot(
+            load=read_load_trace(self.load) if self.load is not None else None,
+            load_scale=self.load_scale,
+            cop=CopTransform(self.cop_scale, offset_m, self.cop_axes),
+            lead_s=self.lead_s,
+            seed=self.seed,
+            parts_seed=self.parts_seed,
+        )
+
+    def as_arguments(self) -> list[str]:
+        """The same options for another command."""
+        values = {f.name.replace("_", "-"): getattr(self, f.name) for f in fields(self)}
+        return [f"--{name}={value}" for name, value in values.items() if value is not None]
+
+
+def with_foot_options(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose parameter `options`, a `FootOptions`, is an option for each of its fields."""
+    own = inspect.signature(command, eval_str=True)
+    of_foot = inspect.signature(FootOptions, eval_str=True).parameters
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        options = FootOptions(**{name: given.pop(name) for name in of_foot})
+        command(**given, options=options)
+
+    parameters = [p for p in own.parameters.values() if p.name != "options"] + [*of_foot.values()]
+    # What typer reads of a function.
+    run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
 
 
 def check_emulated(scene: Scene) -> None:
@@ -48,64 +114,6 @@ def check_emulated(scene: Scene) -> None:
             "emulates",
             remedy='Set servo.port = "emulated"',
         )
-
-
-def check_load(load_scale: float, cop_scale: float, lead_s: float) -> None:
-    """Refuse numbers that cannot be meant.
-
-    Raises:
-        UsageError: one of them.
-    """
-    for option, value, least in (
-        ("--load-scale", load_scale, 0.0),
-        ("--cop-scale", cop_scale, None),
-        ("--lead-s", lead_s, -1e-9),
-    ):
-        if not abs(value) < 1e9 or (least is not None and value <= least):
-            raise UsageError(f"{option} {value:g}", expected="a sensible positive number")
-
-
-def rig_options(
-    scene: Scene,
-    node: str,
-    *,
-    load: Path | None,
-    load_scale: float,
-    cop_scale: float,
-    cop_offset_m: str,
-    cop_axes: str,
-    lead_s: float,
-    seed: int,
-    parts_seed: int,
-) -> RigOptions:
-    """What a node is to open.
-
-    Raises:
-        UsageError: options that do not fit.
-        LoadTraceError: the load is not readable.
-    """
-    from devices.emulation.ground.load_trace import CopTransform
-    from service.rig.rig import RigOptions
-    from storage.formats.load_trace import read_load_trace
-
-    check_load(load_scale, cop_scale, lead_s)
-    if load is not None and scene.array.bus != EMULATED:
-        raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
-    if scene.array.bus == EMULATED and scene.ground.kind == "trace" and load is None:
-        raise UsageError(
-            f"scene {scene.name!r} presses a recorded load, and none was given",
-            remedy="Add --load FILE",
-        )
-    return RigOptions(
-        scene=scene,
-        node=node,
-        load=read_load_trace(load) if load is not None else None,
-        load_scale=load_scale,
-        cop=CopTransform(cop_scale, pair(cop_offset_m, "--cop-offset-m") or (0.0, 0.0), cop_axes),
-        lead_s=lead_s,
-        seed=seed,
-        parts_seed=parts_seed,
-    )
 
 
 def scene_with(name: str, *, bus: str | None, servo: str | None) -> Scene:

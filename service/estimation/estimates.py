@@ -8,7 +8,7 @@ from enum import IntFlag
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Columns, Floats, Times
+from devices.arrays import Arrays, Floats, Times
 
 COP_COLUMNS = (
     "cop_x_m",
@@ -46,7 +46,7 @@ class EstimateStatus(IntFlag):
 
 
 @dataclass(frozen=True)
-class Estimates(Columns):
+class Estimates(Arrays):
     """Estimates of n frames; the columns of `storage.schema.ESTIMATES` in float64.
 
     Arrays are (n,), those of tiles (n, tiles). Undefined is NaN, contact 255.

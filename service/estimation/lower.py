@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Bools, Columns, Floats, Ints, Times
+from devices.arrays import Arrays, Bools, Floats, Ints, Times
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.estimates import EstimateStatus
@@ -24,7 +24,7 @@ NEVER_NS = -(1 << 62)
 
 
 @dataclass(frozen=True)
-class ApparentForces(Columns):
+class ApparentForces(Arrays):
     """Forces as they appear in n frames; arrays (n, bearing tiles) unless said otherwise.
 
     Attributes:

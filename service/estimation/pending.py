@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Columns, Ints, Times
+from devices.arrays import Arrays, Ints, Times
 from service.estimation.foot.kinematics import Readings
 from service.estimation.lower import ApparentForces
 from service.estimation.models import denoise
 
 
 @dataclass(frozen=True)
-class PendingFrames(Columns):
+class PendingFrames(Arrays):
     """Facts of frames that are needed once, when their estimate is due; arrays (n,).
 
     Attributes:

@@ -363,8 +363,7 @@ class Publisher:
         said |= {} if hello is None else {s.array_info.boot_id: s.lost for s in hello.earlier}
         while True:
             for boot_id, stream in self._streams().items():
-                with stream.lock:
-                    lost = stream.lost.as_pairs()
+                lost = stream.lost.as_pairs()
                 if boot_id in said and lost != said[boot_id]:
                     said[boot_id] = lost
                     await socket.send(say(Lost(boot_id=boot_id, lost=lost)))

@@ -150,7 +150,7 @@ class _Node:
                 elif self._present is not None:
                     self._take(self._present, message)
             if self._present is not None:
-                self._present.has_ended = True
+                self._present.end()
             await self._drain()
             # Sealed before it is settled, a session would end without what was in flight.
             outcome = Outcome(is_lossy=self._options.record is not None)

@@ -18,6 +18,7 @@ from devices.errors import CalibrationError
 from devices.extras import needs_extra
 from devices.scene.file import Scene, build_scene, load_scene
 from service.estimation.calibration import PRESETS, Calibration
+from service.rig.emulated import EmulatedFoot
 from service.version import SOFTWARE
 from storage.durable import write_whole
 
@@ -94,9 +95,10 @@ def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) 
         from service.offline.simulate import SimulateOptions, simulate
 
     progress(f"pressing tile {serial} on the emulated bench")
+    foot = EmulatedFoot(parts_seed=parts_seed)
     with tempfile.TemporaryDirectory(prefix="foottile-bench-") as work:
         recording = Path(work) / f"bench-{serial}.parquet"
-        simulate(SimulateOptions(scene, parts_seed=parts_seed), recording, None)
+        simulate(SimulateOptions(scene, foot=foot), recording, None)
         calibration = calibrate([recording], name=f"{BENCH}-{serial}", reference=BENCH_REFERENCE)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(kept, calibration.to_json().encode())

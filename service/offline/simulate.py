@@ -24,16 +24,15 @@ from devices.buses.i2c import open_bus
 from devices.chips.dynamixel.reader import open_servo
 from devices.chips.dynamixel.servo import PolledServo
 from devices.clock import UtcAnchor, VirtualClock
-from devices.emulation.ground.grounds import press_on
-from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace
+from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.world import World
 from devices.errors import UsageError
 from devices.frames import FrameBatch, TileStatus
 from devices.scene.file import Scene
 from devices.scene.hardware import AnySchedule, ServoScene
-from service.estimation.foot.stances import Stance, Stances
-from service.offline.accuracy import JUDGED, Accuracy, judge
+from service.offline.findings import Findings, FindingsOf
 from service.rig.description import describe
+from service.rig.emulated import EmulatedFoot
 from service.rig.peripherals import open_recovery_lines, open_reference_sensor
 from service.sessions.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
 from storage.sessions.file import SessionWriter
@@ -58,13 +57,8 @@ class SimulateOptions:
     otherwise_s: float | None = None
     """Length of a scene that has no end of its own, if `seconds` does not say one either."""
     schedule: AnySchedule | None = None
-    seed: int = 0
-    parts_seed: int = 0
-    lead_s: float = 1.0
     truth: bool = False
-    load: LoadTrace | None = None
-    load_scale: float = 1.0
-    cop: CopTransform = CopTransform()  # noqa: RUF009  # frozen, so one for all is safe
+    foot: EmulatedFoot = EmulatedFoot()  # noqa: RUF009  # frozen, so one for all is safe
 
 
 @dataclass(frozen=True)
@@ -83,10 +77,7 @@ class Simulated:
     flags: Mapping[str, Mapping[str, int]]
     """Frames in which a tile was flagged, by serial and reason."""
     pressed: PressedTrace | None
-    stances: tuple[Stance, ...]
-    accuracy: Accuracy | None
-    assumed_scale: bool | None
-    """Whether newtons rest on an assumed scale; None without estimates."""
+    findings: Findings
     wall_s: float
     """What taking, estimating and writing the frames took, set-up and bench left out."""
 
@@ -97,25 +88,9 @@ class Simulation:
     def __init__(self, options: SimulateOptions, stack: ExitStack) -> None:
         scene = options.scene
         self._options = options
-        self.pressed = None
-        if options.load is not None:
-            self.pressed = press_on(
-                scene,
-                options.load,
-                load_scale=options.load_scale,
-                cop=options.cop,
-                lead_s=options.lead_s,
-            )
+        self.pressed = options.foot.pressed_on(scene)
         self._clock = VirtualClock()
-        self._world = World(
-            scene,
-            self._clock,
-            seed=options.seed,
-            parts_seed=options.parts_seed,
-            lead_s=options.lead_s,
-            pressed=self.pressed,
-            begun=False,
-        )
+        self._world = options.foot.world(scene, self._clock, self.pressed)
         duration_ns = _duration_ns(options, self._world.ground.duration_s)
         ready = make_ready(
             open_bus("emulated", self._world.i2c_adapter),
@@ -142,7 +117,7 @@ class Simulation:
             ready.tiles,
             anchor,
             node=NODE,
-            boot_id=f"{options.seed:032x}",
+            boot_id=f"{options.foot.seed:032x}",
             schedule=ready.choice.schedule,
             rate_hz=self.rate_hz,
         )
@@ -153,7 +128,7 @@ class Simulation:
             anchor,
             rate_hz=scene.rate_hz,
             servo=servo,
-            lead_end_ns=begin_ns + round(options.lead_s * 1e9),
+            lead_end_ns=begin_ns + round(options.foot.lead_s * 1e9),
         )
 
     def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
@@ -187,15 +162,14 @@ def simulate(
     """
     notes: dict[str, object] = {
         "scene": options.scene.model_dump(mode="json"),
-        "seed": options.seed,
-        "parts_seed": options.parts_seed,
-        "lead_s": options.lead_s,
+        "seed": options.foot.seed,
+        "parts_seed": options.foot.parts_seed,
+        "lead_s": options.foot.lead_s,
     }
-    judged: list[Mapping[str, npt.NDArray[Any]]] = []
+    found = FindingsOf(judging=options.truth)
     frames = 0
     first_ns = last_ns = 0
     flagged: Counter[tuple[int, str]] = Counter()
-    stances = Stances()
     with ExitStack() as stack:
         simulation = Simulation(options, stack)
         pieces: Iterator[tuple[FrameBatch, Extra]] = simulation.pieces()
@@ -214,10 +188,7 @@ def simulate(
             frames += len(batch)
             flagged.update(_flags(batch))
             if stream is not None:
-                stances.feed(batch.t_ns, extra["grf_n"], extra["contact"])
-            if options.truth and estimate is not None:
-                columns = {"t_ns": batch.t_ns, **extra}
-                judged.append({name: columns[name] for name in JUDGED})
+                found.feed(batch, extra)
     seconds = (last_ns - first_ns) * 1e-9
     return Simulated(
         frames=frames,
@@ -233,9 +204,7 @@ def simulate(
             if any(i == tile for i, _ in flagged)
         },
         pressed=simulation.pressed,
-        stances=stances.finish(),
-        accuracy=judged_of(judged, stream),
-        assumed_scale=stream.plan.assumed_scale if stream and stream.plan else None,
+        findings=found.finish(stream.plan) if stream and stream.plan else Findings(),
         wall_s=time.perf_counter() - began_s,
     )
 
@@ -250,20 +219,6 @@ def _flags(batch: FrameBatch) -> dict[tuple[int, str], int]:
             if n and bit.name:
                 counts[tile, bit.name.lower()] = n
     return counts
-
-
-def judged_of(
-    pieces: list[Mapping[str, npt.NDArray[Any]]], stream: EstimateStream | None
-) -> Accuracy | None:
-    """How far off the estimates of a stream were; None if there is no truth to compare with."""
-    if not pieces or stream is None or stream.plan is None:
-        return None
-    return judge(joined(pieces), lag_ms=stream.plan.lag_ns * 1e-6)
-
-
-def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArray[Any]]:
-    """Columns of all pieces, one after another."""
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
 def _duration_ns(options: SimulateOptions, ground_s: float | None) -> int:

@@ -16,15 +16,13 @@ from devices.buses.i2c import open_bus
 from devices.chips.dynamixel.reader import open_servo
 from devices.chips.dynamixel.servo import ServoReader
 from devices.clock import SpinningClock, SystemClock, UtcAnchor
-from devices.emulation.ground.grounds import press_on
-from devices.emulation.ground.load_trace import CopTransform, LoadTrace
 from devices.errors import I2cError, TileSetupError
-from devices.extras import needs_extra
 from devices.frames import ArrayInfo, FrameBatch
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
 from devices.scene.file import Scene
 from devices.scene.hardware import EMULATED, ServoScene
 from service.rig.description import describe
+from service.rig.emulated import EmulatedFoot
 from service.rig.peripherals import open_recovery_lines, open_reference_sensor
 from storage.journal.in_flight import InFlight, open_in_flight
 
@@ -41,16 +39,11 @@ _SWITCH_S = 0.0002
 
 @dataclass(frozen=True)
 class RigOptions:
-    """What to open; everything but `scene` and `node` is for emulation."""
+    """What to open; `foot` is for emulation only."""
 
     scene: Scene
     node: str
-    load: LoadTrace | None = None
-    load_scale: float = 1.0
-    cop: CopTransform = CopTransform()  # noqa: RUF009  # frozen, so one for all is safe
-    lead_s: float = 1.0
-    seed: int = 0
-    parts_seed: int = 0
+    foot: EmulatedFoot = EmulatedFoot()  # noqa: RUF009  # frozen, so one for all is safe
     streams: Path | None = None
     """Folder of the node's journals: frames in flight are kept there, each stream's in its own."""
 
@@ -103,7 +96,7 @@ class Rig:
         if world is not None:
             world.begin()
             if options.emulated:
-                self._lead_end_ns = world.epoch_ns + round(options.lead_s * 1e9)
+                self._lead_end_ns = world.epoch_ns + round(options.foot.lead_s * 1e9)
         self._begin_stream(bus_hz, is_new=False)
         if not options.emulated:
             # Last, and only this thread: an emulated world would starve the rest of the machine.
@@ -189,30 +182,9 @@ class Rig:
         scene = options.scene
         if not options.emulated and (scene.servo is None or scene.servo.port != EMULATED):
             return None
-        # Here, because a real node need not wait for scipy, nor have room for it.
-        with needs_extra("emulation", "an emulated array"):
-            from devices.emulation.world import World
-
         sys.setswitchinterval(_SWITCH_S)
-        pressed = None
-        if options.load is not None:
-            pressed = press_on(
-                scene,
-                options.load,
-                load_scale=options.load_scale,
-                cop=options.cop,
-                lead_s=options.lead_s,
-            )
-        world = World(
-            scene,
-            self._line_clock,
-            seed=options.seed,
-            parts_seed=options.parts_seed,
-            lead_s=options.lead_s,
-            pressed=pressed,
-            looped=True,
-            begun=False,
-        )
+        pressed = options.foot.pressed_on(scene)
+        world = options.foot.world(scene, self._line_clock, pressed, looped=True)
         stack.enter_context(world.foresight())
         return world
 

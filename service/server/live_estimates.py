@@ -17,7 +17,9 @@ from service.estimation.models.static import StaticCurves
 from service.estimation.plan import make_plan
 from service.estimation.tare.automatic import Look, first_in_flight, look_in_flight
 from service.estimation.tare.flight import LOOK_BACK_NS, tare_in_flight
-from service.estimation.tare.tare import Tare, take_tare
+from service.estimation.tare.recorded import take_tare
+from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded import TareFrames
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
 
 LIVE_LAG_MS = 10.0
@@ -160,18 +162,14 @@ class LiveEstimates:
         if calibration is None or not self._recent:
             return Look()
         frames = FrameBatch.concatenate(list(self._recent))
-        serials = self._info.serials
         if tare is None:
-            return first_in_flight(frames, self._compensation, calibration, serials)
+            return first_in_flight(self._seen(frames, calibration))
         if self.free_since_t_ns is None or self._due_t_ns is None:
             return Look()
         # Of younger frames it is not yet known whether there was contact.
         known = int(np.searchsorted(frames.t_ns, self._due_t_ns, side="right"))
         return look_in_flight(
-            frames.rows(0, known),
-            self._compensation,
-            calibration,
-            serials,
+            self._seen(frames.rows(0, known), calibration),
             present=tare,
             anchor=anchor,
             free_since_t_ns=self.free_since_t_ns,
@@ -187,14 +185,12 @@ class LiveEstimates:
         calibration = self._needed()
         if not self._recent:
             raise TareError("no frames have come yet", remedy="Is the node connected?")
-        return tare_in_flight(
-            FrameBatch.concatenate(list(self._recent)),
-            self._compensation,
-            calibration,
-            self._info.serials,
-            present=self.tare,
-            bears=self._bears,
-        )
+        frames = FrameBatch.concatenate(list(self._recent))
+        seen = self._seen(frames, calibration)
+        return tare_in_flight(seen, present=self.tare, bears=self._bears)
+
+    def _seen(self, frames: FrameBatch, calibration: Calibration) -> TareFrames:
+        return TareFrames(frames, self._compensation, calibration, self._info.serials)
 
     def _needed(self) -> Calibration:
         if self._calibration is None:

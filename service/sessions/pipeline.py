@@ -23,7 +23,8 @@ from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare.tare import RECOGNISE_WITHIN_NS, Tare, take_tare
+from service.estimation.tare.recorded import RECOGNISE_WITHIN_NS, take_tare
+from service.estimation.tare.tare import Tare
 
 Extra = Mapping[str, npt.NDArray[Any]]
 Columns = dict[str, npt.NDArray[Any]]

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from devices.acquisition import RangeFlag
 from devices.errors import StorageError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from storage.durable import make_folder, storage_errors
@@ -145,7 +146,9 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     columns = {
         name: np.ascontiguousarray(found[name], dtype=FRAME_COLUMNS[name][0]) for name in _ORDER
     }
-    return info, FrameBatch(**columns)
+    frames = FrameBatch(**columns)
+    RangeFlag(info.tiles).flag(frames)  # as acquisition does when a batch is whole
+    return info, frames
 
 
 def delete_in_flight(folder: Path) -> None:

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
-from devices.acquisition import RangeFlag
-from devices.frames import ArrayInfo, FrameBatch
-from storage.intervals import Intervals
+from devices.errors import FileFormatError
 from storage.journal.in_flight import read_in_flight
-from storage.journal.node_stream import NodeStream, opened
+from storage.journal.journal import Journal
+from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
 from storage.kernel import kernel_boot_id
 from storage.losses import DISK_SLOW
-from storage.schema import wire_schema
-from storage.wire import EncodedBatch, encode
-
-_MESSAGE_FRAMES = 64
+from storage.wire import messages_of
 
 
-def taken_up(folder: Path) -> NodeStream | None:
-    """A stream that an earlier process left, with what it had in flight when it was killed.
+def recover_stream(folder: Path) -> NodeStream | None:
+    """A stream that an earlier process left, with what it had in flight; None if nothing is left.
 
     If the machine itself went down, what was in flight is lost; how much that can have been is
     noted: what was taken since the last sync, by the disk's slowest one.
@@ -29,61 +25,44 @@ def taken_up(folder: Path) -> NodeStream | None:
         StorageError: it cannot be read.
     """
     left = read_in_flight(folder)
-    stream = opened(folder)
+    stream = _open(folder)
     if stream is None:
         if left is None:
             return None
-        stream = NodeStream(folder, StreamNotes(array_info=left[0]), None)
-        stream.notes = stream.notes.model_copy(update={"kernel_boot_id": kernel_boot_id()})
-    if stream.notes.has_ended:
+        # A file in flight is read only in the start of the machine in which it was written.
+        notes = StreamNotes(array_info=left[0], kernel_boot_id=kernel_boot_id())
+        stream = NodeStream(folder, notes, None)
+    if stream.has_ended:
         return stream
-    held = stream.held
-    end = (held.last + 1) if held.last is not None else 0
-    lost_last = stream.lost.all.last
-    end = max(end, (lost_last + 1) if lost_last is not None else 0)
-    rescued = left[1] if left is not None else None
-    tail = 0
-    if rescued is not None:
-        RangeFlag(stream.info.tiles).flag(rescued)
-        first, last = int(rescued.seq[0]), int(rescued.seq[-1])
-        if first > end:  # more waited for the disk than was in flight
-            stream.lost.add(Intervals([(end, first - 1)]), DISK_SLOW)
-        for a, b in held.missing(max(first, _oldest(held)), last):
-            for batch in encoded(rescued.rows(a - first, b + 1 - first), stream.info):
-                stream.waiting.append(batch)
-                stream.waiting_bytes += len(batch.payload)
-        end = max(end, last + 1)
-    elif left is None:
-        tail = unsynced_tail_max(stream.info.nominal_rate_hz, stream.notes.sync_max_s)
-    stream.next_seq = end
-    stream.has_ended = True
-    stream.notes = stream.notes.model_copy(update={"unsynced_tail_max": tail})
+    if left is None:
+        rate_hz, slowest_s = stream.info.nominal_rate_hz, stream.notes.sync_max_s
+        stream.end(unsynced_tail_max=unsynced_tail_max(rate_hz, slowest_s))
+        return stream
+    frames = left[1]
+    if frames is not None:
+        held, first = stream.stored, int(frames.seq[0])
+        # What is older than everything that is held was evicted, not lost in flight.
+        oldest = next(iter(held), (0, 0))[0]
+        for a, b in held.missing(max(first, oldest), int(frames.seq[-1])):
+            # If there is a gap before them, more waited for the disk than was in flight.
+            for batch in messages_of(frames.rows(a - first, b + 1 - first), stream.info):
+                stream.put(batch, gap=DISK_SLOW)
+    stream.end(unsynced_tail_max=0)
     return stream
 
 
-def encoded(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
-    """Frames as messages of the size that nodes send."""
-    schema = wire_schema(info)
-    for begin in range(0, len(frames), _MESSAGE_FRAMES):
-        rows = frames.rows(begin, min(begin + _MESSAGE_FRAMES, len(frames)))
-        yield EncodedBatch.of(rows, encode(rows, schema))
-
-
-def _oldest(held: Intervals) -> int:
-    """What is older than everything that is held was evicted, not lost in flight."""
-    return next(iter(held))[0] if held else 0
-
-
-def in_flight_since(stream: NodeStream) -> FrameBatch | None:
-    """What acquisition had taken and not handed over when it ended; None if that is nothing.
+def _open(folder: Path) -> NodeStream | None:
+    """A stream that is on disk; None if nothing of it can be read.
 
     Raises:
         StorageError: it cannot be read.
     """
-    left = read_in_flight(stream.folder)
-    if left is None or left[1] is None or int(left[1].seq[-1]) < stream.next_seq:
-        return None
-    frames = left[1]
-    rows = frames.rows(max(0, stream.next_seq - int(frames.seq[0])), len(frames))
-    RangeFlag(stream.info.tiles).flag(rows)
-    return rows
+    notes: StreamNotes | None = None
+    journal: Journal | None = None
+    with suppress(FileFormatError):
+        notes = StreamNotes.load(folder)
+    with suppress(FileFormatError):
+        journal = Journal.open(folder)
+    if notes is None and journal is not None:  # its segments still say which array they are of
+        notes = StreamNotes(array_info=journal.info)
+    return None if notes is None else NodeStream(folder, notes, journal)

@@ -1,122 +1,202 @@
-"""One stream as a node keeps it: its journal on disk, and what is not on the disk yet."""
+"""One stream as a node keeps it: its journal on disk, and what is not on the disk yet.
+
+A frame first waits in memory, then it is written, then synced. Its batch is let go only when a sync
+has succeeded: a kernel that could not write it may have forgotten it, and then it is written once
+more.
+"""
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from itertools import chain, takewhile
 from pathlib import Path
 
-from devices.errors import FileFormatError
-from devices.frames import ArrayInfo
+from devices.errors import StorageError
 from storage.intervals import Intervals
+from storage.journal.in_flight import delete_in_flight, read_in_flight
 from storage.journal.journal import Journal
-from storage.journal.stream_notes import StreamNotes
-from storage.losses import NODE_BUSY, Losses
-from storage.wire import EncodedBatch
+from storage.journal.stream_notes import PROMISE_S, StreamNotes
+from storage.journal.wanted import Wanted
+from storage.losses import CORRUPT, EVICTED, NODE_BUSY, Losses
+from storage.wire import EncodedBatch, messages_of
 
 RECENT_BYTES = 4 << 20
 """What is kept in memory of the newest frames, for the live picture."""
 
 
 class NodeStream:
-    """Frames of one stream, wherever they are. Safe to use from several threads.
+    """Frames of one stream, wherever they are.
+
+    Safe to use from several threads; its attributes are to be read. One thread writes: only it
+    calls the methods of the last section. The lock is never held while the disk works.
 
     Args:
         folder: the stream's own.
         notes: what is known of it.
-        journal: what is on disk already.
+        journal: what is on disk already; None: nothing, it is begun when the disk lets it be.
     """
 
     def __init__(self, folder: Path, notes: StreamNotes, journal: Journal | None) -> None:
         self.folder = folder
+        self.info = notes.array_info
+        self.boot_id = self.info.boot_id
         self.notes = notes
+        """What is written down of it, or will be."""
         self.journal = journal
-        """None as long as the disk does not let it be begun."""
-        self.lost = Losses(notes.lost)
-        self.acked_by: dict[str, Intervals] = {}
-        """Numbers that are on a server's disk, by server."""
-        self.next_seq = notes.next_seq or 0
-        """The number of the next frame to come."""
+        """To read from; None as long as the disk does not let it be begun."""
         self.missed_slots = notes.missed_slots
-        self.lock = threading.Lock()
-        """Guards everything here; never held while the disk works."""
-        self.waiting: deque[EncodedBatch] = deque()
-        """Not in the journal yet, oldest first."""
-        self.waiting_bytes = 0
-        self.unsynced: list[EncodedBatch] = []
-        """In the journal, but perhaps not on the disk yet."""
+        """Slots in which no frame was taken."""
         self.has_ended = notes.has_ended
+        """Will no more frames come?"""
         self.is_settled = notes.has_ended
         """Is all of it on disk, with a note of where it ended?"""
-        self.waiting_since_s: float | None = None
+        self._lock = threading.Lock()
+        self._noted_lost = notes.lost
+        self._lost = Losses(notes.lost)
+        self._acked_by: dict[str, Intervals] = {}
+        self._waiting = _Queue()
+        """Not in the journal yet."""
+        self._unsynced: list[EncodedBatch] = []
+        """In the journal, but perhaps not on the disk yet."""
+        self._waiting_since_s: float | None = None
         """Since when the oldest frame that is not surely on the disk is here."""
-        self._recent: deque[EncodedBatch] = deque()
-        self._recent_bytes = 0
+        self._recent = _Queue()
         if journal is not None:
-            self.lost.found(journal.held)
+            self._lost.found(journal.held)
             for reason, numbers in journal.lost.by_reason.items():
-                self.lost.add(numbers, reason)
+                self._lost.add(numbers, reason)
+        last = (self.stored | self._lost.all).last
+        known = 0 if last is None else last + 1
+        self.next_seq = known if notes.next_seq is None else notes.next_seq
+        """The number of the next frame to come."""
+
+    # --- what is known of it ----------------------------------------------------------------------
 
     @property
-    def info(self) -> ArrayInfo:
-        """Description of its array."""
-        return self.notes.array_info
+    def is_synced(self) -> bool:
+        """Is everything that came on the disk?"""
+        with self._lock:
+            return not self._waiting.batches and not self._unsynced
 
     @property
-    def boot_id(self) -> str:
-        """Its name."""
-        return self.info.boot_id
+    def waiting_bytes(self) -> int:
+        """What waits in memory to be written."""
+        return self._waiting.size_bytes
+
+    @property
+    def waiting_s(self) -> float:
+        """How long it took to take what waits in memory to be written."""
+        with self._lock:
+            return self._waiting.frames / self.info.nominal_rate_hz
 
     @property
     def held(self) -> Intervals:
         """Numbers that can be given away: on disk, or waiting for it."""
-        with self.lock:
-            numbers = Intervals(self.journal.held if self.journal is not None else ())
-            for batch in self.waiting:
+        with self._lock:
+            numbers = self.stored
+            for batch in self._waiting.batches:
                 numbers.add(batch.seq_first, batch.seq_last)
         return numbers
 
-    def put(self, batch: EncodedBatch, missed_slots: int) -> None:
-        """Take in the newest frames."""
-        with self.lock:
-            if batch.seq_first > self.next_seq:  # the node was too busy to take them over
-                self.lost.add(Intervals([(self.next_seq, batch.seq_first - 1)]), NODE_BUSY)
-            if self.waiting_since_s is None:
-                self.waiting_since_s = time.monotonic()
-            self.waiting.append(batch)
-            self.waiting_bytes += len(batch.payload)
-            self._recent.append(batch)
-            self._recent_bytes += len(batch.payload)
-            while self._recent_bytes > RECENT_BYTES and len(self._recent) > 1:
-                self._recent_bytes -= len(self._recent.popleft().payload)
-            self.next_seq = batch.seq_last + 1
-            self.missed_slots = missed_slots
+    @property
+    def stored(self) -> Intervals:
+        """Numbers that are in the journal."""
+        return Intervals(self.journal.held if self.journal is not None else ())
+
+    @property
+    def lost(self) -> Losses:
+        """Numbers that are not held any more, and that no server has, by reason."""
+        with self._lock:
+            return Losses(self._lost.by_reason)
 
     @property
     def acked(self) -> Intervals:
         """Numbers that are on any server's disk."""
-        servers = list(self.acked_by.values())
-        if len(servers) == 1:
-            return Intervals(servers[0])
-        return Intervals(pair for numbers in servers for pair in numbers)
+        with self._lock:
+            return self._acked()
+
+    def undelivered(self, wanted: Wanted) -> Intervals:
+        """What servers need of it and have not got, of what is held."""
+        held = self.held
+        with self._lock:
+            return held & wanted.undelivered(self.boot_id, self._acked_by)
+
+    def needed(self, wanted: Wanted) -> Intervals:
+        """What must not be deleted."""
+        with self._lock:
+            return wanted.unmet(self.boot_id, self._acked_by)
+
+    # --- frames come and go -----------------------------------------------------------------------
+
+    def put(
+        self, batch: EncodedBatch, missed_slots: int | None = None, *, gap: str = NODE_BUSY
+    ) -> None:
+        """Take in frames, the newest ones if they come as they are taken.
+
+        Args:
+            batch: the frames.
+            missed_slots: since the stream began; None: as before.
+            gap: why frames between the newest one so far and these are lost.
+        """
+        with self._lock:
+            if batch.seq_first > self.next_seq:
+                self._lost.add(Intervals([(self.next_seq, batch.seq_first - 1)]), gap)
+            if self._waiting_since_s is None:
+                self._waiting_since_s = time.monotonic()
+            self._waiting.append(batch)
+            self._recent.append(batch)
+            while self._recent.size_bytes > RECENT_BYTES and len(self._recent.batches) > 1:
+                self._recent.popleft()
+            self.next_seq = max(self.next_seq, batch.seq_last + 1)
+            if missed_slots is not None:
+                self.missed_slots = missed_slots
+
+    def end(self, **known: object) -> None:
+        """No more frames come. What is known of that is noted, as in `StreamNotes`."""
+        with self._lock:
+            self.has_ended = True
+        self.note(**known)
 
     def acknowledge(self, server_id: str, seq_first: int, seq_last: int) -> None:
         """These frames are on a server's disk."""
-        with self.lock:
-            self.acked_by.setdefault(server_id, Intervals()).add(seq_first, seq_last)
-            self.lost.found(Intervals([(seq_first, seq_last)]))
+        with self._lock:
+            self._acked_by.setdefault(server_id, Intervals()).add(seq_first, seq_last)
+            self._lost.found(Intervals([(seq_first, seq_last)]))
+
+    def drop_oldest(self, reason: str, wanted: Wanted, *, at_least: int = 0) -> bool:
+        """Give up what has waited longest to be written; was there anything?
+
+        Args:
+            reason: why.
+            wanted: what sessions need.
+            at_least: so many batches stay.
+        """
+        with self._lock:
+            if len(self._waiting.batches) <= at_least:
+                return False
+            oldest = self._waiting.popleft()
+        self.lose(oldest.numbers, reason, wanted)
+        return True
+
+    def lose(self, numbers: Intervals, reason: str, wanted: Wanted) -> None:
+        """Note frames that are not kept any more.
+
+        Those that a server has are not lost, but for what the node's own session needs.
+        """
+        needed_here = wanted.local(self.boot_id)
+        with self._lock:
+            self._lost.add(numbers - (self._acked() - needed_here), reason)
 
     def recent(self, seq: int) -> list[EncodedBatch]:
         """The newest batches with frames from `seq` on, oldest first, as far as memory goes."""
-        found: deque[EncodedBatch] = deque()
-        with self.lock:
-            for batch in reversed(self._recent):
-                if batch.seq_last < seq:
-                    break
-                found.appendleft(batch)
-        return list(found)
+        with self._lock:
+            found = list(takewhile(lambda b: b.seq_last >= seq, reversed(self._recent.batches)))
+        return found[::-1]
 
     def batches(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
         """Batches with any of these frames, from disk and memory, in order.
@@ -125,18 +205,17 @@ class NodeStream:
             DamagedFramesError: a batch on disk is damaged.
             StorageError: the journal cannot be read.
         """
-        asked = Intervals([(seq_first, seq_last)])
-        with self.lock:
+        with self._lock:
             journal = self.journal
             memory = [
                 batch
-                for batch in self.waiting
+                for batch in self._waiting.batches
                 if batch.seq_first <= seq_last and batch.seq_last >= seq_first
             ]
-        for batch in memory:
-            asked = asked - batch.numbers
+        asked = Intervals([(seq_first, seq_last)])
+        on_disk = asked - Intervals((batch.seq_first, batch.seq_last) for batch in memory)
         at = 0
-        for first, last in asked:
+        for first, last in on_disk:
             while at < len(memory) and memory[at].seq_first < first:
                 yield memory[at]
                 at += 1
@@ -144,25 +223,13 @@ class NodeStream:
                 yield from journal.messages(first, last)
         yield from memory[at:]
 
-    def lose(self, numbers: Intervals, reason: str, needed_here: Intervals | None = None) -> None:
-        """Note frames that are not kept any more.
+    # --- for the thread that writes ---------------------------------------------------------------
 
-        Args:
-            numbers: which ones. Those that a server has are not lost,
-            reason: why.
-            needed_here: but for these, which the node's own session needs.
-        """
-        with self.lock:
-            elsewhere = self.acked
-            if needed_here is not None:
-                elsewhere = elsewhere - needed_here
-            self.lost.add(numbers - elsewhere, reason)
-
-    def forget_recent(self) -> None:
-        """It has ended: nothing of it is news any more."""
-        with self.lock:
-            self._recent.clear()
-            self._recent_bytes = 0
+    def note(self, **changes: object) -> None:
+        """Change what is known of it; `save_notes` writes it down."""
+        with self._lock:
+            now = {"lost": self._lost.as_pairs(), "missed_slots": self.missed_slots, **changes}
+            self.notes = self.notes.model_copy(update=now)
 
     def save_notes(self, **changes: object) -> None:
         """Write down what is known of it.
@@ -170,32 +237,165 @@ class NodeStream:
         Raises:
             StorageError: the disk is full or not writable; what is known stays in memory.
         """
-        with self.lock:
-            now = {"lost": self.lost.as_pairs(), "missed_slots": self.missed_slots, **changes}
-            self.notes = self.notes.model_copy(update=now)
-            notes = self.notes
+        self.note(**changes)
+        notes = self.notes
         notes.save(self.folder)
+        self._noted_lost = notes.lost
+
+    def save_losses(self) -> None:
+        """Write down what was lost since the notes were written; if that fails, next time."""
+        if self.lost.as_pairs() != self._noted_lost:
+            with suppress(StorageError):
+                self.save_notes()
+
+    def write_oldest(self) -> None:
+        """Have the batch that has waited longest in the journal, if there is one.
+
+        Raises:
+            StorageError: the disk does not take it; it goes on waiting.
+        """
+        journal = self.journal
+        with self._lock:
+            batch = next(iter(self._waiting.batches), None)
+        if journal is None or batch is None:
+            return
+        journal.append_message(batch)
+        with self._lock:
+            if self._waiting.batches and self._waiting.batches[0] is batch:  # not given up by now
+                self._waiting.popleft()
+            self._lost.found(batch.numbers)
+            self._unsynced.append(batch)
+
+    def begin_journal(self) -> None:
+        """Have a journal, if there is none.
+
+        Raises:
+            StorageError: the disk does not let it be begun.
+        """
+        if self.journal is None and not self.is_settled:
+            journal = Journal(self.folder, self.info)
+            self.save_notes()
+            with self._lock:
+                self.journal = journal
+
+    def sync(self) -> None:
+        """Have on the disk what was written; what it refuses waits once more."""
+        journal = self.journal
+        if journal is None or not self._unsynced:
+            return
+        with self._lock:
+            since_s = self._waiting_since_s
+            # What waits has come since the others were written.
+            self._waiting_since_s = time.monotonic() if self._waiting.batches else None
+        try:
+            journal.sync()
+        except StorageError:
+            journal.disown(Intervals((b.seq_first, b.seq_last) for b in self._unsynced))
+            with self._lock:
+                self._waiting.give_back(self._unsynced)
+                self._unsynced = []
+                self._waiting_since_s = since_s
+            return
+        with self._lock:
+            self._unsynced = []
+        took_s = 0.0 if since_s is None else time.monotonic() - since_s
+        if took_s > max(PROMISE_S, self.notes.sync_max_s):
+            with suppress(StorageError):
+                self.save_notes(sync_max_s=took_s)
+
+    def settle(self, wanted: Wanted) -> None:
+        """Note where it has ended, once all of it is on disk; if that fails, next time."""
+        if self.is_settled or not self.has_ended or not self.is_synced:
+            return
+        if self._take_over_in_flight():  # it is written first
+            return
+        try:
+            if self.journal is not None:
+                self.journal.close()
+            # One that ended before its first frame is remembered if a server asks for it.
+            if self.next_seq or wanted.numbers(self.boot_id):
+                self.save_notes(next_seq=self.next_seq)
+            elif self.folder.is_dir():
+                shutil.rmtree(self.folder, ignore_errors=True)
+        except StorageError:
+            return
+        # Only now: until its end is noted, what was in flight may be needed once more.
+        delete_in_flight(self.folder)
+        with self._lock:
+            self._recent = _Queue()
+            self.is_settled = True
+
+    def disown(self, damaged: Intervals, wanted: Wanted) -> None:
+        """Hold frames no longer that turned out not to be what was written."""
+        if self.journal is not None:
+            self.journal.disown(damaged)
+            self.lose(damaged, CORRUPT, wanted)
+
+    def prune(self, before_t_ns: int, wanted: Wanted) -> None:
+        """Delete segments that end before an instant, and hold nothing that is needed.
+
+        Raises:
+            StorageError: a file cannot be deleted.
+        """
+        if self.journal is not None:
+            gone = self.journal.prune(before_t_ns, self.needed(wanted))
+            self.lose(gone, EVICTED, wanted)
+
+    def evict(self, wanted: Wanted) -> bool:
+        """Delete its oldest segment that holds nothing that is needed; is there any?
+
+        Raises:
+            StorageError: it cannot be deleted.
+        """
+        gone = Intervals()
+        if self.journal is not None:
+            gone = self.journal.evict(self.needed(wanted))
+            self.lose(gone, EVICTED, wanted)
+        return bool(gone)
+
+    def _take_over_in_flight(self) -> bool:
+        """Take over what acquisition had taken when it was killed; was there anything?"""
+        try:
+            left = read_in_flight(self.folder)
+        except StorageError:
+            return False
+        if left is None or left[1] is None or int(left[1].seq[-1]) < self.next_seq:
+            return False
+        frames = left[1]
+        new = frames.rows(max(0, self.next_seq - int(frames.seq[0])), len(frames))
+        for batch in messages_of(new, self.info):
+            self.put(batch)
+        return True
+
+    def _acked(self) -> Intervals:
+        return Intervals(chain(*self._acked_by.values()))
 
 
-def opened(folder: Path) -> NodeStream | None:
-    """A stream that is on disk already; None if there is nothing of it.
+class _Queue:
+    """Batches, oldest first, and what they take in memory."""
 
-    Raises:
-        StorageError: it cannot be read.
-    """
-    notes: StreamNotes | None = None
-    journal: Journal | None = None
-    try:
-        notes = StreamNotes.load(folder)
-    except FileFormatError:
-        notes = None  # its segments still say which array they are of
-    try:
-        journal = Journal.open(folder)
-    except FileFormatError:
-        if notes is None:
-            return None
-    if notes is None and journal is not None:
-        notes = StreamNotes(array_info=journal.info)
-    if notes is None:
-        return None
-    return NodeStream(folder, notes, journal)
+    def __init__(self) -> None:
+        self.batches: deque[EncodedBatch] = deque()
+        self.size_bytes = 0
+
+    @property
+    def frames(self) -> int:
+        """How many frames there are in them."""
+        return sum(batch.seq_last - batch.seq_first + 1 for batch in self.batches)
+
+    def append(self, batch: EncodedBatch) -> None:
+        """Add the newest one."""
+        self.batches.append(batch)
+        self.size_bytes += len(batch.payload)
+
+    def popleft(self) -> EncodedBatch:
+        """Take out the oldest one."""
+        batch = self.batches.popleft()
+        self.size_bytes -= len(batch.payload)
+        return batch
+
+    def give_back(self, batches: Iterable[EncodedBatch]) -> None:
+        """Put back what was taken out, before all others."""
+        given = list(batches)
+        self.batches.extendleft(reversed(given))
+        self.size_bytes += sum(len(batch.payload) for batch in given)

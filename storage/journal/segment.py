@@ -15,35 +15,29 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
-from devices.errors import FileFormatError, StorageError
+from devices.errors import StorageError
 from storage.durable import write_whole
 from storage.intervals import Intervals
-from storage.wire import EncodedBatch, decode
+from storage.journal.segment_bytes import messages_from, payload_of, read_header
+from storage.journal.segment_index import (
+    INDEX_SUFFIX,
+    RECORD,
+    Records,
+    batches_in,
+    closing_record,
+    end_of,
+    is_closed,
+    is_whole,
+    numbers,
+    read_index,
+    record_of,
+)
+from storage.wire import EncodedBatch
 
 SUFFIX = ".arrows"
-INDEX_SUFFIX = ".idx"
 UNREAD_SUFFIX = ".unread"
-
-RECORD = np.dtype(
-    [
-        ("seq_first", "<u8"),
-        ("t_ns_first", "<i8"),
-        ("t_ns_last", "<i8"),
-        ("offset", "<u8"),
-        ("length", "<u4"),
-        ("count", "<u4"),
-        ("crc32", "<u4"),
-        ("check", "<u4"),
-    ]
-)
-"""One batch in the index: `crc32` is of its bytes, `check` of this record before it."""
-
-_CHECKED = RECORD.itemsize - 4
-
-Records = npt.NDArray[np.void]
 
 
 @dataclass
@@ -90,13 +84,21 @@ class Segment:
         Raises:
             OSError: the index cannot be read.
         """
-        found = read_index(self.path)
-        found = found[[is_whole(record) for record in found]]
-        held = [
-            bool(record["count"]) and not self.held.missing(*numbers(record)) for record in found
-        ]
+        found = batches_in(read_index(self.path))
+        held = [not self.held.missing(*numbers(record)) for record in found]
         found = found[np.array(held, dtype=np.bool_)]
         return found[np.argsort(found["seq_first"], kind="stable")]
+
+    def disown(self, doubtful: Intervals) -> None:
+        """Hold batches within these numbers no longer.
+
+        Raises:
+            OSError: the index cannot be read.
+        """
+        for record in self.records():
+            batch = Intervals([numbers(record)])
+            if not (batch - doubtful):
+                self.held = self.held - batch
 
     def rewrite_index(self) -> None:
         """Have only what counts in the index, which says that it was closed.
@@ -104,9 +106,7 @@ class Segment:
         Raises:
             StorageError: the disk is full or not writable; the old index is still there then.
         """
-        closing = _sealed(np.zeros(1, RECORD))
-        content = self.records().tobytes() + closing.tobytes()
-        write_whole(self.path.with_suffix(INDEX_SUFFIX), content)
+        _write_index(self.path, self.records())
 
     def delete(self) -> None:
         """Delete both files.
@@ -193,7 +193,7 @@ class SegmentWriter:
                 self._forget_doubtful()
                 return
             with suppress(OSError):  # without it the batches are checked when it is opened again
-                write_all(self._index, _sealed(np.zeros(1, RECORD)).tobytes())
+                write_all(self._index, closing_record().tobytes())
                 os.fsync(self._index.fileno())
         finally:
             self.abandon()
@@ -205,7 +205,7 @@ class SegmentWriter:
             if not len(records):
                 self.segment.delete()
                 return
-            self._data.truncate(int((records["offset"] + records["length"]).max()))
+            self._data.truncate(end_of(records))
             os.fsync(self._data.fileno())
             self.segment.rewrite_index()
 
@@ -213,49 +213,6 @@ class SegmentWriter:
         """Close the files as they are."""
         self._data.close()
         self._index.close()
-
-
-def record_of(message: EncodedBatch, offset: int) -> Records:
-    """The index record of a batch: an array of one."""
-    record = np.zeros(1, RECORD)
-    record["seq_first"] = message.seq_first
-    record["t_ns_first"], record["t_ns_last"] = message.t_ns_first, message.t_ns_last
-    record["offset"], record["length"] = offset, len(message.payload)
-    record["count"] = message.seq_last - message.seq_first + 1
-    record["crc32"] = zlib.crc32(message.payload)
-    return _sealed(record)
-
-
-def numbers(record: Any) -> tuple[int, int]:
-    """First and last frame of a record with frames."""
-    first = int(record["seq_first"])
-    return first, first + int(record["count"]) - 1
-
-
-def is_whole(record: Any) -> bool:
-    """Is the record what was written?"""
-    return zlib.crc32(record.tobytes()[:_CHECKED]) == int(record["check"])
-
-
-def read_index(path: Path) -> Records:
-    """All whole records of a segment's index, right or not; a cut one at its end is left out.
-
-    Raises:
-        OSError: there is none, or it cannot be read.
-    """
-    content = path.with_suffix(INDEX_SUFFIX).read_bytes()
-    return np.frombuffer(content, RECORD, len(content) // RECORD.itemsize)
-
-
-def payload_of(descriptor: int, record: Any) -> bytes | None:
-    """A batch's bytes from an open segment; None if they are not the ones that were written.
-
-    Raises:
-        OSError: they cannot be read.
-    """
-    payload = os.pread(descriptor, int(record["length"]), int(record["offset"]))
-    whole = len(payload) == record["length"] and zlib.crc32(payload) == record["crc32"]
-    return payload if whole else None
 
 
 def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
@@ -270,15 +227,16 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
     """
     size = path.stat().st_size
     damaged, doubtful = Intervals(), Intervals()
+    _, end = read_header(path)
     try:
         index = read_index(path)
     except FileNotFoundError:
-        index, was_closed = _index_anew(path, schema), False
+        index, was_closed = _index_anew(path, end, schema), False
     else:
-        was_closed = _was_closed(index, size)
+        batches = batches_in(index)
+        was_closed = is_closed(index) and len(batches) == len(index) - 1 and end_of(batches) == size
     good = []
     with path.open("rb") as file:
-        end = _header_length(path)
         for record in index:
             found = record if was_closed else _checked(file.fileno(), path, record, end, schema)
             if found is None and is_whole(record):
@@ -286,8 +244,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
             elif found is not None:
                 # What is damaged before something whole was damaged later; at the end of a file
                 # that was not closed it never was on the disk, and nobody was promised it.
-                damaged = damaged | doubtful
-                doubtful = Intervals()
+                damaged, doubtful = damaged | doubtful, Intervals()
                 if found["count"]:
                     good.append(found)
                     end = max(end, int(found["offset"]) + int(found["length"]))
@@ -305,8 +262,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
         # A killed process leaves frames that only the kernel holds; from now on they are promised.
         with path.open("rb") as file:
             os.fsync(file.fileno())
-        closing = _sealed(np.zeros(1, RECORD))
-        write_whole(path.with_suffix(INDEX_SUFFIX), records.tobytes() + closing.tobytes())
+        _write_index(path, records)
     return segment, damaged
 
 
@@ -324,55 +280,27 @@ def write_all(file: BinaryIO, data: bytes) -> None:
         raise
 
 
-def _sealed(record: Records) -> Records:
-    record["check"] = zlib.crc32(record.tobytes()[:_CHECKED])
-    return record
-
-
-def _was_closed(index: Records, size: int) -> bool:
-    """Was it synced to its end, and is it as long as it was then?"""
-    if len(index) < 2 or not all(is_whole(record) for record in index) or index[-1]["count"]:
-        return False
-    return bool((index["offset"] + index["length"]).max() == size)
+def _write_index(path: Path, records: Records) -> None:
+    """Replace a segment's index by one that says that it was closed."""
+    content = records.tobytes() + closing_record().tobytes()
+    write_whole(path.with_suffix(INDEX_SUFFIX), content)
 
 
 def _checked(descriptor: int, path: Path, record: Any, end: int, schema: pa.Schema) -> Any | None:
     """The record if the batch's bytes agree with it; mended if only the record was damaged."""
     if is_whole(record):
-        if not record["count"]:
-            return record
-        return record if payload_of(descriptor, record) is not None else None
-    found = _message_at(path, end, schema)
-    if found is None or zlib.crc32(found.payload) != record["crc32"]:
+        is_right = not record["count"] or payload_of(descriptor, record) is not None
+        return record if is_right else None
+    message = next(messages_from(path, end, schema), None)
+    if message is None or zlib.crc32(message.payload) != record["crc32"]:
         return None
-    return record_of(found, end)[0]
+    return record_of(message, end)[0]
 
 
-def _index_anew(path: Path, schema: pa.Schema) -> Records:
-    records = []
-    end = _header_length(path)
-    while end and (found := _message_at(path, end, schema)) is not None:
-        records.append(record_of(found, end))
-        end += len(found.payload)
-    return np.concatenate(records) if records else np.zeros(0, RECORD)
-
-
-def _header_length(path: Path) -> int:
-    """Where the first batch begins; 0 if not even the schema was written."""
-    with pa.OSFile(str(path), "r") as file:
-        try:
-            pa.ipc.read_schema(pa.ipc.read_message(file))
-        except (pa.ArrowException, EOFError, OSError):
-            return 0
-        return file.tell()
-
-
-def _message_at(path: Path, offset: int, schema: pa.Schema) -> EncodedBatch | None:
-    with pa.OSFile(str(path), "r") as file:
-        try:
-            file.seek(offset)
-            pa.ipc.read_message(file)
-            payload = os.pread(file.fileno(), file.tell() - offset, offset)
-            return EncodedBatch.of(decode(payload, schema), payload)
-        except (pa.ArrowException, EOFError, OSError, FileFormatError):
-            return None
+def _index_anew(path: Path, begin: int, schema: pa.Schema) -> Records:
+    records = [np.zeros(0, RECORD)]
+    # Without a whole header nothing behind it is known to be a batch.
+    for message in messages_from(path, begin, schema) if begin else ():
+        records.append(record_of(message, begin))
+        begin += len(message.payload)
+    return np.concatenate(records)

@@ -17,13 +17,16 @@ import pyarrow as pa
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
 from storage.intervals import Intervals
-from storage.journal.segment import (
+from storage.journal.segment_bytes import messages_from, payload_of, read_header
+from storage.journal.segment_index import (
     INDEX_SUFFIX,
     RECORD,
     Records,
+    batches_in,
+    end_of,
+    is_closed,
     is_whole,
     numbers,
-    payload_of,
     read_index,
 )
 from storage.schema import array_info, wire_schema
@@ -82,7 +85,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
         if not path.exists():
             raise
         index = None
-    report.is_closed = index is not None and _is_closed(index)
+    report.is_closed = index is not None and is_closed(index)
     schema, header_bytes = _schema_of(path, report)
     if schema is None:
         # One that was just begun when the power failed may be empty; one with frames may not.
@@ -97,8 +100,13 @@ def _verify(path: Path, report: SegmentReport) -> None:
             )
         return
     _check_batches(report, index, schema, header_bytes)
-    end = _end_of(index, header_bytes)
-    behind = _whole_messages(path, end, size, schema)
+    end = max(header_bytes, end_of(batches_in(index)))
+    behind, at = 0, end
+    for message in messages_from(path, end, schema):
+        at += len(message.payload)
+        if at > size:
+            break
+        behind += 1
     if report.is_closed and size > end:
         report.problems.append(f"{size - end} bytes behind its last batch are in no index")
     elif behind > 1:
@@ -175,53 +183,22 @@ def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, offset_ns: int
     return ""
 
 
-def _is_closed(index: Records) -> bool:
-    return bool(len(index)) and is_whole(index[-1]) and not index[-1]["count"]
-
-
 def _holds_any(path: Path, index: Records) -> bool:
     """Are any bytes in the segment those that the index says?"""
     with path.open("rb") as file:
-        return any(
-            is_whole(record) and record["count"] and payload_of(file.fileno(), record) is not None
-            for record in index
-        )
+        batches = batches_in(index)
+        return any(payload_of(file.fileno(), record) is not None for record in batches)
 
 
 def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int]:
     """Schema at a segment's beginning, and how many bytes it takes."""
-    try:
-        with pa.OSFile(str(path), "r") as file:
-            schema = pa.ipc.read_schema(pa.ipc.read_message(file))
-            length = file.tell()
-        report.info = array_info(schema, where=str(path))
-        if not schema.equals(wire_schema(report.info), check_metadata=True):
-            report.problems.append("its columns are not those of a stream of frames")
-    except (pa.ArrowException, EOFError, OSError, ValueError):
+    schema, length = read_header(path)
+    if schema is None:
         return None, 0
+    try:
+        report.info = array_info(schema, where=str(path))
+    except FileFormatError:
+        return None, 0
+    if not schema.equals(wire_schema(report.info), check_metadata=True):
+        report.problems.append("its columns are not those of a stream of frames")
     return schema, length
-
-
-def _end_of(index: Records, header_bytes: int) -> int:
-    whole = index[[is_whole(record) and bool(record["count"]) for record in index]]
-    ends: list[int] = (whole["offset"] + whole["length"]).tolist()
-    return max([header_bytes, *ends])
-
-
-def _whole_messages(path: Path, begin: int, end: int, schema: pa.Schema) -> int:
-    """How many whole batches stand between two places of a segment."""
-    found = 0
-    with pa.OSFile(str(path), "r") as file:
-        try:
-            while begin < end:
-                file.seek(begin)
-                pa.ipc.read_message(file)
-                after = file.tell()
-                file.seek(begin)
-                if after > end:
-                    break
-                decode(file.read(after - begin), schema)
-                found, begin = found + 1, after
-        except (pa.ArrowException, EOFError, OSError, FileFormatError):
-            pass
-    return found

@@ -79,7 +79,7 @@ def test_the_errno_of_the_adapter_survives_pickling(kind: type[I2cError]) -> Non
 def test_an_error_is_usage_only_where_the_user_can_mend_it_in_what_he_typed(
     kind: type[FootTileError],
 ) -> None:
-    assert kind.exit_code == (2 if kind in (SceneError, UsageError) else 1)
+    assert kind.exit_code == (2 if issubclass(kind, (SceneError, UsageError)) else 1)
 
 
 @pytest.mark.parametrize(

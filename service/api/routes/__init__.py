@@ -1,1 +1,1 @@
-"""The HTTP API, a module for each kind of thing."""
+"""The HTTP API, a module for each kind of thing. No rule of a session stands here."""

@@ -11,23 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from devices.errors import FootTileError, UsageError
+from devices.errors import FootTileError
 from devices.extras import needs_extra
-from devices.scene.hardware import EMULATED
 from service.cli.commands.node import calibration_of
 from service.cli.commands.serve import PREPARING, announce
-from service.cli.emulation import (
-    CopAxesOption,
-    CopOffsetOption,
-    CopScaleOption,
-    LeadOption,
-    LoadOption,
-    LoadScaleOption,
-    PartsSeedOption,
-    SeedOption,
-    rig_options,
-    scene_with,
-)
+from service.cli.emulation import FootOptions, check_emulated, scene_with, with_foot_options
 from service.cli.options import remark
 from service.cli.signals import stop_on_signals
 
@@ -40,9 +28,10 @@ _END_S = 8.0
 
 
 @needs_extra("server", "`foottile demo`")
+@with_foot_options
 def demo_command(
+    options: FootOptions,
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")] = "rolling",
-    load: LoadOption = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any.")] = 8000,
     data: Annotated[
@@ -51,13 +40,6 @@ def demo_command(
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="End after so long; default: at Ctrl-C.")
     ] = None,
-    load_scale: LoadScaleOption = 1.0,
-    cop_scale: CopScaleOption = 1.0,
-    cop_offset_m: CopOffsetOption = "0,0",
-    cop_axes: CopAxesOption = "xy",
-    lead_s: LeadOption = 1.0,
-    seed: SeedOption = 0,
-    parts_seed: PartsSeedOption = 0,
 ) -> None:
     """Run a server and an emulated node, and show where the live page is.
 
@@ -67,38 +49,13 @@ def demo_command(
     import uvloop
     from platformdirs import user_data_path
 
+    from service.rig.rig import RigOptions
+
     the_scene = scene_with(scene, bus=None, servo=None)
-    servo = the_scene.servo
-    if the_scene.array.bus != EMULATED or (servo is not None and servo.port != EMULATED):
-        raise UsageError(
-            f"scene {the_scene.name!r} is of real hardware",
-            remedy="Use `foottile serve` and `foottile node`",
-        )
-    options = rig_options(
-        the_scene,
-        NODE,
-        load=load,
-        load_scale=load_scale,
-        cop_scale=cop_scale,
-        cop_offset_m=cop_offset_m,
-        cop_axes=cop_axes,
-        lead_s=lead_s,
-        seed=seed,
-        parts_seed=parts_seed,
-    )
-    calibration_of(options)  # the node finds it in the cache
-    node_options = {
-        "--scene": scene,
-        "--load": None if load is None else str(load),
-        "--load-scale": str(load_scale),
-        "--cop-scale": str(cop_scale),
-        "--cop-offset-m": cop_offset_m,
-        "--cop-axes": cop_axes,
-        "--lead-s": str(lead_s),
-        "--seed": str(seed),
-        "--parts-seed": str(parts_seed),
-    }
-    arguments = [f"{name}={value}" for name, value in node_options.items() if value is not None]
+    check_emulated(the_scene)
+    # The node finds it in the cache.
+    calibration_of(RigOptions(the_scene, NODE, options.foot(the_scene)))
+    arguments = [f"--scene={scene}", *options.as_arguments()]
     folder = data if data is not None else user_data_path("foottile") / "demo"
     arguments.append(f"--journal={folder / 'node'}")
     uvloop.run(_demo(host, port, folder, seconds, arguments))

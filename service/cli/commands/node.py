@@ -12,18 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import CalibrationError, MissingExtraError, UsageError
-from service.cli.emulation import (
-    CopAxesOption,
-    CopOffsetOption,
-    CopScaleOption,
-    LeadOption,
-    LoadOption,
-    LoadScaleOption,
-    PartsSeedOption,
-    SeedOption,
-    rig_options,
-    scene_with,
-)
+from service.cli.emulation import FootOptions, scene_with, with_foot_options
 from service.cli.options import remark, say
 from service.cli.signals import stop_on_signals
 
@@ -35,7 +24,9 @@ if TYPE_CHECKING:
 SERVER = "http://127.0.0.1:8000"
 
 
+@with_foot_options
 def node_command(
+    options: FootOptions,
     scene: Annotated[str, typer.Option(help="Scene file, or a built-in scene.")],
     server: Annotated[
         str | None,
@@ -59,14 +50,6 @@ def node_command(
         str | None,
         typer.Option(help="Record a session of this name here; no server is needed for it."),
     ] = None,
-    load: LoadOption = None,
-    load_scale: LoadScaleOption = 1.0,
-    cop_scale: CopScaleOption = 1.0,
-    cop_offset_m: CopOffsetOption = "0,0",
-    cop_axes: CopAxesOption = "xy",
-    lead_s: LeadOption = 1.0,
-    seed: SeedOption = 0,
-    parts_seed: PartsSeedOption = 0,
     end_with_parent: Annotated[
         bool, typer.Option("--end-with-parent", hidden=True, help="End when its parent dies.")
     ] = False,
@@ -85,6 +68,7 @@ def node_command(
 
     from service.node.publisher import ingest_url
     from service.node.run import NodeOptions
+    from service.rig.rig import RigOptions
 
     if end_with_parent:
         from devices import realtime
@@ -97,23 +81,12 @@ def node_command(
     if record is not None and not record.strip():
         raise UsageError("--record without a name", expected="the name of the session")
     the_scene = scene_with(scene, bus=bus, servo=servo)
-    options = rig_options(
-        the_scene,
-        _name(name),
-        load=load,
-        load_scale=load_scale,
-        cop_scale=cop_scale,
-        cop_offset_m=cop_offset_m,
-        cop_axes=cop_axes,
-        lead_s=lead_s,
-        seed=seed,
-        parts_seed=parts_seed,
-    )
-    calibration, problem = calibration_of(options)
+    rig = RigOptions(the_scene, _name(name), options.foot(the_scene))
+    calibration, problem = calibration_of(rig)
     outcome = asyncio.run(
         _run(
             NodeOptions(
-                rig=options,
+                rig=rig,
                 journal=journal if journal is not None else user_state_path("foottile"),
                 server=server,
                 record=record,
@@ -161,7 +134,7 @@ def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]
         calibration = find_calibration(
             scene.calibration,
             [tile.serial for tile in scene.tile if not tile.reference],
-            parts_seed=options.parts_seed,
+            parts_seed=options.foot.parts_seed,
             progress=remark,
         )
     except (CalibrationError, MissingExtraError) as error:

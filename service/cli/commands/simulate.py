@@ -9,31 +9,18 @@ import typer
 
 from devices.errors import UsageError
 from devices.extras import needs_extra
-from devices.scene.file import Scene, load_scene
+from devices.scene.file import load_scene
 from devices.scene.hardware import AnySchedule, ScheduleName
-from service.cli.emulation import (
-    CopAxesOption,
-    CopOffsetOption,
-    CopScaleOption,
-    LeadOption,
-    LoadOption,
-    LoadScaleOption,
-    PartsSeedOption,
-    SeedOption,
-    check_emulated,
-    check_load,
-)
+from service.cli.emulation import FootOptions, check_emulated, with_foot_options
 from service.cli.options import (
     JsonOption,
     output_path,
-    pair,
     print_json,
     progress,
     remark,
     say,
-    stdout,
 )
-from service.cli.report import ASSUMED_SCALE, accuracy_table, stances_json, stances_line
+from service.cli.report import findings_json, tell_findings
 from service.estimation import OFFLINE_LAG_MS
 
 if TYPE_CHECKING:
@@ -41,7 +28,9 @@ if TYPE_CHECKING:
 
 
 @needs_extra("server", "`foottile simulate`")
+@with_foot_options
 def simulate_command(
+    options: FootOptions,
     scene: Annotated[str, typer.Option(help="Built-in scene, or a scene file.")],
     out: Annotated[
         Path | None, typer.Option(help="Session to write; default: SCENE.parquet here.")
@@ -50,12 +39,6 @@ def simulate_command(
         float | None,
         typer.Option(help="Length, lead included; default: that of the load or programme."),
     ] = None,
-    load: LoadOption = None,
-    load_scale: LoadScaleOption = 1.0,
-    cop_scale: CopScaleOption = 1.0,
-    cop_offset_m: CopOffsetOption = "0,0",
-    cop_axes: CopAxesOption = "xy",
-    lead_s: LeadOption = 1.0,
     schedule: Annotated[
         str | None,
         typer.Option(
@@ -65,8 +48,6 @@ def simulate_command(
     tiles: Annotated[
         str | None, typer.Option(help="Indentation only: serials to press, T01,T02,...")
     ] = None,
-    seed: SeedOption = 0,
-    parts_seed: PartsSeedOption = 0,
     truth: Annotated[
         bool, typer.Option("--truth", help="Add the true_* columns and print the error.")
     ] = False,
@@ -80,33 +61,22 @@ def simulate_command(
     the scene's frame rate.
     """
     # Imported here: the physics pulls in scipy, which `--help` need not wait for.
-    from devices.emulation.ground.load_trace import CopTransform
     from service.estimation.ladder import check_models
     from service.offline.calibrations import find_calibration, with_tiles
     from service.offline.simulate import SimulateOptions, simulate
     from service.sessions.pipeline import EstimateOptions
-    from storage.formats.load_trace import read_load_trace
 
     the_scene = load_scene(scene)
     if tiles is not None:
         if the_scene.ground.kind != "indentation":
             raise UsageError("--tiles chooses what the mill presses", expected="an indentation")
         the_scene = with_tiles(the_scene, tiles.split(","))
-    _check(the_scene, seconds, lead_s, load_scale, cop_scale)
-    inputs = [Path(scene), *([load] if load is not None else [])]
+    check_emulated(the_scene)
+    if seconds is not None and not 0.0 < seconds < 1e9:
+        raise UsageError(f"--seconds {seconds:g}", expected="a sensible positive number")
+    foot = options.foot(the_scene)
+    inputs = [Path(scene), *([options.load] if options.load is not None else [])]
     path = output_path(out if out is not None else Path(f"{the_scene.name}.parquet"), *inputs)
-    options = SimulateOptions(
-        scene=the_scene,
-        seconds=seconds,
-        schedule=_schedule(schedule),
-        seed=seed,
-        parts_seed=parts_seed,
-        lead_s=lead_s,
-        truth=truth,
-        load=read_load_trace(load) if load is not None else None,
-        load_scale=load_scale,
-        cop=CopTransform(cop_scale, pair(cop_offset_m, "--cop-offset-m") or (0.0, 0.0), cop_axes),
-    )
     has_estimates = not no_estimates and the_scene.calibration != "none"
     if has_estimates:
         check_models(the_scene.models)
@@ -115,13 +85,23 @@ def simulate_command(
         calibration = find_calibration(
             the_scene.calibration,
             [tile.serial for tile in the_scene.tile if not tile.reference],
-            parts_seed=parts_seed,
+            parts_seed=foot.parts_seed,
             progress=remark,
         )
         return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS)
 
     with progress(f"simulating {the_scene.name}"):
-        result = simulate(options, path, estimate if has_estimates else None)
+        result = simulate(
+            SimulateOptions(
+                scene=the_scene,
+                seconds=seconds,
+                schedule=_schedule(schedule),
+                truth=truth,
+                foot=foot,
+            ),
+            path,
+            estimate if has_estimates else None,
+        )
     if as_json:
         print_json(_as_json(result, path))
     else:
@@ -133,24 +113,18 @@ def simulate_command(
 def _as_json(result: Simulated, path: Path) -> dict[str, object]:
     pressed = result.pressed
     return {
-        "out": str(path),
+        "out": path,
         "frames": result.frames,
         "seconds": result.seconds,
         "rate_hz": result.rate_hz,
         "schedule": result.choice.schedule,
-        "unmeasured": list(result.unmeasured),
-        "flags": {serial: dict(flags) for serial, flags in result.flags.items()},
+        "unmeasured": result.unmeasured,
+        "flags": result.flags,
         "missed_slots": result.missed_slots,
         "bytes": path.stat().st_size,
         "moved_to_edge": pressed.moved_to_edge if pressed else None,
         "limited": pressed.limited if pressed else None,
-        "absolute_scale": None
-        if result.assumed_scale is None
-        else "assumed"
-        if result.assumed_scale
-        else "measured",
-        "stances": stances_json(result.stances),
-        "accuracy": result.accuracy.as_dict() if result.accuracy else None,
+        **findings_json(result.findings),
     }
 
 
@@ -178,12 +152,7 @@ def _print(result: Simulated, path: Path) -> None:
             f"load: {result.pressed.moved_to_edge} samples had their COP moved to the hull's edge, "
             f"{result.pressed.limited} had a tile's force limited"
         )
-    if result.assumed_scale:
-        say(ASSUMED_SCALE)
-    if result.stances:
-        say(stances_line(result.stances))
-    if result.accuracy is not None:
-        stdout.print(accuracy_table(result.accuracy))
+    tell_findings(result.findings)
 
 
 def _schedule(name: str | None) -> AnySchedule | None:
@@ -193,12 +162,3 @@ def _schedule(name: str | None) -> AnySchedule | None:
     if name not in names:
         raise UsageError(f"--schedule {name!r}", expected=" or ".join(names))
     return cast(AnySchedule, name)
-
-
-def _check(
-    scene: Scene, seconds: float | None, lead_s: float, load_scale: float, cop_scale: float
-) -> None:
-    check_emulated(scene)
-    if seconds is not None and not 0.0 < seconds < 1e9:
-        raise UsageError(f"--seconds {seconds:g}", expected="a sensible positive number")
-    check_load(load_scale, cop_scale, lead_s)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Bools, Columns, Floats, Ints, Times
+from devices.arrays import Arrays, Bools, Floats, Ints, Times
 from devices.errors import CalibrationError
 from service.estimation.bench.soak import Soak
 
@@ -50,7 +50,7 @@ class Indentation:
 
 
 @dataclass(frozen=True)
-class Strokes(Columns):
+class Strokes(Arrays):
     """Block averages of all slow strokes of a tile, m blocks.
 
     Attributes:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Bools, Columns, Floats, Ints, Times
+from devices.arrays import Arrays, Bools, Floats, Ints, Times
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
 
 _AGE_UNIT_NS = 1000
@@ -20,7 +20,7 @@ _AGE_UNIT_NS = 1000
 
 
 @dataclass(frozen=True)
-class Readings(Columns):
+class Readings(Arrays):
     """The servo's readings as n frames carry them, one row per frame.
 
     Attributes:

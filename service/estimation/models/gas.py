@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Columns, Floats, Times
+from devices.arrays import Arrays, Floats, Times
 from service.estimation.compiled import compiled
 
 RESTART = 5.0
@@ -28,7 +28,7 @@ RESTART = 5.0
 
 
 @dataclass(frozen=True)
-class GasState(Columns):
+class GasState(Arrays):
     """Of every tile: temperature over the wall's, and the reading before (NaN: none)."""
 
     temperature: Floats

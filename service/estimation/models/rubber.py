@@ -16,12 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Columns, Floats, Times
+from devices.arrays import Arrays, Floats, Times
 from service.estimation.compiled import compiled
 
 
 @dataclass(frozen=True)
-class RubberState(Columns):
+class RubberState(Arrays):
     """Of every tile: crept parts (tiles, terms), and the force before (NaN: none)."""
 
     crept_n: Floats

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Columns, Floats, Times
+from devices.arrays import Arrays, Floats, Times
 from service.estimation.compiled import compiled
 
 SETTLE_S = 0.5
@@ -24,7 +24,7 @@ NEAR_COUNTS = 2.0
 
 
 @dataclass(frozen=True)
-class TemperatureState(Columns):
+class TemperatureState(Arrays):
     """Of every tile: counts of its gas, its chip, the first ones and when, and when the last.
 
     NaN before the first reading.

@@ -13,13 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from devices.arrays import Bools
-from devices.chips.compensation import Compensation
 from devices.errors import TareError
-from devices.frames import FrameBatch
-from service.estimation.calibration import Calibration
 from service.estimation.tare.drift import expected_shift_kpa, warmer_k
 from service.estimation.tare.flight import WINDOW_NS, tare_in_flight
-from service.estimation.tare.tare import LOADED_KPA, NEAR_BASELINE_KPA, Tare
+from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded import LOADED_KPA, NEAR_BASELINE_KPA, TareFrames
 
 APART_NS = 60_000_000_000
 """Two automatic tares are at least a minute apart."""
@@ -60,10 +58,7 @@ NOTHING = Look()
 
 
 def look_in_flight(
-    frames: FrameBatch,
-    compensation: Compensation,
-    calibration: Calibration,
-    serials: tuple[str, ...],
+    seen: TareFrames,
     *,
     present: Tare,
     anchor: Tare | None,
@@ -73,23 +68,19 @@ def look_in_flight(
     """Whether the baseline should follow what a foot in the air reads.
 
     Args:
-        frames: the last `LOOK_BACK_NS` of the stream, in order.
-        compensation: of the array's chips.
-        calibration: of its tiles.
-        serials: of the tiles, in order.
+        seen: the last `LOOK_BACK_NS` of the stream, in order.
         present: the tare in force.
         anchor: the last one that was not automatic; None if there is none any more.
         free_since_t_ns: since when there has been no contact, nor any doubt about it.
         bears: (tiles,), False for bare tiles, which follow the weather and no load; None: all do.
     """
+    frames, serials = seen.frames, seen.serials
     if bears is None:
         bears = np.ones(len(serials), dtype=bool)
     if not len(frames) or frames.t_ns[-1] - free_since_t_ns < SETTLE_NS + WINDOW_NS:
         return NOTHING
     try:
-        tare = tare_in_flight(
-            frames, compensation, calibration, serials, present=present, bears=bears
-        )
+        tare = tare_in_flight(seen, present=present, bears=bears)
     except TareError:  # it moves, a tile is silent, or it bears a load: no flight
         return NOTHING
     begin_t_ns = int(frames.t_ns[0]) + round(tare.begin_s * 1e9)
@@ -117,31 +108,23 @@ def look_in_flight(
     return Look(replace(tare, source="flight"), reason)
 
 
-def first_in_flight(
-    frames: FrameBatch,
-    compensation: Compensation,
-    calibration: Calibration,
-    serials: tuple[str, ...],
-) -> Look:
-    """A first tare without anybody's hand, if it can be no mistake.
+def first_in_flight(seen: TareFrames) -> Look:
+    """A first tare that nobody asked for, if it can be no mistake.
 
     The foot has to have been loaded in these seconds and to be off the ground at their end, every
     tile near its baseline on the bench: a foot that merely stands light is quiet and near as well.
     """
-    entries = [calibration.find(serial) for serial in serials]
-    benches = [entry.baseline_kpa if entry is not None else None for entry in entries]
-    known = [entry.baseline_kpa for entry in entries if entry is not None]
-    if not known or None in known or not len(frames):
+    if not seen.has_bench or not len(seen.frames):
         return NOTHING
     try:
-        tare = tare_in_flight(frames, compensation, calibration, serials, present=None)
+        tare = tare_in_flight(seen, present=None)
     except TareError:
         return NOTHING
-    off_kpa = np.abs(tare.baseline_kpa - np.array(benches, dtype=np.float64))
-    above_kpa = compensation.readable_kpa(frames) - tare.baseline_kpa
+    off_kpa = np.abs(tare.baseline_kpa - seen.bench_kpa)
+    above_kpa = seen.kpa - tare.baseline_kpa
     # A sum over the foot, and for a tenth of a second: an outlier is no step.
-    steps = np.nansum(np.maximum(above_kpa, 0.0), axis=1) > LOADED_KPA * np.sqrt(len(serials))
-    stepped_ns = steps.mean() * float(frames.t_ns[-1] - frames.t_ns[0])
+    steps = np.nansum(np.maximum(above_kpa, 0.0), axis=1) > LOADED_KPA * np.sqrt(len(seen.serials))
+    stepped_ns = steps.mean() * float(seen.since_ns[-1])
     if (off_kpa > NEAR_BASELINE_KPA).any() or stepped_ns < SETTLE_NS:
         return NOTHING
     return Look(replace(tare, source="flight"), "in flight, between two steps; there was none yet")

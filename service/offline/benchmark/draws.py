@@ -18,10 +18,12 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.file import Scene
 from service.estimation.calibration import Calibration
-from service.offline.accuracy import JUDGED, Accuracy, judge
+from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 from service.offline.benchmark.rungs import Rung
 from service.offline.calibrations import find_calibration
-from service.offline.simulate import SimulateOptions, Simulation, joined
+from service.offline.findings import joined
+from service.offline.simulate import SimulateOptions, Simulation
+from service.rig.emulated import EmulatedFoot
 from service.sessions.pipeline import EstimateOptions, EstimateStream
 
 LAGS_MS: Mapping[str, float] = {"live": 10.0, "offline": 100.0}
@@ -30,7 +32,7 @@ LAGS_MS: Mapping[str, float] = {"live": 10.0, "offline": 100.0}
 SECONDS = 20.0
 """Length of a scene that has no end of its own."""
 
-_TRUTH = tuple(name for name in JUDGED if name.startswith("true_"))
+_TRUTH = tuple(name for name in COMPARED if name.startswith("true_"))
 
 
 @dataclass(frozen=True)
@@ -98,9 +100,8 @@ def record(
     serials = [tile.serial for tile in scene.tile]
     calibration = find_calibration(scene.calibration, serials, parts_seed=draw, progress=progress)
     with ExitStack() as stack:
-        options = SimulateOptions(
-            scene, seconds, otherwise_s=SECONDS, seed=draw, parts_seed=draw, truth=True
-        )
+        foot = EmulatedFoot(seed=draw, parts_seed=draw)
+        options = SimulateOptions(scene, seconds, otherwise_s=SECONDS, truth=True, foot=foot)
         simulation = Simulation(options, stack)
         pieces = [
             (frames, {name: extra[name] for name in _TRUTH})
@@ -125,8 +126,8 @@ def estimated(recording: Recording, models: tuple[str, ...], lag_ms: float) -> A
     judged: list[Mapping[str, npt.NDArray[Any]]] = []
     for frames, columns in stream.run([(recording.frames, recording.truth)]):
         columns["t_ns"] = frames.t_ns
-        judged.append({name: np.asarray(columns[name]) for name in JUDGED})
-    return judge(joined(judged), lag_ms=lag_ms)
+        judged.append({name: np.asarray(columns[name]) for name in COMPARED})
+    return accuracy_of(joined(judged), lag_ms=lag_ms)
 
 
 def run_draw(task: Task) -> Drawn:

@@ -18,7 +18,7 @@ from devices.chips.compensation import Compensation
 from devices.frames import FrameBatch
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare.tare import take_tare
+from service.estimation.tare.recorded import take_tare
 from service.offline.benchmark.draws import LAGS_MS, Failure, Recording, reason
 from service.offline.benchmark.rungs import Rung
 from service.sessions.pipeline import CHUNK

@@ -30,7 +30,7 @@ from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.lower import ApparentForces
 from service.estimation.models.temperature import Temperature
 from service.estimation.plan import make_plan
-from service.estimation.tare.tare import take_tare
+from service.estimation.tare.recorded import take_tare
 from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.builders.estimates import estimate, newton_plan

@@ -39,6 +39,7 @@ from service.node.publisher import Publisher, ingest_url
 from storage.intervals import Intervals
 from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
+from storage.journal.wanted import Wanted as NodeWanted
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, decode
 from tests.service.fake_node import FakeNode, NodeOf
@@ -422,7 +423,7 @@ def test_losses_are_said_whenever_they_change(node: FakeNode) -> None:
     async def scenario() -> list[Lost]:
         async with played() as script, Publishing(node, script.url) as publishing:
             await publishing.until(lambda: script.said)
-            publishing.stream.lose(Intervals([(3, 9)]), "disk_full")
+            publishing.stream.lose(Intervals([(3, 9)]), "disk_full", NodeWanted(Path("nowhere")))
             await publishing.until(lambda: any(isinstance(m, Lost) for m in script.said))
             await asyncio.sleep(0.1)
             return [message for message in script.said if isinstance(message, Lost)]

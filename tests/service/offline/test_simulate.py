@@ -14,6 +14,7 @@ from devices.frames import FrameBatch, FrameStatus
 from devices.scene.file import load_scene
 from service.estimation.foot.geometry import angle_rad
 from service.offline.simulate import SimulateOptions, Simulation
+from service.rig.emulated import EmulatedFoot
 
 
 @settings(max_examples=12, deadline=None)
@@ -32,7 +33,9 @@ def test_any_turn_of_the_servo_reaches_frames_and_angle_unharmed(
     )
     scene = rolling.model_copy(update={"servo": servo})
     with ExitStack() as stack:
-        options = SimulateOptions(scene=scene, seconds=1.0, lead_s=0.2, truth=True)
+        options = SimulateOptions(
+            scene=scene, seconds=1.0, truth=True, foot=EmulatedFoot(lead_s=0.2)
+        )
         simulation = Simulation(options, stack)
         ((frames, truth),) = simulation.pieces()
         info = simulation.info.servo

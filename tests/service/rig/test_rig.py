@@ -10,6 +10,7 @@ import pytest
 from devices.array.array import TileArray
 from devices.frames import FrameStatus
 from devices.scene.file import load_scene
+from service.rig.emulated import EmulatedFoot
 from service.rig.rig import Rig, RigOptions
 
 
@@ -25,6 +26,6 @@ def test_a_machine_that_is_busy_during_the_trial_frames_does_not_use_up_the_lead
 
     monkeypatch.setattr(Rig, "_bus_hz", slow)
     with ExitStack() as stack:
-        rig = Rig(RigOptions(load_scene("standing"), "busy", lead_s=0.5), stack)
+        rig = Rig(RigOptions(load_scene("standing"), "busy", EmulatedFoot(lead_s=0.5)), stack)
         first = next(rig.batches(lambda: False))
     assert first.frame_status[0] & FrameStatus.LEAD

@@ -17,7 +17,7 @@ import pytest
 from devices.errors import StorageError
 from devices.frames import ArrayInfo, FrameBatch, TileStatus
 from storage.intervals import NO_END, Intervals
-from storage.journal import in_flight, node_journal, segment
+from storage.journal import in_flight, node_journal, retention, segment
 from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal
 from storage.journal.node_journal import NodeJournal
@@ -43,6 +43,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(node_journal, "SYNC_S", 0.02)
     monkeypatch.setattr(node_journal, "_TIDY_S", 0.02)
     monkeypatch.setattr(node_journal, "_AGAIN_S", 0.02)
+    monkeypatch.setattr(retention, "_WEIGH_S", 0.02)
 
 
 @pytest.fixture
@@ -76,7 +77,7 @@ Fill = Callable[[NodeJournal, NodeStream, int, int], None]
 
 
 def on_disk(stream: NodeStream) -> Intervals:
-    return Intervals(stream.journal.held) if stream.journal is not None else Intervals()
+    return stream.stored
 
 
 def given(stream: NodeStream, first: int, last: int) -> list[int]:
@@ -252,8 +253,8 @@ def wants(*numbers: tuple[int, int | None]) -> ServerWants:
 def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
     start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(node_journal, "RING_NS", 200_000_000)
-    monkeypatch.setattr("storage.journal.journal.SEGMENT_NS", 20_000_000)
+    monkeypatch.setattr(retention, "RING_NS", 200_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
     journal = start()
     stream = journal.begin(array_of())
     journal.want("laptop", wants((200, 249)))
@@ -269,16 +270,16 @@ def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
 def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
     start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("storage.journal.journal.SEGMENT_NS", 20_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
     monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
     journal = start(budget_bytes=60_000)
     stream = journal.begin(array_of())
     fill(journal, stream, 0, 99)
-    until(lambda: not stream.waiting)
+    until(lambda: not stream.waiting_bytes)
     journal.want("laptop", wants((100, None)))
     for first in range(100, 1000, 50):
         fill(journal, stream, first, first + 49)
-        until(lambda: not stream.waiting or journal.troubles)
+        until(lambda: not stream.waiting_bytes or journal.troubles)
     assert "is full" in journal.troubles[0]
     fill(journal, stream, 1000, 1999)
     lost = stream.lost.by_reason
@@ -315,7 +316,7 @@ def test_a_disk_that_takes_nothing_costs_what_memory_cannot_hold_and_goes_on_whe
     journal = start()
     stream = journal.begin(array_of())
     fill(journal, stream, 0, 49)
-    until(lambda: on_disk(stream).last == 49 and not stream.unsynced)
+    until(lambda: on_disk(stream).last == 49 and stream.is_synced)
 
     def refuse(file: Any, data: bytes) -> None:
         raise OSError(number, os.strerror(number))
@@ -369,7 +370,7 @@ def test_what_the_disk_could_not_sync_is_written_once_more(
     journal = start()
     stream = journal.begin(array_of())
     fill(journal, stream, 0, 49)
-    until(lambda: on_disk(stream).last == 49 and not stream.unsynced)
+    until(lambda: on_disk(stream).last == 49 and stream.is_synced)
     failures = 1
     real = os.fsync
 
@@ -382,7 +383,7 @@ def test_what_the_disk_could_not_sync_is_written_once_more(
 
     monkeypatch.setattr(os, "fsync", fail)
     fill(journal, stream, 50, 99)
-    until(lambda: not failures and not stream.waiting and not stream.unsynced)
+    until(lambda: not failures and stream.is_synced)
     assert on_disk(stream) == Intervals([(0, 99)])
     names = sorted(path.name for path in stream.folder.glob("*.arrows"))
     assert len(names) >= 2
@@ -427,7 +428,7 @@ def test_recovery_writes_what_was_in_flight_and_drops_nothing(
     until(lambda: on_disk(stream) == Intervals([(0, 99)]))
     flying(stream, frames_of(0, 117))
     folder = killed(journal, tmp_path)
-    monkeypatch.setattr(node_journal, "RING_NS", 0)
+    monkeypatch.setattr(retention, "RING_NS", 0)
     monkeypatch.setattr(node_journal, "BUDGET_BYTES", 0)
     node_journal.settle_left_over(folder)
     notes = StreamNotes.load(folder / "journal" / "leg" / ("0" * 32))
@@ -441,8 +442,8 @@ def test_recovery_writes_what_was_in_flight_and_drops_nothing(
 def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
     start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(node_journal, "RING_NS", 100_000_000)
-    monkeypatch.setattr("storage.journal.journal.SEGMENT_NS", 20_000_000)
+    monkeypatch.setattr(retention, "RING_NS", 100_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
     journal = start()
     stream = journal.begin(array_of())
     journal.wanted.say_local({stream.boot_id: Intervals([(0, NO_END)])})
@@ -456,8 +457,8 @@ def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
 def test_what_one_server_has_another_still_gets(
     start: Start, fill: Fill, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(node_journal, "RING_NS", 100_000_000)
-    monkeypatch.setattr("storage.journal.journal.SEGMENT_NS", 20_000_000)
+    monkeypatch.setattr(retention, "RING_NS", 100_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
     journal = start()
     stream = journal.begin(array_of())
     journal.want("laptop", wants((0, 199)))
@@ -477,7 +478,7 @@ def test_what_acquisition_had_taken_when_it_was_killed_is_taken_over(
     stream = journal.begin(array_of())
     fill(journal, stream, 0, 89)
     flying(stream, frames_of(0, 99))
-    stream.has_ended = True
+    stream.end()
     assert journal.settle()
     assert on_disk(stream) == Intervals([(0, 99)])
     assert (stream.next_seq, stream.lost.as_pairs()) == (100, {})
@@ -512,7 +513,7 @@ def test_the_bound_is_the_age_of_the_oldest_frame_when_it_is_on_the_disk(
     fill(journal, stream, 0, 9)
     assert stuck.wait(5.0)
     fill(journal, stream, 10, 19)
-    until(lambda: on_disk(stream).last == 19 and not stream.unsynced)
+    until(lambda: on_disk(stream).last == 19 and stream.is_synced)
     assert stream.notes.sync_max_s > 0.6
 
 

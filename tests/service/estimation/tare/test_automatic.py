@@ -16,7 +16,7 @@ import pytest
 
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
-from devices.frames import ArrayInfo, FrameBatch
+from devices.frames import NOT_READ, ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration, paper_eq2_shape
 from service.estimation.tare.automatic import (
     APART_NS,
@@ -30,6 +30,7 @@ from service.estimation.tare.automatic import (
 )
 from service.estimation.tare.flight import WINDOW_NS
 from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded import TareFrames
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration, make_tare
 from tests.builders.frames import loaded_frames
@@ -70,10 +71,7 @@ class Bench:
     ) -> Look:
         """A look at frames of a foot that has had no contact for `free_s`."""
         return look_in_flight(
-            frames,
-            self._compensation,
-            self.calibration,
-            self.info.serials,
+            self._seen(frames),
             present=present,
             anchor=present if anchor is None else anchor,
             free_since_t_ns=int(frames.t_ns[-1]) - round(free_s * SECOND_NS),
@@ -82,7 +80,10 @@ class Bench:
 
     def first(self, frames: FrameBatch) -> Look:
         """A look at frames of a foot that was never tared."""
-        return first_in_flight(frames, self._compensation, self.calibration, self.info.serials)
+        return first_in_flight(self._seen(frames))
+
+    def _seen(self, frames: FrameBatch) -> TareFrames:
+        return TareFrames(frames, self._compensation, self.calibration, self.info.serials)
 
 
 @pytest.fixture(scope="module")
@@ -267,6 +268,14 @@ def test_a_foot_that_steps_is_tared_between_two_steps(bench: Bench) -> None:
     assert found.tare.source == "flight"
     assert found.tare.baseline_kpa == pytest.approx([UNLOADED_KPA + 3 * COUNT_KPA] * 2, abs=0.1)
     assert "between two steps" in found.reason
+
+
+def test_a_step_counts_however_seldom_the_temperature_is_read(bench: Bench) -> None:
+    counts = np.zeros((500, 1))
+    counts[100:120] = 40.0  # 0.2 s, of which every fourth frame reads the temperature
+    frames = bench.frames(20.0, counts)
+    tadc = np.where(np.arange(500)[:, None] % 4 == 0, frames.tadc, NOT_READ).astype(np.uint16)
+    assert bench.first(replace(frames, tadc=tadc)).tare is not None
 
 
 @pytest.mark.parametrize("counts", [0.0, 3.0, 11.0], ids=["hangs", "stands light", "stands"])

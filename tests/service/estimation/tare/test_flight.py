@@ -16,7 +16,8 @@ from devices.errors import TareError
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration, paper_eq2_shape
 from service.estimation.tare.flight import LOOK_BACK_NS, WINDOW_NS, tare_in_flight
-from service.estimation.tare.tare import FRAMES_MIN, Tare
+from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded import FRAMES_MIN, TareFrames
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_calibration, make_tare, newton_tile
 from tests.builders.frames import loaded_frames
@@ -37,9 +38,8 @@ def flight_of(
     info = make_array(frames.tile_count)
     if calibration is None:
         calibration = make_calibration(*(newton_tile(s, **bench) for s in info.serials))
-    return tare_in_flight(
-        frames, Compensation(info.tiles), calibration, info.serials, present=present
-    )
+    seen = TareFrames(frames, Compensation(info.tiles), calibration, info.serials)
+    return tare_in_flight(seen, present=present)
 
 
 def present(counts: float = 0.0, *, tiles: int = 2, noise_counts: float = 1.0) -> Tare:

@@ -1,0 +1,198 @@
+"""Frames to take a tare from: windows without load, and when a baseline is refused.
+
+A foot that stands still is as quiet as one in the air, but it presses: so of all quiet windows
+those count in which no tile reads higher than in the lowest of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from devices.arrays import Bools, Floats
+from devices.chips.compensation import Compensation
+from devices.errors import TareError
+from devices.frames import FrameBatch
+from devices.temperature import hold_temperature
+from service.estimation.calibration import Calibration
+from service.estimation.tare.tare import Source, Tare
+
+FRAMES_MIN = 20
+NEAR_BASELINE_KPA = 1.5
+"""How far an unloaded bubble may be from its baseline on the bench: 5 K, by p0 / T0."""
+LOADED_KPA = 3.0
+"""A tile this far above its bench baseline, 10 K by p0 / T0, is not taken for an unloaded one, even
+if the user or a flag says so."""
+QUIET = 1.5
+"""An unloaded tile's readings scatter at most so much more than on the bench."""
+STILL_SIGMAS = 4.0
+"""The halves of a window, and the window and the lowest one, differ by no more than chance does."""
+STUCK_COUNTS = 0.5
+"""A part that scatters by more than so many counts does not read the same one twenty times."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A window in which every tile is quiet and still.
+
+    Attributes:
+        rows: of the frames.
+        mean_kpa: (tiles,), mean pressures.
+        sigma_kpa: (tiles,), their standard uncertainty.
+    """
+
+    rows: slice
+    mean_kpa: Floats
+    sigma_kpa: Floats
+
+
+class TareFrames:
+    """Frames in order, with their pressures and what the bench says of their tiles.
+
+    Args:
+        frames: n frames.
+        compensation: of the array's chips.
+        calibration: of its tiles, whose bench baselines tell an unloaded tile.
+        serials: of the tiles, in order.
+
+    Attributes:
+        kpa: (n, tiles), absolute pressures; NaN where a tile gave none.
+        since_ns: (n,), from the first frame.
+        bench_kpa: (tiles,), baselines on the bench; NaN where not known.
+        bench_noise_kpa: (tiles,), standard deviations of a reading there; likewise.
+        calibrated: (tiles,), False for bare tiles, which bear no load.
+    """
+
+    def __init__(
+        self,
+        frames: FrameBatch,
+        compensation: Compensation,
+        calibration: Calibration,
+        serials: tuple[str, ...],
+    ) -> None:
+        self.frames, _ = hold_temperature(frames)
+        self.serials = serials
+        self.kpa = compensation.readable_kpa(self.frames)
+        self.since_ns = frames.t_ns - frames.t_ns[:1]
+        entries = [calibration.find(serial) for serial in serials]
+        self.bench_kpa = np.array([e.baseline_kpa if e else None for e in entries], dtype=float)
+        self.bench_noise_kpa = np.array([e.noise_kpa if e else None for e in entries], dtype=float)
+        self.calibrated = np.array([entry is not None for entry in entries])
+        self._compensation = compensation
+
+    @property
+    def has_bench(self) -> bool:
+        """Does the calibration say of all its tiles where they lie unloaded?"""
+        known = np.isfinite(self.bench_kpa) & np.isfinite(self.bench_noise_kpa)
+        return bool(self.calibrated.any() and known[self.calibrated].all())
+
+    @property
+    def step_noise_kpa(self) -> Floats:
+        """(tiles,), noise by what changes between two frames, which a slow motion hardly does."""
+        return np.asarray(np.nanstd(np.diff(self.kpa, axis=0), axis=0) / np.sqrt(2.0))
+
+    def quiet_windows(self, spans: Iterable[tuple[int, int]], noise_kpa: Floats) -> list[Window]:
+        """Those of `spans`, first row and row after the last, that may be without load.
+
+        Args:
+            spans: to be looked at.
+            noise_kpa: (tiles,), that an unloaded tile shows.
+        """
+        found = []
+        for first, end in spans:
+            kpa, n = self.kpa[first:end], end - first
+            if n < FRAMES_MIN or not np.isfinite(kpa).all():
+                continue
+            sigma_kpa = noise_kpa / np.sqrt(n)
+            drift_kpa = kpa[: n // 2].mean(axis=0) - kpa[n // 2 :].mean(axis=0)
+            quiet = kpa.std(axis=0, ddof=1) < QUIET * noise_kpa
+            # Each half has sqrt(2) times the mean's uncertainty, so their difference has twice it.
+            still = np.abs(drift_kpa) < STILL_SIGMAS * 2.0 * sigma_kpa
+            if (quiet & still).all():
+                found.append(Window(slice(first, end), kpa.mean(axis=0), sigma_kpa))
+        return found
+
+    def tare(self, rows: Bools | slice, source: Source) -> Tare:
+        """The tare from those frames that `rows` names.
+
+        Raises:
+            TareError: a tile has fewer than `FRAMES_MIN` readable frames among them.
+        """
+        kpa = self.kpa[rows]
+        readable = np.isfinite(kpa).sum(axis=0)
+        for serial, count in zip(self.serials, readable, strict=True):
+            if count < FRAMES_MIN:
+                raise TareError(
+                    f"tile {serial} has {count} readable frames in the interval",
+                    expected=f"at least {FRAMES_MIN}",
+                    remedy="Name another interval with --tare-s BEGIN,END",
+                )
+        tadc_counts = np.nanmean(np.where(np.isfinite(kpa), self.frames.tadc[rows], np.nan), axis=0)
+        # A perfectly quiet reading is still rounded to a count.
+        noise_kpa = np.maximum(np.nanstd(kpa, axis=0, ddof=1), self.rounding_kpa(tadc_counts))
+        t_s = self.since_ns[rows] * 1e-9
+        return Tare(
+            baseline_kpa=np.nanmean(kpa, axis=0),
+            baseline_sigma_kpa=noise_kpa / np.sqrt(readable),
+            noise_kpa=noise_kpa,
+            tadc_counts=tadc_counts,
+            t_ns=int(self.frames.t_ns[rows][-1]),
+            begin_s=float(t_s[0]),
+            end_s=float(t_s[-1]),
+            frames=len(kpa),
+            source=source,
+        )
+
+    def rounding_kpa(self, tadc_counts: Floats) -> Floats:
+        """(tiles,), standard uncertainty that rounding to a count leaves."""
+        return self._compensation.rounding_kpa(tadc_counts)
+
+    def refuse_loaded(self, tare: Tare) -> None:
+        """Refuse a tare under load, which would make every force after it too small.
+
+        A colder tile lies lower than on the bench, and no load does that, so only above is refused.
+
+        Raises:
+            TareError: a tile lies far above its bench baseline, where that is known.
+        """
+        for serial, baseline_kpa, bench_kpa in zip(
+            self.serials, tare.baseline_kpa, self.bench_kpa, strict=True
+        ):
+            if baseline_kpa > bench_kpa + LOADED_KPA:
+                raise TareError(
+                    f"tile {serial} reads {baseline_kpa:.2f} kPa in the interval, and "
+                    f"{bench_kpa:.2f} kPa unloaded on the bench: it seems to be loaded",
+                    expected=f"at most {LOADED_KPA} kPa more",
+                    remedy="Name an unloaded interval with --tare-s BEGIN,END, or calibrate at "
+                    "this temperature",
+                )
+
+    def refuse_stuck(self, tare: Tare, rows: Bools | slice) -> None:
+        """Refuse a baseline of readings that are all the same, unless the bench saw no noise.
+
+        Raises:
+            TareError: a tile gave the same count again and again, as a part does that hangs.
+        """
+        padc = np.where(np.isfinite(self.kpa[rows]), self.frames.padc[rows], np.nan)
+        count_kpa = np.sqrt(12.0) * self.rounding_kpa(tare.tadc_counts)
+        same = np.nanmax(padc, axis=0) == np.nanmin(padc, axis=0)
+        for i in np.flatnonzero(same & ~(self.bench_noise_kpa <= STUCK_COUNTS * count_kpa)):
+            raise TareError(
+                f"tile {self.serials[i]} gave {int(np.nanmin(padc[:, i]))} counts "
+                f"{int(np.isfinite(padc[:, i]).sum())} times and nothing else",
+                expected="readings that scatter, as those of a part that converts do",
+                remedy="It seems to hang: unplug it and plug it in again, then tare",
+            )
+
+
+def lowest(windows: list[Window]) -> list[Window]:
+    """Those in which no tile is higher than in the lowest of them, but for chance."""
+    lowest_kpa = np.min([window.mean_kpa for window in windows], axis=0, initial=np.inf)
+    return [
+        window
+        for window in windows
+        # The difference of two means is uncertain by sqrt(2) times one.
+        if (window.mean_kpa < lowest_kpa + STILL_SIGMAS * np.sqrt(2.0) * window.sigma_kpa).all()
+    ]

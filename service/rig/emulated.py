@@ -1,0 +1,62 @@
+"""An emulated foot: what presses it, and which parts and noise are drawn for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from devices.clock import Clock
+from devices.emulation.ground.grounds import press_on
+from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace
+from devices.extras import needs_extra
+from devices.scene.file import Scene
+
+if TYPE_CHECKING:
+    from devices.emulation.world import World
+
+
+@dataclass(frozen=True)
+class EmulatedFoot:
+    """What a scene does not say; `foottile simulate --help` says what each is for."""
+
+    load: LoadTrace | None = None
+    load_scale: float = 1.0
+    cop: CopTransform = CopTransform()  # noqa: RUF009  # frozen, so one for all is safe
+    lead_s: float = 1.0
+    seed: int = 0
+    parts_seed: int = 0
+
+    def pressed_on(self, scene: Scene) -> PressedTrace | None:
+        """The recorded load on the tiles of a scene; None if there is none.
+
+        Raises:
+            LoadTraceError: it does not fit the tiles.
+        """
+        if self.load is None:
+            return None
+        return press_on(
+            scene, self.load, load_scale=self.load_scale, cop=self.cop, lead_s=self.lead_s
+        )
+
+    def world(
+        self, scene: Scene, clock: Clock, pressed: PressedTrace | None, *, looped: bool = False
+    ) -> World:
+        """Chips, domes and ground of a scene, before they begin.
+
+        Raises:
+            MissingExtraError: the physics needs packages that are not installed.
+        """
+        # Here, because a real node need not wait for scipy, nor have room for it.
+        with needs_extra("emulation", "an emulated array"):
+            from devices.emulation.world import World
+
+        return World(
+            scene,
+            clock,
+            seed=self.seed,
+            parts_seed=self.parts_seed,
+            lead_s=self.lead_s,
+            pressed=pressed,
+            looped=looped,
+            begun=False,
+        )

@@ -1,0 +1,92 @@
+"""The index beside a segment: for each batch where it is, which frames it holds, and its CRC-32.
+
+A record without frames ends it: the segment was synced to its end and closed.
+"""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from storage.wire import EncodedBatch
+
+INDEX_SUFFIX = ".idx"
+
+RECORD = np.dtype(
+    [
+        ("seq_first", "<u8"),
+        ("t_ns_first", "<i8"),
+        ("t_ns_last", "<i8"),
+        ("offset", "<u8"),
+        ("length", "<u4"),
+        ("count", "<u4"),
+        ("crc32", "<u4"),
+        ("check", "<u4"),
+    ]
+)
+"""One batch in the index: `crc32` is of its bytes, `check` of this record before it."""
+
+_CHECKED = RECORD.itemsize - 4
+
+Records = npt.NDArray[np.void]
+
+
+def record_of(message: EncodedBatch, offset: int) -> Records:
+    """The index record of a batch: an array of one."""
+    record = np.zeros(1, RECORD)
+    record["seq_first"] = message.seq_first
+    record["t_ns_first"], record["t_ns_last"] = message.t_ns_first, message.t_ns_last
+    record["offset"], record["length"] = offset, len(message.payload)
+    record["count"] = message.seq_last - message.seq_first + 1
+    record["crc32"] = zlib.crc32(message.payload)
+    return _sealed(record)
+
+
+def closing_record() -> Records:
+    """The record that ends an index: an array of one."""
+    return _sealed(np.zeros(1, RECORD))
+
+
+def numbers(record: Any) -> tuple[int, int]:
+    """First and last frame of a record with frames."""
+    first = int(record["seq_first"])
+    return first, first + int(record["count"]) - 1
+
+
+def is_whole(record: Any) -> bool:
+    """Is the record what was written?"""
+    return zlib.crc32(record.tobytes()[:_CHECKED]) == int(record["check"])
+
+
+def is_closed(index: Records) -> bool:
+    """Does it say that its segment was closed in order?"""
+    return bool(len(index)) and is_whole(index[-1]) and not index[-1]["count"]
+
+
+def batches_in(index: Records) -> Records:
+    """Its whole records with frames."""
+    return index[[bool(record["count"]) and is_whole(record) for record in index]]
+
+
+def end_of(index: Records) -> int:
+    """Where the last of some batches ends in the segment; 0 without any."""
+    return int((index["offset"] + index["length"]).max(initial=0))
+
+
+def read_index(path: Path) -> Records:
+    """All records of a segment's index, right or not; a cut one at its end is left out.
+
+    Raises:
+        OSError: there is none, or it cannot be read.
+    """
+    content = path.with_suffix(INDEX_SUFFIX).read_bytes()
+    return np.frombuffer(content, RECORD, len(content) // RECORD.itemsize)
+
+
+def _sealed(record: Records) -> Records:
+    record["check"] = zlib.crc32(record.tobytes()[:_CHECKED])
+    return record
