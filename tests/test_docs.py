@@ -118,7 +118,7 @@ def test_every_estimate_status_bit_is_documented() -> None:
 def commands() -> dict[str, Any]:
     root = typer.main.get_command(app)
     assert isinstance(root, TyperGroup)
-    return root.commands
+    return dict(root.commands)
 
 
 def test_every_command_is_in_the_readme_and_says_what_its_options_do() -> None:
