@@ -6,9 +6,13 @@ model that needs it is not offered for that tile, and `refused` says why.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from devices.arrays import Floats
 
 WALL_PER_KPA = 0.00124
 """Part of the bubble's volume that the wall gives way for a kPa: elastic estimate for Vytaflex 60
@@ -29,6 +33,11 @@ class Parameter(BaseModel):
     def interval_95(self) -> tuple[float, float]:
         """Where it lies in 95 of 100 cases."""
         return self.value - 1.96 * self.sigma, self.value + 1.96 * self.sigma
+
+
+def values(parameters: Sequence[Parameter]) -> Floats:
+    """Values without their uncertainties, (n,)."""
+    return np.array([parameter.value for parameter in parameters])
 
 
 class _Effect(BaseModel):
