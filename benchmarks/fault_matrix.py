@@ -118,7 +118,7 @@ def run(scene: Scene, seconds: float, seed: int) -> tuple[FrameBatch, Verdict, n
     anchor = UtcAnchor.of(clock.now_ns(), 0, clock_set=True)
     acquisition = Acquisition(ready.array, ready.tiles, clock, anchor)
     frames = FrameBatch.concatenate(list(acquisition.run(lambda: clock.now_ns() >= end_ns)))
-    return frames, witness.accuracy_of(frames, ready.tiles), frames.t_ns * 1e-9
+    return frames, witness.judge(frames, ready.tiles), frames.t_ns * 1e-9
 
 
 def judged(name: str, kind: str, rate: float | None, schedule: str, rounds: int, muxes: int) -> Row:
