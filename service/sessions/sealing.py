@@ -6,64 +6,24 @@ pending gives away as CSV or Arrow.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from devices.errors import FileFormatError, FootTileError
-from devices.frames import ArrayInfo, FrameBatch
+from devices.frames import FrameBatch
 from service.estimation import OFFLINE_LAG_MS
-from service.estimation.calibration import Calibration
 from service.estimation.plan import EstimationPlan
-from service.estimation.tare.tare import Tare
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateStream, notes_of
+from service.sessions.sources import Sources
 from storage.clock.file import CLOCK_NAME, write_clock
-from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
-from storage.journal.journal import Journal
 from storage.sessions.content_hash import sha256_of
 from storage.sessions.events import write_events
 from storage.sessions.file import SessionWriter
 from storage.sessions.folder import FRAMES_NAME, Ledger, Session
 
 _GATHER_FRAMES = 4096
-
-
-@dataclass(frozen=True)
-class Sources:
-    """What a session is sealed from.
-
-    Attributes:
-        session: intervals, events, clock.
-        info: description of the array in its first part.
-        journals: by boot_id.
-        calibration: to estimate with; None: raw frames only.
-        problem: why there is none.
-        tares: that were in force, oldest first.
-        notes: more for the file's metadata.
-    """
-
-    session: Session
-    info: ArrayInfo
-    journals: Mapping[str, Journal]
-    calibration: Calibration | None
-    problem: str | None
-    tares: tuple[Tare, ...]
-    notes: Mapping[str, object]
-
-    @property
-    def streams(self) -> tuple[StreamFacts, ...]:
-        """What is known of the clocks of the session's streams."""
-        boot_ids = dict.fromkeys(part.boot_id for part in self.session.parts)
-        known = {boot_id: journal.info for boot_id, journal in self.journals.items()}
-        known[self.info.boot_id] = self.info
-        return tuple(
-            StreamFacts(boot_id, info.utc_offset_ns, info.clock_set)
-            if (info := known.get(boot_id)) is not None
-            else StreamFacts(boot_id)
-            for boot_id in boot_ids
-        )
 
 
 class SessionFrames:
@@ -177,14 +137,6 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
 
 _IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts", "scene"}
 """What the sealed file says of its session; names and notes may change later and are not in it."""
-
-
-def table_of_rows(sources: Sources) -> ClockTable:
-    """The clock table of a session that is not sealed yet."""
-    parts = [part.boot_id for part in sources.session.parts]
-    where = f"session {sources.session.id}"
-    rows = rows_by_stream(sources.session.clock, where=where)
-    return ClockTable(rows, sources.streams, parts, where=where)
 
 
 def _gathered(batches: Iterator[FrameBatch]) -> Iterator[FrameBatch]:

@@ -15,6 +15,7 @@ from storage.journal.segment_index import INDEX_SUFFIX, RECORD
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.sessions.claims import bytes_of
+from storage.sessions.states import StreamState
 from storage.verify.segment import SegmentReport, verify_segment
 
 
@@ -45,6 +46,24 @@ class StreamReport:
     segments: int = 0
     problems: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+
+    def state(self, may_come: Intervals) -> StreamState:
+        """The stream as sessions know it.
+
+        Args:
+            may_come: what its node may still give, if it is not known to be lost.
+        """
+        notes = self.notes
+        told = Losses(notes.lost if notes is not None else None)
+        return StreamState(
+            held=self.held,
+            lost=told,
+            damaged=self.lost.all - told.all,
+            may_come=may_come - told.all,
+            next_seq=notes.next_seq if notes is not None else None,
+            unsynced_tail_max=notes.unsynced_tail_max if notes is not None else 0,
+            missed_slots=notes.missed_slots if notes is not None else 0,
+        )
 
     @property
     def missing(self) -> Intervals:
