@@ -23,9 +23,8 @@ from storage.intervals import Intervals
 from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal
 from storage.journal.node_journal import SYNC_S, NodeJournal
-from storage.journal.node_stream import EncodedBatch
 from storage.schema import wire_schema
-from storage.wire import decode, encode
+from storage.wire import EncodedBatch, decode, encode
 
 SYNCS_PER_S = 4
 _IN_ORDER = ("seq", "t_mono_ns", "t_ns", "servo_counts", "servo_age_us", "reference_force_n",

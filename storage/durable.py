@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 from devices.errors import StorageError
 
@@ -30,11 +31,22 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
     Raises:
         StorageError: the disk is full or not writable; nothing is left behind then.
     """
+    with whole_file(path, mode=mode) as file:
+        file.write(content)
+
+
+@contextmanager
+def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[BinaryIO]:
+    """A file to write that takes its place, whole and on the disk, when the block ends well.
+
+    Raises:
+        StorageError: the disk is full or not writable; nothing is left behind then.
+    """
     temporary = temporary_of(path)
     try:
         with storage_errors(path):
             with open(temporary, "wb", opener=partial(os.open, mode=mode)) as file:
-                file.write(content)
+                yield file
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(path)

@@ -23,6 +23,7 @@ from devices.recovery.recovery import BusRecovery
 from devices.scene.emulation import ReadDuringConversion
 from devices.scene.faults import BUS, FaultKind, TileFault
 from devices.scene.hardware import ScheduleName
+from tests.builders.arrays import make_tile
 
 DATA_SHEET = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 FORUM = (0x3591, 0xC0A2, 0xC625, 0x2C18)
@@ -121,15 +122,11 @@ class Wires:
     def infos(self) -> tuple[TileInfo, ...]:
         """The tiles as a self-test would have found them."""
         return tuple(
-            TileInfo(
-                serial=f"T{i + 1:02d}",
+            make_tile(
+                i,
                 mux=mux,
                 channel=channel,
                 coefficient_words=self.words[i],
-                x_m=0.014 * i,
-                y_m=0.0,
-                z_m=-0.15,
-                reference=False,
                 conversion_ms=self.tc_ns[i] / 1e6,
             )
             for i, (mux, channel) in enumerate(self.plugs)

@@ -41,7 +41,7 @@ PART = DomePart(
     loop_n=0.45,
 )
 GAMMA = 1.4
-ALL = {"gas": True, "rubber": True, "hysteresis": True}
+ALL: dict[str, Any] = {"gas": True, "rubber": True, "hysteresis": True}
 
 
 class Pressing:
@@ -163,7 +163,8 @@ def test_an_effect_makes_a_difference_only_if_it_is_switched_on(effect: str) -> 
     t_s = grid(0.0, 1.0)
     static = static_kpa(tap(t_s))
     np.testing.assert_allclose(kpa_at(domes_of(tap), t_s), static, atol=1e-9)
-    difference = np.abs(kpa_at(domes_of(tap, **{effect: True}), t_s) - static)
+    only: dict[str, Any] = {effect: True}
+    difference = np.abs(kpa_at(domes_of(tap, **only), t_s) - static)
     assert difference.max() > 0.1, "about a count"
     np.testing.assert_allclose(difference[t_s < 0.2], 0, atol=1e-9)
 

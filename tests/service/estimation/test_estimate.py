@@ -714,7 +714,7 @@ def test_every_flag_has_a_bit_of_its_own(status: EstimateStatus) -> None:
         "tare_old": 128,
         "over_rated": 256,
     }
-    assert bits[status.name.lower()] == status
+    assert bits[str(status.name).lower()] == status
 
 
 def test_a_link_that_loses_every_third_frame_still_sees_the_contact() -> None:

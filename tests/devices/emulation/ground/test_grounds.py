@@ -273,6 +273,7 @@ def test_a_looped_load_comes_again_after_a_second_in_the_air() -> None:
         np.testing.assert_allclose(made.forces_n(again), once[1:], atol=1e-9)
         angle, before = made.angle_rad(again), made.angle_rad(t_s[1:])
         assert angle is not None
+        assert before is not None
         np.testing.assert_allclose(angle, before)
 
 
