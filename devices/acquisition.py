@@ -7,7 +7,7 @@ be waited for here: whoever iterates must be quick, and what was missed is count
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -181,25 +181,23 @@ class Acquisition:
                 servo_age_us = min(age_ns // 1000, _AGE_MAX_US)
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_status |= FrameStatus.SERVO_STALE
-        offsets_us = [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns]
-        t_ns = t_mono_ns + self._anchor.offset_ns
-        columns["seq"][row] = self._next_seq
-        columns["t_mono_ns"][row] = t_mono_ns
-        columns["t_ns"][row] = t_ns
-        columns["padc"][row] = scan.padc
-        columns["tadc"][row] = scan.tadc
-        columns["sample_offset_us"][row] = offsets_us
-        columns["servo_counts"][row] = servo_counts
-        columns["servo_age_us"][row] = servo_age_us
-        columns["status"][row] = scan.status
-        columns["frame_status"][row] = frame_status
-        columns["reference_force_n"][row] = scan.reference_n
+        frame: dict[str, Any] = {
+            "seq": self._next_seq,
+            "t_mono_ns": t_mono_ns,
+            "t_ns": t_mono_ns + self._anchor.offset_ns,
+            "padc": scan.padc,
+            "tadc": scan.tadc,
+            "sample_offset_us": [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
+            "servo_counts": servo_counts,
+            "servo_age_us": servo_age_us,
+            "status": scan.status,
+            "frame_status": frame_status,
+            "reference_force_n": scan.reference_n,
+        }
+        for name, value in frame.items():
+            columns[name][row] = value
         if self._keeper is not None:
-            self._keeper.put(
-                *(self._next_seq, t_mono_ns, t_ns, servo_counts, servo_age_us),
-                *(scan.reference_n, frame_status),
-                *(scan.padc, scan.tadc, offsets_us, scan.status),
-            )
+            self._keeper.put(**frame)
         self._next_seq += 1
 
     def _batch(self, columns: dict[str, np.ndarray], rows: int) -> FrameBatch:
