@@ -15,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from devices.acquisition import FrameRow
 from devices.frames import ArrayInfo, FrameBatch
 from storage.journal import in_flight
 from storage.journal.in_flight import (
@@ -31,13 +32,7 @@ Frames = Callable[..., FrameBatch]
 
 def put(keeper: InFlight, batch: FrameBatch) -> None:
     for i in range(len(batch)):
-        keeper.put(
-            *(int(batch.seq[i]), int(batch.t_mono_ns[i]), int(batch.t_ns[i])),
-            *(int(batch.servo_counts[i]), int(batch.servo_age_us[i])),
-            *(float(batch.reference_force_n[i]), int(batch.frame_status[i])),
-            *(column[i].tolist() for column in (batch.padc, batch.tadc)),
-            *(column[i].tolist() for column in (batch.sample_offset_us, batch.status)),
-        )
+        keeper.put(FrameRow(*(getattr(batch, name)[i].tolist() for name in FrameRow._fields)))
 
 
 def found(folder: Path) -> FrameBatch:
@@ -136,12 +131,14 @@ def test_a_killed_process_has_left_every_frame_that_it_had_taken(
     code = """
 import json, sys
 from pathlib import Path
+from devices.acquisition import FrameRow
 from devices.frames import ArrayInfo
 from storage.journal.in_flight import InFlight
 info = ArrayInfo.model_validate_json(sys.stdin.readline())
 keeper = InFlight(Path(sys.argv[1]), info)
 for seq in range(10_000_000):
-    keeper.put(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
+    row = FrameRow(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
+    keeper.put(row)
     if seq % 1000 == 999:
         print(seq, flush=True)
 """

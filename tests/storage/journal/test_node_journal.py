@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from devices.acquisition import FrameRow
 from devices.errors import StorageError
 from devices.frames import ArrayInfo, FrameBatch, TileStatus
 from storage.intervals import NO_END, Intervals
@@ -144,11 +145,7 @@ def killed(journal: NodeJournal, folder: Path) -> Path:
 def flying(stream: NodeStream, frames: FrameBatch) -> None:
     keeper = InFlight(stream.folder, stream.info)
     for i in range(len(frames)):
-        keeper.put(
-            *(int(frames.seq[i]), int(frames.t_mono_ns[i]), int(frames.t_ns[i]), 0, 0),
-            *(float("nan"), 0, frames.padc[i].tolist(), frames.tadc[i].tolist()),
-            *([0, 0], [0, 0]),
-        )
+        keeper.put(FrameRow(*(getattr(frames, name)[i].tolist() for name in FrameRow._fields)))
     keeper.close()
 
 
