@@ -25,6 +25,7 @@ from storage.clock.offset import ClockOffset
 from storage.journal.journal import Journal
 from storage.journal.node_journal import NodeJournal
 from storage.journal.stream_notes import StreamNotes
+from storage.losses import Losses
 from storage.sessions.folder import Part, Session, SessionFolder
 from storage.sessions.ledger import ledger_of
 from storage.sessions.states import states_of
@@ -70,7 +71,7 @@ class Stream:
                 journal.append(make_frames(np.arange(first, last + 1), frame_status=lead))
             elif fate in REASONS:
                 lost.setdefault(fate, []).append((first, last))
-        StreamNotes(array_info=INFO, lost=lost, **self.notes).save(folder)
+        StreamNotes(array_info=INFO, lost=Losses(lost).as_pairs(), **self.notes).save(folder)
         journal.close()
 
 
@@ -88,7 +89,13 @@ def streams(draw: st.DrawFn, *, has_ended: bool) -> Stream:
 
 
 def session(**content: Any) -> Session:
-    facts = {"id": ID, "name": "walk", "node": "bench", "started_t_ns": t_ns(0), "scene": "test"}
+    facts: dict[str, Any] = {
+        "id": ID,
+        "name": "walk",
+        "node": "bench",
+        "started_t_ns": t_ns(0),
+        "scene": "test",
+    }
     return Session(**facts | {"state": "pending", "scene_content": {"name": "test"}} | content)
 
 
@@ -134,7 +141,7 @@ def test_a_node_alone_and_recovery_in_its_folder_seal_the_same_session(
         shutil.copytree(alone, recovered)
         journal = NodeJournal(alone, "bench")
         recording = NodeRecording(
-            alone, "bench", journal, name=None, calibration=None, notes={}, report=[].append
+            alone, "bench", journal, name=None, calibration=None, notes={}, report=lambda _: None
         )
         recording.seal_what_was_left()
         journal.close()
