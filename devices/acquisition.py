@@ -17,7 +17,6 @@ from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.clock import Clock, UtcAnchor
 from devices.frames import (
-    FRAME_COLUMNS,
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,
     NOT_READ,
@@ -25,6 +24,7 @@ from devices.frames import (
     FrameStatus,
     TileInfo,
     TileStatus,
+    zero_columns,
 )
 from devices.temperature import HeldTemperature, hold_temperature
 
@@ -128,7 +128,7 @@ class Acquisition:
         """
         slot_ns = self._clock.now_ns()
         while not stop():
-            columns = self._empty_columns()
+            columns = zero_columns(_BATCH_FRAMES_MAX, len(self._array.tiles))
             row = 0
             batch_end_ns = self._clock.now_ns() + BATCH_NS
             while row < _BATCH_FRAMES_MAX and self._clock.now_ns() < batch_end_ns and not stop():
@@ -152,13 +152,6 @@ class Acquisition:
                 row += 1
             if row:
                 yield self._batch(columns, row)
-
-    def _empty_columns(self) -> dict[str, np.ndarray]:
-        n, tiles = _BATCH_FRAMES_MAX, len(self._array.tiles)
-        return {
-            name: np.zeros((n, tiles) if per_tile else n, dtype)
-            for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-        }
 
     def _fill(
         self, columns: dict[str, np.ndarray], row: int, scan: Scan, frame_status: int

@@ -12,7 +12,6 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import make_folder, storage_errors
-from storage.intervals import NO_END, Intervals
+from storage.intervals import NO_END, Intervals, union
 from storage.journal.open_segments import OpenSegments
 from storage.journal.segment import SUFFIX, Segment, recover
 from storage.journal.segment_bytes import payload_of, read_header
@@ -310,7 +309,7 @@ class Journal:
             self.held = self.held | segment.held
 
     def _count_anew(self) -> None:
-        self.held = Intervals(chain(*(segment.held for segment in self._segments)))
+        self.held = union(segment.held for segment in self._segments)
 
     def _write(self, message: EncodedBatch) -> None:
         segment = self._open.append(message).segment

@@ -114,10 +114,8 @@ def verify_stream(folder: Path) -> StreamReport:
             if segment.info != report.info:
                 report.problems.append(f"{name}: it is of another stream or array")
                 continue
-        for pair in segment.held:
-            report.held.add(*pair)
-        for pair in segment.unsynced:
-            report.unsynced.add(*pair)
+        report.held = report.held | segment.held
+        report.unsynced = report.unsynced | segment.unsynced
     report.unsynced = report.unsynced - report.held
     for segment in segments:
         report.lost.add(segment.damaged - report.held, CORRUPT)

@@ -118,26 +118,27 @@ def _verify(path: Path, report: SegmentReport) -> None:
 def _check_batches(
     report: SegmentReport, index: Records, schema: pa.Schema, header_bytes: int
 ) -> None:
-    doubtful: list[tuple[Intervals, str]] = []
+    doubtful, said = Intervals(), list[str]()
     good = []
     end, offset_ns = header_bytes, array_info(schema, where="").utc_offset_ns
     descriptor = os.open(report.path, os.O_RDONLY)
     try:
         for at, record in enumerate(index):
             if not is_whole(record):
-                doubtful.append((Intervals(), f"record {at} of its index is damaged"))
+                said.append(f"record {at} of its index is damaged")
                 continue
             if not record["count"]:
                 continue
             first, last = numbers(record)
             payload = payload_of(descriptor, record)
             if payload is None:
-                said = f"frames {first} to {last} do not agree with their checksum"
-                doubtful.append((Intervals([(first, last)]), said))
+                said.append(f"frames {first} to {last} do not agree with their checksum")
+                doubtful.add(first, last)
                 continue
             # What is damaged before something whole was whole once.
-            _take_for_damaged(report, doubtful)
-            doubtful = []
+            report.damaged, doubtful = report.damaged | doubtful, Intervals()
+            report.problems += said
+            said = []
             wrong = _wrong_in(payload, record, schema, offset_ns)
             if int(record["offset"]) < end:
                 wrong = "they stand where other frames stand as well"
@@ -153,19 +154,13 @@ def _check_batches(
         os.close(descriptor)
     report.index = index[good]
     if report.is_closed:
-        _take_for_damaged(report, doubtful)
-    elif doubtful:
-        report.unsynced = Intervals(pair for numbers_, _ in doubtful for pair in numbers_)
+        report.damaged = report.damaged | doubtful
+        report.problems += said
+    elif said:
+        report.unsynced = doubtful
         report.remarks.append(
-            f"{len(doubtful)} batches at its end were not yet on the disk: nobody was promised them"
+            f"{len(said)} batches at its end were not yet on the disk: nobody was promised them"
         )
-
-
-def _take_for_damaged(report: SegmentReport, doubtful: list[tuple[Intervals, str]]) -> None:
-    report.damaged = Intervals(
-        (*report.damaged, *(pair for these, _ in doubtful for pair in these))
-    )
-    report.problems += [said for _, said in doubtful]
 
 
 def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, offset_ns: int) -> str:
