@@ -1,6 +1,7 @@
 """The emulated dome against its own laws: statics, creep, weather, and its grid in time.
 
-Expectations come from physics worked out here (exponentials, two lags in series) and from hardware.md 9, not from the emulation's own numbers.
+Expectations come from physics worked out here (exponentials, two lags in series) and from
+hardware.md 9, not from the emulation's own numbers.
 """
 
 from __future__ import annotations
