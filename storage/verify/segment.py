@@ -186,7 +186,7 @@ def _holds_any(path: Path, index: Records) -> bool:
 
 
 def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int]:
-    """Schema at a segment's beginning, and how many bytes it takes."""
+    """Schema that a segment should begin with, and how many bytes it takes; None: it has none."""
     schema, length = read_header(path)
     if schema is None:
         return None, 0
@@ -194,6 +194,7 @@ def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int
         report.info = array_info(schema, where=str(path))
     except FileFormatError:
         return None, 0
-    if not schema.equals(wire_schema(report.info), check_metadata=True):
+    expected = wire_schema(report.info)
+    if not schema.equals(expected, check_metadata=True):
         report.problems.append("its columns are not those of a stream of frames")
-    return schema, length
+    return expected, length
