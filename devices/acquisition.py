@@ -7,7 +7,7 @@ be waited for here: whoever iterates must be quick, and what was missed is count
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -49,23 +49,26 @@ class ServoSource(Protocol):
         """Age from which a position is older than it should be."""
 
 
+class FrameRow(NamedTuple):
+    """One frame as it is taken: a row of the columns of `FrameBatch`."""
+
+    seq: int
+    t_mono_ns: int
+    t_ns: int
+    servo_counts: int
+    servo_age_us: int
+    reference_force_n: float
+    frame_status: int
+    padc: Sequence[int]
+    tadc: Sequence[int]
+    sample_offset_us: Sequence[int]
+    status: Sequence[int]
+
+
 class FrameKeeper(Protocol):
     """Is given every frame as it is taken, before its batch is whole."""
 
-    def put(
-        self,
-        seq: int,
-        t_mono_ns: int,
-        t_ns: int,
-        servo_counts: int,
-        servo_age_us: int,
-        reference_force_n: float,
-        frame_status: int,
-        padc: Sequence[int],
-        tadc: Sequence[int],
-        sample_offset_us: Sequence[int],
-        status: Sequence[int],
-    ) -> None:
+    def put(self, frame: FrameRow) -> None:
         """Keep one frame; quick, for the loop waits."""
 
 
@@ -181,23 +184,23 @@ class Acquisition:
                 servo_age_us = min(age_ns // 1000, _AGE_MAX_US)
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_status |= FrameStatus.SERVO_STALE
-        frame: dict[str, Any] = {
-            "seq": self._next_seq,
-            "t_mono_ns": t_mono_ns,
-            "t_ns": t_mono_ns + self._anchor.offset_ns,
-            "padc": scan.padc,
-            "tadc": scan.tadc,
-            "sample_offset_us": [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
-            "servo_counts": servo_counts,
-            "servo_age_us": servo_age_us,
-            "status": scan.status,
-            "frame_status": frame_status,
-            "reference_force_n": scan.reference_n,
-        }
-        for name, value in frame.items():
+        frame = FrameRow(
+            seq=self._next_seq,
+            t_mono_ns=t_mono_ns,
+            t_ns=t_mono_ns + self._anchor.offset_ns,
+            servo_counts=servo_counts,
+            servo_age_us=servo_age_us,
+            reference_force_n=scan.reference_n,
+            frame_status=frame_status,
+            padc=scan.padc,
+            tadc=scan.tadc,
+            sample_offset_us=[(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
+            status=scan.status,
+        )
+        for name, value in zip(FrameRow._fields, frame, strict=True):
             columns[name][row] = value
         if self._keeper is not None:
-            self._keeper.put(**frame)
+            self._keeper.put(frame)
         self._next_seq += 1
 
     def _batch(self, columns: dict[str, np.ndarray], rows: int) -> FrameBatch:
