@@ -141,7 +141,14 @@ def test_a_node_alone_and_recovery_in_its_folder_seal_the_same_session(
         shutil.copytree(alone, recovered)
         journal = NodeJournal(alone, "bench")
         recording = NodeRecording(
-            alone, "bench", journal, name=None, calibration=None, notes={}, report=lambda _: None
+            alone,
+            "bench",
+            journal,
+            name=None,
+            calibration=None,
+            scene_content={},
+            emulated=True,
+            report=lambda _: None,
         )
         recording.seal_what_was_left()
         journal.close()
