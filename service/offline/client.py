@@ -142,10 +142,8 @@ class Client:
 
     def _pull_clock(self, session_id: str, path: Path) -> None:
         answer = self._answer(f"/sessions/{session_id}/clock", {"format": "parquet"})
-        if (
-            answer.status_code == HTTPStatus.NOT_FOUND
-        ):  # taken away, or a server that knows no clocks yet
-            return
+        if answer.status_code == HTTPStatus.NOT_FOUND:
+            return  # taken away, or a server that knows no clocks yet
         if answer.is_error:
             raise self._refused(answer)
         write_whole(path, answer.content)

@@ -22,7 +22,7 @@ from devices.frames import FRAME_COLUMNS
 from service.api.problems import problem
 from service.api.routes.access import ServerState, problems
 from service.server.server import Server
-from service.sessions.sealing import SessionFrames
+from service.sessions.frames import SessionFrames
 from service.version import SOFTWARE
 from storage.clock.file import CLOCK_NAME
 from storage.formats.export import MEDIA_TYPES, ClockName, Format, Slice, export

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import resource
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +26,7 @@ from storage.schema import from_record_batch, wire_schema
 from storage.wire import encode
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.frames import any_frames, assert_same_bits
+from tests.storage.faulty_disk import disk_with_room_for
 
 TOP = 60
 
@@ -559,17 +558,6 @@ def test_the_last_number_until_an_instant_is_known_once_the_stream_has_passed_it
 
 
 # --- a disk that is full --------------------------------------------------------------------------
-
-
-@contextmanager
-def disk_with_room_for(size: int) -> Iterator[None]:
-    """No file may grow beyond `size` bytes: a write fails as it does on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 HEADER = len(SCHEMA.serialize().to_pybytes())

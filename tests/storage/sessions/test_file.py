@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -29,6 +26,7 @@ from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN
 from storage.sessions.file import FORMAT_KEY, NOTES_KEY, SessionReader, SessionWriter
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import any_frames, assert_same_bits, make_frames
+from tests.storage.faulty_disk import disk_with_room_for
 
 
 def frames(rows: int, tiles: int = 2, *, seed: int = 0, period_ns: int = PERIOD_NS) -> FrameBatch:
@@ -406,17 +404,6 @@ def test_while_it_is_written_its_name_says_whose_it_is(tmp_path: Path) -> None:
         assert name.startswith(f".s.parquet.{os.getpid()}.")
         assert remove_stale_temporaries(tmp_path) == []
     assert names_in(tmp_path) == ["s.parquet"]
-
-
-@contextmanager
-def disk_with_room_for(size: int) -> Iterator[None]:
-    """No file may grow beyond `size` bytes: a write fails as it does on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("room", [0, 1, 100, 4000, 9000])
