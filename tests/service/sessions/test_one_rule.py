@@ -12,7 +12,6 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import FrameStatus
 from service.link import PROTOCOL, Hello
 from service.node.recording import NodeRecording
 from service.server import following
@@ -38,7 +37,6 @@ ID = "20200101T000000Z-00000a"
 BOOT, PRESENT = "a" * 32, "b" * 32
 INFO = make_array(boot_id=BOOT)
 BATCH, BATCHES = 5, 8
-LEAD = 10
 SERVER_MINUS_NODE_NS = 7_000_000_000
 REASONS = ("disk_full", "evicted", "corrupt")
 FATES = st.sampled_from(("held", "held", "missing", *REASONS))
@@ -67,8 +65,7 @@ class Stream:
         for number, fate in enumerate(self.fates):
             first, last = number * BATCH, number * BATCH + BATCH - 1
             if fate == "held":
-                lead = int(FrameStatus.LEAD) if last < LEAD else 0
-                journal.append(make_frames(np.arange(first, last + 1), frame_status=lead))
+                journal.append(make_frames(np.arange(first, last + 1)))
             elif fate in REASONS:
                 lost.setdefault(fate, []).append((first, last))
         StreamNotes(array_info=INFO, lost=Losses(lost).as_pairs(), **self.notes).save(folder)
