@@ -11,62 +11,60 @@ kept (static_kernel.py); that both give the same is checked first. The goal is w
 from __future__ import annotations
 
 import statistics
+import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from static_kernel import StaticKernel
 
-from devices.frames import ArrayInfo, FrameBatch, TileInfo
+from devices.frames import FrameBatch
 from service.estimation.calibration import paper_eq2_shape
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare.tare import Tare
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from functools import partial
+
+from tests.builders.arrays import DATA_SHEET_CHIP, make_array, make_tile
+from tests.builders.calibrations import make_tare
+from tests.builders.frames import make_frames
 
 GOAL = 2.0
 RUNS = 7
 CHUNK = 4096
-WORDS = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)  # the data sheet's example part
 
 
 def plan_of(models: tuple[str, ...], count: int = 4) -> EstimationPlan:
     """A plan for that many tiles, at most eight in a line."""
-    tiles = tuple(
-        TileInfo(
-            serial=f"T{i}", mux=0x70 + i // 8, channel=i % 8, coefficient_words=WORDS,
-            x_m=0.014 * (i % 8), y_m=0.014 * (i // 8), z_m=-0.15, reference=False,
-            conversion_ms=1.6,
-        )
-        for i in range(count)
-    )  # fmt: skip
-    info = ArrayInfo(
-        node="bench", boot_id="0", tiles=tiles, servo=None, schedule="simultaneous",
-        nominal_rate_hz=395.0, utc_offset_ns=0, clock_set=True, software="bench", scene="bench",
+    info = make_array(
+        [
+            make_tile(
+                i, coefficient_words=DATA_SHEET_CHIP, x_m=0.014 * (i % 8), y_m=0.014 * (i // 8)
+            )
+            for i in range(count)
+        ],
         models=models,
-    )  # fmt: skip
-    baseline_kpa, noise_kpa = np.full(count, 100.0), np.full(count, 0.165)
-    tadc = np.full(count, 480.0)
-    tare = Tare(baseline_kpa, noise_kpa / 20, noise_kpa, tadc, 0, 0.0, 1.0, 400, "lead")
+    )
+    tare = make_tare(
+        count, baseline_kpa=100.0, baseline_sigma_kpa=0.165 / 20, noise_kpa=0.165, t_ns=0
+    )
     return make_plan(info, paper_eq2_shape(), tare, models=models, lag_ms=10.0)
 
 
 def frames_of(n: int, count: int = 4) -> FrameBatch:
     """Frames with all tiles between no load and full load."""
     rng = np.random.default_rng(0)
-    t_ns = np.arange(n, dtype=np.int64) * 2_532_500
     shape = (n, count)
-    return FrameBatch(
-        seq=np.arange(n, dtype=np.uint64),
-        t_mono_ns=t_ns,
-        t_ns=t_ns,
-        padc=rng.integers(270, 380, shape).astype(np.uint16),
-        tadc=rng.integers(500, 510, shape).astype(np.uint16),
-        sample_offset_us=np.zeros(shape, np.int32),
-        servo_counts=np.full(n, -(2**31), np.int32),
-        servo_age_us=np.full(n, -1, np.int32),
-        status=np.zeros(shape, np.uint8),
-        frame_status=np.zeros(n, np.uint8),
-        reference_force_n=np.full(n, np.nan, np.float32),
+    return make_frames(
+        n,
+        count,
+        period_ns=2_532_500,
+        utc_offset_ns=0,
+        padc=rng.integers(270, 380, shape),
+        tadc=rng.integers(500, 510, shape),
     )
 
 
@@ -128,9 +126,9 @@ def main() -> None:
         frames = frames_of(n)
         a, b, c = interleaved(
             [
-                lambda f=frames, b=batch: bare(f, b),
-                lambda f=frames, b=batch: estimate(static, f, b),
-                lambda f=frames, b=batch: estimate(both, f, b),
+                partial(bare, frames, batch),
+                partial(estimate, static, frames, batch),
+                partial(estimate, both, frames, batch),
             ],
             n,
         )
@@ -147,8 +145,8 @@ def main() -> None:
         kernel = StaticKernel(plan, batch)
         a, b = interleaved(
             [
-                lambda k=kernel, f=frames, b=batch: by_hand(k, f, b),
-                lambda p=plan, f=frames, b=batch: estimate(p, f, b),
+                partial(by_hand, kernel, frames, batch),
+                partial(estimate, plan, frames, batch),
             ],
             n,
         )

@@ -22,11 +22,11 @@ from devices.array.startup import make_ready
 from devices.buses.i2c import open_bus
 from devices.clock import UtcAnchor, VirtualClock
 from devices.emulation.buses.gpio import EmulatedLines
-from devices.emulation.witness import Verdict, Witness
 from devices.emulation.world import World
 from devices.frames import FrameBatch, TileStatus
 from devices.recovery.recovery import GpioRecovery
 from devices.scene.file import Scene, build_scene, load_scene
+from tests.builders.witness import Verdict, Witness
 
 FAULT_S, PERIOD_S, LEAD_S = 0.3, 2.0, 1.0
 STRUCK = 1

@@ -132,10 +132,11 @@ def sizes(extent: Extent, folder: Path) -> Lines:
 def writing(extent: Extent, folder: Path) -> Lines:
     """CPU and wall time of writing each format."""
     recording = data.emulated(4, extent.seconds)
-    jobs: dict[str, Callable[[], object]] = {
-        name: (lambda w=write, n=name: w(_fresh(folder / n.replace(" ", "_")), recording))
-        for name, write in formats.writers().items()
-    }
+
+    def job(name: str, write: formats.Write) -> Callable[[], None]:
+        return lambda: write(_fresh(folder / name.replace(" ", "_")), recording)
+
+    jobs = {name: job(name, write) for name, write in formats.writers().items()}
     _note("writing")
     in_turns(jobs, 1)
     times = in_turns(jobs, extent.turns)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -66,10 +66,12 @@ def write_csv(path: Path, recording: Recording) -> None:
     pacsv.write_csv(flat_table(recording.frames), path)
 
 
-def write_arrow(path: Path, recording: Recording, compression: str | None = None) -> None:
+def write_arrow(
+    path: Path, recording: Recording, compression: Literal["zstd"] | None = None
+) -> None:
     table = flat_table(recording.frames)
     options = pa.ipc.IpcWriteOptions(compression=compression)
-    with pa.ipc.new_file(path, table.schema, options=options) as writer:
+    with pa.ipc.new_file(str(path), table.schema, options=options) as writer:
         writer.write_table(table, max_chunksize=minute(recording.frames))
 
 
@@ -145,7 +147,7 @@ def read_parquet(path: Path, column: str, begin_ns: int, end_ns: int) -> Values:
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
         at = file.schema_arrow.get_field_index("t_ns")
         for group in range(file.num_row_groups):
-            known = file.metadata.row_group(group).column(at).statistics
+            known: Any = file.metadata.row_group(group).column(at).statistics
             if known.min < end_ns and known.max >= begin_ns:
                 table = file.read_row_group(group, columns=["t_ns", column])
                 pieces.append(_between(table, column, begin_ns, end_ns))
@@ -245,4 +247,5 @@ def _first_from(t_ns_of: Callable[[int], int], n: int, t_ns: int) -> int:
 def _first_t_ns(path: Path) -> int:
     with pq.ParquetFile(path) as file:
         at = file.schema_arrow.get_field_index("t_ns")
-        return int(file.metadata.row_group(0).column(at).statistics.min)
+        known: Any = file.metadata.row_group(0).column(at).statistics
+        return int(known.min)

@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for tests.builders
+
 BATCH_FRAMES = 14
 LEAD_FRAMES = 1000
 BOOT_ID = "b" * 32
@@ -34,38 +36,21 @@ def peak_mb() -> float:
 
 
 def array(tiles: int, rate_hz: float) -> Any:
-    from devices.frames import ArrayInfo, TileInfo
+    from tests.builders.arrays import DATA_SHEET_CHIP, make_array, make_tile
 
-    return ArrayInfo(
-        node="bench",
+    return make_array(
+        [make_tile(i, coefficient_words=DATA_SHEET_CHIP) for i in range(tiles)],
         boot_id=BOOT_ID,
-        tiles=tuple(
-            TileInfo(
-                serial=f"T{i + 1:02}",
-                mux=0x70 + i // 8,
-                channel=i % 8,
-                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-                x_m=0.01 * i,
-                y_m=0.0,
-                z_m=-0.15,
-                reference=False,
-                conversion_ms=1.6,
-            )
-            for i in range(tiles)
-        ),
-        servo=None,
         schedule="pipelined",
         nominal_rate_hz=rate_hz,
         utc_offset_ns=UTC_NS,
-        clock_set=True,
-        software="benchmark",
-        scene="benchmark",
         models=("static",),
     )
 
 
 def minute(number: int, tiles: int, rate_hz: float) -> Any:
-    from devices.frames import FrameBatch, FrameStatus
+    from devices.frames import FrameStatus
+    from tests.builders.frames import make_frames
 
     rng = np.random.default_rng(number % 7)
     rows = round(60 * rate_hz)
@@ -76,20 +61,15 @@ def minute(number: int, tiles: int, rate_hz: float) -> Any:
     padc = 400 - steps[:, None] + rng.normal(0, 1.3, (rows, tiles))
     lead = seq < LEAD_FRAMES
     padc[lead] = 400 + rng.normal(0, 1.3, (int(lead.sum()), tiles))
-    return FrameBatch(
-        seq=seq,
+    return make_frames(
+        seq,
+        tiles,
+        utc_offset_ns=UTC_NS,
         t_mono_ns=t_mono_ns,
-        t_ns=t_mono_ns + UTC_NS,
-        padc=padc.round().astype(np.uint16),
-        tadc=rng.integers(478, 480, (rows, tiles)).astype(np.uint16),
-        sample_offset_us=(210 * np.arange(tiles) + rng.integers(0, 9, (rows, tiles))).astype(
-            np.int32
-        ),
-        servo_counts=np.full(rows, -(2**31), np.int32),
-        servo_age_us=np.full(rows, -1, np.int32),
-        status=np.zeros((rows, tiles), np.uint8),
-        frame_status=np.where(lead, int(FrameStatus.LEAD), 0).astype(np.uint8),
-        reference_force_n=np.full(rows, np.nan, np.float32),
+        padc=padc.round(),
+        tadc=rng.integers(478, 480, (rows, tiles)),
+        sample_offset_us=210 * np.arange(tiles) + rng.integers(0, 9, (rows, tiles)),
+        frame_status=np.where(lead, FrameStatus.LEAD, 0),
     )
 
 
@@ -108,12 +88,14 @@ def generate(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     from service.offline.calibrations import find_calibration
-    from service.sessions.sealing import Sources, seal
+    from service.sessions.sealing import seal
+    from service.sessions.sources import Sources
     from storage.journal.journal import Journal
     from storage.sessions import file as session_file
     from storage.sessions.content_hash import ContentDigest, write_file_hash
     from storage.sessions.folder import Part, Session, SessionFolder
-    from storage.sessions.ledger import StreamState, ledger_of
+    from storage.sessions.ledger import ledger_of
+    from storage.sessions.states import StreamState
 
     hash_s = 0.0
 
@@ -130,7 +112,7 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
         write_file_hash(path)
         hash_s += time.perf_counter() - begin
 
-    session_file.ContentDigest, session_file.write_file_hash = Timed, timed
+    vars(session_file).update(ContentDigest=Timed, write_file_hash=timed)
     info = array(asked.tiles, asked.rate)
     journal = Journal(folder / "journal" / "bench" / BOOT_ID, info)
     last = journal.held.last
@@ -197,7 +179,7 @@ def verify_journal(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 def imports(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     import service.sessions.sealing
-    import storage.verify
+    import storage.verify.data
 
     return {"modules": [service.sessions.sealing.__name__, storage.verify.data.__name__]}
 

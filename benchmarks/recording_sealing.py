@@ -11,7 +11,8 @@ from recording_formats import flat_table, minute
 
 from service.estimation.calibration import Calibration, paper_eq2_shape
 from service.offline.calibrations import find_calibration
-from service.sessions.sealing import SessionFrames, Sources
+from service.sessions.frames import SessionFrames
+from service.sessions.sources import Sources
 from storage.journal.journal import Journal
 from storage.sessions.content_hash import sha256_of
 from storage.sessions.file import SessionWriter, parquet_options
@@ -58,7 +59,7 @@ def seal(sources: Sources, path: Path) -> int:
             count += len(batch)
     sha256_of(path)
     if sources.calibration is not None:
-        assert frames.plan is not None, frames.problem
+        assert frames.problem is None, frames.problem
     return count
 
 

@@ -20,6 +20,7 @@ from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Silic
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.faults import Faults
 from devices.scene.file import load_scene
+from devices.scene.hardware import ScheduleName
 from service.offline.calibrations import find_calibration
 from service.offline.simulate import SimulateOptions, simulate
 from service.sessions.pipeline import EstimateOptions
@@ -28,7 +29,7 @@ SECONDS = 30.0
 RUNS = 3
 
 
-def session(scene_name: str, schedule: str | None) -> tuple[float, float]:
+def session(scene_name: str, schedule: ScheduleName | None) -> tuple[float, float]:
     """Frames/s in virtual time, and virtual seconds per wall second."""
     scene = load_scene(scene_name)
     calibration = find_calibration("bench", [tile.serial for tile in scene.tile])
@@ -71,12 +72,8 @@ def main() -> None:
     print("| scene | schedule | frames/s | times real time |")
     print("|---|---|--:|--:|")
     print(f"| bare emulated bus | as simultaneous | - | {bare_bus():.1f} |")
-    for name, schedule in (
-        ("standing", "pipelined"),
-        ("standing", "simultaneous"),
-        ("standing", "sequential"),
-        ("rolling", None),
-    ):
+    schedules: tuple[ScheduleName | None, ...] = ("pipelined", "simultaneous", "sequential")
+    for name, schedule in (*(("standing", schedule) for schedule in schedules), ("rolling", None)):
         rate_hz, factor = session(name, schedule)
         print(f"| {name} | {schedule or 'its own'} | {rate_hz:.1f} | {factor:.1f} |")
 

@@ -123,6 +123,14 @@ FRAME_COLUMNS: dict[str, tuple[type[np.generic], bool]] = {
 """Type of every column, and whether it has one value per tile."""
 
 
+def zero_columns(n: int, tiles: int) -> dict[str, np.ndarray]:
+    """Columns of n frames, to be filled in."""
+    return {
+        name: np.zeros((n, tiles) if per_tile else n, dtype)
+        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
+    }
+
+
 class _Fact(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 from devices.errors import StorageError
 
@@ -30,11 +31,22 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
     Raises:
         StorageError: the disk is full or not writable; nothing is left behind then.
     """
+    with whole_file(path, mode=mode) as file:
+        file.write(content)
+
+
+@contextmanager
+def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[BinaryIO]:
+    """A file to write that takes its place, whole and on the disk, when the block ends well.
+
+    Raises:
+        StorageError: the disk is full or not writable; nothing is left behind then.
+    """
     temporary = temporary_of(path)
     try:
         with storage_errors(path):
             with open(temporary, "wb", opener=partial(os.open, mode=mode)) as file:
-                file.write(content)
+                yield file
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(path)
@@ -83,7 +95,7 @@ def _is_stale(name: str) -> bool:
 def _started(process: int) -> int | None:
     """When a process started, in ticks since the machine did; None if there is none of this number.
 
-    One that has ended and that nobody has asked for its end is none.
+    A zombie, which has ended and was not waited for, is none.
     """
     try:
         fields = Path(f"/proc/{process}/stat").read_text("utf-8", "replace").rsplit(") ", 1)[1]

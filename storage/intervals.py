@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator
+from itertools import chain
 
 NO_END = 2**62
 """In place of the last number of an interval that goes on with every number to come."""
@@ -99,6 +100,11 @@ class Intervals:
     def __sub__(self, other: Intervals) -> Intervals:
         """The numbers of this set that are not in `other`."""
         return Intervals(gap for a, b in self._intervals for gap in other.missing(a, b))
+
+
+def union(sets: Iterable[Intervals]) -> Intervals:
+    """The numbers that are in any of these."""
+    return Intervals(chain.from_iterable(sets))
 
 
 def closed(pairs: Iterable[tuple[int, int | None]]) -> Intervals:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from storage.intervals import Intervals
+from storage.intervals import Intervals, union
 
 DISK_FULL = "disk_full"
 READ_ONLY = "read_only"
@@ -38,12 +38,12 @@ class Losses:
     @property
     def all(self) -> Intervals:
         """Every number that is lost."""
-        return Intervals(pair for numbers in self.by_reason.values() for pair in numbers)
+        return union(self.by_reason.values())
 
     def add(self, numbers: Intervals, reason: str) -> None:
         """Note a loss."""
-        for first, last in numbers - self.all:
-            self.by_reason.setdefault(reason, Intervals()).add(first, last)
+        if new := numbers - self.all:
+            self.by_reason[reason] = new | self.by_reason.get(reason, Intervals())
 
     def found(self, numbers: Intervals) -> None:
         """These numbers are held after all."""

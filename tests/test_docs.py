@@ -12,12 +12,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
 
-import numpy as np
 import pytest
 import typer.main
 from pydantic import BaseModel
+from typer.core import TyperGroup
 
-from devices.frames import FRAME_COLUMNS, FrameBatch
 from devices.scene.emulation import EmulationScene
 from devices.scene.faults import FaultScene
 from devices.scene.file import Scene, builtin_scenes
@@ -32,6 +31,7 @@ from service.link import Close
 from service.server.live import Encoder, sum_up
 from service.server.server import Server
 from storage.schema import KNOWN
+from tests.builders.frames import make_frames
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = (ROOT / "docs" / "scenes.md").read_text("utf-8")
@@ -112,12 +112,17 @@ def test_every_column_is_documented_with_its_unit() -> None:
 
 def test_every_estimate_status_bit_is_documented() -> None:
     for bit in EstimateStatus:
-        assert f"| {bit.value} | {bit.name.lower()} |" in FORMATS
+        assert f"| {bit.value} | {str(bit.name).lower()} |" in FORMATS
+
+
+def commands() -> dict[str, Any]:
+    root = typer.main.get_command(app)
+    assert isinstance(root, TyperGroup)
+    return dict(root.commands)
 
 
 def test_every_command_is_in_the_readme_and_says_what_its_options_do() -> None:
-    root = typer.main.get_command(app)
-    for name, command in root.commands.items():
+    for name, command in commands().items():
         assert f"`foottile {name}`" in README
         for parameter in command.params:
             if parameter.name != "help":
@@ -125,12 +130,8 @@ def test_every_command_is_in_the_readme_and_says_what_its_options_do() -> None:
 
 
 def test_every_option_in_the_readme_exists() -> None:
-    root = typer.main.get_command(app)
     known = {
-        option
-        for c in root.commands.values()
-        for p in c.params
-        for option in getattr(p, "opts", [])
+        option for c in commands().values() for p in c.params for option in getattr(p, "opts", [])
     }
     for line in README.splitlines():
         if line.startswith("foottile "):
@@ -149,7 +150,8 @@ def openapi() -> dict[str, Any]:
         server = Server(Path(folder))
         described = make_app(server).openapi()
         asyncio.run(server.close())
-    return json.loads(json.dumps(described))
+    plain: dict[str, Any] = json.loads(json.dumps(described))
+    return plain
 
 
 def test_the_api_description_in_the_repository_is_the_one_that_is_served() -> None:
@@ -168,11 +170,7 @@ def test_every_route_is_documented() -> None:
 
 
 def test_every_live_message_field_is_documented() -> None:
-    one_tile = {
-        name: np.zeros((1, 1) if per_tile else 1, dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-    }
-    piece = sum_up(None, FrameBatch(**one_tile), {})
+    piece = sum_up(None, make_frames(1, 1), {})
     frame = json.loads(Encoder().encode("node", piece, 1.0))
     for name in frame:
         assert f"`{name}`" in API, name
@@ -184,8 +182,7 @@ def test_every_close_code_is_documented() -> None:
 
 
 def test_every_setting_can_be_given_on_the_command_line() -> None:
-    serve = typer.main.get_command(app).commands["serve"]
-    options = {parameter.name for parameter in serve.params}
+    options = {parameter.name for parameter in commands()["serve"].params}
     assert set(Settings.model_fields) - {"token"} <= options
 
 

@@ -9,6 +9,8 @@ import time
 import zipfile
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -44,22 +46,22 @@ def test_an_installed_wheel_and_a_checkout_both_find_the_page(tmp_path: Path) ->
         assert Path(found.stdout.decode().strip()) == page
 
 
-def test_help_does_not_wait_for_heavy_libraries() -> None:
-    code = (
-        "import sys; import service.cli.main; "
-        "print([m for m in ('scipy', 'pyarrow', 'matplotlib', 'fastapi') if m in sys.modules])"
-    )
+HEAVY = ("fastapi", "starlette", "uvicorn", "httpx", "numba", "scipy", "matplotlib")
+
+
+@pytest.mark.parametrize(
+    ("imports", "absent"),
+    [
+        ("service.cli.main", ("pyarrow", *HEAVY)),
+        ("service.cli.commands.node, service.node.run", HEAVY),
+        ("service.node.recording, service.sessions.sealing, service.link", HEAVY),
+    ],
+    ids=["help", "a node", "a node that seals without a calibration"],
+)
+def test_what_needs_no_heavy_library_loads_none(imports: str, absent: tuple[str, ...]) -> None:
+    code = f"import sys, {imports}; print([m for m in {absent!r} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
     assert done.stdout.decode().strip() == "[]"
-
-
-def test_a_node_of_real_tiles_does_not_wait_for_scipy() -> None:
-    code = (
-        "import sys; import service.cli.commands.node, service.node.run;"
-        "print('scipy' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
-    assert done.stdout.decode().strip() == "False"
 
 
 def test_ctrl_c_leaves_no_file_and_a_failing_exit_code(tmp_path: Path) -> None:

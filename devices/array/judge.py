@@ -8,13 +8,14 @@ those before, or where the line is known to be disturbed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 from devices.array.bus_watch import BusWatch
 from devices.array.health import TileHealth, is_impossible
 from devices.array.ports import TilePorts
 from devices.array.scan import Scan
 from devices.clock import Clock
-from devices.errors import BusFaultError, NoAcknowledgeError
+from devices.errors import NoAcknowledgeError
 from devices.frames import TileStatus
 
 DISTURBED_NS = 1_000_000_000
@@ -110,35 +111,23 @@ class Judge:
 
     def _again(self, scan: Scan, tile: int, with_temperature: bool) -> tuple[int, int] | None:
         """The same conversion, selected and read once more; None if it does not answer."""
-        begin_ns = self._clock.now_ns()
         words = None
         self._ports.forget([tile])
-        try:
+        with scan.second_attempt(self._clock), suppress(NoAcknowledgeError):
             self._ports.connect(tile)
             words = self._ports.read(with_temperature)
-        except NoAcknowledgeError:
-            pass
-        except BusFaultError:
-            scan.note_bus_fault()
-        scan.budget_ns -= self._clock.now_ns() - begin_ns
         return words
 
     def _make_sure(self, scan: Scan, tile: int) -> None:
         """Is it this tile, and this one alone, that is connected? Its coefficients tell."""
-        begin_ns = self._clock.now_ns()
         health = self._health[tile]
         found = b""
-        try:
+        with scan.second_attempt(self._clock), suppress(NoAcknowledgeError):
             found = self._ports.read_coefficients()
-        except NoAcknowledgeError:
-            pass
-        except BusFaultError:
-            scan.note_bus_fault()
         if found != health.coefficient_bytes:
             self._ports.router.forget()
             scan.flag(tile, TileStatus.IMPLAUSIBLE)
             health.lose(self._clock.now_ns())
-        scan.budget_ns -= self._clock.now_ns() - begin_ns
 
     def _doubt_all_but(self, tile: int) -> None:
         """A mux that could not be closed may still connect a tile, which would answer too."""

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from devices.clock import Clock
+from devices.errors import BusFaultError
 from devices.frames import NOT_READ, TileStatus
 
 _BUS_FAULTS_MAX = 2
@@ -51,6 +55,16 @@ class Scan:
         """The bus failed once; after the second time, or at once, the frame is given up."""
         self.bus_fault = True
         self._bus_faults += _BUS_FAULTS_MAX if for_good else 1
+
+    @contextmanager
+    def second_attempt(self, clock: Clock) -> Iterator[None]:
+        """Take the block's time from the budget; a fault of the bus in it ends it and is noted."""
+        begin_ns = clock.now_ns()
+        try:
+            yield
+        except BusFaultError:
+            self.note_bus_fault()
+        self.budget_ns -= clock.now_ns() - begin_ns
 
     def flag(self, tile: int, status: TileStatus | int) -> None:
         """Add to a tile's status."""

@@ -12,7 +12,7 @@ from devices.array.health import TileHealth
 from devices.array.ports import TilePorts
 from devices.array.scan import Scan
 from devices.clock import Clock
-from devices.errors import BusFaultError, NoAcknowledgeError, TileSetupError
+from devices.errors import NoAcknowledgeError, TileSetupError
 from devices.frames import TileStatus
 
 
@@ -33,23 +33,18 @@ class Search:
         """See whether a tile is back, if it is time to; its sample comes with the next frame."""
         self.note_absence(scan, tile)
         health = self._health[tile]
-        begin_ns = self._clock.now_ns()
-        if not health.is_probe_due(begin_ns):
+        if not health.is_probe_due(self._clock.now_ns()):
             return
-        try:
-            if self._is_itself(tile):
-                health.find()
-            else:
-                health.lose(self._clock.now_ns())
-        except TileSetupError:
-            scan.flag(tile, TileStatus.IMPLAUSIBLE)
+        with scan.second_attempt(self._clock):
+            try:
+                if self._is_itself(tile):
+                    health.find()
+                    return
+            except TileSetupError:
+                scan.flag(tile, TileStatus.IMPLAUSIBLE)
+            except NoAcknowledgeError:
+                self._ports.forget([tile])
             health.lose(self._clock.now_ns())
-        except NoAcknowledgeError:
-            self._ports.forget([tile])
-            health.lose(self._clock.now_ns())
-        except BusFaultError:
-            scan.note_bus_fault()
-        scan.budget_ns -= self._clock.now_ns() - begin_ns
 
     def _is_itself(self, tile: int) -> bool:
         """Do its coefficients say so? If another part's do, it is noted as replaced."""

@@ -33,20 +33,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-app.command("demo")(demo_command)
-app.command("serve")(serve_command)
-app.command("node")(node_command)
-app.command("sessions")(sessions_command)
-app.command("pull")(pull_command)
-app.command("export")(export_command)
-app.command("simulate")(simulate_command)
-app.command("estimate")(estimate_command)
-app.command("calibrate")(calibrate_command)
-app.command("domes")(domes_command)
-app.command("verify")(verify_command)
-app.command("recover")(recover_command)
-app.command("doctor")(doctor_command)
-app.command("bench")(bench_command)
+for command in (
+    *(demo_command, serve_command, node_command, sessions_command, pull_command, export_command),
+    *(simulate_command, estimate_command, calibrate_command, domes_command, verify_command),
+    *(recover_command, doctor_command, bench_command),
+):
+    app.command(command.__name__.removesuffix("_command"))(command)
 
 
 def _print_version(wanted: bool) -> None:

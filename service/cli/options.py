@@ -6,10 +6,11 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -69,9 +70,27 @@ def output_path(path: Path, *inputs: Path) -> Path:
     return target
 
 
+def plain(value: Any) -> Any:
+    """A result as JSON can hold it: what is not finite is null, a dataclass an object.
+
+    A dataclass with a method `as_dict` is what that says.
+    """
+    if hasattr(value, "as_dict"):
+        return plain(value.as_dict())
+    if is_dataclass(value):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {name: plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def json_text(value: object) -> str:
-    """A JSON document; NaN has no place in it."""
-    return json.dumps(value, indent=2, allow_nan=False) + "\n"
+    """A JSON document of any result."""
+    return json.dumps(plain(value), indent=2, allow_nan=False) + "\n"
 
 
 def print_json(value: object) -> None:

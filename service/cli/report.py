@@ -8,8 +8,10 @@ from statistics import median
 
 from rich.table import Table
 
+from service.cli.options import say, stdout
 from service.estimation.foot.stances import Stance
 from service.offline.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
+from service.offline.findings import Findings
 
 PHASES = {
     "flight": "in flight",
@@ -60,21 +62,30 @@ def accuracy_table(a: Accuracy) -> Table:
     return table
 
 
-def stances_json(stances: Sequence[Stance]) -> list[dict[str, float | int | bool | None]]:
-    """One entry a stance; a peak that is not known is null."""
-    return [
-        {
-            "begin_t_ns": s.begin_t_ns,
-            "duration_s": s.duration_s,
-            "peak_n": s.peak_n if math.isfinite(s.peak_n) else None,
-            "peak_t_ns": s.peak_t_ns,
-            "impulse_ns": s.impulse_ns,
-            "unknown_frames": s.unknown_frames,
-            "begun": s.begun,
-            "ended": s.ended,
-        }
-        for s in stances
-    ]
+def tell_findings(findings: Findings) -> None:
+    """Print what the estimates of a session come to."""
+    if findings.assumed_scale:
+        say(ASSUMED_SCALE)
+    if findings.stances:
+        say(stances_line(findings.stances))
+    if findings.accuracy is not None:
+        stdout.print(accuracy_table(findings.accuracy))
+
+
+def findings_json(findings: Findings) -> dict[str, object]:
+    """The same for programs."""
+    scale = {None: None, True: "assumed", False: "measured"}[findings.assumed_scale]
+    return {
+        "absolute_scale": scale,
+        "stances": [{name: getattr(s, name) for name in _OF_A_STANCE} for s in findings.stances],
+        "accuracy": findings.accuracy,
+    }
+
+
+_OF_A_STANCE = (
+    *("begin_t_ns", "duration_s", "peak_n", "peak_t_ns", "impulse_ns", "unknown_frames"),
+    *("begun", "ended"),
+)
 
 
 def stances_line(stances: Sequence[Stance]) -> str:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from service.estimation.effects import CalibrationPart
 
 
-class BandPoint(BaseModel):
+class BandPoint(CalibrationPart):
     """The curve at one pressure, with half widths of its 95 % bands."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     gauge_kpa: float
     force_n: float
@@ -20,10 +20,8 @@ class BandPoint(BaseModel):
     """Of a reading in a single new loading."""
 
 
-class BenchFacts(BaseModel):
+class BenchFacts(CalibrationPart):
     """Facts about the slow strokes that a curve was fitted to."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     recordings: int = Field(ge=1)
     """Files with slow strokes of the tile."""

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from devices.arrays import Floats
 from devices.errors import CalibrationError
 from service.estimation.bench_facts import BenchFacts
-from service.estimation.effects import Effects
+from service.estimation.effects import CalibrationPart, Effects
 
 ANY_SERIAL = "*"
 LOOP_OPENS_N = 1.0
@@ -28,15 +28,13 @@ BASIS = 3
 """A cubic without constant term has three coefficients to be uncertain about."""
 
 
-class TileCalibration(BaseModel):
+class TileCalibration(CalibrationPart):
     """The static curve of one tile.
 
     Force in newtons: `f_offset_n + f_scale_n * poly(u)` with `u = (gauge_kpa - p_offset_kpa) /
     p_scale_kpa` and `poly` from `coefficients`, low to high; with `zero_mode` "subtract_f0" less
     the same at zero gauge pressure.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     serial: str
     p_input: Literal["gauge_kpa", "normalised"]
@@ -101,10 +99,8 @@ class TileCalibration(BaseModel):
         return low, high
 
 
-class Calibration(BaseModel):
+class Calibration(CalibrationPart):
     """Calibrations of tiles by serial, with the reference they were made against."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     version: Literal[1] = 1
     name: str
@@ -113,7 +109,7 @@ class Calibration(BaseModel):
     date: str
     """ISO 8601, of the recordings."""
     tiles: tuple[TileCalibration, ...]
-    refused: dict[str, str] = {}
+    refused: dict[str, str] = Field(default={})
     """Serials that were pressed as well, and why they have no curve."""
 
     @property

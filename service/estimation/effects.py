@@ -6,9 +6,13 @@ model that needs it is not offered for that tile, and `refused` says why.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from devices.arrays import Floats
 
 WALL_PER_KPA = 0.00124
 """Part of the bubble's volume that the wall gives way for a kPa: elastic estimate for Vytaflex 60
@@ -17,10 +21,14 @@ WALL_PER_KPA = 0.00124
 EffectName = Literal["temperature", "ambient", "gas", "rubber", "hysteresis"]
 
 
-class Parameter(BaseModel):
-    """A fitted value and its standard uncertainty."""
+class CalibrationPart(BaseModel):
+    """A part of a calibration file: no unknown key, and no number that is not finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Parameter(CalibrationPart):
+    """A fitted value and its standard uncertainty."""
 
     value: float
     sigma: float = Field(ge=0)
@@ -31,11 +39,12 @@ class Parameter(BaseModel):
         return self.value - 1.96 * self.sigma, self.value + 1.96 * self.sigma
 
 
-class _Effect(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+def values(parameters: Iterable[Parameter]) -> Floats:
+    """Values without their uncertainties, (n,)."""
+    return np.array([parameter.value for parameter in parameters])
 
 
-class GasEffect(_Effect):
+class GasEffect(CalibrationPart):
     """Of the model `gas`."""
 
     gamma: Parameter
@@ -50,7 +59,7 @@ class GasEffect(_Effect):
         return self
 
 
-class RubberEffect(_Effect):
+class RubberEffect(CalibrationPart):
     """Of the model `rubber`, with the curve of forces that have lasted, beneath creep and loop.
 
     Curve as in `TileCalibration`, in the same variable and units.
@@ -75,7 +84,7 @@ class RubberEffect(_Effect):
         return self
 
 
-class HysteresisEffect(_Effect):
+class HysteresisEffect(CalibrationPart):
     """Of the model `hysteresis`: parts of its plays."""
 
     part: tuple[Parameter, ...]
@@ -86,7 +95,7 @@ class HysteresisEffect(_Effect):
         return self
 
 
-class TemperatureEffect(_Effect):
+class TemperatureEffect(CalibrationPart):
     """Of the model `temperature`, and of `ambient`, which needs the wall's give."""
 
     kpa_per_k: Parameter
@@ -103,7 +112,7 @@ class TemperatureEffect(_Effect):
         return self
 
 
-class Effects(_Effect):
+class Effects(CalibrationPart):
     """All that the recording determined; None where it did not, and then `refused` says why."""
 
     gas: GasEffect | None = None

@@ -18,7 +18,7 @@ from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.effects import EffectName
+from service.estimation.effects import EffectName, GasEffect, RubberEffect, values
 from service.estimation.models.ambient import Ambient
 from service.estimation.models.gas import Gas
 from service.estimation.models.hysteresis import WIDTHS_N, Hysteresis
@@ -99,42 +99,19 @@ def make_ladder(
             remedy="Leave it out, or plug in a bare chip and mark it `reference = true`",
         )
     _refuse_mixed(tiles, models, calibration)
-    gas = [tile.effects.gas for tile in tiles]
-    rubber = [tile.effects.rubber for tile in tiles]
+    baseline_kpa = tare.baseline_kpa[columns]
     return Ladder(
         unwrap="unwrap" in models,
         temperature=_temperature(tiles, tare, columns) if "temperature" in models else None,
-        ambient=_ambient(tiles, tare.baseline_kpa[columns]) if "ambient" in models else None,
-        gas=Gas(
-            gamma=np.array([g.gamma.value for g in gas if g is not None]),
-            tau_s=np.array([g.tau_s.value for g in gas if g is not None]),
-            wall_per_kpa=np.array([tile.effects.wall_per_kpa for tile in tiles]),
-            baseline_kpa=tare.baseline_kpa[columns],
-        )
-        if "gas" in models
-        else None,
-        gas_misfit=np.array([0.0 if g is None else max(g.misfit, MISFIT_MIN) for g in gas]),
+        ambient=_ambient(tiles, baseline_kpa) if "ambient" in models else None,
+        gas=_gas(tiles, baseline_kpa) if "gas" in models else None,
+        gas_misfit=_misfit([tile.effects.gas for tile in tiles]),
         curves=StaticCurves(tiles, lasting="rubber" in models),
         skew="skew" in models,
         denoise="denoise" in models,
-        hysteresis=Hysteresis(
-            np.array(
-                [
-                    [p.value for p in h.part]
-                    for t in tiles
-                    if (h := t.effects.hysteresis) is not None
-                ]
-            )
-        )
-        if "hysteresis" in models
-        else None,
-        rubber=Rubber(
-            part=np.array([[p.value for p in r.part] for r in rubber if r is not None]),
-            tau_s=np.array([[p.value for p in r.tau_s] for r in rubber if r is not None]),
-        )
-        if "rubber" in models
-        else None,
-        rubber_misfit=np.array([0.0 if r is None else max(r.misfit, MISFIT_MIN) for r in rubber]),
+        hysteresis=_hysteresis(tiles) if "hysteresis" in models else None,
+        rubber=_rubber(tiles) if "rubber" in models else None,
+        rubber_misfit=_misfit([tile.effects.rubber for tile in tiles]),
     )
 
 
@@ -188,13 +165,40 @@ def _temperature(
 ) -> Temperature:
     found = [effect for tile in tiles if (effect := tile.effects.temperature) is not None]
     return Temperature(
-        kpa_per_count=np.array([e.kpa_per_k.value for e in found]) / TADC_PER_KELVIN,
+        kpa_per_count=values(e.kpa_per_k for e in found) / TADC_PER_KELVIN,
         relative_sigma=np.array([e.kpa_per_k.sigma / e.kpa_per_k.value for e in found]),
-        lag_s=np.array([e.lag_s.value for e in found]),
+        lag_s=values(e.lag_s for e in found),
         relative_lag_sigma=np.array([e.lag_s.sigma / e.lag_s.value for e in found]),
         tare_counts=tare.tadc_counts[columns],
         baseline_kpa=tare.baseline_kpa[columns],
     )
+
+
+def _gas(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> Gas:
+    found = [effect for tile in tiles if (effect := tile.effects.gas) is not None]
+    return Gas(
+        gamma=values(effect.gamma for effect in found),
+        tau_s=values(effect.tau_s for effect in found),
+        wall_per_kpa=np.array([tile.effects.wall_per_kpa for tile in tiles]),
+        baseline_kpa=baseline_kpa,
+    )
+
+
+def _hysteresis(tiles: Sequence[TileCalibration]) -> Hysteresis:
+    found = [effect for tile in tiles if (effect := tile.effects.hysteresis) is not None]
+    return Hysteresis(np.array([values(effect.part) for effect in found]))
+
+
+def _rubber(tiles: Sequence[TileCalibration]) -> Rubber:
+    found = [effect for tile in tiles if (effect := tile.effects.rubber) is not None]
+    return Rubber(
+        part=np.array([values(effect.part) for effect in found]),
+        tau_s=np.array([values(effect.tau_s) for effect in found]),
+    )
+
+
+def _misfit(effects: Sequence[GasEffect | RubberEffect | None]) -> Floats:
+    return np.array([0.0 if e is None else max(e.misfit, MISFIT_MIN) for e in effects])
 
 
 def _ambient(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> Ambient:

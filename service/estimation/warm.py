@@ -8,7 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, TileInfo
+from devices.frames import (
+    NO_SERVO_AGE,
+    NO_SERVO_COUNTS,
+    ArrayInfo,
+    FrameBatch,
+    TileInfo,
+    zero_columns,
+)
 from service.estimation.calibration import Calibration, paper_eq2_shape
 from service.estimation.effects import (
     Effects,
@@ -65,21 +72,21 @@ def _tile(channel: int) -> TileInfo:
 
 
 def _calibration() -> Calibration:
-    one = Parameter(value=0.1, sigma=0.01)
+    tenth = Parameter(value=0.1, sigma=0.01)
     curve = paper_eq2_shape().tiles[0]
     effects = Effects(
-        gas=GasEffect(gamma=Parameter(value=1.3, sigma=0.01), tau_s=one, misfit=0.1),
+        gas=GasEffect(gamma=Parameter(value=1.3, sigma=0.01), tau_s=tenth, misfit=0.1),
         rubber=RubberEffect(
-            part=(one, one),
-            tau_s=(one, one),
+            part=(tenth, tenth),
+            tau_s=(tenth, tenth),
             coefficients=curve.coefficients,
             covariance=curve.covariance,
             scatter=0.03,
             misfit=0.1,
             curve_misfit_n=0.1,
         ),
-        hysteresis=HysteresisEffect(part=(one,) * len(WIDTHS_N)),
-        temperature=TemperatureEffect(kpa_per_k=one, lag_s=one, wall_per_kpa=one),
+        hysteresis=HysteresisEffect(part=(tenth,) * len(WIDTHS_N)),
+        temperature=TemperatureEffect(kpa_per_k=tenth, lag_s=tenth, wall_per_kpa=tenth),
     )
     tiles = tuple(
         curve.model_copy(update={"serial": serial, "effects": effects}) for serial in ("W0", "W1")
@@ -88,18 +95,10 @@ def _calibration() -> Calibration:
 
 
 def _frames() -> FrameBatch:
-    n = _FRAMES
-    t_ns = np.arange(n, dtype=np.int64) * 2_000_000
-    return FrameBatch(
-        seq=np.arange(n, dtype=np.uint64),
-        t_mono_ns=t_ns,
-        t_ns=t_ns,
-        padc=np.full((n, 3), 400, dtype=np.uint16),
-        tadc=np.full((n, 3), 507, dtype=np.uint16),
-        sample_offset_us=np.zeros((n, 3), dtype=np.int32),
-        servo_counts=np.full(n, NO_SERVO_COUNTS, dtype=np.int32),
-        servo_age_us=np.full(n, NO_SERVO_AGE, dtype=np.int32),
-        status=np.zeros((n, 3), dtype=np.uint8),
-        frame_status=np.zeros(n, dtype=np.uint8),
-        reference_force_n=np.full(n, np.nan, dtype=np.float32),
-    )
+    columns = zero_columns(_FRAMES, 3)
+    columns["seq"][:] = np.arange(_FRAMES)
+    columns["t_mono_ns"][:] = columns["t_ns"][:] = 2_000_000 * np.arange(_FRAMES)
+    columns["padc"][:], columns["tadc"][:] = 400, 507
+    columns["servo_counts"][:], columns["servo_age_us"][:] = NO_SERVO_COUNTS, NO_SERVO_AGE
+    columns["reference_force_n"][:] = np.nan
+    return FrameBatch(**columns)

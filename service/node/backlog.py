@@ -22,8 +22,7 @@ class Backlog:
         """How many frames."""
         streams: dict[str, Intervals] = {}
         for boot_id, numbers in self._lacks:
-            for interval in numbers:
-                streams.setdefault(boot_id, Intervals()).add(*interval)
+            streams[boot_id] = numbers | streams.get(boot_id, Intervals())
         return sum(numbers.count for numbers in streams.values())
 
     def add(self, boot_id: str, first: int, last: int) -> None:

@@ -10,18 +10,45 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from urllib.parse import urlsplit, urlunsplit
+
+from devices.errors import UsageError
+from service.link import INGEST_PATH
 
 EVERY_S = 0.5
 GIVE_UP_S = 5.0
 _UNSENT_BYTES = 16 << 10
 
 
-async def dial(host: str, port: int) -> socket.socket:
-    """Connect to a server.
+def ingest_url(server: str) -> str:
+    """The websocket address of a server's ingest.
 
     Raises:
-        OSError: it refuses, or nobody answers.
+        UsageError: `server` is no address.
     """
+    expected = "one such as http://192.168.4.1:8000"
+    try:
+        parts = urlsplit(server)
+        known = parts.hostname is not None and parts.port != 0
+    except ValueError as error:
+        raise UsageError(f"{server!r} is no server address", expected=expected) from error
+    scheme = {"http": "ws", "https": "wss", "ws": "ws", "wss": "wss"}.get(parts.scheme)
+    if scheme is None or not known:
+        raise UsageError(f"{server!r} is no server address", expected=expected)
+    return urlunsplit((scheme, parts.netloc, parts.path.rstrip("/") + INGEST_PATH, "", ""))
+
+
+async def dial(url: str) -> socket.socket:
+    """Connect to a server.
+
+    Args:
+        url: its websocket address.
+
+    Raises:
+        OSError: it refuses, or does not answer.
+    """
+    parts = urlsplit(url)
+    host, port = parts.hostname or "", parts.port or (443 if parts.scheme == "wss" else 80)
     loop = asyncio.get_running_loop()
     end_s = loop.time() + GIVE_UP_S
     attempts: set[asyncio.Task[socket.socket]] = set()
@@ -45,7 +72,7 @@ async def dial(host: str, port: int) -> socket.socket:
         for left in await asyncio.gather(*attempts, return_exceptions=True):
             if isinstance(left, socket.socket):  # two came through at once
                 left.close()
-    raise refused or TimeoutError(f"nobody answered for {GIVE_UP_S:g} s")
+    raise refused or TimeoutError(f"no answer for {GIVE_UP_S:g} s")
 
 
 async def _attempt(host: str, port: int) -> socket.socket:

@@ -15,12 +15,15 @@ from pathlib import Path
 from devices.errors import FootTileError, StorageError
 from service.estimation.calibration import Calibration
 from service.server_clock import utc_ns
+from service.sessions.ends import at_end, broken_off
+from service.sessions.streams import SessionStream
 from storage.durable import remove_stale_temporaries
 from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
 from storage.sessions.folder import Part, Session, SessionFolder, new_session_id
-from storage.sessions.ledger import StreamState, ledger_of, lost_numbers
+from storage.sessions.ledger import ledger_of
+from storage.sessions.states import numbers_of, states_of
 
 
 class NodeRecording:
@@ -80,7 +83,8 @@ class NodeRecording:
         if session is None:
             session = self._new(part, stream)
         else:
-            session = session.model_copy(update={"parts": (*self._closed(session), part)})
+            session = at_end(session, self._described(session))
+            session = session.model_copy(update={"parts": (*session.parts, part)})
         self._session = session
         self._need()
         try:
@@ -134,68 +138,34 @@ class NodeRecording:
 
     def _seal(self, session: Session) -> Session:
         # Here, because a real node need not wait for scipy before its first frame.
-        from service.sessions.sealing import Sources, seal
+        from service.sessions.sealing import seal
+        from service.sessions.sources import sources_of
 
-        session = session.model_copy(update={"parts": self._closed(session), "state": "sealing"})
-        streams = self._streams(session)
-        states = {
-            boot_id: StreamState(
-                held=stream.stored,
-                lost=stream.lost,
-                unsynced_tail_max=stream.notes.unsynced_tail_max,
-                missed_slots=stream.missed_slots,
-            )
-            for boot_id, stream in streams.items()
-        }
-        ledger = ledger_of(session.parts, states, finished=True)
+        streams = self._described(session)
+        session = broken_off(session, streams).model_copy(update={"state": "sealing"})
         self._folder.save(session)
         folder = self._folder.path(session.id)
         remove_stale_temporaries(folder)
-        journals = {b: s.journal for b, s in streams.items() if s.journal is not None}
-        first = streams.get(session.parts[0].boot_id) or next(iter(streams.values()), None)
-        if first is None:
-            raise StorageError("its frames are gone", where=str(folder))
-        sources = Sources(
-            session=session,
-            info=first.info,
-            journals=journals,
-            calibration=(
-                Calibration.model_validate(session.calibration) if session.calibration else None
-            ),
-            problem=None if session.calibration else "the node had no calibration",
-            tares=(),
-            notes={**self._notes, "lost": lost_numbers(session.parts, states)},
-        )
+        emulated = self._notes.get("emulated")
+        sources = sources_of(session, streams, tares=None, emulated=bool(emulated))
+        ledger = ledger_of(session.parts, states_of(session, streams), finished=True)
         sealed = seal(sources, folder, ledger)
         self._folder.save(sealed)
         return sealed
 
-    def _closed(self, session: Session) -> tuple[Part, ...]:
-        """Its parts, each with an end: where its stream ended."""
-        streams = self._streams(session)
-        return tuple(
-            part
-            if part.seq_last is not None or part.boot_id not in streams
-            else part.model_copy(update={"seq_last": streams[part.boot_id].next_seq - 1})
-            for part in session.parts
-        )
-
-    def _streams(self, session: Session) -> dict[str, NodeStream]:
-        ids = {part.boot_id for part in session.parts}
-        return {s.boot_id: s for s in self._journal.streams if s.boot_id in ids}
+    def _described(self, session: Session) -> dict[str, SessionStream]:
+        """What is known of a session's streams, by boot_id."""
+        known = {stream.boot_id: _described(stream) for stream in self._journal.streams}
+        return {p.boot_id: known.get(p.boot_id, SessionStream()) for p in session.parts}
 
     def _has_other_tiles(self, session: Session, stream: NodeStream) -> bool:
-        before = self._streams(session).get(session.parts[-1].boot_id)
-        return before is not None and not before.info.has_same_tiles_as(stream.info)
+        before = self._described(session)[session.parts[-1].boot_id].info
+        return before is not None and not before.has_same_tiles_as(stream.info)
 
     def _need(self) -> None:
         """Have the journal keep what is not sealed yet."""
-        needed: dict[str, Intervals] = {}
-        for session in (*self._left_over, *((self._session,) if self._session else ())):
-            for part in session.parts:
-                last = NO_END if part.seq_last is None else part.seq_last
-                if last >= part.seq_first:
-                    needed.setdefault(part.boot_id, Intervals()).add(part.seq_first, last)
+        sessions = (*self._left_over, *((self._session,) if self._session else ()))
+        needed = numbers_of(part for session in sessions for part in session.parts)
         if self._unreadable:
             needed = {stream.boot_id: Intervals([(0, NO_END)]) for stream in self._journal.streams}
         self._journal.wanted.say_local(needed)
@@ -212,6 +182,22 @@ class NodeRecording:
             if session.state != "sealed" and session.node == self._node:
                 found.append(session)
         return found
+
+
+def _described(stream: NodeStream) -> SessionStream:
+    """What a session on the node knows of one of its streams: it has ended, and all of it is here.
+
+    A session here ends with its stream, not by an instant: the date may have been set meanwhile.
+    """
+    return SessionStream(
+        held=stream.stored,
+        lost=stream.lost,
+        next_seq=stream.next_seq,
+        unsynced_tail_max=stream.notes.unsynced_tail_max,
+        missed_slots=stream.missed_slots,
+        info=stream.info,
+        journal=stream.journal,
+    )
 
 
 def _object(value: object) -> Mapping[str, object]:

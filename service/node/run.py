@@ -15,6 +15,7 @@ from service.link import PROTOCOL, EarlierStream, Hello, Status, Wanted
 from service.node.acquisition import AcquisitionProcess, Batch, Failed, Health, Message, Started
 from service.node.publisher import Publisher
 from service.node.recording import NodeRecording
+from service.node.sending import Source
 from service.rig.rig import RigOptions
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
@@ -85,7 +86,7 @@ async def run_node(
     rig = options.rig
     journal = await asyncio.to_thread(NodeJournal, options.journal, rig.node)
     try:
-        node = _Node(options, journal, report)
+        node = RunningNode(options, journal, report)
         journal.start()  # it knows now what the node's own sessions need
         try:
             return await node.run(stop)
@@ -95,7 +96,7 @@ async def run_node(
         await asyncio.to_thread(journal.close)
 
 
-class _Node:
+class RunningNode:
     """The parts of a running node, and how they are joined."""
 
     def __init__(
@@ -132,7 +133,7 @@ class _Node:
     async def run(self, stop: asyncio.Event) -> Outcome:
         """Until it is stopped, or the array fails for good."""
         stopping = asyncio.create_task(stop.wait())
-        beside: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._watch_disk())]
+        tasks: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._watch_disk())]
         try:
             started = await _started(self._messages, stopping)
             if started is None:
@@ -140,12 +141,12 @@ class _Node:
             stopping.add_done_callback(lambda _: self._acquisition.stop())
             await self._begin(started)
             sealing = asyncio.create_task(asyncio.to_thread(self._seal_what_was_left))
-            beside.append(sealing)
+            tasks.append(sealing)
             if self._options.server is not None:
                 self._publish(self._options.server)
             while not isinstance(message := await self._messages.get(), Failed):
                 if isinstance(message, Started):
-                    self._report("the tiles are described anew: a new stream begins")
+                    self._report("the tiles have a new description: a new stream begins")
                     await self._begin(message)
                 elif self._present is not None:
                     self._take(self._present, message)
@@ -162,9 +163,9 @@ class _Node:
                 raise message.error
             return outcome
         finally:
-            for task in beside:
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(*beside, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
 
     def _tell_failure(self, task: asyncio.Task[None]) -> None:
         """A publisher that ended by itself ends the node: better that than to go on in silence."""
@@ -173,7 +174,7 @@ class _Node:
             self._messages.put_nowait(Failed(error or FootTileError("the publisher has ended")))
 
     async def close(self) -> None:
-        """End what runs beside."""
+        """End publisher and acquisition."""
         self._is_closing = True
         if self._publishing is not None:
             self._publishing.cancel()
@@ -201,28 +202,30 @@ class _Node:
     def _publish(self, server: str) -> None:
         self._publisher = Publisher(
             server,
-            present=self._stream,
-            streams=lambda: {stream.boot_id: stream for stream in self._journal.streams},
-            hello=self._hello,
-            status=self._status,
-            wanted=self._want,
-            damaged=self._journal.damaged,
+            Source(
+                present=self._present_stream,
+                streams=lambda: {stream.boot_id: stream for stream in self._journal.streams},
+                hello=self._hello,
+                status=self._status,
+                wanted=self._want,
+                damaged=self._journal.damaged,
+            ),
             token=self._options.token,
             report=self._report,
         )
         self._publishing = asyncio.create_task(self._publisher.run())
         self._publishing.add_done_callback(self._tell_failure)
 
-    def _stream(self) -> NodeStream:
+    def _present_stream(self) -> NodeStream:
         if self._present is None:
             raise RuntimeError("no stream has begun")
         return self._present
 
     def _hello(self) -> Hello:
-        options, present = self._options, self._stream()
+        options, present = self._options, self._present_stream()
         next_seq = present.next_seq  # before what is held, which may go on meanwhile
         others = [stream for stream in self._journal.streams if stream is not present]
-        # As many as fit into a message, those that somebody waits for first.
+        # As many as fit into a message, those that a session waits for first.
         waited_for = [stream for stream in others if self._journal.undelivered(stream)]
         rest = [stream for stream in others if stream not in waited_for]
         chosen = (*waited_for[:_EARLIER_MAX], *rest[-_EARLIER_MAX:])[:_EARLIER_MAX]
@@ -243,7 +246,7 @@ class _Node:
 
     def _status(self, backlog_frames: int) -> Status:
         return Status(
-            missed_slots=self._stream().missed_slots,
+            missed_slots=self._present_stream().missed_slots,
             backlog_frames=backlog_frames,
             troubles=(*self._health.troubles, *self._journal.troubles),
             counts={serial: dict(counts) for serial, counts in self._health.counts.items()},
@@ -346,5 +349,5 @@ def _hand_over(
 ) -> None:
     try:
         loop.call_soon_threadsafe(messages.put_nowait, message)
-    except RuntimeError:  # the loop has ended; nobody listens any more
+    except RuntimeError:  # the loop has ended, and with it all who listen
         return

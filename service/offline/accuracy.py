@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats
+from devices.arrays import Bools, Floats
 from service.estimation.estimates import EstimateStatus
 
-JUDGED = (
+COMPARED = (
     "t_ns",
     "grf_n",
     "grf_sigma_n",
@@ -29,7 +29,7 @@ JUDGED = (
     "true_cop_x_m",
     "true_cop_y_m",
 )
-"""Columns that `judge` needs."""
+"""Columns that `accuracy_of` needs."""
 
 GRF_FROM_N = 0.5
 COP_FROM_N = 3.0
@@ -59,10 +59,9 @@ class Covered:
     def __add__(self, other: Covered) -> Covered:
         return Covered(self.frames + other.frames, self.within + other.within)
 
-    def as_dict(self) -> dict[str, float | int | None]:
+    def as_dict(self) -> dict[str, float]:
         """For JSON."""
-        share = self.share if self.frames else None
-        return {"frames": self.frames, "within": self.within, "coverage_95": share}
+        return {"frames": self.frames, "within": self.within, "coverage_95": self.share}
 
 
 @dataclass(frozen=True)
@@ -109,44 +108,33 @@ class Accuracy:
     """The same as a part of all frames with more than 3 N of truth."""
     saturated_frames: int
 
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON: what is not finite is null."""
-        numbers = {
-            f.name: value if math.isfinite(value) else None
-            for f in fields(self)
-            for value in (getattr(self, f.name),)
-            if isinstance(value, float | int)
-        }
-        phases = {name: covered.as_dict() for name, covered in self.grf_phases.items()}
-        return {**numbers, "grf_phases": phases, "cop_covered": self.cop_covered.as_dict()}
 
-
-def judge(c: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0) -> Accuracy:
+def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0) -> Accuracy:
     """Compare estimates with truth.
 
     Args:
-        c: the columns `JUDGED`, one value per frame, at least one.
+        columns: `COMPARED`, one value per frame, at least one.
         lag_ms: look-ahead of the estimates: how long after its frame one is published.
     """
-    true_n, error_n = c["true_grf_n"], c["grf_n"] - c["true_grf_n"]
-    saturated = (c["estimate_status"] & EstimateStatus.SATURATED) != 0
+    true_n, error_n = columns["true_grf_n"], columns["grf_n"] - columns["true_grf_n"]
+    saturated = (columns["estimate_status"] & EstimateStatus.SATURATED) != 0
     usable = ~saturated & np.isfinite(error_n)
     judged = (true_n > GRF_FROM_N) & usable
     heavy = true_n > COP_FROM_N
-    stated = heavy & np.isfinite(c["cop_x_m"])
+    stated = heavy & np.isfinite(columns["cop_x_m"])
     off_m = np.hypot(
-        c["cop_x_m"][stated] - c["true_cop_x_m"][stated],
-        c["cop_y_m"][stated] - c["true_cop_y_m"][stated],
+        columns["cop_x_m"][stated] - columns["true_cop_x_m"][stated],
+        columns["cop_y_m"][stated] - columns["true_cop_y_m"][stated],
     )
-    within = np.abs(error_n[judged]) <= INTERVAL_95 * c["grf_sigma_n"][judged]
+    within = np.abs(error_n[judged]) <= INTERVAL_95 * columns["grf_sigma_n"][judged]
     within_x = (
-        np.abs(c["cop_x_m"][stated] - c["true_cop_x_m"][stated])
-        <= INTERVAL_95 * c["cop_sigma_x_m"][stated]
+        np.abs(columns["cop_x_m"][stated] - columns["true_cop_x_m"][stated])
+        <= INTERVAL_95 * columns["cop_sigma_x_m"][stated]
     )
-    peaks_n, impulses_ns = _stances(c["t_ns"], true_n, c["grf_n"])
+    peaks_n, impulses_ns = _stances(columns["t_ns"], true_n, columns["grf_n"])
     flight = error_n[(true_n == 0.0) & np.isfinite(error_n)]
-    phases = phases_of(c["t_ns"], true_n)
-    covered = np.abs(error_n) <= INTERVAL_95 * c["grf_sigma_n"]
+    phases = phases_of(columns["t_ns"], true_n)
+    covered = np.abs(error_n) <= INTERVAL_95 * columns["grf_sigma_n"]
     steady = usable & (phases == PHASES.index("mid_stance"))
     cop_masked = int((heavy & ~stated).sum())
     return Accuracy(
@@ -156,9 +144,9 @@ def judge(c: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0) -> Accuracy
         grf_rms_n=float(np.sqrt(_mean(error_n[judged] ** 2))),
         grf_bias_n=_mean(error_n[judged]),
         grf_coverage_95=_mean(within),
-        grf_sigma_median_n=_median(c["grf_sigma_n"][judged]),
-        grf_sigma_mid_stance_n=_median(c["grf_sigma_n"][steady]),
-        grf_published_mae_n=_mean(_published_error_n(c, round(lag_ms * 1e6), judged)),
+        grf_sigma_median_n=_median(columns["grf_sigma_n"][judged]),
+        grf_sigma_mid_stance_n=_median(columns["grf_sigma_n"][steady]),
+        grf_published_mae_n=_mean(_published_error_n(columns, round(lag_ms * 1e6), judged)),
         grf_phases={
             name: Covered(int(rows.sum()), int((rows & covered).sum()))
             for i, name in enumerate(PHASES)
@@ -188,12 +176,9 @@ def phases_of(t_ns: npt.NDArray[np.int64], true_n: Floats) -> npt.NDArray[np.int
     """
     phases = np.full(len(true_n), PHASES.index("flight"))
     t_s = (t_ns - t_ns[0]) * 1e-9
-    bears = np.concatenate([[False], true_n != 0.0, [False]])
-    begins = np.flatnonzero(~bears[:-1] & bears[1:])
-    ends = np.flatnonzero(bears[:-1] & ~bears[1:])
-    for begin, end in zip(begins, ends, strict=True):
+    for begin, end in _stretches(true_n != 0.0):
         # With a frame of flight on each side, so that a touch has a slope, too.
-        first, last = max(int(begin) - 1, 0), min(int(end) + 1, len(true_n))
+        first, last = max(begin - 1, 0), min(end + 1, len(true_n))
         inner = slice(begin - first, end - first)
         duration_s = t_s[last - 1] - t_s[first]
         if duration_s == 0.0:
@@ -210,23 +195,20 @@ def phases_of(t_ns: npt.NDArray[np.int64], true_n: Floats) -> npt.NDArray[np.int
 
 
 def _published_error_n(
-    c: Mapping[str, npt.NDArray[Any]], lag_ns: int, rows: npt.NDArray[np.bool_]
+    columns: Mapping[str, npt.NDArray[Any]], lag_ns: int, rows: npt.NDArray[np.bool_]
 ) -> Floats:
     # Counted from the first frame: float64 does not hold nanoseconds since 1970.
-    since_ns = (c["t_ns"] - c["t_ns"][0]).astype(np.float64)
+    since_ns = (columns["t_ns"] - columns["t_ns"][0]).astype(np.float64)
     published_ns = since_ns[rows] + lag_ns
     seen = published_ns <= since_ns[-1]
-    then_n = np.interp(published_ns[seen], since_ns, c["true_grf_n"])
-    return np.asarray(np.abs(c["grf_n"][rows][seen] - then_n))
+    then_n = np.interp(published_ns[seen], since_ns, columns["true_grf_n"])
+    return np.asarray(np.abs(columns["grf_n"][rows][seen] - then_n))
 
 
 def _stances(t_ns: Floats, true_n: Floats, grf_n: Floats) -> tuple[Floats, Floats]:
     """Errors of peak and impulse of every stance: a stretch of truth above `GRF_FROM_N`."""
-    loaded = np.concatenate([[False], true_n > GRF_FROM_N, [False]])
-    begins = np.flatnonzero(~loaded[:-1] & loaded[1:])
-    ends = np.flatnonzero(loaded[:-1] & ~loaded[1:])
     peaks, impulses = [], []
-    for begin, end in zip(begins, ends, strict=True):
+    for begin, end in _stretches(true_n > GRF_FROM_N):
         rows = slice(begin, end)
         if t_ns[end - 1] - t_ns[begin] < STANCE_MIN_NS or not np.isfinite(grf_n[rows]).all():
             continue
@@ -234,6 +216,12 @@ def _stances(t_ns: Floats, true_n: Floats, grf_n: Floats) -> tuple[Floats, Float
         t_s = (t_ns[rows] - t_ns[begin]) * 1e-9
         impulses.append(np.trapezoid(grf_n[rows] - true_n[rows], t_s))
     return np.array(peaks), np.array(impulses)
+
+
+def _stretches(rows: Bools) -> list[tuple[int, int]]:
+    """First row of every run of rows that are true, and the first row behind it."""
+    edges = np.flatnonzero(np.diff(rows, prepend=False, append=False)).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _mean(values: npt.NDArray[Any]) -> float:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+from http import HTTPStatus
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import httpx
@@ -18,8 +19,6 @@ from storage.sessions.folder import FRAMES_NAME
 
 API = "/api/v1"
 _CHUNK = 1 << 20
-_PARTIAL = 206
-_NOT_FOUND = 404
 
 
 class Client:
@@ -44,12 +43,7 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._http.close()
 
     def sessions(self) -> list[dict[str, Any]]:
@@ -101,7 +95,7 @@ class Client:
         events = self._get(f"/sessions/{session_id}/events")
         ledger = self._get(f"/sessions/{session_id}/ledger")
         for name, content in (("session", session), ("events", events), ("ledger", ledger)):
-            write_whole(folder / f"{name}.json", _json(content))
+            write_whole(folder / f"{name}.json", json.dumps(content, indent=1).encode())
         self._pull_clock(session_id, folder / CLOCK_NAME)
         return {**session, "path": str(path), "resumed_bytes": resumed}
 
@@ -115,18 +109,19 @@ class Client:
         url = f"/sessions/{session['id']}/data?format=parquet"
         try:
             with self._http.stream("GET", url, headers=headers) as answer:
-                if answer.is_error and not (have and answer.status_code == 416):
+                status = answer.status_code
+                # All of it is here already, and only its name was lacking.
+                is_here = bool(have) and status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE
+                if answer.is_error and not is_here:
                     answer.read()
                     raise self._refused(answer)
-                resumed = have if answer.status_code == _PARTIAL else 0
-                if not answer.is_error:
+                resumed = have if is_here or status == HTTPStatus.PARTIAL_CONTENT else 0
+                if not is_here:
                     with storage_errors(partial), partial.open("ab" if resumed else "wb") as file:
                         for chunk in answer.iter_bytes(_CHUNK):
                             file.write(chunk)
                         file.flush()
                         os.fsync(file.fileno())
-                else:
-                    resumed = have
         except httpx.HTTPError as error:
             raise LinkError(
                 f"the download broke off: {error}",
@@ -147,8 +142,8 @@ class Client:
 
     def _pull_clock(self, session_id: str, path: Path) -> None:
         answer = self._answer(f"/sessions/{session_id}/clock", {"format": "parquet"})
-        if answer.status_code == _NOT_FOUND:  # taken away, or a server that knows no clocks yet
-            return
+        if answer.status_code == HTTPStatus.NOT_FOUND:
+            return  # taken away, or a server that knows no clocks yet
         if answer.is_error:
             raise self._refused(answer)
         write_whole(path, answer.content)
@@ -181,9 +176,3 @@ class Client:
         except (ValueError, KeyError, TypeError):
             detail = answer.reason_phrase
         return LinkError(f"{detail} (HTTP {answer.status_code})", where=self.server)
-
-
-def _json(content: dict[str, Any]) -> bytes:
-    import json
-
-    return json.dumps(content, indent=1).encode()

@@ -103,13 +103,9 @@ def diagnose(bus: I2cBus, clock: Clock, scene: Scene | None, *, asked_hz: float 
         except I2cError as error:
             conversion_ns, problem = None, f"it went silent while it was measured: {error}"
         conversions_ns.append(conversion_ns)
-        measured[finding.mux, finding.channel] = TileFinding(
-            finding.serial,
-            finding.mux,
-            finding.channel,
-            finding.coefficient_words,
-            None if conversion_ns is None else conversion_ns / 1e6,
-            problem,
+        conversion_ms = None if conversion_ns is None else conversion_ns / 1e6
+        measured[finding.mux, finding.channel] = replace(
+            finding, conversion_ms=conversion_ms, problem=problem
         )
     findings = tuple(measured.get((f.mux, f.channel), f) for f in findings)
     asked = tuple(measured.values())

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy.typing as npt
 
 from devices.errors import CalibrationError, FileFormatError, TareError, UsageError
 from devices.frames import ArrayInfo
 from devices.scene.file import Scene, load_scene
 from service.estimation.calibration import Calibration
-from service.estimation.foot.stances import Stance, Stances
 from service.estimation.plan import EstimationPlan
 from service.estimation.tare.tare import Tare
-from service.offline.accuracy import JUDGED, Accuracy
 from service.offline.calibrations import BENCH, find_calibration
-from service.offline.simulate import judged_of
+from service.offline.findings import Findings, FindingsOf
 from service.sessions.pipeline import EstimateOptions, EstimateStream, notes_of
 from storage.schema import MILL, PARTS, TRUTH
 from storage.sessions.file import SessionReader, SessionWriter
@@ -31,8 +26,7 @@ class Estimated:
 
     frames: int
     plan: EstimationPlan
-    stances: tuple[Stance, ...]
-    accuracy: Accuracy | None
+    findings: Findings
 
 
 def estimate_session(
@@ -62,10 +56,8 @@ def estimate_session(
             tares=_recorded_tares(session) if tare_s is None else (),
         )
         kept = [c.name for c in (*PARTS, *TRUTH, *MILL) if session.has(c.name)]
-        judging = all(c.name in kept for c in TRUTH)
         stream = EstimateStream(info, options)
-        judged: list[Mapping[str, npt.NDArray[Any]]] = []
-        stances = Stances()
+        found = FindingsOf(judging=all(c.name in kept for c in TRUTH))
         frames = 0
         with SessionWriter(out, info, session.notes) as writer:
             ordered = in_order(session.batches(*kept), where=str(source))
@@ -74,13 +66,10 @@ def estimate_session(
                     writer.add_notes(notes_of(stream.plan, options.tares))
                 writer.append(batch, extra)
                 frames += len(batch)
-                stances.feed(batch.t_ns, extra["grf_n"], extra["contact"])
-                if judging:
-                    columns = {"t_ns": batch.t_ns, **extra}
-                    judged.append({name: columns[name] for name in JUDGED})
+                found.feed(batch, extra)
     if stream.plan is None:
         raise FileFormatError("the session has no frames", where=str(source))
-    return Estimated(frames, stream.plan, stances.finish(), judged_of(judged, stream))
+    return Estimated(frames, stream.plan, found.finish(stream.plan))
 
 
 def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:

@@ -30,8 +30,7 @@ from devices.errors import UsageError
 from devices.frames import FrameBatch, TileStatus
 from devices.scene.file import Scene
 from devices.scene.hardware import AnySchedule, ServoScene
-from service.estimation.foot.stances import Stance, Stances
-from service.offline.accuracy import JUDGED, Accuracy, judge
+from service.offline.findings import Findings, FindingsOf
 from service.rig.description import describe
 from service.rig.emulated import EmulatedFoot
 from service.rig.peripherals import open_recovery_lines, open_reference_sensor
@@ -78,10 +77,7 @@ class Simulated:
     flags: Mapping[str, Mapping[str, int]]
     """Frames in which a tile was flagged, by serial and reason."""
     pressed: PressedTrace | None
-    stances: tuple[Stance, ...]
-    accuracy: Accuracy | None
-    assumed_scale: bool | None
-    """Whether newtons rest on an assumed scale; None without estimates."""
+    findings: Findings
     wall_s: float
     """What taking, estimating and writing the frames took, set-up and bench left out."""
 
@@ -170,11 +166,10 @@ def simulate(
         "parts_seed": options.foot.parts_seed,
         "lead_s": options.foot.lead_s,
     }
-    judged: list[Mapping[str, npt.NDArray[Any]]] = []
+    found = FindingsOf(judging=options.truth)
     frames = 0
     first_ns = last_ns = 0
     flagged: Counter[tuple[int, str]] = Counter()
-    stances = Stances()
     with ExitStack() as stack:
         simulation = Simulation(options, stack)
         pieces: Iterator[tuple[FrameBatch, Extra]] = simulation.pieces()
@@ -193,10 +188,7 @@ def simulate(
             frames += len(batch)
             flagged.update(_flags(batch))
             if stream is not None:
-                stances.feed(batch.t_ns, extra["grf_n"], extra["contact"])
-            if options.truth and estimate is not None:
-                columns = {"t_ns": batch.t_ns, **extra}
-                judged.append({name: columns[name] for name in JUDGED})
+                found.feed(batch, extra)
     seconds = (last_ns - first_ns) * 1e-9
     return Simulated(
         frames=frames,
@@ -212,9 +204,7 @@ def simulate(
             if any(i == tile for i, _ in flagged)
         },
         pressed=simulation.pressed,
-        stances=stances.finish(),
-        accuracy=judged_of(judged, stream),
-        assumed_scale=stream.plan.assumed_scale if stream and stream.plan else None,
+        findings=found.finish(stream.plan) if stream and stream.plan else Findings(),
         wall_s=time.perf_counter() - began_s,
     )
 
@@ -229,20 +219,6 @@ def _flags(batch: FrameBatch) -> dict[tuple[int, str], int]:
             if n and bit.name:
                 counts[tile, bit.name.lower()] = n
     return counts
-
-
-def judged_of(
-    pieces: list[Mapping[str, npt.NDArray[Any]]], stream: EstimateStream | None
-) -> Accuracy | None:
-    """How far off the estimates of a stream were; None if there is no truth to compare with."""
-    if not pieces or stream is None or stream.plan is None:
-        return None
-    return judge(joined(pieces), lag_ms=stream.plan.lag_ns * 1e-6)
-
-
-def joined(pieces: list[Mapping[str, npt.NDArray[Any]]]) -> dict[str, npt.NDArray[Any]]:
-    """Columns of all pieces, one after another."""
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
 def _duration_ns(options: SimulateOptions, ground_s: float | None) -> int:

@@ -23,17 +23,20 @@ from devices.errors import (
     StorageError,
     UnknownError,
 )
-from service.estimation.calibration import Calibration
 from service.link import ClockRow, StreamNumbers, Wanted
-from service.server import ends as parts
+from service.server import following
 from service.server.nodes import Node, Nodes
 from service.server.trash import Trash
 from service.server_clock import utc_ns
-from service.sessions.sealing import Sources, seal
+from service.sessions.ends import at_stop
+from service.sessions.sealing import seal
+from service.sessions.sources import Sources, sources_of
+from service.sessions.streams import SessionStream
 from storage.intervals import NO_END, Intervals, with_open_ends
 from storage.sessions.events import write_events
 from storage.sessions.folder import Event, Ledger, Session, SessionFolder, new_session_id
-from storage.sessions.ledger import ledger_of, lost_numbers
+from storage.sessions.ledger import ledger_of
+from storage.sessions.states import numbers_of, states_of
 
 log = logging.getLogger("foottile.recorder")
 
@@ -133,7 +136,7 @@ class Recorder:
                 remedy="Record when it has caught up",
             )
         calibration = node.live.calibration
-        part = parts.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
+        part = following.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
         now = datetime.now(UTC)
         session = Session(
             id=new_session_id(now),
@@ -149,7 +152,7 @@ class Recorder:
             scene_content=node.hello.scene,
             calibration=calibration.model_dump(mode="json") if calibration is not None else None,
             missed_slots_at_start=node.present.missed_slots,
-            clock=parts.clock_at_start(node, part),
+            clock=following.clock_at_start(node, part),
         )
         self._keep(session)
         return session
@@ -168,7 +171,7 @@ class Recorder:
                 f"session {session_id} was stopped already and is {session.state}",
                 expected="a session that is recording",
             )
-        self._keep(parts.stopped(session, self._nodes.find(session.node)))
+        self._keep(following.stopped(session, self._nodes.find(session.node)))
         self.settle()
         return self._sessions[session_id]
 
@@ -222,7 +225,7 @@ class Recorder:
                 expected="a session that is pending",
                 remedy="Stop it first" if session.state == "recording" else "",
             )
-        self._keep(parts.given_up(session, self._nodes.find(session.node)))
+        self._keep(following.given_up(session, self._nodes.find(session.node)))
         self._again_after.pop(session_id, None)
         self.settle()
         return self._sessions[session_id]
@@ -326,12 +329,9 @@ class Recorder:
         """The same of a session that may be in the trash."""
         if session.state == "sealed" and session.ledger is not None:
             return session.ledger
-        node = self._nodes.find(session.node)
-        about, finished = session, session.parts[-1].seq_last is not None
-        with suppress(FootTileError):  # the frames that tell are damaged
-            about = parts.provisional(session, node)
-        finished = finished and session.stopped_t_ns is not None
-        return ledger_of(about.parts, parts.states(session, node), finished=finished)
+        finished = session.stopped_t_ns is not None and session.parts[-1].seq_last is not None
+        about, streams = self._provisional(session)
+        return ledger_of(about.parts, states_of(about, streams), finished=finished)
 
     def problem_of(self, session: Session) -> str | None:
         """What a person should know of a session as it is now."""
@@ -350,30 +350,14 @@ class Recorder:
         Raises:
             UnknownError: no such session.
         """
-        session = self.get(session_id)
+        session, streams = self._provisional(self.get(session_id))
         node = self._nodes.get(session.node)
-        with suppress(FootTileError):
-            session = parts.provisional(session, node)
-        first = node.journals.get(session.parts[0].boot_id)
-        info = first.info if first is not None else node.info
-        tares, problem = parts.tares_of(session, node, info)
-        calibration = None
-        if session.calibration is None:
-            problem = "the node had no calibration"
-        elif problem is None:
-            calibration = Calibration.model_validate(session.calibration)
-        return Sources(
-            session=session,
-            info=info,
-            journals=dict(node.journals),
-            calibration=calibration,
-            problem=problem,
-            tares=tares,
-            notes={
-                "scene": session.scene_content,
-                "emulated": node.hello.emulated,
-                "lost": lost_numbers(session.parts, parts.states(session, node)),
-            },
+        return sources_of(
+            session,
+            streams,
+            tares=lambda: node.tares,
+            emulated=node.hello.emulated,
+            no_array=node.info,
         )
 
     def needed(self, node_name: str) -> dict[str, Intervals]:
@@ -384,10 +368,11 @@ class Recorder:
         node = self._nodes.find(node_name)
         if self._unreadable and node is not None:
             return {boot_id: Intervals([(0, NO_END)]) for boot_id in node.streams}
-        return parts.by_stream(
-            parts.needed(session, node)
+        return numbers_of(
+            part
             for session in (*self._sessions.values(), *self.trash.all())
             if session.node == node_name and session.state != "sealed"
+            for part in following.parts_needed(session, node)
         )
 
     def wanted(self, node_name: str) -> Wanted:
@@ -428,7 +413,7 @@ class Recorder:
         node = self._nodes.find(session.node)
         if node is None:
             return session
-        followed = parts.followed(session, node)
+        followed = following.followed(session, node)
         # Those that take it up first: if the server is killed between, none is forgotten.
         if not any(known.continues == session.id for known in self._sessions.values()):
             for further in reversed(followed[1:]):
@@ -477,14 +462,24 @@ class Recorder:
         finally:
             del self._sealing[session_id]
 
+    def _provisional(self, session: Session) -> tuple[Session, dict[str, SessionStream]]:
+        """A session with the end that it will have nearly, and its streams."""
+        streams = following.streams_of(session, self._nodes.find(session.node))
+        with suppress(FootTileError):  # the frames that tell are damaged
+            session = at_stop(session, streams)
+        return session, streams
+
     def _with_clock(self, session: Session) -> Session:
-        if session.state == "sealed":
+        node = self._nodes.find(session.node)
+        if session.state == "sealed" or node is None:
             return session
         try:
-            return parts.with_clock_logs(session, self._nodes.find(session.node))
+            for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
+                if (stream := node.streams.get(boot_id)) is not None:
+                    session = session.with_clock(stream.all_clock_rows())
         except StorageError as error:  # its frames are worth more than its clock
             log.warning("session %s: %s", session.id, error)
-            return session
+        return session
 
     def _keep(self, session: Session) -> Session:
         self.folder.save(session)

@@ -13,6 +13,7 @@ from pathlib import Path
 from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.link import ClockRow, EarlierStream, Hello, PairsByReason
+from service.sessions.streams import SessionStream, around_in
 from storage.clock.log import ClockLog
 from storage.clock.offset import ClockOffset
 from storage.intervals import NO_END, Intervals
@@ -136,22 +137,35 @@ class ServerStream:
                 lost.add(numbers - self.may_come, reason)
         return lost
 
+    def for_session(self, offset_ns: int | None) -> SessionStream:
+        """What sessions know of it.
+
+        Args:
+            offset_ns: what to add to its instants for the server's.
+        """
+        return SessionStream(
+            held=self.held,
+            lost=Losses(self.notes.lost),
+            damaged=self.journal.lost.all if self.journal is not None else Intervals(),
+            may_come=self.may_come,
+            next_seq=self.notes.next_seq,
+            unsynced_tail_max=self.notes.unsynced_tail_max,
+            missed_slots=self.missed_slots,
+            info=self.info,
+            journal=self.journal,
+            around=self.around,
+            offset_ns=offset_ns,
+            last_seen_t_ns=self.last_seen_t_ns,
+        )
+
     def around(self, t_ns: int, *, at_least: int, waiting: bool = False) -> tuple[int, int] | None:
         """Numbers held next to an instant of the node's UTC: the last until it, the first after.
 
         Asked again and again while frames between them are waited for; the journal's index is read
         only when such frames have come.
 
-        Args:
-            t_ns: the instant.
-            at_least: earlier numbers do not count; the last is `at_least` - 1 if there is none.
+        Args, result and errors: as for `around_in`; and
             waiting: look again only when all of those frames have come, or never will.
-
-        Returns:
-            Both; None while the stream has not passed the instant.
-
-        Raises:
-            DamagedFramesError: the frames that tell are damaged.
         """
         if self.journal is None:
             return None
@@ -163,10 +177,9 @@ class ServerStream:
             none_came = missing.count == after - last - 1
             if ends and (none_came or (waiting and missing & self.may_come)):
                 return found
-        newest = self.journal.last_seq_until(t_ns, at_least=at_least)
-        if newest is None:
+        found = around_in(self.journal, t_ns, at_least=at_least)
+        if found is None:
             return None
-        found = newest, next(iter(held.within(newest + 1, NO_END)))[0]
         if len(self._around) >= _AROUND_MAX:
             self._around.clear()
         self._around[t_ns, at_least] = found

@@ -18,27 +18,25 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from devices.errors import FootTileError
-from service.sessions.recover_ends import with_ends
-from service.sessions.recover_sources import (
-    Stream,
-    hello_of,
-    open_streams,
-    sources_of,
-    with_clock_logs,
-)
+from service.sessions.ends import at_stop, broken_off, open_tail
+from service.sessions.recover_streams import OpenedStream, hello_of, open_streams
 from service.sessions.sealing import seal
+from service.sessions.sources import sources_of
+from service.sessions.streams import SessionStream
+from service.sessions.tares import TareHistory
+from storage.clock.log import ClockLog
 from storage.durable import remove_stale_temporaries
 from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import settle_left_over
 from storage.journal.segment import UNREAD_SUFFIX
-from storage.losses import GIVEN_UP, NODE_RESTARTED, Losses
 from storage.sessions.events import EVENTS_NAME, write_events
 from storage.sessions.folder import Ledger, Part, Session, SessionFolder, new_session_id
-from storage.sessions.ledger import StreamState, ledger_of
+from storage.sessions.ledger import ledger_of
+from storage.sessions.states import numbers_of, states_of
 from storage.verify.session import verify_session
 
 Outcome = Literal["sealed", "waiting", "failed"]
-Streams = Mapping[tuple[str, str], Stream]
+Streams = Mapping[tuple[str, str], OpenedStream]
 
 
 @dataclass(frozen=True)
@@ -111,9 +109,9 @@ def recover(
     sessions = SessionFolder(data / "sessions")
     recovery.removed += remove_stale_temporaries(data)
     set_aside = _set_aside(data)
-    if not (data / "nodes").is_dir():
+    if _is_local(data):
         settle_left_over(data)  # a node's: what it had in flight when it was killed is there yet
-    opened, recovery.problems = open_streams(data, tell)
+    opened, recovery.problems = open_streams(data, tell, is_local=_is_local(data))
     for path in sorted(_set_aside(data) - set_aside):
         name = f"{path.parent.parent.name}/{path.parent.name}"
         recovery.cut[name] = recovery.cut.get(name, 0) + path.stat().st_size
@@ -139,30 +137,42 @@ def recover(
 
 
 def _complete(
-    data: Path, sessions: SessionFolder, session: Session, streams: Streams, *, give_up: bool
+    data: Path, sessions: SessionFolder, session: Session, opened: Streams, *, give_up: bool
 ) -> Recovered:
     """Seal one session if that can be; say why not otherwise."""
-    is_local = not (data / "nodes").is_dir()
-    session = with_clock_logs(session, streams)
-    session = with_ends(session, streams, is_local=is_local, may_guess=is_local or give_up)
+    own = {part.boot_id: opened.get((session.node, part.boot_id)) for part in session.parts}
+    for stream in own.values():
+        if stream is not None:
+            session = session.with_clock(ClockLog(stream.journal.folder).rows())
+    is_local, give_up = _is_local(data), give_up or session.given_up
+    streams = _described(session, own, is_local=is_local)
+    if is_local or give_up:
+        session = broken_off(session, streams).model_copy(update={"given_up": not is_local})
+    else:
+        session = at_stop(session, streams, waiting=True)
     if any(part.seq_last is None for part in session.parts):
         return Recovered(session, "waiting", "its node may still be recording it")
     for part in session.parts:
-        stream = streams.get((session.node, part.boot_id))
+        stream = own[part.boot_id]
         if stream is not None and part.seq_last is not None:
             stream.disown_damaged(part.seq_first, part.seq_last)
             stream.note_losses()
-    states = _states(session, streams, is_local=is_local, give_up=give_up)
-    ledger = ledger_of(session.parts, states, finished=True)
+    streams = _described(session, own, is_local=is_local)
+    ledger = ledger_of(session.parts, states_of(session, streams), finished=True)
     if pending := sum(part.pending for part in ledger.parts):
         text = f"{pending} frames may still come from node {session.node}"
         return Recovered(session, "waiting", text, ledger)
-    lost = {b: state.lost.as_pairs() for b, state in states.items() if state.lost}
     folder = sessions.path(session.id)
     try:
         session = session.model_copy(update={"state": "sealing"})
         sessions.save(session)
-        sealed = seal(sources_of(data, session, streams, lost), folder, ledger)
+        sources = sources_of(
+            session,
+            streams,
+            tares=lambda: TareHistory(data / "nodes" / session.node / "tares.json"),
+            emulated=hello_of(data, session.node).get("emulated"),
+        )
+        sealed = seal(sources, folder, ledger)
         problems = verify_session(folder, session=sealed).problems
         if problems:
             return Recovered(session, "failed", "; ".join(problems), ledger)
@@ -172,39 +182,19 @@ def _complete(
     return Recovered(sealed, "sealed", sealed.problem or "", ledger)
 
 
-def _states(
-    session: Session, streams: Streams, *, is_local: bool, give_up: bool
-) -> dict[str, StreamState]:
-    """What is known of each of a session's streams, every gap with its reason or still to come."""
-    states = {}
-    for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
-        stream = streams.get((session.node, boot_id))
-        held = stream.journal.held if stream is not None else Intervals()
-        gaps = Intervals(
-            gap
-            for part in session.parts
-            if part.boot_id == boot_id and part.seq_last is not None
-            for gap in held.missing(part.seq_first, part.seq_last)
-        )
-        lost = Losses()
-        if stream is not None:
-            for reason, numbers in stream.losses.within(gaps).items():
-                lost.add(numbers, reason)
-        if is_local or give_up:
-            lost.add(gaps, NODE_RESTARTED if is_local else GIVEN_UP)
-        missed_slots = 0
-        if stream is not None and stream.notes is not None:
-            missed_slots = stream.notes.missed_slots
-            if boot_id == session.parts[0].boot_id:
-                missed_slots = max(0, missed_slots - session.missed_slots_at_start)
-        states[boot_id] = StreamState(
-            held=held,
-            lost=lost,
-            may_come=Intervals([(0, NO_END)]),
-            unsynced_tail_max=session.unsynced_tail_max.get(boot_id, 0),
-            missed_slots=missed_slots,
-        )
-    return states
+def _is_local(data: Path) -> bool:
+    """Is it a node's own folder? Then nothing more will come."""
+    return not (data / "nodes").is_dir()
+
+
+def _described(
+    session: Session, streams: Mapping[str, OpenedStream | None], *, is_local: bool
+) -> dict[str, SessionStream]:
+    unknown = SessionStream(may_come=Intervals(() if is_local else [(0, NO_END)]))
+    return {
+        boot_id: stream.for_session(session) if stream is not None else unknown
+        for boot_id, stream in streams.items()
+    }
 
 
 def _of_no_session(
@@ -219,39 +209,31 @@ def _of_no_session(
             continue
     found = []
     for (node, boot_id), stream in streams.items():
-        taken = Intervals(
-            (part.seq_first, NO_END if part.seq_last is None else part.seq_last)
-            for session in known
-            for part in session.parts
-            if (session.node, part.boot_id) == (node, boot_id)
-            and (part.seq_last is None or part.seq_last >= part.seq_first)
-        )
+        parts = (part for session in known if session.node == node for part in session.parts)
+        taken = numbers_of(parts).get(boot_id, Intervals())
         journal, hello = stream.journal, hello_of(data, node)
         # What was lost between two frames does not part them; what a session took does.
-        own = (journal.held | stream.losses.all) - taken
+        own = (journal.held | stream.lost.all | stream.damaged) - taken
         for run in own:
             held = list(journal.held.within(*run))
             if not held:
                 continue
             first, last = held[0][0], held[-1][1]
-            is_end = last == journal.held.last
-            begin_t_ns = journal.t_ns_near(first, newest=False)
-            end_t_ns = journal.t_ns_near(last, newest=True)
-            found.append(
-                Session(
-                    id=new_session_id(now()),
-                    name=f"recovered {node} {boot_id}",
-                    node=node,
-                    state="sealing",
-                    started_t_ns=begin_t_ns or 0,
-                    stopped_t_ns=end_t_ns,
-                    parts=(Part(boot_id=boot_id, seq_first=first, seq_last=last),),
-                    scene=journal.info.scene,
-                    scene_content=hello.get("scene") or {},
-                    calibration=hello.get("calibration"),
-                    unsynced_tail_max={boot_id: t} if is_end and (t := stream.tail_max) else {},
-                )
+            session = Session(
+                id=new_session_id(now()),
+                name=f"recovered {node} {boot_id}",
+                node=node,
+                state="sealing",
+                started_t_ns=journal.t_ns_near(first, newest=False) or 0,
+                stopped_t_ns=journal.t_ns_near(last, newest=True),
+                parts=(Part(boot_id=boot_id, seq_first=first, seq_last=last),),
+                scene=journal.info.scene,
+                scene_content=hello.get("scene") or {},
+                calibration=hello.get("calibration"),
             )
+            if last == journal.held.last and (tail := open_tail(stream.for_session(session))):
+                session = session.model_copy(update={"unsynced_tail_max": {boot_id: tail}})
+            found.append(session)
     return found
 
 

@@ -1,115 +1,17 @@
-"""From journals to a sealed session: frames with estimates in one Parquet file, and its ledger.
-
-The same frames, with estimates made the same way, are what a session that is still recorded or
-pending gives away as CSV or Arrow.
-"""
+"""From journals to a sealed session: its frames in one Parquet file, and its ledger."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from devices.errors import FileFormatError, FootTileError
-from devices.frames import ArrayInfo, FrameBatch
-from service.estimation import OFFLINE_LAG_MS
-from service.estimation.calibration import Calibration
-from service.estimation.plan import EstimationPlan
-from service.estimation.tare.tare import Tare
-from service.sessions.pipeline import Columns, EstimateOptions, EstimateStream, notes_of
+from devices.errors import FileFormatError
+from service.sessions.frames import SessionFrames
+from service.sessions.sources import Sources
 from storage.clock.file import CLOCK_NAME, write_clock
-from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
-from storage.journal.journal import Journal
 from storage.sessions.content_hash import sha256_of
 from storage.sessions.events import write_events
 from storage.sessions.file import SessionWriter
 from storage.sessions.folder import FRAMES_NAME, Ledger, Session
-
-_GATHER_FRAMES = 4096
-
-
-@dataclass(frozen=True)
-class Sources:
-    """What a session is sealed from.
-
-    Attributes:
-        session: intervals, events, clock.
-        info: description of the array in its first part.
-        journals: by boot_id.
-        calibration: to estimate with; None: raw frames only.
-        problem: why there is none.
-        tares: that were in force, oldest first.
-        notes: more for the file's metadata.
-    """
-
-    session: Session
-    info: ArrayInfo
-    journals: Mapping[str, Journal]
-    calibration: Calibration | None
-    problem: str | None
-    tares: tuple[Tare, ...]
-    notes: Mapping[str, object]
-
-    @property
-    def streams(self) -> tuple[StreamFacts, ...]:
-        """What is known of the clocks of the session's streams."""
-        boot_ids = dict.fromkeys(part.boot_id for part in self.session.parts)
-        known = {boot_id: journal.info for boot_id, journal in self.journals.items()}
-        known[self.info.boot_id] = self.info
-        return tuple(
-            StreamFacts(boot_id, info.utc_offset_ns, info.clock_set)
-            if (info := known.get(boot_id)) is not None
-            else StreamFacts(boot_id)
-            for boot_id in boot_ids
-        )
-
-
-class SessionFrames:
-    """Frames of a session, with the column `part` and, where possible, estimates.
-
-    `plan` is there once the first frames are; without estimates it stays None, and `problem` says
-    why.
-    """
-
-    def __init__(self, sources: Sources) -> None:
-        self.plan: EstimationPlan | None = None
-        self.problem: str | None = None
-        self._sources = sources
-
-    def __iter__(self) -> Iterator[tuple[FrameBatch, Columns]]:
-        sources = self._sources
-        if sources.calibration is None:
-            self.problem = f"no estimates: {sources.problem}"
-            yield from self._raw()
-            return
-        options = EstimateOptions(
-            sources.calibration, sources.info.models, OFFLINE_LAG_MS, tares=sources.tares
-        )
-        try:
-            stream = EstimateStream(sources.info, options)
-            pieces = stream.run(self._raw())
-            first = next(pieces, None)
-        except FootTileError as error:  # no tare, or a calibration of other tiles
-            self.problem = f"no estimates: {error}"
-            yield from self._raw()
-            return
-        self.plan = stream.plan
-        if first is not None:
-            yield first
-            yield from pieces
-
-    def _raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
-        for number, part in enumerate(self._sources.session.parts):
-            journal = self._sources.journals.get(part.boot_id)
-            if journal is None:
-                continue
-            last = part.seq_last if part.seq_last is not None else journal.held.last
-            if last is None:
-                continue
-            for batch in _gathered(journal.read(part.seq_first, last)):
-                yield batch, {"part": np.full(len(batch), number, dtype=np.uint16)}
 
 
 def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
@@ -139,10 +41,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
     with SessionWriter(path, sources.info, notes) as writer:
         for batch, columns in frames:
             if not count:
-                if frames.plan is not None:
-                    writer.add_notes(notes_of(frames.plan, sources.tares))
-                else:
-                    writer.add_notes({"estimates": frames.problem})
+                writer.add_notes(frames.notes)
             writer.append(batch, columns)
             count += len(batch)
             part = int(columns["part"][0])
@@ -157,7 +56,6 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
         )
     write_events(session, folder)
     write_clock(folder / CLOCK_NAME, session.clock, sources.streams)
-    plan = frames.plan
     return session.model_copy(
         update={
             "state": "sealed",
@@ -167,35 +65,11 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
             "duration_s": duration_ns * 1e-9,
             "bytes": path.stat().st_size,
             "sha256": sha256_of(path),
-            "calibration_id": plan.calibration.id if plan is not None else None,
-            "absolute_scale": (
-                None if plan is None else "assumed" if plan.assumed_scale else "measured"
-            ),
+            "calibration_id": frames.notes.get("calibration_id"),
+            "absolute_scale": frames.notes.get("absolute_scale"),
         }
     )
 
 
 _IN_FILE = {"id", "name", "node", "started_t_ns", "stopped_t_ns", "parts", "scene"}
 """What the sealed file says of its session; names and notes may change later and are not in it."""
-
-
-def table_of_rows(sources: Sources) -> ClockTable:
-    """The clock table of a session that is not sealed yet."""
-    parts = [part.boot_id for part in sources.session.parts]
-    where = f"session {sources.session.id}"
-    rows = rows_by_stream(sources.session.clock, where=where)
-    return ClockTable(rows, sources.streams, parts, where=where)
-
-
-def _gathered(batches: Iterator[FrameBatch]) -> Iterator[FrameBatch]:
-    """Fewer and longer batches: estimates of ten rows cost nearly what those of thousands do."""
-    waiting: list[FrameBatch] = []
-    count = 0
-    for batch in batches:
-        waiting.append(batch)
-        count += len(batch)
-        if count >= _GATHER_FRAMES:
-            yield FrameBatch.concatenate(waiting)
-            waiting, count = [], 0
-    if waiting:
-        yield FrameBatch.concatenate(waiting)

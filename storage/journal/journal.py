@@ -2,18 +2,14 @@
 
 `<folder>/<first_seq>.arrows` begins with the schema message; each batch is appended as the bytes in
 which it came. Appending does not wait for the disk; `sync` does, and only what was synced may be
-promised to anybody. Opening a journal takes in the segments that are there and cuts off what is not
+promised. Opening a journal takes in the segments that are there and cuts off what is not
 whole. Nothing is held twice: a number that is there already is left as it is.
-
-Frames may come out of order, newest first and what was missed behind them: two segments are open,
-and each takes only what follows its last frame, so that within a file time never runs back.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -22,21 +18,19 @@ import numpy as np
 
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
-from storage.durable import make_folder, storage_errors, sync_folder
-from storage.intervals import Intervals
-from storage.journal.segment import SUFFIX, Segment, SegmentWriter, recover
+from storage.durable import make_folder, storage_errors
+from storage.intervals import NO_END, Intervals, union
+from storage.journal.open_segments import OpenSegments
+from storage.journal.segment import SUFFIX, Segment, recover
 from storage.journal.segment_bytes import payload_of, read_header
-from storage.journal.segment_index import numbers
+from storage.journal.segment_index import RECORD, numbers
 from storage.journal.stream_notes import StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.schema import array_info, wire_schema
 from storage.wire import FRAMES_MAX, EncodedBatch, decode, encode
 
-SEGMENT_NS = 60_000_000_000
-"""A segment is closed after a minute of frames: what is not needed is deleted by segments."""
 RING_NS = 600_000_000_000
 """Frames of no session are kept so long, for pre-roll and for what was not recorded in time."""
-_OPEN_MAX = 2
 _WINDOW_FRAMES = 1 << 16
 """So many frames' index is in memory when a journal of any length is read."""
 
@@ -57,13 +51,8 @@ class Journal:
         self.lost = Losses()
         """Numbers that were held, or should have been, and why they are not."""
         self._schema = wire_schema(info)
-        self._header = self._schema.serialize().to_pybytes()
         self._segments: list[Segment] = []
-        self._open: list[SegmentWriter] = []
-        self._closing: list[SegmentWriter] = []
-        self._has_new_names = False
-        self._lock = threading.Lock()
-        """Guards the lists of writers: `sync` may run in another thread."""
+        self._open = OpenSegments(folder, self._schema.serialize().to_pybytes())
         with storage_errors(folder):
             make_folder(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
@@ -137,49 +126,27 @@ class Journal:
         Raises:
             StorageError: the disk refused.
         """
-        with self._lock:
-            closing, self._closing = self._closing, []
-            writers = [writer for writer in self._open if writer.has_news]
-            has_new_names, self._has_new_names = self._has_new_names, False
-        failed: OSError | None = None
-        for writer in closing:
-            try:
-                writer.close()
-            except OSError as error:
-                failed = error
-        with storage_errors(self.folder):
-            for writer in writers:
-                # A segment that is closed meanwhile was synced by whoever closed it.
-                with suppress(ValueError):
-                    writer.sync()
-            if has_new_names:
-                sync_folder(self.folder)
-            if failed is not None:
-                raise failed
+        self._open.sync()
 
     def disown(self, doubtful: Intervals) -> None:
         """Hold batches within `doubtful` no longer: they could not be synced, or are damaged.
 
-        A segment that was closed forgets them for ever, so that a copy that comes later is the one
+        A segment that was closed forgets them for good, so that a copy that comes later is the one
         that counts after a restart.
         """
-        written = {writer.segment.path for writer in (*self._open, *self._closing)}
+        written = self._open.paths
         for segment in self._segments:
-            if not any(segment.held.within(*interval) for interval in doubtful):
+            if not segment.held & doubtful:
                 continue
-            for record in segment.records():
-                if not (Intervals([numbers(record)]) - doubtful):
-                    segment.held = segment.held - Intervals([numbers(record)])
+            segment.disown(doubtful)
             if segment.path in written:
                 segment.is_doubtful = True
             else:
                 with suppress(StorageError, OSError):
                     segment.rewrite_index()
         self._segments = [segment for segment in self._segments if segment.held]
-        self._count_anew()
-        with self._lock:
-            self._closing += self._open
-            self._open = []
+        self._recount()
+        self._open.retire_all()
 
     def read(self, seq_first: int, seq_last: int) -> Iterator[FrameBatch]:
         """Frames from `seq_first` to `seq_last` that are held, in order, a batch at a time.
@@ -231,7 +198,7 @@ class Journal:
                 young.append(segment.span[0])
             elif segment.t_ns_last >= t_ns:
                 records = segment.records()
-                young.append(int(records["seq_first"][records["t_ns_last"] >= t_ns].min()))
+                young += records["seq_first"][records["t_ns_last"] >= t_ns].tolist()
         return min(young, default=None)
 
     def t_ns_near(self, seq: int, *, newest: bool) -> int | None:
@@ -239,27 +206,18 @@ class Journal:
 
         By whole batches; None if there is no such frame.
         """
-        found: list[tuple[int, int]] = []
-        reach = [segment.span for segment in self._segments]
-        # Of segments that lie beside `seq` altogether only the nearest one counts.
-        nearest = (
-            max((last for _, last in reach if last <= seq), default=None)
-            if newest
-            else min((first for first, _ in reach if first >= seq), default=None)
-        )
-        for segment, (first, last) in zip(self._segments, reach, strict=True):
-            if not first <= seq <= last and nearest not in (first, last):
-                continue
-            records = segment.records()
-            if newest:
-                records = records[records["seq_first"] <= seq][-1:]
-            else:
-                records = records[records["seq_first"] + records["count"] > seq][:1]
-            name = "t_ns_last" if newest else "t_ns_first"
-            found += [(int(r["seq_first"]), int(r[name])) for r in records]
-        if not found:
+        if newest:
+            near = self.held.within(0, seq).last
+        else:
+            near = next(iter(self.held.within(seq, NO_END)), (None,))[0]
+        if near is None:
             return None
-        return max(found)[1] if newest else min(found)[1]
+        for segment in self._segments:
+            if segment.held.within(near, near):
+                records = segment.records()
+                record = records[np.searchsorted(records["seq_first"], near, side="right") - 1]
+                return int(record["t_ns_last" if newest else "t_ns_first"])
+        return None
 
     def last_seq_until(self, t_ns: int, *, at_least: int) -> int | None:
         """The last number taken at `t_ns` or before, if frames after `t_ns` are held too.
@@ -270,25 +228,24 @@ class Journal:
         segments = [segment for segment in self._segments if segment.span[1] >= at_least]
         if all(segment.t_ns_last <= t_ns for segment in segments):
             return None
-        newest: tuple[int, int] | None = None
-        passed = any(segment.t_ns_first > t_ns for segment in segments)
         # Of segments that were taken before `t_ns` altogether only the last one counts.
         before = max((s.span[1] for s in segments if s.t_ns_last <= t_ns), default=None)
-        for segment in segments:
-            if segment.t_ns_first > t_ns:
-                continue
-            if segment.t_ns_last <= t_ns and segment.span[1] != before:
-                continue
-            records = segment.records()
-            records = records[records["seq_first"] + records["count"] > at_least]
-            passed = passed or bool((records["t_ns_last"] > t_ns).any())
-            early = records[records["t_ns_first"] <= t_ns]
-            if len(early) and (newest is None or numbers(early[-1]) > newest):
-                newest = numbers(early[-1])
-        if not passed:
+        records = np.concatenate(
+            [np.zeros(0, RECORD)]
+            + [
+                segment.records()
+                for segment in segments
+                if segment.span[1] == before or segment.t_ns_first <= t_ns < segment.t_ns_last
+            ]
+        )
+        records = records[records["seq_first"] + records["count"] > at_least]
+        is_later_known = any(segment.t_ns_first > t_ns for segment in segments)
+        if not is_later_known and not (records["t_ns_last"] > t_ns).any():
             return None
-        if newest is None:
+        early = records[records["t_ns_first"] <= t_ns]
+        if not len(early):
             return at_least - 1
+        newest = numbers(early[early["seq_first"].argmax()])
         rows = sum(
             int(np.searchsorted(batch.t_ns, t_ns, side="right")) for batch in self.read(*newest)
         )
@@ -300,21 +257,19 @@ class Journal:
         Raises:
             StorageError: a file cannot be deleted.
         """
-        writers = (*self._open, *self._closing)
-        written = {writer.segment.path for writer in writers}
+        written = self._open.paths
         gone = Intervals()
         for segment in list(self._segments):
             if segment.path in written or segment.t_ns_last >= before_t_ns:
                 continue
-            if any(keep.within(*interval) for interval in segment.held):
+            if segment.held & keep:
                 continue
             with storage_errors(segment.path):
                 segment.delete()
             self._segments.remove(segment)
-            for interval in segment.held:
-                gone.add(*interval)
+            gone = gone | segment.held
         if gone:
-            self._count_anew()
+            self._recount()
         return gone
 
     def evict(self, keep: Intervals) -> Intervals:
@@ -323,8 +278,7 @@ class Journal:
         Raises:
             StorageError: it cannot be deleted.
         """
-        ends = sorted(segment.t_ns_last for segment in self._segments)
-        for t_ns in ends:
+        for t_ns in sorted(segment.t_ns_last for segment in self._segments):
             if gone := self.prune(t_ns + 1, keep):
                 return gone
         return Intervals()
@@ -343,74 +297,26 @@ class Journal:
         Raises:
             StorageError: the disk refused.
         """
-        with self._lock:
-            self._closing += self._open
-            self._open = []
+        self._open.retire_all()
         self.sync()
 
     def _take_in(self, segment: Segment) -> None:
         """Take in a segment that was there; what was disowned once may be in two of them."""
-        twice = segment.held & self.held
-        if twice:
-            for record in segment.records():
-                if not (Intervals([numbers(record)]) - self.held):
-                    segment.held = segment.held - Intervals([numbers(record)])
+        if segment.held & self.held:
+            segment.disown(self.held)
         if segment.held:
             self._segments.append(segment)
-            for interval in segment.held:
-                self.held.add(*interval)
+            self.held = self.held | segment.held
 
-    def _count_anew(self) -> None:
-        self.held = Intervals(pair for segment in self._segments for pair in segment.held)
+    def _recount(self) -> None:
+        self.held = union(segment.held for segment in self._segments)
 
     def _write(self, message: EncodedBatch) -> None:
-        first, last = message.seq_first, message.seq_last
-        writer = self._writer_for(first, message.t_ns_first)
-        try:
-            with storage_errors(writer.segment.path):
-                writer.append(message)
-        except StorageError:
-            # Whatever stands at the end of the file now: the next batch begins another one.
-            self._retire(writer)
-            raise
-        if len(list(writer.segment.held)) == 1 and writer.segment.span == (first, last):
-            self._segments.append(writer.segment)
-        self.held.add(first, last)
+        segment = self._open.append(message).segment
+        if segment.held == message.numbers:  # its first batch
+            self._segments.append(segment)
+        self.held.add(message.seq_first, message.seq_last)
         self.lost.found(message.numbers)
-
-    def _writer_for(self, seq_first: int, t_ns: int) -> SegmentWriter:
-        """An open segment that these frames may follow in: the one that ends nearest before."""
-        fitting = [w for w in self._open if w.segment.span[1] < seq_first]
-        if fitting:
-            writer = max(fitting, key=lambda w: w.segment.span[1])
-            if t_ns - writer.segment.t_ns_first < SEGMENT_NS:
-                return writer
-            self._retire(writer)
-        if len(self._open) >= _OPEN_MAX:
-            self._retire(self._open[0])
-        # After a failed write the name may be taken.
-        path = self.folder / f"{seq_first:020d}{SUFFIX}"
-        taken = 1
-        while path.exists():
-            path = self.folder / f"{seq_first:020d}-{taken}{SUFFIX}"
-            taken += 1
-        with storage_errors(path):
-            writer = SegmentWriter(path, self._header)
-        with self._lock:
-            self._open.append(writer)
-            self._has_new_names = True
-        return writer
-
-    def _retire(self, writer: SegmentWriter) -> None:
-        """Take nothing more into this segment; the next sync closes it."""
-        with self._lock:
-            self._open.remove(writer)
-            if writer.segment.held:
-                self._closing.append(writer)
-                return
-        writer.abandon()
-        with suppress(OSError):
-            writer.segment.delete()
 
     def _messages_of(
         self, found: list[tuple[tuple[int, int], Path, np.void]]

@@ -13,11 +13,11 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from itertools import chain, takewhile
+from itertools import takewhile
 from pathlib import Path
 
 from devices.errors import StorageError
-from storage.intervals import Intervals
+from storage.intervals import Intervals, union
 from storage.journal.in_flight import delete_in_flight, read_in_flight
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import PROMISE_S, StreamNotes
@@ -98,10 +98,8 @@ class NodeStream:
     def held(self) -> Intervals:
         """Numbers that can be given away: on disk, or waiting for it."""
         with self._lock:
-            numbers = self.stored
-            for batch in self._waiting.batches:
-                numbers.add(batch.seq_first, batch.seq_last)
-        return numbers
+            waiting = Intervals((b.seq_first, b.seq_last) for b in self._waiting.batches)
+            return self.stored | waiting
 
     @property
     def stored(self) -> Intervals:
@@ -368,7 +366,7 @@ class NodeStream:
         return True
 
     def _acked(self) -> Intervals:
-        return Intervals(chain(*self._acked_by.values()))
+        return union(self._acked_by.values())
 
 
 class _Queue:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import FileFormatError
 from storage.durable import write_whole
-from storage.intervals import NO_END, Intervals, OpenPairs, closed
+from storage.intervals import NO_END, Intervals, OpenPairs, closed, union
 
 
 class ServerWants(BaseModel):
@@ -71,24 +71,16 @@ class Wanted:
             ) from error
 
     def numbers(self, boot_id: str) -> Intervals:
-        """What anybody needs of a stream."""
-        wanted = Intervals(self._local.get(boot_id, ()))
-        for server in list(self._servers.values()):
-            for interval in server.numbers(boot_id):
-                wanted.add(*interval)
-        return wanted
+        """What servers and the node's own session need of a stream."""
+        servers = list(self._servers.values())
+        return self.local(boot_id) | union(server.numbers(boot_id) for server in servers)
 
     def unmet(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
-        """What somebody needs and has not got: each server by its own acknowledgements.
+        """What is needed and not delivered: of each server by its own acknowledgements.
 
-        What the node's own session needs is here only, whoever has it besides.
+        What the node's own session needs is needed here even if a server has it as well.
         """
-        unmet = Intervals(self._local.get(boot_id, ()))
-        for server_id, server in list(self._servers.items()):
-            has = acked_by.get(server_id, Intervals())
-            for interval in server.numbers(boot_id) - has:
-                unmet.add(*interval)
-        return unmet
+        return self.local(boot_id) | self.undelivered(boot_id, acked_by)
 
     def local(self, boot_id: str) -> Intervals:
         """What the node's own session needs of a stream."""
@@ -96,10 +88,9 @@ class Wanted:
 
     def undelivered(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
         """What servers need and have not got."""
-        return Intervals(
-            interval
+        return union(
+            server.numbers(boot_id) - acked_by.get(server_id, Intervals())
             for server_id, server in list(self._servers.items())
-            for interval in server.numbers(boot_id) - acked_by.get(server_id, Intervals())
         )
 
     def say(self, server_id: str, wants: ServerWants) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -111,6 +111,13 @@ class Session(_Record):
     sha256: str | None = None
     calibration_id: str | None = None
     absolute_scale: Literal["measured", "assumed"] | None = None
+
+    def with_clock(self, rows: Iterable[ClockOffset]) -> Session:
+        """The session with those measurements of one of its streams that it has not yet."""
+        known = sorted(self.clock, key=lambda row: row.t_mono_ns)
+        newest = {row.boot_id: row.t_mono_ns for row in known}
+        further = [row for row in rows if row.t_mono_ns > newest.get(row.boot_id, -1)]
+        return self.model_copy(update={"clock": (*self.clock, *further)})
 
 
 def new_session_id(now: datetime) -> str:

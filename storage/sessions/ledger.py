@@ -6,30 +6,11 @@ Pure: it is made from intervals, wherever they come from: a running server, or f
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 from storage.intervals import Intervals
 from storage.losses import NODE_RESTARTED, Losses
 from storage.sessions.folder import Ledger, Part, PartLedger
-
-
-@dataclass(frozen=True)
-class StreamState:
-    """What is known of one stream where its frames are wanted.
-
-    Attributes:
-        held: numbers that are here, or in the sealed file.
-        lost: numbers that are known not to come, by reason. What is held is not lost.
-        may_come: numbers that the node may still have; until it says so nothing is given up.
-        unsynced_tail_max: how many more frames there may have been behind the last one.
-        missed_slots: slots without a frame, over the session.
-    """
-
-    held: Intervals = field(default_factory=Intervals)
-    lost: Losses = field(default_factory=Losses)
-    may_come: Intervals = field(default_factory=Intervals)
-    unsynced_tail_max: int = 0
-    missed_slots: int = 0
+from storage.sessions.states import StreamState
 
 
 def ledger_of(
@@ -48,18 +29,8 @@ def ledger_of(
     counted = []
     for part in parts:
         stream = streams.get(part.boot_id, StreamState())
-        last = part.seq_last
-        if last is None:
-            newest = stream.held.last
-            last = max(part.seq_first - 1, -1 if newest is None else newest)
-        gaps = Intervals()
-        if last >= part.seq_first:
-            gaps = stream.held.missing(part.seq_first, last)
-        lost = {reason: lost.count for reason, lost in stream.lost.within(gaps).items()}
-        unknown = gaps - stream.lost.all
-        never = unknown - stream.may_come
-        if never:
-            lost[NODE_RESTARTED] = lost.get(NODE_RESTARTED, 0) + never.count
+        last = _last_of(part, stream)
+        gaps, lost = _gaps_and_losses(part, stream)
         length = max(0, last - part.seq_first + 1)
         counted.append(
             PartLedger(
@@ -67,8 +38,8 @@ def ledger_of(
                 seq_first=part.seq_first,
                 seq_last=last,
                 recorded=length - gaps.count,
-                lost=dict(sorted(lost.items())),
-                pending=gaps.count - sum(lost.values()),
+                lost={reason: numbers.count for reason, numbers in sorted(lost.by_reason.items())},
+                pending=(gaps - lost.all).count,
                 unsynced_tail_max=stream.unsynced_tail_max,
             )
         )
@@ -88,16 +59,30 @@ def lost_numbers(
     """Which numbers the ledger counts as lost, by boot_id and reason; for the sealed file."""
     found: dict[str, Losses] = {}
     for part in parts:
-        stream = streams.get(part.boot_id, StreamState())
-        if part.seq_last is None or part.seq_last < part.seq_first:
-            continue
-        gaps = stream.held.missing(part.seq_first, part.seq_last)
+        _, lost = _gaps_and_losses(part, streams.get(part.boot_id, StreamState()))
         losses = found.setdefault(part.boot_id, Losses())
-        for reason, numbers in stream.lost.within(gaps).items():
+        for reason, numbers in lost.by_reason.items():
             losses.add(numbers, reason)
-        losses.add(gaps - stream.lost.all - stream.may_come, NODE_RESTARTED)
     return {
         boot_id: {reason: list(pairs) for reason, pairs in losses.as_pairs().items()}
         for boot_id, losses in found.items()
         if losses
     }
+
+
+def _last_of(part: Part, stream: StreamState) -> int:
+    if part.seq_last is not None:
+        return part.seq_last
+    newest = stream.held.last
+    return max(part.seq_first - 1, -1 if newest is None else newest)
+
+
+def _gaps_and_losses(part: Part, stream: StreamState) -> tuple[Intervals, Losses]:
+    """Numbers of a part that are not held, and those of them that never will be, by reason."""
+    last = _last_of(part, stream)
+    gaps = Intervals()
+    if last >= part.seq_first:
+        gaps = stream.held.missing(part.seq_first, last)
+    lost = Losses(stream.lost.within(gaps))
+    lost.add(gaps - stream.may_come - stream.lost.all, NODE_RESTARTED)
+    return gaps, lost

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import FileFormatError
-from storage.intervals import Intervals
+from storage.intervals import Intervals, union
 from storage.losses import AsPairs, Losses
 from storage.sessions.content_hash import ContentDigest, file_hashes
 from storage.sessions.file import FORMAT_WITHOUT_HASH, SessionReader
@@ -190,7 +190,7 @@ def _read_through(reader: SessionReader, report: FileReport, *, has_file_hash: b
                 "that nothing in it was edited: an older foottile wrote it, without hashes"
             )
         else:
-            report.problems.append("it has no hashes: another program has written it anew")
+            report.problems.append("it has no hashes: another program has rewritten it")
     _check_offset(report, reader.info.utc_offset_ns)
 
 
@@ -237,7 +237,7 @@ def _check_ledger(report: FileReport) -> None:
     """Hold the frames against the ledger in the notes, or make one from the frames."""
     said = report.notes.get("ledger")
     if said is None:
-        gaps = Intervals(pair for part in report.parts for pair in part.gaps)
+        gaps = union(part.gaps for part in report.parts)
         if gaps:
             report.problems.append(
                 f"frames {_named(gaps)} are missing, and nothing says why: it has no ledger"

@@ -15,6 +15,7 @@ from storage.journal.segment_index import INDEX_SUFFIX, RECORD
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.sessions.claims import bytes_of
+from storage.sessions.states import StreamState
 from storage.verify.segment import SegmentReport, verify_segment
 
 
@@ -46,11 +47,29 @@ class StreamReport:
     problems: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
+    def state(self, may_come: Intervals) -> StreamState:
+        """The stream as sessions know it.
+
+        Args:
+            may_come: what its node may still give, if it is not known to be lost.
+        """
+        notes = self.notes
+        told = Losses(notes.lost if notes is not None else None)
+        return StreamState(
+            held=self.held,
+            lost=told,
+            damaged=self.lost.all - told.all,
+            may_come=may_come - told.all,
+            next_seq=notes.next_seq if notes is not None else None,
+            unsynced_tail_max=notes.unsynced_tail_max if notes is not None else 0,
+            missed_slots=notes.missed_slots if notes is not None else 0,
+        )
+
     @property
     def missing(self) -> Intervals:
         """Numbers up to the stream's end that are neither here nor known to be lost.
 
-        They were deleted when nobody needed them any more, or are still to come.
+        They were deleted when no session needed them any more, or are still to come.
         """
         last = self.held.last
         if self.notes is not None and self.notes.next_seq is not None:
@@ -95,10 +114,8 @@ def verify_stream(folder: Path) -> StreamReport:
             if segment.info != report.info:
                 report.problems.append(f"{name}: it is of another stream or array")
                 continue
-        for pair in segment.held:
-            report.held.add(*pair)
-        for pair in segment.unsynced:
-            report.unsynced.add(*pair)
+        report.held = report.held | segment.held
+        report.unsynced = report.unsynced | segment.unsynced
     report.unsynced = report.unsynced - report.held
     for segment in segments:
         report.lost.add(segment.damaged - report.held, CORRUPT)
@@ -148,7 +165,7 @@ def _segments(folder: Path) -> list[SegmentReport]:
 
 
 def _if_there(path: Path) -> SegmentReport | None:
-    """The segment's report; None if it was deleted meanwhile, as those are that nobody needs."""
+    """The segment's report; None if it was deleted meanwhile because no session needs it."""
     try:
         report = verify_segment(path)
     except FileFormatError:

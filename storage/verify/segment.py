@@ -2,7 +2,7 @@
 
 It may be written meanwhile, or have been until the power failed: behind the last batch of a segment
 that was not closed there may be half a batch, and its index may name some that never came to the
-disk. Nobody was promised those. Everything else has to agree with its checksum.
+disk. Those were never promised. Everything else has to agree with its checksum.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class SegmentReport:
         held: numbers of frames whose bytes agree with their checksum.
         damaged: numbers of frames whose bytes do not.
         unsynced: numbers that the index names at the end of a segment that was not closed, and that
-            are not on the disk: nobody was promised them.
+            are not on the disk: they were never promised.
         is_closed: was it closed in order?
         info: the array it is of; None if that cannot be read.
         index: records of the batches that are held.
@@ -77,7 +77,7 @@ def verify_segment(path: Path) -> SegmentReport:
 
 def _verify(path: Path, report: SegmentReport) -> None:
     try:
-        # In this order, for whoever writes appends to the segment first: what was there before the
+        # In this order, for a writer appends to the segment first: what was there before the
         # index was read, and is not in the index, is one batch at most.
         size = path.stat().st_size
         index: Records | None = read_index(path)
@@ -96,7 +96,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
         if size > header_bytes:
             report.problems.append(
                 f"its index {path.with_suffix(INDEX_SUFFIX).name} is missing: nothing proves its "
-                "frames; it is made anew when the journal is next opened"
+                "frames; it is rebuilt when the journal is next opened"
             )
         return
     _check_batches(report, index, schema, header_bytes)
@@ -118,26 +118,27 @@ def _verify(path: Path, report: SegmentReport) -> None:
 def _check_batches(
     report: SegmentReport, index: Records, schema: pa.Schema, header_bytes: int
 ) -> None:
-    doubtful: list[tuple[Intervals, str]] = []
+    doubtful, said = Intervals(), list[str]()
     good = []
     end, offset_ns = header_bytes, array_info(schema, where="").utc_offset_ns
     descriptor = os.open(report.path, os.O_RDONLY)
     try:
         for at, record in enumerate(index):
             if not is_whole(record):
-                doubtful.append((Intervals(), f"record {at} of its index is damaged"))
+                said.append(f"record {at} of its index is damaged")
                 continue
             if not record["count"]:
                 continue
             first, last = numbers(record)
             payload = payload_of(descriptor, record)
             if payload is None:
-                said = f"frames {first} to {last} do not agree with their checksum"
-                doubtful.append((Intervals([(first, last)]), said))
+                said.append(f"frames {first} to {last} do not agree with their checksum")
+                doubtful.add(first, last)
                 continue
             # What is damaged before something whole was whole once.
-            _take_for_damaged(report, doubtful)
-            doubtful = []
+            report.damaged, doubtful = report.damaged | doubtful, Intervals()
+            report.problems += said
+            said = []
             wrong = _wrong_in(payload, record, schema, offset_ns)
             if int(record["offset"]) < end:
                 wrong = "they stand where other frames stand as well"
@@ -153,19 +154,13 @@ def _check_batches(
         os.close(descriptor)
     report.index = index[good]
     if report.is_closed:
-        _take_for_damaged(report, doubtful)
-    elif doubtful:
-        report.unsynced = Intervals(pair for numbers_, _ in doubtful for pair in numbers_)
+        report.damaged = report.damaged | doubtful
+        report.problems += said
+    elif said:
+        report.unsynced = doubtful
         report.remarks.append(
-            f"{len(doubtful)} batches at its end were not yet on the disk: nobody was promised them"
+            f"{len(said)} batches at its end were not yet on the disk: they were never promised"
         )
-
-
-def _take_for_damaged(report: SegmentReport, doubtful: list[tuple[Intervals, str]]) -> None:
-    report.damaged = Intervals(
-        (*report.damaged, *(pair for these, _ in doubtful for pair in these))
-    )
-    report.problems += [said for _, said in doubtful]
 
 
 def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, offset_ns: int) -> str:
@@ -191,7 +186,7 @@ def _holds_any(path: Path, index: Records) -> bool:
 
 
 def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int]:
-    """Schema at a segment's beginning, and how many bytes it takes."""
+    """Schema that a segment should begin with, and how many bytes it takes; None: it has none."""
     schema, length = read_header(path)
     if schema is None:
         return None, 0
@@ -199,6 +194,7 @@ def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int
         report.info = array_info(schema, where=str(path))
     except FileFormatError:
         return None, 0
-    if not schema.equals(wire_schema(report.info), check_metadata=True):
+    expected = wire_schema(report.info)
+    if not schema.equals(expected, check_metadata=True):
         report.problems.append("its columns are not those of a stream of frames")
-    return schema, length
+    return expected, length

@@ -18,12 +18,12 @@ from pydantic import TypeAdapter, ValidationError
 from devices.errors import FileFormatError
 from storage.clock.file import CLOCK_NAME
 from storage.intervals import NO_END, Intervals
-from storage.losses import Losses
 from storage.sessions.claims import SESSION_NAME, Claims, bytes_of, claims_in, claims_of, first_line
 from storage.sessions.content_hash import file_hashes, sha256_of
 from storage.sessions.events import EVENTS_NAME
 from storage.sessions.folder import FRAMES_NAME, Event, Ledger, Session
-from storage.sessions.ledger import StreamState, ledger_of
+from storage.sessions.ledger import ledger_of
+from storage.sessions.states import states_of
 from storage.verify.file import FileReport, ledger_problems, verify_file
 from storage.verify.journal import StreamReport, verify_stream
 
@@ -266,30 +266,15 @@ def _count(report: SessionReport, data: Path, session: Session, streams: Streams
     if not (data / "journal").is_dir():
         report.unproven.append("what of it is there: its journals are not here")
         return
-    states: dict[str, StreamState] = {}
-    may_come = (data / "nodes").is_dir()  # a server's folder; a node has what there is
+    reports: dict[str, StreamReport] = {}
     for part in session.parts:
         folder = data / "journal" / session.node / part.boot_id
-        found = StreamReport(session.node, part.boot_id)
-        if part.boot_id not in states and folder.is_dir():
-            found = streams(folder)
+        if part.boot_id not in reports and folder.is_dir():
+            reports[part.boot_id] = found = streams(folder)
             report.problems += [f"journal {part.boot_id}: {problem}" for problem in found.problems]
-        tail, missed_slots = session.unsynced_tail_max.get(part.boot_id, 0), 0
-        if found.notes is not None:
-            tail = max(tail, found.notes.unsynced_tail_max)
-            missed_slots = found.notes.missed_slots
-        if part.boot_id == session.parts[0].boot_id:
-            missed_slots = max(0, missed_slots - session.missed_slots_at_start)
-        states.setdefault(
-            part.boot_id,
-            StreamState(
-                held=found.held,
-                lost=Losses(found.lost.as_pairs()),
-                may_come=Intervals([(0, NO_END)]) if may_come else Intervals(),
-                unsynced_tail_max=tail,
-                missed_slots=missed_slots,
-            ),
-        )
-    finished = session.stopped_t_ns is not None
-    report.ledger = ledger_of(session.parts, states, finished=finished)
-    report.ledger = report.ledger.model_copy(update={"complete": False})
+        reports.setdefault(part.boot_id, StreamReport(session.node, part.boot_id))
+    # Of a server's folder a node may still bring frames; a node has what there is.
+    may_come = Intervals([(0, NO_END)] if (data / "nodes").is_dir() else ())
+    states = states_of(session, {b: found.state(may_come) for b, found in reports.items()})
+    ledger = ledger_of(session.parts, states, finished=session.stopped_t_ns is not None)
+    report.ledger = ledger.model_copy(update={"complete": False})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +19,9 @@ from devices.frames import (
     ArrayInfo,
     FrameBatch,
     FrameStatus,
-    ServoInfo,
-    TileInfo,
     TileStatus,
 )
+from tests.builders.arrays import NEWTON_CHIP, UTC_NS, make_array, make_servo
 
 # docs/formats.md, table of the columns
 DESIGN = {
@@ -150,59 +148,30 @@ def test_no_batch_at_all_does_not_join() -> None:
         FrameBatch.concatenate([])
 
 
-def facts() -> dict[str, Any]:
-    tile = TileInfo(
-        serial="T01",
-        mux=0x70,
-        channel=3,
-        coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-        x_m=0.021,
-        y_m=0.0,
-        z_m=-0.15,
-        reference=False,
-        conversion_ms=1.6,
-    )
-    servo = ServoInfo(
-        model="MX-28",
-        counts_per_turn=4096,
-        zero_counts=2048,
-        sign=-1,
-        ratio=0.1,
-        ankle_travel_m_per_rad=None,
-    )
-    return {
-        "node": "pi",
-        "boot_id": "00ff",
-        "tiles": (tile, tile.model_copy(update={"serial": "T02"})),
-        "servo": servo,
-        "schedule": "simultaneous",
-        "nominal_rate_hz": 394.87,
-        "utc_offset_ns": 1_577_836_800_000_000_000,
-        "clock_set": True,
-        "software": "foottile 0",
-        "scene": "standing",
-        "models": ("static",),
-    }
+def described() -> ArrayInfo:
+    """An array with a servo, nothing in it a default."""
+    servo = make_servo(sign=-1, ratio=0.1, ankle_travel_m_per_rad=None)
+    return make_array(servo=servo, nominal_rate_hz=394.87, boot_id="00ff")
 
 
 def test_array_info_travels_as_json_without_loss() -> None:
-    info = ArrayInfo(**facts())
+    info = described()
     assert ArrayInfo.model_validate_json(info.model_dump_json()) == info
     plain = json.loads(info.model_dump_json())
-    assert plain["utc_offset_ns"] == 1_577_836_800_000_000_000
-    assert plain["tiles"][0]["coefficient_words"] == [0x3ECE, 0xB3F9, 0xC517, 0x33C8]
+    assert plain["utc_offset_ns"] == UTC_NS
+    assert plain["tiles"][0]["coefficient_words"] == list(NEWTON_CHIP)
     assert plain["servo"]["ankle_travel_m_per_rad"] is None
 
 
 def test_serials_come_in_the_order_of_the_tiles() -> None:
-    assert ArrayInfo(**facts()).serials == ("T01", "T02")
+    assert make_array(2).serials == ("T01", "T02")
 
 
 def test_array_info_of_a_newer_version_is_refused_rather_than_half_read() -> None:
     with pytest.raises(ValidationError, match="phase_of_the_moon"):
-        ArrayInfo(**(facts() | {"phase_of_the_moon": 1}))
+        make_array(phase_of_the_moon=1)
 
 
 def test_array_info_cannot_be_changed() -> None:
     with pytest.raises(ValidationError, match="frozen"):
-        ArrayInfo(**facts()).node = "other"
+        make_array().node = "other"

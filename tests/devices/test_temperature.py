@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import FRAME_COLUMNS, NOT_READ, FrameBatch, TileStatus
+from devices.frames import NOT_READ, FrameBatch, TileStatus
 from devices.temperature import HeldTemperature, hold_temperature
+from tests.builders.frames import make_frames
 
 MS = 1_000_000
 
@@ -17,16 +18,8 @@ def frames(
     tadc: list[list[int]], t_ms: list[int] | None = None, status: list[list[int]] | None = None
 ) -> FrameBatch:
     n, tiles = len(tadc), len(tadc[0])
-    columns = {
-        name: np.zeros((n, tiles) if per_tile else n, dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-    }
-    columns["tadc"][:] = tadc
-    columns["padc"][:] = 400
-    columns["t_mono_ns"][:] = np.array(t_ms if t_ms is not None else range(n)) * MS
-    if status is not None:
-        columns["status"][:] = status
-    return FrameBatch(**columns)
+    t_mono_ns = np.array(t_ms if t_ms is not None else range(n)) * MS
+    return make_frames(n, tiles, tadc=tadc, t_mono_ns=t_mono_ns, status=status or 0)
 
 
 def held(batch: FrameBatch, before: HeldTemperature | None = None) -> list[list[int]]:
@@ -59,7 +52,7 @@ def test_the_last_of_temperatures_that_were_all_read_is_held_and_is_no_part_of_t
     last = hold_temperature(batch)[1]
     assert last.tadc.tolist() == [510, 601]
     assert last.t_mono_ns.tolist() == [9 * MS, 9 * MS]
-    assert (last.tadc.dtype, last.t_mono_ns.dtype) == (np.uint16, np.int64)
+    assert (last.tadc.dtype.name, last.t_mono_ns.dtype.name) == ("uint16", "int64")
     assert not np.shares_memory(last.tadc, batch.tadc)
     assert held(frames([[N, N]], [10]), last) == [[510, 601]]
 

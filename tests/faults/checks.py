@@ -138,7 +138,8 @@ def _rows_by_part(facts: Facts, table: pa.Table | None) -> list[Columns]:
     for name in ("padc", "tadc", "sample_offset_us", "status"):
         each = [table.column(f"{name}_{i}") for i in range(tiles)]
         if name in ("padc", "tadc"):
-            each = [column.fill_null(_NOT_READ_COUNTS) for column in each]
+            not_read = pa.scalar(_NOT_READ_COUNTS, pa.uint16())
+            each = [column.fill_null(not_read) for column in each]
         columns[name] = np.stack([column.to_numpy() for column in each], axis=1)
     return [
         {name: values[columns["part"] == number] for name, values in columns.items()}

@@ -82,7 +82,7 @@ def journal_of(root: Path, boot_id: str = "*") -> dict[str, Columns]:
     for path in sorted((root / "journal" / NODE).glob(f"{boot_id}/*.arrows")):
         pieces = found.setdefault(path.parent.name, [])
         try:
-            with pa.OSFile(str(path)) as file, pa.ipc.open_stream(file) as stream:
+            with pa.OSFile(str(path), "rb") as file, pa.ipc.open_stream(file) as stream:
                 for batch in stream:
                     pieces.append(columns_of(batch))
         except (pa.ArrowException, EOFError, OSError):

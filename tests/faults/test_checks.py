@@ -14,12 +14,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from devices.frames import FrameBatch
 from storage.schema import wire_schema
 from storage.wire import encode
+from tests.builders.arrays import make_array
+from tests.builders.frames import make_frames
 from tests.faults.checks import findings, sessions_are_whole
 from tests.faults.draws import Remains, Tree
 from tests.faults.facts import End, Facts
-from tests.faults.frames_by_hand import batch, info_of
 from tests.faults.link_witness import Ack, Sent, Witness
 from tests.faults.product import Product
 from tests.faults.stories import Story
@@ -61,13 +63,29 @@ def seal(facts: Facts, content: bytes) -> None:
         pq.write_table(pa.table({"t_ns": pa.array([], pa.int64())}), folder / name)
 
 
+def batch(first: int, count: int) -> FrameBatch:
+    """At a hundred frames a second, with the number in everything that is read."""
+    seq = np.arange(first, first + count)
+    counts = seq[:, None] % 1000
+    return make_frames(
+        seq,
+        1,
+        period_ns=10_000_000,
+        utc_offset_ns=0,
+        padc=counts,
+        tadc=counts,
+        sample_offset_us=counts,
+        status=counts % 256,
+    )
+
+
 @pytest.fixture
 def facts(tmp_path: Path) -> Facts:
     """A node that was killed after 200 frames and took 200 more in another stream, all of them
     acknowledged; the session begins with frame 50."""
     witness = Witness()
     for number, boot_id in enumerate(STREAMS):
-        info = info_of(boot_id)
+        info = make_array(1, boot_id=boot_id)
         witness.infos[boot_id] = info
         for first in range(0, FRAMES, 10):
             at_s = 10.0 * number + first * 0.01
@@ -75,7 +93,7 @@ def facts(tmp_path: Path) -> Facts:
             witness.sent.append(Sent(boot_id, payload, at_s))
             witness.acks.append(Ack(boot_id, first, first + 9, at_s + 0.2))
     firsts = (50, 0)
-    parts = [
+    parts: list[dict[str, Any]] = [
         {"boot_id": boot_id, "seq_first": first, "seq_last": FRAMES - 1}
         for boot_id, first in zip(STREAMS, firsts, strict=True)
     ]

@@ -12,7 +12,8 @@ from websockets.frames import Frame, Opcode
 
 from storage.schema import wire_schema
 from storage.wire import encode
-from tests.faults.frames_by_hand import batch, info_of
+from tests.builders.arrays import make_array
+from tests.builders.frames import make_frames
 from tests.faults.link_witness import Messages, Witness
 
 HEAD = b"GET /api/v1/ingest HTTP/1.1\r\nUpgrade: websocket\r\n\r\n"
@@ -51,9 +52,19 @@ def test_a_message_in_pieces_with_a_ping_between_them_is_one() -> None:
     assert list(Messages().feed(data)) == [(TEXT, b"hello")]
 
 
+def frames(first: int, count: int, boot_id: str) -> bytes:
+    """A message of frames with their number as the first tile's count."""
+    seq = np.arange(first, first + count)
+    payload = encode(
+        make_frames(seq, 1, padc=seq[:, None]), wire_schema(make_array(1, boot_id=boot_id))
+    )
+    return frame(Opcode.BINARY, payload)
+
+
 def connected(witness: Witness, *boot_ids: str) -> tuple[bytes, bytes]:
     """What a node says first, of its last stream, and a server's answer."""
-    *earlier, present = [info_of(boot_id).model_dump(mode="json") for boot_id in boot_ids]
+    arrays = [make_array(1, boot_id=boot_id) for boot_id in boot_ids]
+    *earlier, present = [array.model_dump(mode="json") for array in arrays]
     hello = {
         "type": "hello",
         "array_info": present,
@@ -67,11 +78,10 @@ def test_frames_belong_to_the_stream_that_was_named_last_and_count_once() -> Non
     tap = witness.tap()
     node, _ = connected(witness, "old", "new")
     tap.to_server(node)
-    schema = wire_schema(info_of("new"))
     for first in (0, 10, 5):
-        tap.to_server(frame(Opcode.BINARY, encode(batch(first, 10), schema)))
+        tap.to_server(frames(first, 10, "new"))
     tap.to_server(frame(Opcode.TEXT, json.dumps({"type": "stream", "boot_id": "old"}).encode()))
-    tap.to_server(frame(Opcode.BINARY, encode(batch(70, 3), wire_schema(info_of("old")))))
+    tap.to_server(frames(70, 3, "old"))
     new, old = witness.frames("new"), witness.frames("old")
     assert new is not None
     assert old is not None

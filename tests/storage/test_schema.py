@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -15,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, ServoInfo, TileInfo
+from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from service.estimation.estimates import Estimates
 from storage.schema import (
     ARRAY_INFO_KEY,
@@ -31,6 +30,8 @@ from storage.schema import (
     to_record_batch,
     wire_schema,
 )
+from tests.builders.arrays import make_array, make_servo, make_tile
+from tests.builders.frames import LAYOUTS, any_frames, assert_same_bits, laid_out
 
 SUFFIXES = {
     "kpa": "kPa",
@@ -44,64 +45,13 @@ SUFFIXES = {
 
 
 def array(tiles: int) -> ArrayInfo:
-    return ArrayInfo(
+    """Text and numbers that are easily mistaken on their way through JSON."""
+    return make_array(
+        [make_tile(i, x_m=0.1 / 3 * i, y_m=-0.1, reference=i == 1) for i in range(tiles)],
         node="node-7 'µ'",
-        boot_id="f" * 32,
-        tiles=tuple(
-            TileInfo(
-                serial=f"T{i + 1:02}",
-                mux=0x70 + i // 8,
-                channel=i % 8,
-                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-                x_m=0.1 / 3 * i,
-                y_m=-0.1,
-                z_m=-0.15,
-                reference=i == 1,
-                conversion_ms=1.6,
-            )
-            for i in range(tiles)
-        ),
-        servo=ServoInfo(
-            model="MX-28",
-            counts_per_turn=4096,
-            zero_counts=2048,
-            sign=-1,
-            ratio=0.1,
-            ankle_travel_m_per_rad=None,
-        ),
-        schedule="simultaneous",
+        servo=make_servo(sign=-1, ratio=0.1, ankle_travel_m_per_rad=None),
         nominal_rate_hz=395.1234567890123,
-        utc_offset_ns=1_577_836_800_000_000_000,
-        clock_set=True,
-        software="foottile 0.1.0",
-        scene="mud",
-        models=("unwrap", "static"),
     )
-
-
-def frames(rows: int, tiles: int, seed: int = 0) -> FrameBatch:
-    """Any bits at all, the ends of every type among them."""
-    rng = np.random.default_rng(seed)
-    columns: dict[str, Any] = {}
-    for name, (dtype, per_tile) in FRAME_COLUMNS.items():
-        shape = (rows, tiles) if per_tile else (rows,)
-        if np.issubdtype(dtype, np.floating):
-            values = rng.choice([np.nan, np.inf, -np.inf, -0.0, 1e-40, 29.97], shape)
-            columns[name] = values.astype(dtype)
-        else:
-            ends = np.iinfo(dtype)
-            values = rng.integers(ends.min, ends.max, shape, dtype=dtype, endpoint=True)
-            values[rng.random(shape) < 0.2] = ends.max
-            values[rng.random(shape) < 0.2] = ends.min
-            columns[name] = values
-    return FrameBatch(**columns)
-
-
-def same(one: FrameBatch, other: FrameBatch) -> None:
-    for f in fields(FrameBatch):
-        a, b = getattr(one, f.name), getattr(other, f.name)
-        assert (a.dtype, a.shape) == (b.dtype, b.shape), f.name
-        assert a.tobytes() == b.tobytes(), f.name
 
 
 def message(record: pa.RecordBatch) -> pa.Buffer:
@@ -117,7 +67,7 @@ def record_of(batch: FrameBatch) -> pa.RecordBatch:
 
 def lies_in(values: np.ndarray, buffer: pa.Buffer) -> bool:
     address = values.__array_interface__["data"][0]
-    return buffer.address <= address < buffer.address + buffer.size
+    return bool(buffer.address <= address < buffer.address + buffer.size)
 
 
 sizes = {"rows": st.integers(1, 40), "tiles": st.integers(1, 9), "seed": st.integers(0, 2**32 - 1)}
@@ -128,8 +78,8 @@ sizes = {"rows": st.integers(1, 40), "tiles": st.integers(1, 9), "seed": st.inte
 
 @given(**sizes)
 def test_frames_survive_a_record_batch_bit_by_bit(rows: int, tiles: int, seed: int) -> None:
-    batch = frames(rows, tiles, seed)
-    same(from_record_batch(record_of(batch)), batch)
+    batch = any_frames(rows, tiles, seed)
+    assert_same_bits(from_record_batch(record_of(batch)), batch)
 
 
 @settings(deadline=None)
@@ -137,44 +87,43 @@ def test_frames_survive_a_record_batch_bit_by_bit(rows: int, tiles: int, seed: i
 def test_frames_survive_an_arrow_stream_bit_by_bit_with_the_array_beside_them(
     rows: int, tiles: int, seed: int
 ) -> None:
-    batch = frames(rows, tiles, seed)
+    batch = any_frames(rows, tiles, seed)
     with pa.ipc.open_stream(message(record_of(batch))) as reader:
         assert array_info(reader.schema, where="stream") == array(tiles)
-        same(from_record_batch(reader.read_next_batch()), batch)
+        assert_same_bits(from_record_batch(reader.read_next_batch()), batch)
 
 
 def test_a_batch_of_no_frames_survives_too() -> None:
-    batch = frames(0, 4)
-    same(from_record_batch(record_of(batch)), batch)
+    batch = any_frames(0, 4)
+    assert_same_bits(from_record_batch(record_of(batch)), batch)
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0, 5), (3, 17), (19, 20)])
 def test_a_slice_of_a_message_gives_its_own_rows(start: int, stop: int) -> None:
-    batch = frames(20, 4)
+    batch = any_frames(20, 4)
     part = record_of(batch).slice(start, stop - start)
-    same(from_record_batch(part), batch.rows(start, stop))
+    assert_same_bits(from_record_batch(part), batch.rows(start, stop))
 
 
-@pytest.mark.parametrize("how", [np.asfortranarray, lambda a: np.repeat(a, 2, axis=0)[::2]])
-def test_frames_that_lie_in_memory_some_other_way_are_sent_right(
-    how: Callable[[np.ndarray], np.ndarray],
-) -> None:
-    batch = frames(20, 4)
-    other = FrameBatch(**{f.name: how(getattr(batch, f.name)) for f in fields(FrameBatch)})
-    same(from_record_batch(record_of(other)), batch)
+@pytest.mark.parametrize("how", LAYOUTS)
+def test_frames_that_lie_in_memory_some_other_way_are_sent_right(how: str) -> None:
+    batch = any_frames(20, 4)
+    assert_same_bits(from_record_batch(record_of(laid_out(batch, how))), batch)
 
 
 def test_sending_copies_nothing() -> None:
-    batch = frames(20, 4)
+    batch = any_frames(20, 4)
     record = record_of(batch)
     for column in FRAMES:
         sent = record.column(column.name)
-        values = sent.values if column.per_tile else sent
-        assert values.buffers()[1].address == getattr(batch, column.name).ctypes.data, column.name
+        values = sent.values if isinstance(sent, pa.FixedSizeListArray) else sent
+        buffer = values.buffers()[1]
+        assert buffer is not None
+        assert buffer.address == getattr(batch, column.name).ctypes.data, column.name
 
 
 def test_receiving_copies_nothing() -> None:
-    received = message(record_of(frames(20, 4)))
+    received = message(record_of(any_frames(20, 4)))
     with pa.ipc.open_stream(received) as reader:
         batch = from_record_batch(reader.read_next_batch())
     for column in FRAMES:
@@ -184,23 +133,23 @@ def test_receiving_copies_nothing() -> None:
 
 
 def test_what_was_received_outlives_its_reader() -> None:
-    batch = frames(20, 4)
+    batch = any_frames(20, 4)
     with pa.ipc.open_stream(message(record_of(batch))) as reader:
         received = from_record_batch(reader.read_next_batch())
     del reader
-    same(received, batch)
+    assert_same_bits(received, batch)
 
 
 def test_the_wire_is_a_fixed_number_of_bytes_a_frame_beside_its_header() -> None:
     # 8 + 8 + 8 + 4 + 4 + 1 + 4 of a frame, and 2 + 2 + 4 + 1 of each tile (docs/formats.md)
-    record = record_of(frames(64, 4))
+    record = record_of(any_frames(64, 4))
     assert record.nbytes == 64 * (37 + 4 * 9)
 
 
 # --- units and names ------------------------------------------------------------------------------
 
 
-def assert_described(field: pa.Field) -> None:
+def assert_described(field: pa.Field[Any]) -> None:
     metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     assert set(metadata) == {"unit", "description"}, field.name
     assert metadata["unit"], field.name
@@ -220,7 +169,7 @@ def test_every_column_on_the_wire_says_its_unit() -> None:
 
 
 def test_every_column_on_disk_says_its_unit() -> None:
-    batch = frames(3, 2)
+    batch = any_frames(3, 2)
     values = {column.name: getattr(batch, column.name) for column in FRAMES}
     for column in (*ESTIMATES, *TRUTH):
         shape = (3, 2) if column.per_tile else (3,)
@@ -243,7 +192,7 @@ def test_a_number_with_a_unit_carries_it_as_a_suffix() -> None:
 
 
 def test_a_column_per_tile_is_flat_on_disk_and_a_list_on_the_wire() -> None:
-    batch = frames(3, 2)
+    batch = any_frames(3, 2)
     values = {column.name: getattr(batch, column.name) for column in FRAMES}
     names = [field.name for field, _ in flat_columns(FRAMES, values)]
     assert names[3:7] == ["padc_0", "padc_1", "tadc_0", "tadc_1"]
@@ -294,13 +243,13 @@ def refused(record: pa.RecordBatch) -> None:
 
 @pytest.mark.parametrize("missing", list(FRAME_COLUMNS))
 def test_a_message_without_one_of_the_columns_is_refused(missing: str) -> None:
-    record = record_of(frames(5, 4))
+    record = record_of(any_frames(5, 4))
     refused(record.drop_columns([missing]))
 
 
 @pytest.mark.parametrize("name", list(FRAME_COLUMNS))
 def test_a_message_with_a_column_of_another_type_is_refused(name: str) -> None:
-    record = record_of(frames(5, 4))
+    record = record_of(any_frames(5, 4))
     at = record.schema.get_field_index(name)
     for other in (
         pa.array(np.arange(5.0)),
@@ -312,14 +261,14 @@ def test_a_message_with_a_column_of_another_type_is_refused(name: str) -> None:
 
 
 def test_a_message_whose_tiles_differ_in_number_is_refused() -> None:
-    record, three = record_of(frames(6, 4)), record_of(frames(6, 3))
+    record, three = record_of(any_frames(6, 4)), record_of(any_frames(6, 3))
     at = record.schema.get_field_index("tadc")
     refused(record.set_column(at, "tadc", three.column("tadc")))
 
 
 @pytest.mark.parametrize("name", ["seq", "servo_counts", "reference_force_n"])
 def test_a_message_with_an_empty_value_is_refused(name: str) -> None:
-    record = record_of(frames(5, 4))
+    record = record_of(any_frames(5, 4))
     at = record.schema.get_field_index(name)
     type_ = record.schema.field(name).type
     refused(record.set_column(at, name, pa.array([1, 2, None, 4, 5], type_)))
@@ -328,13 +277,11 @@ def test_a_message_with_an_empty_value_is_refused(name: str) -> None:
 @pytest.mark.parametrize(("rows", "tiles"), [(4, 4), (5, 4), (3, 3), (2, 1)])
 def test_a_message_with_an_empty_row_of_tiles_is_refused(rows: int, tiles: int) -> None:
     # An empty list in a column hides its values; what is left must not be dealt out anew.
-    record = record_of(frames(rows, tiles))
+    record = record_of(any_frames(rows, tiles))
     mask = pa.array([i == 1 for i in range(rows)])
     columns = [
-        pa.FixedSizeListArray.from_arrays(
-            column.flatten(), type=pa.list_(field.type.value_type, tiles), mask=mask
-        )
-        if pa.types.is_fixed_size_list(field.type)
+        pa.FixedSizeListArray.from_arrays(column.flatten(), type=field.type, mask=mask)
+        if isinstance(column, pa.FixedSizeListArray)
         else column
         for field, column in zip(record.schema, record.columns, strict=True)
     ]
@@ -342,14 +289,14 @@ def test_a_message_with_an_empty_row_of_tiles_is_refused(rows: int, tiles: int) 
 
 
 def test_a_message_with_an_empty_value_of_one_tile_is_refused() -> None:
-    record = record_of(frames(2, 2))
+    record = record_of(any_frames(2, 2))
     at = record.schema.get_field_index("padc")
     lists = pa.array([[1, 2], [None, 4]], pa.list_(pa.uint16(), 2))
     refused(record.set_column(at, "padc", lists))
 
 
 def test_a_message_with_a_column_twice_is_refused() -> None:
-    record = record_of(frames(2, 2))
+    record = record_of(any_frames(2, 2))
     columns, names = record.columns, record.schema.names
     refused(pa.RecordBatch.from_arrays([*columns, columns[0]], names=[*names, "seq"]))
 
@@ -375,6 +322,6 @@ def test_an_array_with_an_unknown_fact_is_refused() -> None:
 
 
 def test_frames_of_the_wrong_type_never_become_a_batch() -> None:
-    batch = frames(3, 2)
+    batch = any_frames(3, 2)
     with pytest.raises(ValueError, match=r"FrameBatch\.padc: expected uint16\(3, 2\), got int64"):
         replace(batch, padc=batch.padc.astype(np.int64))

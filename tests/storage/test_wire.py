@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -13,60 +12,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
+from devices.frames import FrameBatch
 from storage.schema import wire_schema
 from storage.wire import FRAMES_MAX, decode, encode
+from tests.builders.arrays import make_array
+from tests.builders.frames import any_frames, assert_same_bits
 
 
 def schema_of(tiles: int) -> pa.Schema:
-    return wire_schema(
-        ArrayInfo(
-            node="bench",
-            boot_id="0" * 32,
-            tiles=tuple(
-                TileInfo(
-                    serial=f"T{i + 1:02}",
-                    mux=0x70,
-                    channel=i,
-                    coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-                    x_m=0.014 * i,
-                    y_m=0.0,
-                    z_m=-0.15,
-                    reference=False,
-                    conversion_ms=1.6,
-                )
-                for i in range(tiles)
-            ),
-            servo=None,
-            schedule="simultaneous",
-            nominal_rate_hz=500.0,
-            utc_offset_ns=10**18,
-            clock_set=True,
-            software="test",
-            scene="test",
-            models=("unwrap", "static"),
-        )
-    )
+    return wire_schema(make_array(tiles))
 
 
 def frames(rows: int, tiles: int = 2, seed: int = 0, *, first: int = 0) -> FrameBatch:
     """Any bits at all in columns without a law; `seq` and time rise."""
-    rng = np.random.default_rng(seed)
-    columns: dict[str, Any] = {}
-    for name, (dtype, per_tile) in FRAME_COLUMNS.items():
-        size = rows * tiles if per_tile else rows
-        bits = rng.integers(0, 256, size * np.dtype(dtype).itemsize, dtype=np.uint8)
-        columns[name] = bits.view(dtype).reshape((rows, tiles) if per_tile else (rows,))
-    columns["seq"] = np.arange(first, first + rows, dtype=np.uint64)
-    columns["t_mono_ns"] = np.sort(rng.integers(-(2**61), 2**61, rows))
-    return FrameBatch(**columns)
-
-
-def same(one: FrameBatch, other: FrameBatch) -> None:
-    for f in fields(FrameBatch):
-        a, b = getattr(one, f.name), getattr(other, f.name)
-        assert (a.dtype, a.shape) == (b.dtype, b.shape), f.name
-        assert a.tobytes() == b.tobytes(), f.name
+    t_mono_ns = np.sort(np.random.default_rng(seed).integers(-(2**61), 2**61, rows))
+    return any_frames(
+        rows,
+        tiles,
+        seed,
+        seq=np.arange(rows, dtype=np.uint64) + np.uint64(first),
+        t_mono_ns=t_mono_ns,
+    )
 
 
 def refused(batch: FrameBatch, match: str) -> None:
@@ -88,8 +54,8 @@ def refused(batch: FrameBatch, match: str) -> None:
 def test_frames_survive_the_wire_bit_by_bit(rows: int, tiles: int, seed: int, first: int) -> None:
     batch, schema = frames(rows, tiles, seed, first=first), schema_of(tiles)
     payload = encode(batch, schema)
-    same(decode(payload, schema), batch)
-    same(decode(memoryview(bytearray(payload)), schema), batch)
+    assert_same_bits(decode(payload, schema), batch)
+    assert_same_bits(decode(memoryview(bytearray(payload)), schema), batch)
 
 
 @given(start=st.integers(0, 19), stop=st.integers(1, 20))
@@ -97,7 +63,7 @@ def test_some_rows_of_a_message_are_a_message_again(start: int, stop: int) -> No
     schema, stop = schema_of(2), max(stop, start + 1)
     received = decode(encode(frames(20), schema), schema)
     part = received.rows(start, stop)
-    same(decode(encode(part, schema), schema), frames(20).rows(start, stop))
+    assert_same_bits(decode(encode(part, schema), schema), frames(20).rows(start, stop))
 
 
 def test_the_same_frames_are_the_same_bytes_and_know_nothing_of_their_neighbours() -> None:
@@ -119,7 +85,7 @@ def test_messages_behind_the_schema_are_a_stream_that_arrow_reads_alone() -> Non
 def test_frames_of_one_instant_and_the_longest_message_are_taken() -> None:
     schema = schema_of(1)
     batch = replace(frames(FRAMES_MAX, 1), t_mono_ns=np.full(FRAMES_MAX, 7, dtype=np.int64))
-    same(decode(encode(batch, schema), schema), batch)
+    assert_same_bits(decode(encode(batch, schema), schema), batch)
 
 
 # --- refused --------------------------------------------------------------------------------------
@@ -212,6 +178,6 @@ def test_time_that_runs_backwards_is_refused_however_far(times: list[int]) -> No
     batch = replace(frames(len(times)), t_mono_ns=np.array(times, dtype=np.int64))
     if times == sorted(times):
         schema = schema_of(2)
-        same(decode(encode(batch, schema), schema), batch)
+        assert_same_bits(decode(encode(batch, schema), schema), batch)
     else:
         refused(batch, "time runs backwards")

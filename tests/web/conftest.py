@@ -50,7 +50,7 @@ class Field:
     environment: dict[str, str]
     port: int = 0
     server: subprocess.Popen[str] | None = None
-    others: list[subprocess.Popen[str]] = field(default_factory=list)
+    others: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     @property
     def url(self) -> str:
@@ -81,13 +81,16 @@ class Field:
         self._reap(self.server)
 
     def close(self) -> None:
-        for process in (*self.others, *([self.server] if self.server else [])):
+        processes: list[subprocess.Popen[Any]] = [*self.others]
+        if self.server is not None:
+            processes.append(self.server)
+        for process in processes:
             process.terminate()
-        for process in (*self.others, *([self.server] if self.server else [])):
+        for process in processes:
             self._reap(process)
 
     @staticmethod
-    def _reap(process: subprocess.Popen[str]) -> None:
+    def _reap(process: subprocess.Popen[Any]) -> None:
         try:
             process.wait(10)
         except subprocess.TimeoutExpired:

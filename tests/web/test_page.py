@@ -116,7 +116,7 @@ def test_record_mark_stop_download(known: Field, open_page: OpenPage, tmp_path: 
     seq = table["seq"].to_numpy()
     assert len(seq) == session["frames"] > 300
     assert (np.diff(seq) == 1).all()
-    assert table.schema.field("grf_n").metadata[b"unit"] == b"N"
+    assert (table.schema.field("grf_n").metadata or {})[b"unit"] == b"N"
     events = known.get(f"/sessions/{session['id']}/events")["items"]
     assert [event["label"] for event in events] == ["a stone"]
 

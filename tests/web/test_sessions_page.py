@@ -14,7 +14,9 @@ from playwright.sync_api import Page, expect
 import service.api.routes.sessions
 import service.server
 import service.server.recorder
-from tests.service.conftest import FakeNode, Play, Running
+from tests.service.fake_node import FakeNode, Play
+from tests.service.recording import Recording
+from tests.service.running import Running
 from tests.web.conftest import wait_until
 
 pytestmark = pytest.mark.real_time
@@ -36,38 +38,25 @@ class Scripted:
     def url(self) -> str:
         return self.running.url
 
-    def start(self, name: str) -> dict[str, Any]:
-        answer = self.running.http.post("/sessions", json={"node": "bench", "name": name})
-        assert answer.status_code == 201, answer.text
-        content: dict[str, Any] = answer.json()
-        return content
-
-    def stop(self, session: dict[str, Any]) -> None:
-        answer = self.running.http.post(f"/sessions/{session['id']}/stop")
-        assert answer.status_code == 200, answer.text
-
-    def recorded(self, name: str) -> dict[str, Any]:
+    def recorded(self, name: str) -> Recording:
         """A sealed session."""
         with Play(self.node):
-            session = self.start(name)
+            session = self.node.record(name=name)
             time.sleep(0.2)
-            self.stop(session)
-            return self.running.sealed(session["id"])
+            session.stop()
+            session.sealed()
+        return session
 
-    def pending(self, name: str) -> dict[str, Any]:
+    def pending(self, name: str) -> Recording:
         """A session with a hundred frames that are still with the node."""
-        session = self.start(name)
+        session = self.node.record(name=name)
         self.node.next_t_mono_ns = time.monotonic_ns()
         self.node.frames(100)
         self.node.send(50)
         time.sleep(0.4)
-        self.stop(session)
+        session.stop()
         self.node.send(10, now=True)
         return session
-
-    def sessions(self) -> list[dict[str, Any]]:
-        items: list[dict[str, Any]] = self.running.http.get("/sessions").json()["items"]
-        return items
 
     def close(self) -> None:
         self.node.close()
@@ -84,8 +73,8 @@ def scripted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Script
     one.close()
 
 
-def row_of(page: Page, session: dict[str, Any]) -> Any:
-    return page.locator(f'#sessions [data-session-id="{session["id"]}"]')
+def row_of(page: Page, session: Recording) -> Any:
+    return page.locator(f'#sessions [data-session-id="{session.id}"]')
 
 
 def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one(
@@ -107,9 +96,9 @@ def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one
         expect(page.locator("#recordings")).to_contain_text("second")
         page.click("#stop")
         expect(page.locator("#recordings")).to_be_hidden()
-        found = scripted.sessions()
-        wait_until(lambda: {s["state"] for s in scripted.sessions()} == {"sealed"}, "both sealed")
-    for session in found:
+        sessions = scripted.running.sessions
+        wait_until(lambda: {s["state"] for s in sessions()} == {"sealed"}, "both sealed")
+    for session in sessions():
         events = scripted.running.http.get(f"/sessions/{session['id']}/events").json()["items"]
         assert [event["label"] for event in events] == ["a stone"]
 
@@ -117,7 +106,7 @@ def test_recordings_that_run_at_once_are_all_shown_marked_and_stopped_one_by_one
 def test_a_mark_that_is_set_while_the_server_is_away_has_the_instant_of_the_press(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
-    session = scripted.start("walk")
+    session = scripted.node.record(name="walk")
     with Play(scripted.node):
         page = open_page(scripted.url)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
@@ -134,8 +123,7 @@ def test_a_mark_that_is_set_while_the_server_is_away_has_the_instant_of_the_pres
     time.sleep(1.5)
     scripted.running.start()
     expect(page.locator("#waiting-marks")).to_be_hidden(timeout=15_000)
-    url = f"/sessions/{session['id']}/events"
-    [event] = scripted.running.http.get(url).json()["items"]
+    [event] = scripted.running.http.get(f"{session.url}/events").json()["items"]
     assert event["label"] == "a stone"
     assert abs(event["t_ns"] - pressed_ns) < 1_000_000_000
 
@@ -153,7 +141,7 @@ def test_a_deleted_session_can_be_had_back_at_once_or_from_the_trash_until_it_is
     row.get_by_role("button", name="Delete").click()
     expect(row).to_have_count(0)
     page.locator("#trash-card summary").click()
-    trashed = page.locator(f'#trash [data-session-id="{session["id"]}"]')
+    trashed = page.locator(f'#trash [data-session-id="{session.id}"]')
     expect(trashed).to_contain_text("walk")
     trashed.get_by_role("button", name="Restore").click()
     expect(trashed).to_have_count(0)
@@ -190,9 +178,8 @@ def test_losses_troubles_and_what_is_behind_are_said_in_words(
     node = scripted.node
     first = node.seq
     node.frames(1000)
-    lost = {"disk_full": [[first, first + 1]], "evicted": [[first + 2, first + 101]]}
     with Play(node):
-        node.socket.send(json.dumps({"type": "lost", "boot_id": node.boot_id, "lost": lost}))
+        node.say_lost(disk_full=[[first, first + 1]], evicted=[[first + 2, first + 101]])
         status = {"type": "status", "missed_slots": 3, "troubles": ["the node's disk is full"]}
         node.socket.send(json.dumps(status))
         page = open_page(scripted.url)
@@ -217,7 +204,7 @@ def test_what_is_said_of_a_session_can_be_changed(scripted: Scripted, open_page:
     page.get_by_role("button", name="Save").click()
     expect(row).to_contain_text("mud & <b>stones</b>")
     expect(row).to_contain_text("leg 2 · #wet · #slow")
-    found = scripted.running.session(session["id"])
+    found = session.now()
     assert (found["subject"], found["tags"]) == ("leg 2", ["wet", "slow"])
     assert found["notes"] == "first line\nsecond"
 
@@ -228,7 +215,7 @@ def test_a_phone_has_room_for_several_recordings_and_all_buttons(
     scripted.recorded("before")
     with Play(scripted.node):
         for name in ("first", "second", "third"):
-            scripted.start(name)
+            scripted.node.record(name=name)
         page = open_page(scripted.url, 390, 844)
         expect(page.locator("body")).to_have_attribute("data-live", "true")
         expect(page.locator("#recordings li")).to_have_count(3)

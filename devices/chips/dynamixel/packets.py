@@ -47,14 +47,12 @@ class Packet:
 class Status:
     """What a servo answered."""
 
-    servo_id: int
+    packet: Packet
     data: bytes
     alert: bool
     """The hardware complains; the data are valid all the same."""
     refusal: str
     """Why the servo did not do what it was asked; empty if it did."""
-    intact: bool
-    wire_bytes: int
 
 
 class DynamixelProtocol(ABC):

@@ -85,14 +85,8 @@ class _Protocol1(DynamixelProtocol):
 
     def status(self, packet: Packet) -> Status | None:
         error = Error(packet.instruction)
-        return Status(
-            servo_id=packet.servo_id,
-            data=packet.parameters,
-            alert=bool(error & Error.ALERT),
-            refusal=", ".join(meaning for bit, meaning in _REFUSALS.items() if error & bit),
-            intact=packet.intact,
-            wire_bytes=len(packet.wire),
-        )
+        refusal = ", ".join(meaning for bit, meaning in _REFUSALS.items() if error & bit)
+        return Status(packet, packet.parameters, bool(error & Error.ALERT), refusal)
 
 
 PROTOCOL_1 = _Protocol1()

@@ -87,14 +87,7 @@ class _Protocol2(DynamixelProtocol):
         if number:
             meaning = ERRORS[number] if number < len(ERRORS) else "unknown"
             refusal = f"error {number}, {meaning}"
-        return Status(
-            servo_id=packet.servo_id,
-            data=packet.parameters[1:],
-            alert=bool(error & ALERT),
-            refusal=refusal,
-            intact=packet.intact,
-            wire_bytes=len(packet.wire),
-        )
+        return Status(packet, packet.parameters[1:], bool(error & ALERT), refusal)
 
 
 PROTOCOL_2 = _Protocol2()

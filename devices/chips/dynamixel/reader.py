@@ -138,7 +138,7 @@ class Dynamixel:
         """
         answer = self._exchange(self._position_request, n_data=self._firmware.asked_bytes)
         earliest_ns = answer.asked_ns + wire_time_ns(len(self._position_request), self._baudrate)
-        latest_ns = answer.done_ns - wire_time_ns(answer.status.wire_bytes, self._baudrate)
+        latest_ns = answer.done_ns - wire_time_ns(len(answer.status.packet.wire), self._baudrate)
         position = answer.status.data[: self._firmware.position_bytes]
         return PositionReading(
             counts=int.from_bytes(position, "little", signed=True),
@@ -203,10 +203,10 @@ class Dynamixel:
         return ServoPacketError(what, where=self._where, expected=expected, remedy=remedy)
 
     def _check(self, status: Status, n_data: int) -> None:
-        if not status.intact:
+        if not status.packet.intact:
             raise self._packet_error("the answer is damaged: its checksum does not fit")
-        if status.servo_id != self._id:
-            raise self._packet_error(f"servo {status.servo_id} answered", f"servo {self._id}")
+        if (other := status.packet.servo_id) != self._id:
+            raise self._packet_error(f"servo {other} answered", f"servo {self._id}")
         if status.refusal:
             raise ServoStatusError(f"the servo refused: {status.refusal}", where=self._where)
         if len(status.data) != n_data:

@@ -21,26 +21,33 @@ _RECENT = 16
 """Readings kept for a frame that takes long: 64 tiles take 16 ms, a quick servo 1 ms."""
 
 
-class PolledServo:
+class _PacedServo:
+    """A servo that is read at fixed intervals."""
+
+    def __init__(self, servo: Dynamixel, clock: Clock, *, rate_hz: float) -> None:
+        self.failures = 0
+        """Readings that failed: silence, garbage, or an error status."""
+        self._servo = servo
+        self._clock = clock
+        self._period_ns = round(1e9 / rate_hz)
+
+    @property
+    def stale_after_ns(self) -> int:
+        """Three intervals: one late answer is no fault."""
+        return 3 * self._period_ns
+
+
+class PolledServo(_PacedServo):
     """A `ServoSource` for virtual time: readings at fixed intervals on the servo line's clock.
 
     It blocks while a servo is silent, so it is not for a real loop.
     """
 
     def __init__(self, servo: Dynamixel, line_clock: Clock, *, rate_hz: float) -> None:
-        self.failures = 0
-        """Readings that failed: silence, garbage, or an error status."""
-        self._servo = servo
-        self._clock = line_clock
-        self._period_ns = round(1e9 / rate_hz)
+        super().__init__(servo, line_clock, rate_hz=rate_hz)
         self._due_ns = line_clock.now_ns()
         self._newest: PositionReading | None = None
         self._on_the_way: deque[PositionReading] = deque()
-
-    @property
-    def stale_after_ns(self) -> int:
-        """Three intervals: one late answer is no fault."""
-        return 3 * self._period_ns
 
     def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
         """Newest position known at `t_mono_ns` with its sample instant; None before the first."""
@@ -56,26 +63,17 @@ class PolledServo:
         return None if self._newest is None else (self._newest.counts, self._newest.t_mono_ns)
 
 
-class ServoReader:
+class ServoReader(_PacedServo):
     """A `ServoSource` for a real clock: a thread reads the servo at a fixed rate.
 
     Use as a context manager: the thread runs while the block does.
     """
 
     def __init__(self, servo: Dynamixel, clock: Clock, *, rate_hz: float) -> None:
-        self.failures = 0
-        """Readings that failed: silence, garbage, or an error status."""
-        self._servo = servo
-        self._clock = clock
-        self._period_ns = round(1e9 / rate_hz)
+        super().__init__(servo, clock, rate_hz=rate_hz)
         self._recent: tuple[PositionReading, ...] = ()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read, name="servo", daemon=True)
-
-    @property
-    def stale_after_ns(self) -> int:
-        """Three intervals: one late answer is no fault."""
-        return 3 * self._period_ns
 
     def latest(self, t_mono_ns: int) -> tuple[int, int] | None:
         """Newest position sampled by `t_mono_ns`, with its sample instant; None before the first.

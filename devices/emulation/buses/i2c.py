@@ -132,7 +132,7 @@ class EmulatedI2cAdapter:
                 if not routed:
                     routed = address in self._mux_addresses
                 if not listeners or (disturbed is not None and disturbed.loses_acknowledge(t_ns)):
-                    raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+                    raise _refusal(errno.EREMOTEIO)
                 if reading:
                     bits += 9 * length
                     _read(message, listeners, t_ns, disturbed)
@@ -141,7 +141,7 @@ class EmulatedI2cAdapter:
                 bits += 9 * length
                 if acknowledged < length:
                     bits -= 9 * (length - acknowledged - 1)
-                    raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+                    raise _refusal(errno.EREMOTEIO)
         finally:
             stop_ns = begin_ns + round((bits + 1) * self._ns_per_bit)
             for device in addressed:
@@ -164,10 +164,10 @@ class EmulatedI2cAdapter:
         """Go through a transaction on wires that do not move; True if that looks like success."""
         if self.line.wedged(begin_ns):
             self._clock.sleep_until_ns(begin_ns + self._timeout_ns)
-            raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
+            raise _refusal(errno.ETIMEDOUT)
         if self.line.sda_high(begin_ns):
             self._pass(begin_ns, _NOT_ACKNOWLEDGED_BITS)
-            raise OSError(errno.EREMOTEIO, os.strerror(errno.EREMOTEIO))
+            raise _refusal(errno.EREMOTEIO)
         if self.line.sda_low(begin_ns):
             for message in messages:
                 if message.flags & _FLAG_READ:
@@ -193,16 +193,20 @@ class EmulatedI2cAdapter:
         return wire
 
 
+def _refusal(number: int) -> OSError:
+    return OSError(number, os.strerror(number))
+
+
 def _refuse_unsupported(messages: Sequence[i2c_msg]) -> None:
     last = len(messages) - 1
     if not 0 <= last < I2C_RDWR_IOCTL_MAX_MSGS:
-        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        raise _refusal(errno.EINVAL)
     for index, message in enumerate(messages):
         if message.len > MESSAGE_BYTES_MAX:
-            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+            raise _refusal(errno.EINVAL)
         # drivers/i2c/busses/i2c-bcm2835.c: "only one read message supported, has to be last"
         if index < last and message.flags & _FLAG_READ:
-            raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+            raise _refusal(errno.EOPNOTSUPP)
 
 
 def _write(

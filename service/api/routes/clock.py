@@ -11,7 +11,6 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError, UnknownError
 from service.api.routes.access import ServerState, problems
-from service.sessions.sealing import table_of_rows
 from storage.clock.file import CLOCK_NAME
 from storage.clock.summary import ClockSummary
 from storage.formats.export import MEDIA_TYPES
@@ -50,7 +49,7 @@ async def clock(
     if format == "parquet":
         return _table(session, server.recorder.folder.path(session_id) / CLOCK_NAME)
     if session.sha256 is None:
-        table = table_of_rows(server.recorder.sources(session_id))
+        table = server.recorder.sources(session_id).clock_table()
         return await run_in_threadpool(table.summary)
     return await run_in_threadpool(_sealed, server.recorder.folder.path(session_id) / FRAMES_NAME)
 

@@ -22,7 +22,7 @@ from devices.frames import FRAME_COLUMNS
 from service.api.problems import problem
 from service.api.routes.access import ServerState, problems
 from service.server.server import Server
-from service.sessions.sealing import SessionFrames, table_of_rows
+from service.sessions.frames import SessionFrames
 from service.version import SOFTWARE
 from storage.clock.file import CLOCK_NAME
 from storage.formats.export import MEDIA_TYPES, ClockName, Format, Slice, export
@@ -216,7 +216,7 @@ def _clocks_hash(session: Session, server: Server) -> str:
 def _chunks(session: Session, query: DataQuery, server: Server) -> Iterator[bytes]:
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
-        clock = table_of_rows(sources) if query.clock == "server" else None
+        clock = sources.clock_table() if query.clock == "server" else None
         return export(SessionFrames(sources), sources.info, {}, query.format, query.slice, clock)
     return _chunks_of_file(server.recorder.folder.path(session.id) / FRAMES_NAME, query)
 

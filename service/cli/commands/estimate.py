@@ -16,7 +16,6 @@ from service.cli.options import (
     progress,
     remark,
     say,
-    stdout,
 )
 from service.estimation import OFFLINE_LAG_MS
 
@@ -53,7 +52,7 @@ def estimate_command(
     The tare comes from --tare-s, else from frames flagged as lead, else from the first interval
     that can be recognised as unloaded. Exit codes: 0 good, 1 failed, 2 wrong usage.
     """
-    from service.cli.report import ASSUMED_SCALE, accuracy_table, stances_json, stances_line
+    from service.cli.report import findings_json, tell_findings
     from service.offline.estimate import estimate_session
 
     # The session itself may be written anew: it is replaced whole, and nothing raw is lost.
@@ -73,19 +72,17 @@ def estimate_command(
     if as_json:
         print_json(
             {
-                "out": str(path),
+                "out": path,
                 "frames": result.frames,
                 "calibration_id": plan.calibration.id,
-                "absolute_scale": "assumed" if plan.assumed_scale else "measured",
-                "models": list(plan.models),
+                "models": plan.models,
                 "lag_ms": lag_ms,
                 "tare": {
                     "source": plan.tare.source,
                     "begin_s": plan.tare.begin_s,
                     "end_s": plan.tare.end_s,
                 },
-                "stances": stances_json(result.stances),
-                "accuracy": result.accuracy.as_dict() if result.accuracy else None,
+                **findings_json(result.findings),
             }
         )
         return
@@ -94,9 +91,4 @@ def estimate_command(
         f"({plan.calibration.id}), models {', '.join(plan.models)}, tare {plan.tare.source} "
         f"{plan.tare.begin_s:.2f} to {plan.tare.end_s:.2f} s"
     )
-    if plan.assumed_scale:
-        say(ASSUMED_SCALE)
-    if result.stances:
-        say(stances_line(result.stances))
-    if result.accuracy is not None:
-        stdout.print(accuracy_table(result.accuracy))
+    tell_findings(result.findings)

@@ -66,7 +66,7 @@ def node_command(
     """
     from platformdirs import user_state_path
 
-    from service.node.publisher import ingest_url
+    from service.node.dial import ingest_url
     from service.node.run import NodeOptions
     from service.rig.rig import RigOptions
 

@@ -51,9 +51,9 @@ def recover_command(
         print_json(_as_dict(recovery))
     else:
         _tell(recovery)
-    if recovery.problems or any(one.outcome == "failed" for one in recovery.sessions):
+    if recovery.problems or any(found.outcome == "failed" for found in recovery.sessions):
         raise typer.Exit(_FAILED)
-    if any(one.ledger is None or not one.ledger.complete for one in recovery.sessions):
+    if any(found.ledger is None or not found.ledger.complete for found in recovery.sessions):
         raise typer.Exit(_NOT_ALL)
 
 
@@ -61,14 +61,14 @@ def _as_dict(recovery: Recovery) -> dict[str, Any]:
     return {
         "sessions": [
             {
-                **(one.ledger.model_dump(mode="json") if one.ledger is not None else {}),
-                "id": one.session.id,
-                "name": one.session.name,
-                "outcome": one.outcome,
-                "problem": one.problem or None,
-                "sha256": one.session.sha256,
+                **(found.ledger.model_dump(mode="json") if found.ledger is not None else {}),
+                "id": found.session.id,
+                "name": found.session.name,
+                "outcome": found.outcome,
+                "problem": found.problem or None,
+                "sha256": found.session.sha256,
             }
-            for one in recovery.sessions
+            for found in recovery.sessions
         ],
         "removed": [str(path) for path in recovery.removed],
         "cut_bytes": recovery.cut,
@@ -84,22 +84,22 @@ def _tell(recovery: Recovery) -> None:
         say(f"{len(recovery.removed)} half-written files were removed")
     for session_id in recovery.mended:
         say(f"session {session_id}: events.parquet was written anew")
-    for one in recovery.sessions:
-        say(f"session {one.session.id} ({one.session.name}): {_outcome(one)}")
-        if one.problem:
-            say(f"  {one.problem}")
+    for found in recovery.sessions:
+        say(f"session {found.session.id} ({found.session.name}): {_outcome(found)}")
+        if found.problem:
+            say(f"  {found.problem}")
     for problem in recovery.problems:
         say(f"not recovered: {problem}")
     if recovery.is_nothing:
         say("nothing to recover")
-    if any(one.outcome == "waiting" for one in recovery.sessions):
+    if any(found.outcome == "waiting" for found in recovery.sessions):
         remark("what waits for its node is completed by the server, or sealed with --give-up")
 
 
-def _outcome(one: Recovered) -> str:
-    ledger = one.ledger
-    if one.outcome != "sealed" or ledger is None:
-        return {"waiting": "waits for its node"}.get(one.outcome, "NOT recovered")
+def _outcome(found: Recovered) -> str:
+    ledger = found.ledger
+    if found.outcome != "sealed" or ledger is None:
+        return {"waiting": "waits for its node"}.get(found.outcome, "NOT recovered")
     recorded = sum(part.recorded for part in ledger.parts)
     lost = sum(sum(part.lost.values()) for part in ledger.parts)
     tail = sum(part.unsynced_tail_max for part in ledger.parts)

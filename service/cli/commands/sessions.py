@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -117,7 +116,7 @@ def export_command(
     ] = "node",
 ) -> None:
     """Write a sealed session, or a slice of it, in another format."""
-    from storage.durable import storage_errors
+    from storage.durable import whole_file
     from storage.formats.export import CLOCKS, FORMATS, Slice, export
     from storage.schema import FRAMES, KNOWN
     from storage.sessions.clock import clock_beside
@@ -132,7 +131,6 @@ def export_command(
     path = output_path(out, source)
     names = tuple(name.strip() for name in (columns or "").split(",") if name.strip())
     frame_names = {column.name for column in FRAMES}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with SessionReader(source) as reader:
         extra = [name for name in KNOWN if name not in frame_names and reader.has(name)]
         chunks = export(
@@ -143,14 +141,9 @@ def export_command(
             Slice(start_s, end_s, names),
             clock_beside(reader) if clock == "server" else None,
         )
-        try:
-            with storage_errors(path), progress(f"writing {path.name}"):
-                with temporary.open("wb") as file:
-                    for chunk in chunks:
-                        file.write(chunk)
-                temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with whole_file(path) as file, progress(f"writing {path.name}"):
+            for chunk in chunks:
+                file.write(chunk)
     say(f"{path}: {path.stat().st_size} bytes")
 
 

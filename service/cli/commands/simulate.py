@@ -19,9 +19,8 @@ from service.cli.options import (
     progress,
     remark,
     say,
-    stdout,
 )
-from service.cli.report import ASSUMED_SCALE, accuracy_table, stances_json, stances_line
+from service.cli.report import findings_json, tell_findings
 from service.estimation import OFFLINE_LAG_MS
 
 if TYPE_CHECKING:
@@ -114,24 +113,18 @@ def simulate_command(
 def _as_json(result: Simulated, path: Path) -> dict[str, object]:
     pressed = result.pressed
     return {
-        "out": str(path),
+        "out": path,
         "frames": result.frames,
         "seconds": result.seconds,
         "rate_hz": result.rate_hz,
         "schedule": result.choice.schedule,
-        "unmeasured": list(result.unmeasured),
-        "flags": {serial: dict(flags) for serial, flags in result.flags.items()},
+        "unmeasured": result.unmeasured,
+        "flags": result.flags,
         "missed_slots": result.missed_slots,
         "bytes": path.stat().st_size,
         "moved_to_edge": pressed.moved_to_edge if pressed else None,
         "limited": pressed.limited if pressed else None,
-        "absolute_scale": None
-        if result.assumed_scale is None
-        else "assumed"
-        if result.assumed_scale
-        else "measured",
-        "stances": stances_json(result.stances),
-        "accuracy": result.accuracy.as_dict() if result.accuracy else None,
+        **findings_json(result.findings),
     }
 
 
@@ -159,12 +152,7 @@ def _print(result: Simulated, path: Path) -> None:
             f"load: {result.pressed.moved_to_edge} samples had their COP moved to the hull's edge, "
             f"{result.pressed.limited} had a tile's force limited"
         )
-    if result.assumed_scale:
-        say(ASSUMED_SCALE)
-    if result.stances:
-        say(stances_line(result.stances))
-    if result.accuracy is not None:
-        stdout.print(accuracy_table(result.accuracy))
+    tell_findings(result.findings)
 
 
 def _schedule(name: str | None) -> AnySchedule | None:

@@ -8,6 +8,8 @@ spread of a repeat itself.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.special import stdtrit
 
@@ -15,6 +17,12 @@ from devices.arrays import Floats
 from service.estimation.calibration import BASIS, TileCalibration, loop_share
 
 _UPPER_95 = 0.975
+
+
+def fit_covariance(jacobian: Any) -> Floats:
+    """Covariance of the parameters of a least-squares fit whose residuals have unit variance."""
+    j = np.asarray(jacobian)
+    return np.asarray(np.linalg.pinv(j.T @ j))
 
 
 def student_t_95(repeats: int) -> float:
@@ -31,7 +39,7 @@ def student_t_95(repeats: int) -> float:
 def curve_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
     """Force of the cubic at gauge pressures (m,), zero at zero pressure."""
     coefficients = np.array(tile.coefficients[1:]) * tile.f_scale_n
-    return np.asarray(_basis(tile, gauge_kpa) @ coefficients)
+    return np.asarray(_basis_of(tile, gauge_kpa) @ coefficients)
 
 
 def mean_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
@@ -54,12 +62,17 @@ def new_loading_band_n(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
 
 
 def _mean_variance(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    basis = _basis(tile, gauge_kpa)
+    basis = _basis_of(tile, gauge_kpa)
     covariance = np.array(tile.covariance) * tile.f_scale_n**2
     return np.asarray(np.maximum(((basis @ covariance) * basis).sum(axis=1), 0.0))
 
 
-def _basis(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
-    u = (gauge_kpa - tile.p_offset_kpa) / tile.p_scale_kpa
-    u0 = -tile.p_offset_kpa / tile.p_scale_kpa
+def _basis_of(tile: TileCalibration, gauge_kpa: Floats) -> Floats:
+    return cubic_basis(gauge_kpa, tile.p_offset_kpa, tile.p_scale_kpa)
+
+
+def cubic_basis(gauge_kpa: Floats, offset_kpa: float, scale_kpa: float) -> Floats:
+    """Basis u^k - u0^k of a cubic, (m, 3), which is zero at zero pressure by construction."""
+    u = (gauge_kpa - offset_kpa) / scale_kpa
+    u0 = -offset_kpa / scale_kpa
     return np.stack([u**k - u0**k for k in range(1, BASIS + 1)], axis=1)

@@ -51,7 +51,7 @@ def fit_effects(recordings: Sequence[Indentation], tile: TileCalibration) -> Eff
     in_u = rubber.model_copy(
         update={
             "coefficients": polynomial,
-            "covariance": tuple(tuple(float(c) for c in row) for row in covariance),
+            "covariance": tuple(map(tuple, covariance.tolist())),
         }
     )
     return effects.model_copy(update={"rubber": in_u})

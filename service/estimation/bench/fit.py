@@ -22,7 +22,12 @@ from service.estimation.bench.checks import (
     refuse_saturated_reference,
     refuse_unloaded,
 )
-from service.estimation.bench.confidence import curve_n, mean_band_n, new_loading_band_n
+from service.estimation.bench.confidence import (
+    cubic_basis,
+    curve_n,
+    mean_band_n,
+    new_loading_band_n,
+)
 from service.estimation.bench.indentation import (
     Indentation,
     Strokes,
@@ -39,15 +44,13 @@ MEAN_STEPS = 30
 
 
 class _Cubic:
-    """Least squares with the basis u^k - u0^k, which is zero at zero pressure by construction."""
+    """Least squares with `cubic_basis` over a range that is centred."""
 
     def __init__(self, high_kpa: float) -> None:
         self.offset_kpa = self.scale_kpa = high_kpa / 2
-        self.u0 = -1.0
 
     def design(self, gauge_kpa: Floats) -> Floats:
-        u = (gauge_kpa - self.offset_kpa) / self.scale_kpa
-        return np.stack([u**k - self.u0**k for k in (1, 2, 3)], axis=1)
+        return cubic_basis(gauge_kpa, self.offset_kpa, self.scale_kpa)
 
     def solve(self, blocks: Strokes) -> Floats:
         solution, *_ = np.linalg.lstsq(self.design(blocks.gauge_kpa), blocks.force_n, rcond=None)
@@ -80,7 +83,7 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
     residual_n = cubic.residual_n(blocks, coefficients)
     gains = _gains(blocks, blocks.force_n - residual_n)
     refuse_contradictions(gains, where)
-    if not is_monotonic(polynomial, (cubic.u0, 1.0)):
+    if not is_monotonic(polynomial, (-1.0, 1.0)):
         raise CalibrationError(
             "the fitted curve is not monotonic: force would fall while pressure rises",
             where=where,
@@ -105,7 +108,7 @@ def fit_tile(*recordings: Indentation) -> TileCalibration:
         range_kpa=(0.0, high_kpa),
         monotonic=True,
         absolute_scale="measured",
-        covariance=tuple(tuple(float(c) for c in row) for row in left_out.covariance),
+        covariance=tuple(map(tuple, left_out.covariance.tolist())),
         relative_misfit=relative_misfit,
         loop_misfit_n=loop_misfit_n,
         r2=r2,
@@ -148,7 +151,7 @@ def _left_out(cubic: _Cubic, blocks: Strokes) -> _LeftOut:
     # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
     repeats = np.unique(blocks.repeat)
     without = np.stack([cubic.solve(blocks.select(blocks.repeat != r)) for r in repeats])
-    parts = [blocks.select(blocks.repeat == r) for r in repeats]
+    parts = blocks.by_repeat()
     deviation = without - without.mean(axis=0)
     return _LeftOut(
         force_n=np.concatenate([part.force_n for part in parts]),

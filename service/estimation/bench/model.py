@@ -8,19 +8,64 @@ away (gamma = 46).
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from devices.arrays import Floats
 from service.estimation.compiled import compiled
 from service.estimation.models.gas import warmed
-from service.estimation.models.hysteresis import played
+from service.estimation.models.hysteresis import WIDTHS_N, played
 from service.estimation.models.rubber import crept_parts
 
 _NEWTON_STEPS = 30
 _GAS_STEPS = 6
 _FLATTEST = 0.05
 """Of the curve's slope at zero: where a trial cubic turns over it is taken to go on like that."""
+
+
+@dataclass(frozen=True)
+class DomeModel:
+    """Parameters of one tile; without the last ones it has the static curve alone.
+
+    Attributes:
+        curve: c1, c2, c3 of force over x = gauge / `scale_kpa`.
+        scale_kpa: end of the curve.
+        baseline_kpa: absolute pressure unloaded.
+        wall_per_kpa: part of the volume that the wall gives way for a kPa.
+        gamma: ratio of heat capacities; 1 for no gas effect.
+        tau_s: the gas' time constant.
+        part: (terms,) of the creep.
+        creep_s: (terms,) its times.
+        loop: (plays,) parts of the plays of half widths `WIDTHS_N`.
+    """
+
+    curve: Floats
+    scale_kpa: float
+    baseline_kpa: float
+    wall_per_kpa: float
+    gamma: float = 1.0
+    tau_s: float = 1.0
+    part: Floats = field(default_factory=lambda: np.zeros(0))
+    creep_s: Floats = field(default_factory=lambda: np.zeros(0))
+    loop: Floats = field(default_factory=lambda: np.zeros(0))
+
+    def pressed(self, t_s: Floats, force_n: Floats) -> Floats:
+        """What `pressed` gives for these parameters."""
+        return pressed(
+            t_s,
+            force_n,
+            self.curve,
+            self.scale_kpa,
+            self.baseline_kpa,
+            self.gamma,
+            self.tau_s,
+            self.wall_per_kpa,
+            self.part,
+            self.creep_s,
+            self.loop,
+            WIDTHS_N[: len(self.loop)],
+        )
 
 
 @compiled
@@ -43,16 +88,16 @@ def pressed(
     Args:
         t_s: (n,) instants.
         force_n: (n,) forces on the dome.
-        curve: c1, c2, c3 of force over x = gauge / `scale_kpa`.
+        curve: this and what follows as in `DomeModel`.
         scale_kpa: end of the curve.
         baseline_kpa: pressure unloaded.
-        gamma: ratio of heat capacities; 1 for no gas effect.
+        gamma: ratio of heat capacities.
         tau_s: the gas' time constant.
-        wall: part of the volume that the wall gives way for a kPa.
-        part: (terms,) of the creep.
-        creep_s: (terms,) its times.
-        loop: (plays,) parts of the plays.
-        widths: (plays,) their half widths.
+        wall: the wall's give.
+        part: of the creep.
+        creep_s: its times.
+        loop: parts of the plays.
+        widths: their half widths.
 
     Returns:
         (n, 3): pressure, pressure without the gas' heat, and the part of the force that creep and

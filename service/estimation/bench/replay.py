@@ -6,20 +6,19 @@ For people: whether a model of gas and rubber is any good shows in a release and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from devices.arrays import Bools, Floats, Ints
 from service.estimation.bench.effects_fit import curve_over_range, loadings
 from service.estimation.bench.indentation import Indentation
-from service.estimation.bench.model import pressed
+from service.estimation.bench.model import DomeModel
 from service.estimation.calibration import TileCalibration
-from service.estimation.models.hysteresis import WIDTHS_N
+from service.estimation.effects import values
 
 _BEFORE_S = 0.02
 _AFTER_S = 0.1
-_NONE = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,7 @@ class Replay:
 def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[str, Replay]:
     """A "release" and a "tap" of the tile, as far as it was released and tapped.
 
-    Of several the one whose noise is nearest to the middle is not looked for: it is the second, so
-    that the first one's settling does not show.
+    Of several it is the second, so that the first one's settling does not show.
     """
     if not any(np.isin(recording.phase, ("release", "tap")).any() for recording in recordings):
         return {}
@@ -54,25 +52,17 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
     # The slow strokes' mean curve has creep and loop in it already.
     static_curve = curve_over_range(tile.coefficients)
 
-    def model(of_curve: Floats, *, all_effects: bool) -> Floats:
-        found = pressed(
-            points.t_s,
-            points.force_n,
-            of_curve,
-            tile.range_kpa[1],
-            baseline_kpa,
-            gas.gamma.value if gas and all_effects else 1.0,
-            gas.tau_s.value if gas and all_effects else 1.0,
-            effects.wall_per_kpa,
-            np.array([part.value for part in rubber.part]) if rubber and all_effects else _NONE,
-            np.array([tau.value for tau in rubber.tau_s]) if rubber and all_effects else _NONE,
-            np.array([part.value for part in loop.part]) if loop and all_effects else _NONE,
-            WIDTHS_N[: len(loop.part)] if loop and all_effects else _NONE,
-        )
-        return np.asarray(found[:, 0] - baseline_kpa)
-
-    static_kpa = model(static_curve, all_effects=False)
-    modelled_kpa = model(curve, all_effects=True)
+    static = DomeModel(static_curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa)
+    model = replace(static, curve=curve)
+    if gas is not None:
+        model = replace(model, gamma=gas.gamma.value, tau_s=gas.tau_s.value)
+    if rubber is not None:
+        model = replace(model, part=values(rubber.part), creep_s=values(rubber.tau_s))
+    if loop is not None:
+        model = replace(model, loop=values(loop.part))
+    static_kpa, modelled_kpa = (
+        each.pressed(points.t_s, points.force_n)[:, 0] - baseline_kpa for each in (static, model)
+    )
     measured_kpa = points.kpa - baseline_kpa
     found: dict[str, Replay] = {}
     for name, centre in _moments(points.t_s, points.force_n, points.loading, points.fast).items():

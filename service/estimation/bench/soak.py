@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 
 from devices.arrays import Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN, indicative_degc
+from service.estimation.bench.confidence import fit_covariance
 from service.estimation.effects import Parameter, TemperatureEffect
 
 STEP_MIN_K = 1.0
@@ -72,9 +73,8 @@ def fit_soak(soak: Soak) -> TemperatureEffect | str:
         x_scale=[1.0, 0.1, 1.0],
         loss="soft_l1",
     )
-    jacobian = np.asarray(found.jac)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian)
-    sigma = np.sqrt(np.diag(covariance)) * max(1.0, np.sqrt(np.mean(found.fun**2)))
+    # Where readings scatter more than their noise says, so do the parameters.
+    sigma = np.sqrt(np.diag(fit_covariance(found.jac))) * max(1.0, np.sqrt(np.mean(found.fun**2)))
     base_kpa, kpa_per_k, ln_lag = (float(x) for x in found.x)
     if not kpa_per_k > 0.0 or sigma[1] > _SIGMA_MAX * kpa_per_k:
         return f"baseline per kelvin is {kpa_per_k:.3f} +- {sigma[1]:.3f} kPa: not determined"

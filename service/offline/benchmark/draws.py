@@ -18,10 +18,11 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.file import Scene
 from service.estimation.calibration import Calibration
-from service.offline.accuracy import JUDGED, Accuracy, judge
+from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 from service.offline.benchmark.rungs import Rung
 from service.offline.calibrations import find_calibration
-from service.offline.simulate import SimulateOptions, Simulation, joined
+from service.offline.findings import joined
+from service.offline.simulate import SimulateOptions, Simulation
 from service.rig.emulated import EmulatedFoot
 from service.sessions.pipeline import EstimateOptions, EstimateStream
 
@@ -31,7 +32,7 @@ LAGS_MS: Mapping[str, float] = {"live": 10.0, "offline": 100.0}
 SECONDS = 20.0
 """Length of a scene that has no end of its own."""
 
-_TRUTH = tuple(name for name in JUDGED if name.startswith("true_"))
+_TRUTH = tuple(name for name in COMPARED if name.startswith("true_"))
 
 
 @dataclass(frozen=True)
@@ -125,8 +126,8 @@ def estimated(recording: Recording, models: tuple[str, ...], lag_ms: float) -> A
     judged: list[Mapping[str, npt.NDArray[Any]]] = []
     for frames, columns in stream.run([(recording.frames, recording.truth)]):
         columns["t_ns"] = frames.t_ns
-        judged.append({name: np.asarray(columns[name]) for name in JUDGED})
-    return judge(joined(judged), lag_ms=lag_ms)
+        judged.append({name: np.asarray(columns[name]) for name in COMPARED})
+    return accuracy_of(joined(judged), lag_ms=lag_ms)
 
 
 def run_draw(task: Task) -> Drawn:

@@ -26,8 +26,8 @@ class Spread:
     """A figure over draws or repetitions: median, 5th and 95th percentile, and of how many."""
 
     median: float
-    low: float
-    high: float
+    p5: float
+    p95: float
     n: int
 
     @classmethod
@@ -36,13 +36,8 @@ class Spread:
         finite = [value for value in values if math.isfinite(value)]
         if not finite:
             return cls(math.nan, math.nan, math.nan, 0)
-        low, median, high = np.percentile(finite, [5.0, 50.0, 95.0]).tolist()
-        return cls(median, low, high, len(finite))
-
-    def as_dict(self) -> dict[str, float | int | None]:
-        """For JSON."""
-        names = {"median": self.median, "p5": self.low, "p95": self.high}
-        return {n: v if math.isfinite(v) else None for n, v in names.items()} | {"n": self.n}
+        p5, median, p95 = np.percentile(finite, [5.0, 50.0, 95.0]).tolist()
+        return cls(median, p5, p95, len(finite))
 
 
 @dataclass(frozen=True)
@@ -98,8 +93,8 @@ class SceneFigures:
             "absent_models": list(self.absent_models),
             "absolute_scale": "assumed" if self.assumed_scale else "measured",
             "draws": self.draws,
-            "frames": self.frames.as_dict(),
-            "failures": [{"what": f.what, "why": f.why} for f in self.failures],
+            "frames": self.frames,
+            "failures": self.failures,
             "rungs": [
                 {
                     "label": rung.label,
@@ -108,21 +103,11 @@ class SceneFigures:
                     "lacks": rung.lacks,
                     "spare": rung.spare,
                     "default": rung.is_default,
-                    **{mode: _as_dict(self.measured[mode, rung.label]) for mode in LAGS_MS},
+                    **{mode: self.measured[mode, rung.label] for mode in LAGS_MS},
                 }
                 for rung in self.rungs
             ],
         }
-
-
-def _as_dict(m: Measured) -> dict[str, Any]:
-    return {
-        "lag_ms": m.lag_ms,
-        "ns_per_frame": m.ns_per_frame.as_dict(),
-        "figures": {name: spread.as_dict() for name, spread in m.figures.items()},
-        "coverage": {name: covered.as_dict() for name, covered in m.coverage.items()},
-        "beyond_whole": {name: spread.as_dict() for name, spread in m.beyond_whole.items()},
-    }
 
 
 def measured_of(

@@ -7,7 +7,7 @@ they say little.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from service.offline.accuracy import PHASES
 from service.offline.benchmark.draws import LAGS_MS
@@ -53,15 +53,7 @@ class Goal:
 
     def as_dict(self) -> dict[str, object]:
         """For JSON."""
-        value = self.value if math.isfinite(self.value) else None
-        return {
-            "mode": self.mode,
-            "figure": self.figure,
-            "value": value,
-            "least": self.least,
-            "most": self.most,
-            "met": self.met,
-        }
+        return asdict(self) | {"met": self.met}
 
 
 def goals_of(figures: SceneFigures) -> list[Goal]:

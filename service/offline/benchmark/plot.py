@@ -89,7 +89,7 @@ def _half(axes: Axes, figures: SceneFigures, mode: str, goal_n: float | None) ->
         error_n, is_default = mark.error_n, mark.rung.is_default
         axes.errorbar(
             *([mark.ns], [error_n.median]),
-            yerr=[[error_n.median - error_n.low], [error_n.high - error_n.median]],
+            yerr=[[error_n.median - error_n.p5], [error_n.p95 - error_n.median]],
             marker=shape,
             markersize=12 if is_default else 6.5,
             markerfacecolor=colour if mark.rung.is_built_up else "white",
@@ -126,7 +126,7 @@ def _scales(axes: Axes, figures: SceneFigures, times_ns: Sequence[float]) -> Non
         middle = math.sqrt(min(times_ns) * max(times_ns))
         reach = 2.2 * math.sqrt(max(times_ns) / min(times_ns))
         axes.set_xlim(middle / reach, middle * reach)
-    highs = [m.figures["grf_mae_n"].high for m in figures.measured.values()]
+    highs = [m.figures["grf_mae_n"].p95 for m in figures.measured.values()]
     goals_n = GRF_MAE_N.get(figures.scene, {}).values()
     known = [high for high in highs if math.isfinite(high)] + list(goals_n)
     axes.set_ylim(0.0, 1.08 * max(known, default=1.0))
@@ -197,7 +197,7 @@ def _label(axes: Axes, mode: str, goal_n: float | None, marks: Sequence[_Mark]) 
     marks = sorted(marks, key=lambda m: (not m.rung.is_default, not m.rung.is_built_up))
     ns, errors_n = [m.ns for m in marks], [m.error_n.median for m in marks]
     front = pareto(list(zip(ns, errors_n, strict=True)))
-    bars = [([m.ns, m.ns], [m.error_n.low, m.error_n.high]) for m in marks]
+    bars = [([m.ns, m.ns], [m.error_n.p5, m.error_n.p95]) for m in marks]
     along = ([ns[i] for i in front], [errors_n[i] for i in front])
     goal = (list(axes.get_xlim()), [goal_n or 0.0] * 2)
     x_lines, y_lines = zip(*bars, along, goal, strict=True)

@@ -173,7 +173,7 @@ def spread_text(spread: Spread, scale: float, digits: int, *, sign: str = "") ->
     if not spread.n:
         return "-"
     low, median, high = (
-        f"{scale * v:{sign}.{digits}f}" for v in (spread.low, spread.median, spread.high)
+        f"{scale * v:{sign}.{digits}f}" for v in (spread.p5, spread.median, spread.p95)
     )
     return f"{median} ({low} to {high})"
 

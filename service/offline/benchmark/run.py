@@ -107,10 +107,7 @@ class Bench:
                 "offline": {"frames": options.offline_frames, "batch": BATCH["offline"]},
                 "repetitions": options.repetitions,
             },
-            "scenes": [
-                figures.as_dict() | {"goals": [goal.as_dict() for goal in goals_of(figures)]}
-                for figures in self.scenes
-            ],
+            "scenes": [figures.as_dict() | {"goals": goals_of(figures)} for figures in self.scenes],
         }
 
 

@@ -19,13 +19,13 @@ from devices.array.startup import make_ready
 from devices.buses.i2c import open_bus
 from devices.clock import UtcAnchor, VirtualClock
 from devices.emulation.buses.gpio import EmulatedLines
-from devices.emulation.witness import Verdict, Witness
 from devices.emulation.world import World
 from devices.frames import NOT_READ, FrameBatch, FrameStatus, TileStatus
 from devices.recovery.recovery import GpioRecovery
 from devices.scene.faults import BusFault, FaultKind, MuxFault, TileFault
 from devices.scene.file import build_scene
 from devices.scene.hardware import ScheduleName
+from tests.builders.witness import Verdict, Witness
 from tests.devices.rigs import FOUR, SCHEDULES, TWO_MUXES, Plugs
 
 BEGIN_S, LENGTH_S, RECOVERED_S, RUN_S = 0.7, 0.4, 1.2, 2.6

@@ -34,7 +34,7 @@ def _stand_in_for_boot_id(path: str) -> None:
     def os_stand_in(file: Any, *arguments: Any, **options: Any) -> int:
         return real_os_open(named(file), *arguments, **options)
 
-    builtins.open = io.open = stand_in  # type: ignore[assignment]
+    builtins.open = io.open = stand_in
     if real_os_open in os.supports_dir_fd:
         os.supports_dir_fd.add(os_stand_in)
-    os.open = os_stand_in
+    os.open = os_stand_in  # type: ignore[assignment]  # of its overloads one is enough

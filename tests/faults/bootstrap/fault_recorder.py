@@ -88,8 +88,8 @@ class _Recorder:
 
     def install(self) -> None:
         """Take the place of the functions of `os` that make things durable or move names."""
-        os.fsync = self._synced("fsync")
-        os.fdatasync = self._synced("fdatasync")
+        for name in ("fsync", "fdatasync"):
+            self._wrap(name, self._synced(name))
         for name in ("rename", "replace"):
             self._wrap(name, self._moved(name))
         for name in ("unlink", "remove"):
@@ -331,7 +331,8 @@ class _Recorder:
             spec = _content(self._kill_file)
             if spec.endswith("\n"):
                 with self._lock:
-                    self._kill = self._kill or KillPoint(spec)
+                    if self._kill is None:
+                        self._kill = KillPoint(spec)
         if when == "before":
             self._note(e="call", t=time.monotonic_ns(), kind=kind, path=path)
         if self._kill is not None:

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 import service.estimation
-from devices.frames import FrameBatch
 from service.estimation import warm
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.ladder import MODELS
-from service.estimation.plan import make_plan
-from service.estimation.tare.tare import Tare
+from service.estimation.plan import EstimationPlan, make_plan
 from storage.schema import wire_schema
 from storage.wire import decode, encode
+from tests.builders.calibrations import make_tare
+from tests.builders.frames import with_columns
 
 
 def compiled_for() -> dict[str, int]:
@@ -36,32 +35,27 @@ def test_nothing_is_compiled_after_the_warm_up(
     models: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Any] = []
-    original: Callable[..., Any] = make_plan
-    monkeypatch.setattr(warm, "make_plan", lambda *a, **k: made.append((a, k)) or original(*a, **k))
+
+    def noted(*arguments: Any, **options: Any) -> EstimationPlan:
+        made.append(arguments)
+        return make_plan(*arguments, **options)
+
+    monkeypatch.setattr(warm, "make_plan", noted)
     warm.warm_up()
     before = compiled_for()
     assert before["service.estimation.models.denoise.denoised"] >= 1
-    ((info, calibration, _), _) = made[0]
-    tare = Tare(
-        np.full(3, 97.0), np.full(3, 0.01), np.full(3, 0.1), np.full(3, 507.0), 0, 0, 1, 9, "lead"
+    info, calibration, _ = made[0]
+    tare = make_tare(
+        3, baseline_kpa=97.0, baseline_sigma_kpa=0.01, noise_kpa=0.1, tadc_counts=507.0
     )
     plan = make_plan(info, calibration, tare, models=models, lag_ms=10.0)
     state = EstimationState()
     first = warm._frames()
     for number in range(6):  # as they come over the wire: views of what was received, read-only
-        later = FrameBatch(
-            **{
-                name: value + number * len(first) * np.asarray(by, dtype=value.dtype)
-                for name, by in (("seq", 1), ("t_mono_ns", 2_000_000), ("t_ns", 2_000_000))
-                for value in (getattr(first, name),)
-            },
-            **{
-                name: getattr(first, name)
-                for name in (
-                    *("padc", "tadc", "sample_offset_us", "servo_counts", "servo_age_us"),
-                    *("status", "frame_status", "reference_force_n"),
-                )
-            },
+        later = with_columns(
+            first,
+            seq=first.seq + np.uint64(number * len(first)),
+            t_mono_ns=first.t_mono_ns + 2_000_000 * number * len(first),
         )
         schema = wire_schema(info)
         _, state = step(plan, decode(bytes(encode(later, schema)), schema), state)

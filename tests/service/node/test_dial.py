@@ -21,7 +21,7 @@ def listening() -> socket.socket:
 def test_where_somebody_listens_it_connects() -> None:
     with listening() as server:
         port = server.getsockname()[1]
-        found = asyncio.run(dial("127.0.0.1", port))
+        found = asyncio.run(dial(f"ws://127.0.0.1:{port}"))
         assert found.getpeername() == ("127.0.0.1", port)
         assert found.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
         found.close()
@@ -31,12 +31,12 @@ def test_where_nobody_listens_it_says_so_at_once() -> None:
     with listening() as server:
         port = server.getsockname()[1]
     with pytest.raises(ConnectionRefusedError):
-        asyncio.run(dial("127.0.0.1", port))
+        asyncio.run(dial(f"ws://127.0.0.1:{port}"))
 
 
 def test_a_name_that_is_none_is_an_error() -> None:
     with pytest.raises(OSError, match=r"."):
-        asyncio.run(dial("no-such-host.invalid", 1))
+        asyncio.run(dial("ws://no-such-host.invalid:1"))
 
 
 def test_a_link_that_returns_is_noticed_by_a_fresh_attempt_beside_those_that_wait(
@@ -58,7 +58,7 @@ def test_a_link_that_returns_is_noticed_by_a_fresh_attempt_beside_those_that_wai
 
         monkeypatch.setattr(loop, "sock_connect", connect)
         with listening() as server:
-            (await dial("127.0.0.1", server.getsockname()[1])).close()
+            (await dial(f"ws://127.0.0.1:{server.getsockname()[1]}")).close()
         assert asyncio.all_tasks() == {asyncio.current_task()}
 
     asyncio.run(scenario())
@@ -76,7 +76,7 @@ def test_nobody_who_answers_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPat
             await asyncio.sleep(60.0)
 
         monkeypatch.setattr(loop, "sock_connect", connect)
-        with pytest.raises(TimeoutError, match="nobody answered"):
-            await dial("127.0.0.1", 9)
+        with pytest.raises(TimeoutError, match="no answer"):
+            await dial("ws://127.0.0.1:9")
 
     asyncio.run(scenario())

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
-import service.node.publisher
+import service.node.back_off
+import service.node.sending
 import service.server
 from devices.errors import UsageError
 from service.link import (
@@ -35,7 +36,9 @@ from service.link import (
     heard,
     say,
 )
-from service.node.publisher import Publisher, ingest_url
+from service.node.dial import ingest_url
+from service.node.publisher import Publisher
+from service.node.sending import Source
 from storage.intervals import Intervals
 from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
@@ -49,8 +52,8 @@ from tests.service.running import Running, ServeWith
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Try again soon."""
-    monkeypatch.setattr(service.node.publisher, "_BACK_OFF_S", (0.05, 0.1))
-    monkeypatch.setattr(service.node.publisher, "_REFUSED_BACK_OFF_S", (0.05, 0.1))
+    monkeypatch.setattr(service.node.back_off, "BACK_OFF_S", (0.05, 0.1))
+    monkeypatch.setattr(service.node.back_off, "REFUSED_BACK_OFF_S", (0.05, 0.1))
 
 
 class Publishing:
@@ -72,12 +75,14 @@ class Publishing:
         self.damaged: list[Intervals] = []
         self.publisher = Publisher(
             server,
-            present=lambda: self.stream,
-            streams=lambda: {s.boot_id: s for s in (*self.earlier, self.stream)},
-            hello=self._hello,
-            status=self._status,
-            wanted=lambda *said: self.wanted.append(said),
-            damaged=lambda stream, numbers: self.damaged.append(numbers),
+            Source(
+                present=lambda: self.stream,
+                streams=lambda: {s.boot_id: s for s in (*self.earlier, self.stream)},
+                hello=self._hello,
+                status=self._status,
+                wanted=lambda *said: self.wanted.append(said),
+                damaged=lambda stream, numbers: self.damaged.append(numbers),
+            ),
             token=token,
             report=self.reports.append,
         )
@@ -454,8 +459,8 @@ def test_a_link_that_is_half_open_is_noticed_and_dialled_again(
     node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server that reads nothing, and closes nothing: its machine has gone."""
-    monkeypatch.setattr(service.node.publisher, "_NO_ANSWER_S", 0.3)
-    monkeypatch.setattr(service.node.publisher, "_ASK_EVERY_S", 0.05)
+    monkeypatch.setattr(service.node.sending, "_NO_ANSWER_S", 0.3)
+    monkeypatch.setattr(service.node.sending, "_ASK_EVERY_S", 0.05)
 
     async def scenario() -> list[str]:
         async with played() as script:

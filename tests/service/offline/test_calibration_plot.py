@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,12 +52,10 @@ def test_a_recording_without_fast_loads_has_nothing_to_replay(bench: Bench) -> N
     (recording,) = recordings["T01"]
     slow = np.isin(recording.phase, ("rest", "load", "unload"))
     last = int(np.flatnonzero(~slow)[0])
-    only_slow = Indentation(
-        **{
-            name: value[:last] if isinstance(value, np.ndarray) else value
-            for name, value in vars(recording).items()
-        }
-    )
+    columns: dict[str, Any] = {
+        n: v[:last] for n, v in vars(recording).items() if isinstance(v, np.ndarray)
+    }
+    only_slow = replace(recording, **columns)
     assert replays([only_slow], calibration.of("T01")) == {}
 
 

@@ -13,12 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import NO_SERVO_AGE, FrameBatch
+from devices.frames import FrameBatch
 from service.estimation.foot.contact import UNKNOWN
 from service.server.live import SUMMARY_NS, Encoder, Hub, Piece, Subscriber, min_of, sum_up
 from service.server.nodes import Node
+from tests.builders.arrays import PERIOD_NS
+from tests.builders.frames import make_frames
 
-PERIOD_NS = 2_000_000
 TILES = 2
 RANGE_KPA = np.array([15.0, 15.0])
 
@@ -38,18 +39,12 @@ def fake_node(name: str = "bench", boot_id: str = "0" * 32) -> Node:
 
 def frames(first: int, rows: int, *, period_ns: int = PERIOD_NS) -> FrameBatch:
     seq = np.arange(first, first + rows)
-    return FrameBatch(
-        seq=seq.astype(np.uint64),
-        t_mono_ns=seq * period_ns,
-        t_ns=10**18 + seq * period_ns,
-        padc=np.full((rows, TILES), 500, dtype=np.uint16),
-        tadc=np.full((rows, TILES), 480, dtype=np.uint16),
-        sample_offset_us=np.zeros((rows, TILES), dtype=np.int32),
-        servo_counts=np.zeros(rows, dtype=np.int32),
-        servo_age_us=np.full(rows, NO_SERVO_AGE, dtype=np.int32),
-        status=(seq[:, None] % 64 * [1, 0]).astype(np.uint8),
-        frame_status=(seq % 32).astype(np.uint8),
-        reference_force_n=np.full(rows, np.nan, dtype=np.float32),
+    return make_frames(
+        seq,
+        period_ns=period_ns,
+        servo_counts=0,
+        status=seq[:, None] % 64 * [1, 0],
+        frame_status=seq % 32,
     )
 
 

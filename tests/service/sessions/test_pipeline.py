@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import CalibrationError, TareError, UsageError
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus, TileInfo, TileStatus
-from service.estimation.calibration import Calibration, TileCalibration
+from devices.frames import ArrayInfo, FrameBatch, FrameStatus, TileStatus
+from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
 from service.estimation.plan import make_plan
@@ -26,74 +26,24 @@ from service.estimation.tare.tare import Tare
 from service.sessions import pipeline
 from service.sessions.pipeline import EstimateOptions, EstimateStream, estimate_columns, notes_of
 from storage.schema import ESTIMATES
-
-COUNT_KPA = 130 / 1023
-UNLOADED_KPA = 787 * 65 / 1023 + 50
+from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, make_array
+from tests.builders.calibrations import make_calibration, newton_tile
+from tests.builders.frames import loaded_frames
 
 Piece = tuple[FrameBatch, dict[str, np.ndarray]]
 
 
 def array(rate_hz: float = 500.0) -> ArrayInfo:
-    return ArrayInfo(
-        node="bench",
-        boot_id="0" * 32,
-        tiles=tuple(
-            TileInfo(
-                serial=f"T{i + 1:02}",
-                mux=0x70,
-                channel=i,
-                coefficient_words=(1787 * 8, 0xC000, 0, 0),
-                x_m=0.014 * i,
-                y_m=0.0,
-                z_m=-0.15,
-                reference=False,
-                conversion_ms=1.6,
-            )
-            for i in range(2)
-        ),
-        servo=None,
-        schedule="simultaneous",
-        nominal_rate_hz=rate_hz,
-        utc_offset_ns=10**18,
-        clock_set=True,
-        software="test",
-        scene="test",
-        models=("unwrap", "static"),
-    )
+    return make_array(nominal_rate_hz=rate_hz)
 
 
 def calibration(*serials: str, **changes: Any) -> Calibration:
-    entry: dict[str, Any] = {
-        "p_input": "gauge_kpa",
-        "p_offset_kpa": 0.0,
-        "p_scale_kpa": COUNT_KPA,
-        "f_offset_n": 0.0,
-        "f_scale_n": 1.0,
-        "zero_mode": "subtract_f0",
+    entry = {
         "coefficients": (0.0, 1.0, 0.001, 0.0),
-        "range_kpa": (0.0, 150 * COUNT_KPA),
-        "monotonic": True,
-        "absolute_scale": "measured",
         "covariance": ((1e-4, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-9)),
         "relative_misfit": 0.01,
-        "loop_misfit_n": 0.0,
-        "r2": 0.999,
-        "rmse_n": 0.1,
-        "cv_rmse_n": 0.1,
-        "hysteresis_n": 0.5,
-        "repeats": 4,
-        "baseline_kpa": UNLOADED_KPA,
-        "noise_kpa": COUNT_KPA,
     }
-    return Calibration(
-        name="by hand",
-        reference="none",
-        date="2020-01-01",
-        tiles=tuple(
-            TileCalibration.model_validate(entry | {"serial": serial} | changes)
-            for serial in serials or ("T01", "T02")
-        ),
-    )
+    return make_calibration(*(newton_tile(s, **entry | changes) for s in serials or ("T01", "T02")))
 
 
 def options(**changes: Any) -> EstimateOptions:
@@ -105,22 +55,11 @@ def options(**changes: Any) -> EstimateOptions:
     return EstimateOptions(**chosen | changes)
 
 
-def frames(forces_n: np.ndarray, *, lead: int = 0, period_ns: int = 2_000_000) -> FrameBatch:
-    n, tiles = forces_n.shape
-    t_mono_ns = period_ns * np.arange(n, dtype=np.int64)
-    return FrameBatch(
-        seq=np.arange(n, dtype=np.uint64),
-        t_mono_ns=t_mono_ns,
-        t_ns=t_mono_ns + 10**18,
-        padc=(500 - np.rint(forces_n)).astype(np.uint16),
-        tadc=np.full((n, tiles), 480, dtype=np.uint16),
-        sample_offset_us=np.zeros((n, tiles), dtype=np.int32),
-        servo_counts=np.zeros(n, dtype=np.int32),
-        servo_age_us=np.zeros(n, dtype=np.int32),
-        status=np.zeros((n, tiles), dtype=np.uint8),
-        frame_status=np.where(np.arange(n) < lead, FrameStatus.LEAD, 0).astype(np.uint8),
-        reference_force_n=np.full(n, np.nan, dtype=np.float32),
-    )
+def frames(
+    forces_n: np.ndarray, *, lead: int = 0, period_ns: int = PERIOD_NS, **columns: Any
+) -> FrameBatch:
+    status = np.where(np.arange(len(forces_n)) < lead, FrameStatus.LEAD, 0)
+    return loaded_frames(forces_n, period_ns=period_ns, frame_status=status, **columns)
 
 
 def hopping(n: int, *, loaded_from: int, seed: int = 0) -> np.ndarray:

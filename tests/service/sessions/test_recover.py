@@ -295,6 +295,43 @@ def test_a_session_that_was_stopped_is_ended_by_its_clock(tmp_path: Path) -> Non
     assert (one.outcome, one.session.parts[0].seq_last) == ("sealed", 50)
 
 
+def test_what_was_given_up_before_the_crash_is_not_waited_for(tmp_path: Path) -> None:
+    stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
+    parts = (Part(boot_id=BOOT, seq_first=0, seq_last=150),)
+    session(tmp_path, state="pending", stopped_t_ns=t_ns(150), parts=parts, given_up=True)
+    (one,) = recover(tmp_path).sessions
+    assert one.ledger is not None
+    assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"given_up": 20})
+
+
+def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tmp_path: Path) -> None:
+    stream(tmp_path, info_of(), (0, 99), (150, 199), next_seq=200, lost={"evicted": ((100, 149),)})
+    session(tmp_path, state="pending", stopped_t_ns=t_ns(119) + 1)
+    (one,) = recover(tmp_path).sessions
+    assert one.session.parts[0].seq_last == 119
+    assert one.ledger is not None
+    assert one.ledger.parts[0].lost == {"evicted": 20}
+
+
+def test_what_is_damaged_on_a_server_may_come_again_until_it_is_given_up(
+    tmp_path: Path,
+) -> None:
+    data, again = tmp_path / "data", tmp_path / "again"
+    folder = stream(servers(data), info_of(), (0, 99))
+    (segment,) = folder.glob("*.arrows")
+    content = bytearray(segment.read_bytes())
+    content[len(content) // 2] ^= 1
+    segment.write_bytes(content)
+    parts = (Part(boot_id=BOOT, seq_first=0, seq_last=99),)
+    session(data, state="pending", stopped_t_ns=t_ns(99), parts=parts)
+    shutil.copytree(data, again)
+    (one,) = recover(data).sessions
+    assert (one.outcome, one.problem) == ("waiting", "10 frames may still come from node bench")
+    (one,) = recover(again, give_up=True).sessions
+    assert one.ledger is not None
+    assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
+
+
 # --- streams of no session ------------------------------------------------------------------------
 
 

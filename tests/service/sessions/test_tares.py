@@ -14,38 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, StorageError, UnknownError
-from devices.frames import ArrayInfo, TileInfo
+from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Source, Tare
 from service.sessions.tares import KEPT_MAX, RecordedTare, TareHistory
+from tests.builders.arrays import make_array, make_tile
+from tests.builders.calibrations import make_tare
 
 
 def array(*serials: str) -> ArrayInfo:
-    return ArrayInfo(
-        node="bench",
-        boot_id="0" * 32,
-        tiles=tuple(
-            TileInfo(
-                serial=serial,
-                mux=0x70,
-                channel=i,
-                coefficient_words=(1787 * 8, 0xC000, 0, 0),
-                x_m=0.014 * i,
-                y_m=0.0,
-                z_m=-0.15,
-                reference=False,
-                conversion_ms=1.6,
-            )
-            for i, serial in enumerate(serials)
-        ),
-        servo=None,
-        schedule="simultaneous",
-        nominal_rate_hz=500.0,
-        utc_offset_ns=10**18,
-        clock_set=True,
-        software="test",
-        scene="test",
-        models=("unwrap", "static"),
-    )
+    return make_array([make_tile(i, serial=serial) for i, serial in enumerate(serials)])
 
 
 INFO = array("T01", "T02")
@@ -53,15 +30,12 @@ OTHERS = (array("T01", "T03"), array("T02", "T01"), array("T01"), array("T01", "
 
 
 def tare(t_ns: int = 0, *, tiles: int = 2, source: Source = "unloaded") -> Tare:
-    return Tare(
+    return make_tare(
+        tiles,
         baseline_kpa=100.0 + np.arange(tiles) / 3,
-        baseline_sigma_kpa=np.full(tiles, 0.01),
-        noise_kpa=np.full(tiles, 1 / 7),
+        noise_kpa=1 / 7,
         tadc_counts=480.0 + np.arange(tiles) / 7,
         t_ns=t_ns,
-        begin_s=0.1,
-        end_s=0.35,
-        frames=125,
         source=source,
     )
 

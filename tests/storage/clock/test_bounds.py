@@ -185,7 +185,8 @@ def best_possible(rows: Rows, t_mono_ns: int) -> float:
         for sign in (1, -1)
     ]
     assert all(end.success for end in ends)
-    return float(-(ends[0].fun + ends[1].fun) / 2 / scale * 1e9)
+    low, high = (float(end.fun or 0.0) for end in ends)
+    return -(low + high) / 2 / scale * 1e9
 
 
 @settings(max_examples=60)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -11,12 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, TileInfo
 from storage.clock.file import read_clock, write_clock
 from storage.clock.offset import ClockOffset
 from storage.clock.table import StreamFacts
 from storage.sessions.clock import clock_beside
 from storage.sessions.file import SessionReader, SessionWriter
+from tests.builders.arrays import make_array
+from tests.builders.frames import make_frames
 
 SECOND = 1_000_000_000
 
@@ -50,14 +52,15 @@ def test_a_table_without_rows_is_one(tmp_path: Path) -> None:
     assert facts["one"].clock_set is False
 
 
-def numbers(**changed: pa.Array) -> dict[str, pa.Array]:
+def numbers(**changed: pa.Array[Any]) -> dict[str, pa.Array[Any]]:
     one = pa.array([1], pa.int64())
-    return {
+    columns: dict[str, pa.Array[Any]] = {
         "boot_id": pa.array(["b"]),
         "t_mono_ns": one,
         "server_minus_node_ns": one,
         "uncertainty_ns": one,
-    } | changed
+    }
+    return columns | changed
 
 
 @pytest.mark.parametrize(
@@ -72,7 +75,7 @@ def numbers(**changed: pa.Array) -> dict[str, pa.Array]:
     ids=["columns missing", "empty instant", "empty stream", "text", "fraction"],
 )
 def test_a_file_that_is_no_clock_table_is_refused(
-    tmp_path: Path, columns: dict[str, pa.Array]
+    tmp_path: Path, columns: dict[str, pa.Array[Any]]
 ) -> None:
     path = tmp_path / "clock.parquet"
     pq.write_table(pa.table(columns), path)
@@ -100,47 +103,10 @@ def test_facts_that_are_not_understood_are_refused(tmp_path: Path) -> None:
 
 
 def sealed(folder: Path, notes: dict[str, object]) -> Path:
-    info = ArrayInfo(
-        node="bench",
-        boot_id="one",
-        tiles=(
-            TileInfo(
-                serial="T01",
-                mux=0x70,
-                channel=0,
-                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-                x_m=0.0,
-                y_m=0.0,
-                z_m=-0.15,
-                reference=False,
-                conversion_ms=1.6,
-            ),
-        ),
-        servo=None,
-        schedule="simultaneous",
-        nominal_rate_hz=1.0,
-        utc_offset_ns=7,
-        clock_set=False,
-        software="test",
-        scene="test",
-        models=("static",),
-    )
-    t_mono_ns = np.arange(4, dtype=np.int64) * SECOND
-    frames = FrameBatch(
-        seq=np.arange(4, dtype=np.uint64),
-        t_mono_ns=t_mono_ns,
-        t_ns=t_mono_ns + 7,
-        padc=np.full((4, 1), 400, dtype=np.uint16),
-        tadc=np.full((4, 1), 480, dtype=np.uint16),
-        sample_offset_us=np.zeros((4, 1), dtype=np.int32),
-        servo_counts=np.full(4, NO_SERVO_COUNTS, dtype=np.int32),
-        servo_age_us=np.full(4, NO_SERVO_AGE, dtype=np.int32),
-        status=np.zeros((4, 1), dtype=np.uint8),
-        frame_status=np.zeros(4, dtype=np.uint8),
-        reference_force_n=np.full(4, np.nan, dtype=np.float32),
-    )
+    info = make_array(1, boot_id="one", nominal_rate_hz=1.0, utc_offset_ns=7, clock_set=False)
     path = folder / "frames.parquet"
     with SessionWriter(path, info, notes) as writer:
+        frames = make_frames(4, 1, period_ns=SECOND, utc_offset_ns=7)
         writer.append(frames, {"part": np.array([0, 0, 1, 1], dtype=np.uint16)})
     return path
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -334,7 +335,7 @@ def test_a_column_of_words_is_refused_by_name(read: Read, value: str) -> None:
     ],
 )
 def test_a_parquet_column_that_is_no_number_is_refused_by_name(
-    read_parquet: Callable[..., LoadTrace], time_s: pa.Array
+    read_parquet: Callable[..., LoadTrace], time_s: pa.Array[Any]
 ) -> None:
     with pytest.raises(LoadTraceError, match="column time_s is not numeric"):
         read_parquet(time_s=time_s, cell1_n=[1.0, 2.0])

@@ -6,16 +6,14 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import ArrayInfo, FrameBatch
+from devices.frames import FrameBatch
 from storage.journal import in_flight
 from storage.journal.in_flight import (
     ROWS,
@@ -24,20 +22,9 @@ from storage.journal.in_flight import (
     open_in_flight,
     read_in_flight,
 )
-
-Arrays = Callable[..., ArrayInfo]
-Frames = Callable[..., FrameBatch]
-
-
-def put(keeper: InFlight, batch: FrameBatch) -> None:
-    for i in range(len(batch)):
-        keeper.put(
-            *(int(batch.seq[i]), int(batch.t_mono_ns[i]), int(batch.t_ns[i])),
-            *(int(batch.servo_counts[i]), int(batch.servo_age_us[i])),
-            *(float(batch.reference_force_n[i]), int(batch.frame_status[i])),
-            *(column[i].tolist() for column in (batch.padc, batch.tadc)),
-            *(column[i].tolist() for column in (batch.sample_offset_us, batch.status)),
-        )
+from tests.builders.arrays import make_array
+from tests.builders.frames import assert_same_bits
+from tests.storage.stream import frames, take_in_flight
 
 
 def found(folder: Path) -> FrameBatch:
@@ -47,50 +34,33 @@ def found(folder: Path) -> FrameBatch:
     return left[1]
 
 
-def same(one: FrameBatch, other: FrameBatch) -> None:
-    for f in fields(FrameBatch):
-        assert getattr(one, f.name).tobytes() == getattr(other, f.name).tobytes(), f.name
-
-
 @pytest.mark.parametrize("last", [0, 9, ROWS - 1, ROWS, 3 * ROWS + 17])
-def test_the_newest_frames_are_there_whatever_came_before(
-    tmp_path: Path, array_of: Arrays, frames_of: Frames, last: int
-) -> None:
-    keeper = InFlight(tmp_path / "stream", array_of())
-    put(keeper, frames_of(max(0, last - ROWS - 50), last))
-    keeper.close()
-    same(found(tmp_path / "stream"), frames_of(max(0, last - ROWS + 1), last))
+def test_the_newest_frames_are_there_whatever_came_before(tmp_path: Path, last: int) -> None:
+    take_in_flight(tmp_path / "stream", frames(max(0, last - ROWS - 50), last))
+    assert_same_bits(found(tmp_path / "stream"), frames(max(0, last - ROWS + 1), last))
 
 
-def test_the_array_is_known_before_the_first_frame(tmp_path: Path, array_of: Arrays) -> None:
-    InFlight(tmp_path, array_of(3)).close()
-    assert read_in_flight(tmp_path) == (array_of(3), None)
+def test_the_array_is_known_before_the_first_frame(tmp_path: Path) -> None:
+    InFlight(tmp_path, make_array(3)).close()
+    assert read_in_flight(tmp_path) == (make_array(3), None)
 
 
 def test_after_another_start_of_the_machine_nothing_is_trusted(
-    tmp_path: Path, array_of: Arrays, frames_of: Frames, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keeper = InFlight(tmp_path, array_of())
-    put(keeper, frames_of(0, 99))
-    keeper.close()
+    take_in_flight(tmp_path, frames(0, 99))
     monkeypatch.setattr(in_flight, "kernel_boot_id", lambda: "another start")
     assert read_in_flight(tmp_path) is None
 
 
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_a_damaged_row_ends_what_is_trusted_and_never_gives_another_frame(
     tmp_path_factory: pytest.TempPathFactory,
-    array_of: Arrays,
-    frames_of: Frames,
     data: st.DataObject,
 ) -> None:
     folder = tmp_path_factory.mktemp("damaged")
-    keeper = InFlight(folder, array_of())
-    put(keeper, frames_of(0, 199))
-    keeper.close()
+    take_in_flight(folder, frames(0, 199))
     path = folder / "in_flight"
     content = bytearray(path.read_bytes())
     begin = len(content) - ROWS * ((len(content) - 1000) // ROWS)
@@ -103,11 +73,11 @@ def test_a_damaged_row_ends_what_is_trusted_and_never_gives_another_frame(
     first = int(left[1].seq[0])
     last = int(left[1].seq[-1])
     assert last >= 198 or first == 0
-    same(left[1], frames_of(first, last))
+    assert_same_bits(left[1], frames(first, last))
 
 
 def test_a_full_disk_is_known_at_once_and_leaves_nothing_behind(
-    tmp_path: Path, array_of: Arrays, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without room that is reserved, the first write to a mapped page would end the process."""
 
@@ -115,12 +85,12 @@ def test_a_full_disk_is_known_at_once_and_leaves_nothing_behind(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    assert open_in_flight(tmp_path, array_of()) is None
+    assert open_in_flight(tmp_path, make_array()) is None
     assert list(tmp_path.iterdir()) == []
-    assert open_in_flight(None, array_of()) is None
+    assert open_in_flight(None, make_array()) is None
 
 
-def test_what_is_no_such_file_is_nothing(tmp_path: Path, array_of: Arrays) -> None:
+def test_what_is_no_such_file_is_nothing(tmp_path: Path) -> None:
     assert read_in_flight(tmp_path) is None
     for content in (b"", b"FootTile", bytes(5000)):
         (tmp_path / "in_flight").write_bytes(content)
@@ -130,18 +100,18 @@ def test_what_is_no_such_file_is_nothing(tmp_path: Path, array_of: Arrays) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_killed_process_has_left_every_frame_that_it_had_taken(
-    tmp_path: Path, array_of: Arrays, frames_of: Frames
-) -> None:
+def test_a_killed_process_has_left_every_frame_that_it_had_taken(tmp_path: Path) -> None:
     code = """
 import json, sys
 from pathlib import Path
+from devices.acquisition import FrameRow
 from devices.frames import ArrayInfo
 from storage.journal.in_flight import InFlight
 info = ArrayInfo.model_validate_json(sys.stdin.readline())
 keeper = InFlight(Path(sys.argv[1]), info)
 for seq in range(10_000_000):
-    keeper.put(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
+    row = FrameRow(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
+    keeper.put(row)
     if seq % 1000 == 999:
         print(seq, flush=True)
 """
@@ -153,7 +123,7 @@ for seq in range(10_000_000):
     )
     assert process.stdin is not None
     assert process.stdout is not None
-    process.stdin.write(array_of().model_dump_json() + "\n")
+    process.stdin.write(make_array().model_dump_json() + "\n")
     process.stdin.close()
     for _ in range(13):
         said = int(process.stdout.readline())
@@ -162,7 +132,7 @@ for seq in range(10_000_000):
     rest = process.stdout.read().split()
     process.stdout.close()
     said = int(rest[-1]) if rest else said
-    frames = found(tmp_path)
-    assert int(frames.seq[-1]) >= said
-    assert len(frames) in (ROWS, ROWS - 1)  # it may have been in the midst of a row
-    np.testing.assert_array_equal(frames.t_ns, frames.seq.astype(np.int64) + 1)
+    batch = found(tmp_path)
+    assert int(batch.seq[-1]) >= said
+    assert len(batch) in (ROWS, ROWS - 1)  # it may have been in the midst of a row
+    np.testing.assert_array_equal(batch.t_ns, batch.seq.astype(np.int64) + 1)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import resource
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
@@ -19,74 +17,35 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
+from devices.frames import FrameBatch
 from storage.intervals import Intervals
 from storage.journal import segment as segment_module
-from storage.journal.journal import SEGMENT_NS, Journal
+from storage.journal.journal import Journal
+from storage.journal.open_segments import SEGMENT_NS
 from storage.schema import from_record_batch, wire_schema
 from storage.wire import encode
+from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
+from tests.builders.frames import any_frames, assert_same_bits
+from tests.storage.faulty_disk import disk_with_room_for
 
-PERIOD_NS = 2_000_000
-UTC_NS = 10**18
 TOP = 60
-
-
-def array(tiles: int = 2) -> ArrayInfo:
-    return ArrayInfo(
-        node="bench",
-        boot_id="0" * 32,
-        tiles=tuple(
-            TileInfo(
-                serial=f"T{i + 1:02}",
-                mux=0x70,
-                channel=i,
-                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-                x_m=0.014 * i,
-                y_m=0.0,
-                z_m=-0.15,
-                reference=False,
-                conversion_ms=1.6,
-            )
-            for i in range(tiles)
-        ),
-        servo=None,
-        schedule="simultaneous",
-        nominal_rate_hz=1e9 / PERIOD_NS,
-        utc_offset_ns=UTC_NS,
-        clock_set=True,
-        software="test",
-        scene="test",
-        models=("unwrap", "static"),
-    )
 
 
 def stream(rows: int = TOP, tiles: int = 2, *, period_ns: int = PERIOD_NS) -> FrameBatch:
     """A stream from its first frame on, with any bits in columns without a law."""
-    rng = np.random.default_rng(rows)
-    columns: dict[str, Any] = {}
-    for name, (dtype, per_tile) in FRAME_COLUMNS.items():
-        size = rows * tiles if per_tile else rows
-        bits = rng.integers(0, 256, size * np.dtype(dtype).itemsize, dtype=np.uint8)
-        columns[name] = bits.view(dtype).reshape((rows, tiles) if per_tile else (rows,))
-    columns["seq"] = np.arange(rows, dtype=np.uint64)
-    columns["t_mono_ns"] = period_ns * np.arange(rows, dtype=np.int64)
-    return FrameBatch(**columns | {"t_ns": columns["t_mono_ns"] + UTC_NS})
+    seq = np.arange(rows)
+    t_mono_ns = period_ns * seq
+    times = {"t_mono_ns": t_mono_ns, "t_ns": t_mono_ns + UTC_NS}
+    return any_frames(rows, tiles, rows, seq=seq, **times)
 
 
 ALL = stream()
-SCHEMA = wire_schema(array())
+SCHEMA = wire_schema(make_array())
 
 
 def part(first: int, last: int) -> FrameBatch:
     """Frames `first` to `last`, both included, of the one stream that all tests take them from."""
     return ALL.rows(first, last + 1)
-
-
-def same(one: FrameBatch, other: FrameBatch) -> None:
-    for f in fields(FrameBatch):
-        a, b = getattr(one, f.name), getattr(other, f.name)
-        assert (a.dtype, a.shape) == (b.dtype, b.shape), f.name
-        assert a.tobytes() == b.tobytes(), f.name
 
 
 def members(intervals: Intervals) -> set[int]:
@@ -105,8 +64,8 @@ def assert_holds(
     assert read == expected
     if read:
         whole = FrameBatch.concatenate(batches)
-        rows = np.array(expected)
-        same(whole, FrameBatch(**{f.name: getattr(of, f.name)[rows] for f in fields(of)}))
+        rows = {f.name: getattr(of, f.name)[expected] for f in fields(of)}
+        assert_same_bits(whole, FrameBatch(**rows))
 
 
 _OPENED: list[Journal] = []
@@ -121,7 +80,7 @@ def _closed() -> Iterator[None]:
 
 def begun(folder: Path) -> Journal:
     """A journal for this array; it is closed when the test ends."""
-    _OPENED.append(Journal(folder, array()))
+    _OPENED.append(Journal(folder, make_array()))
     return _OPENED[-1]
 
 
@@ -178,7 +137,7 @@ def test_every_frame_is_held_once_whatever_comes_twice_and_in_whatever_order(
 def test_a_reopened_journal_knows_its_array_and_holds_the_same(tmp_path: Path) -> None:
     filled(tmp_path, (0, 9), (20, 29), (10, 14)).close()
     journal = reopened(tmp_path)
-    assert journal.info == array()
+    assert journal.info == make_array()
     assert_holds(journal, {*range(15), *range(20, 30)})
 
 
@@ -220,7 +179,7 @@ def test_arrow_alone_reads_a_segment(tmp_path: Path) -> None:
             found.append([from_record_batch(record) for record in reader])
     numbers = [[n for batch in rows for n in batch.seq.tolist()] for rows in found]
     assert numbers == [[*range(10), *range(15, 20)], [*range(10, 15)]]
-    same(found[0][0], part(0, 9))
+    assert_same_bits(found[0][0], part(0, 9))
 
 
 def test_within_a_segment_time_never_runs_back_in_whatever_order_frames_come(
@@ -333,7 +292,7 @@ def test_a_tail_of_another_array_is_cut_off(tmp_path: Path) -> None:
     filled(tmp_path, (0, 9)).close()
     (path,) = segments(tmp_path)
     with path.open("ab") as file:
-        file.write(encode(stream(5, 3), wire_schema(array(3))))
+        file.write(encode(stream(5, 3), wire_schema(make_array(3))))
     assert_holds(reopened(tmp_path), set(range(10)))
 
 
@@ -354,7 +313,7 @@ def test_a_batch_that_was_damaged_since_is_refused_when_it_is_read(tmp_path: Pat
     content[second : second + 8] = bytes(8)
     path.write_bytes(content)
     reading = journal.read(0, 19)
-    same(next(reading), part(0, 9))
+    assert_same_bits(next(reading), part(0, 9))
     with pytest.raises(FileFormatError):
         next(reading)
 
@@ -454,7 +413,7 @@ def test_what_is_not_in_the_index_was_never_promised_and_is_set_aside(
     os.truncate(index_of(path), kept)
     journal = reopened(path.parent) if kept >= 48 else None
     if journal is None:
-        journal = Journal(path.parent, array())
+        journal = Journal(path.parent, make_array())
         _OPENED.append(journal)
     assert_holds(journal, set(range(10 * (kept // 48))))
     assert path.with_suffix(".unread").exists()
@@ -475,7 +434,7 @@ def test_pages_that_a_power_cut_left_empty_are_no_frames(tmp_path: Path, empty: 
     path = crashed(tmp_path / "j", (0, 9), (10, 19), (20, 29))
     content = path.read_bytes()
     path.write_bytes(content[:-empty] + bytes(empty))
-    journal = Journal(path.parent, array())
+    journal = Journal(path.parent, make_array())
     _OPENED.append(journal)
     kept = {16: 20, 400: 20, 4096: 0}[empty]
     assert_holds(journal, set(range(kept)))
@@ -599,17 +558,6 @@ def test_the_last_number_until_an_instant_is_known_once_the_stream_has_passed_it
 
 
 # --- a disk that is full --------------------------------------------------------------------------
-
-
-@contextmanager
-def disk_with_room_for(size: int) -> Iterator[None]:
-    """No file may grow beyond `size` bytes: a write fails as it does on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 HEADER = len(SCHEMA.serialize().to_pybytes())

@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,60 +18,31 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.frames import ArrayInfo, FrameBatch, TileInfo
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
 from storage.sessions.content_hash import file_hashes, write_file_hash
 from storage.sessions.file import SessionReader, SessionWriter
+from tests.builders.arrays import make_array
+from tests.builders.frames import make_frames
 
 FORMATS = Path(__file__).resolve().parents[3] / "docs" / "formats.md"
-UTC_NS = 10**18
-
-
-def array(tiles: int = 2) -> ArrayInfo:
-    return ArrayInfo(
-        node="bench",
-        boot_id="0" * 32,
-        tiles=tuple(
-            TileInfo(
-                serial=f"T{i + 1:02}",
-                mux=0x70,
-                channel=i,
-                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-                x_m=0.1 / 3 * i,
-                y_m=0.0,
-                z_m=-0.15,
-                reference=False,
-                conversion_ms=1.6,
-            )
-            for i in range(tiles)
-        ),
-        servo=None,
-        schedule="simultaneous",
-        nominal_rate_hz=500.0,
-        utc_offset_ns=UTC_NS,
-        clock_set=True,
-        software="test",
-        scene="test",
-        models=("unwrap", "static"),
-    )
 
 
 def frames(rows: int, tiles: int = 2) -> FrameBatch:
     """Frames over minutes, with everything in them that can be missing."""
     rng = np.random.default_rng(rows)
-    t_mono_ns = 1_000_000_000 * np.arange(rows, dtype=np.int64)
     shape = (rows, tiles)
-    return FrameBatch(
-        seq=np.arange(rows, dtype=np.uint64),
-        t_mono_ns=t_mono_ns,
-        t_ns=t_mono_ns + UTC_NS,
-        padc=rng.choice([300, 65535], shape).astype(np.uint16),
-        tadc=rng.choice([480, 65535], shape).astype(np.uint16),
-        sample_offset_us=rng.integers(-100, 3000, shape).astype(np.int32),
-        servo_counts=rng.choice([-(2**31), 5], rows).astype(np.int32),
-        servo_age_us=rng.choice([-1, 7], rows).astype(np.int32),
-        status=rng.integers(0, 64, shape).astype(np.uint8),
-        frame_status=rng.integers(0, 32, rows).astype(np.uint8),
-        reference_force_n=rng.choice([np.nan, -0.0, 3.25], rows).astype(np.float32),
+    return make_frames(
+        rows,
+        tiles,
+        period_ns=1_000_000_000,
+        padc=rng.choice([300, NOT_READ], shape),
+        tadc=rng.choice([480, NOT_READ], shape),
+        sample_offset_us=rng.integers(-100, 3000, shape),
+        servo_counts=rng.choice([NO_SERVO_COUNTS, 5], rows),
+        servo_age_us=rng.choice([NO_SERVO_AGE, 7], rows),
+        status=rng.integers(0, 64, shape),
+        frame_status=rng.integers(0, 32, rows),
+        reference_force_n=rng.choice([np.nan, -0.0, 3.25], rows),
     )
 
 
@@ -85,14 +57,20 @@ def extra(rows: int) -> dict[str, Any]:
     }
 
 
-def write(path: Path, rows: int = 200, cuts: tuple[int, ...] = (), **notes: object) -> Path:
+def write(path: Path, rows: int = 200, cuts: Sequence[int] = (), **notes: object) -> Path:
     batch, columns = frames(rows), extra(rows)
-    with SessionWriter(path, array(), notes) as writer:
+    with SessionWriter(path, make_array(), notes) as writer:
         bounds = [0, *cuts, rows]
         for begin, end in itertools.pairwise(bounds):
             piece = {name: values[begin:end] for name, values in columns.items()}
             writer.append(batch.rows(begin, end), piece)
     return path
+
+
+def metadata_of(path: Path) -> dict[bytes, bytes]:
+    said = pq.ParquetFile(path).metadata.metadata
+    assert said is not None
+    return said
 
 
 def content(path: Path) -> dict[str, Any]:
@@ -126,7 +104,7 @@ def test_content_has_one_hash_however_it_was_cut(
 ) -> None:
     folder = tmp_path_factory.mktemp("cut")
     whole = write(folder / "a.parquet")
-    cut = write(folder / "b.parquet", 200, tuple(cuts))
+    cut = write(folder / "b.parquet", 200, cuts)
     assert content(whole) == content(cut)
 
 
@@ -155,12 +133,12 @@ def test_row_groups_and_encodings_do_not_change_the_hashes_of_columns(tmp_path: 
 def test_nothing_that_is_missing_is_taken_for_a_number(
     tmp_path: Path, name: str, before: Any, after: Any
 ) -> None:
-    found = []
+    found: list[dict[str, str]] = []
     for value in (before, after):
         batch = frames(3)
         getattr(batch, name)[...] = value
         path = tmp_path / f"{len(found)}.parquet"
-        with SessionWriter(path, array(), {}) as writer:
+        with SessionWriter(path, make_array(), {}) as writer:
             writer.append(batch, {})
         found.append(content(path)["columns"])
     changed = {column for column in found[0] if found[0][column] != found[1][column]}
@@ -168,7 +146,7 @@ def test_nothing_that_is_missing_is_taken_for_a_number(
 
 
 def test_counts_and_parts_are_in_the_metadata(tmp_path: Path) -> None:
-    with SessionWriter(tmp_path / "s.parquet", array(), {}) as writer:
+    with SessionWriter(tmp_path / "s.parquet", make_array(), {}) as writer:
         batch = frames(10)
         writer.append(batch, {"part": np.array([0] * 4 + [1] * 6, np.uint16)})
     said = content(tmp_path / "s.parquet")
@@ -177,14 +155,14 @@ def test_counts_and_parts_are_in_the_metadata(tmp_path: Path) -> None:
         {"part": 0, "seq_first": 0, "seq_last": 3, "frames": 4},
         {"part": 1, "seq_first": 4, "seq_last": 9, "frames": 6},
     ]
-    raw = pq.ParquetFile(tmp_path / "s.parquet").metadata.metadata
-    assert json.loads(raw[b"foottile.content"]) == said
+    assert json.loads(metadata_of(tmp_path / "s.parquet")[b"foottile.content"]) == said
 
 
 def test_notes_and_array_are_in_the_content_hash(tmp_path: Path) -> None:
     hashes = set()
-    for number, notes in enumerate(({"a": 1}, {"a": 2}, {})):
-        with SessionReader(write(tmp_path / f"{number}.parquet", **notes)) as reader:
+    kept: tuple[dict[str, object], ...] = ({"a": 1}, {"a": 2}, {})
+    for number, notes in enumerate(kept):
+        with SessionReader(write(tmp_path / f"{number}.parquet", 200, (), **notes)) as reader:
             hashes.add(reader.content_sha256)
     assert len(hashes) == 3
 
@@ -194,7 +172,7 @@ def test_a_changed_note_is_seen_whenever_the_file_is_opened(tmp_path: Path) -> N
     whole = path.read_bytes()
     table = pq.read_table(path)
     changed = {**table.schema.metadata, b"foottile.notes": b'{"calibration": "by foot"}'}
-    said = pq.ParquetFile(path).metadata.metadata
+    said = metadata_of(path)
     kept = {key: said[key] for key in said if key.startswith(b"foottile.content")}
     pq.write_table(table.replace_schema_metadata({**changed, **kept}), path)
     with pytest.raises(FileFormatError, match="not the one that was sealed"):

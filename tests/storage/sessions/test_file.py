@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,96 +16,41 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import (
-    FRAME_COLUMNS,
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,
     NOT_READ,
-    ArrayInfo,
     FrameBatch,
-    TileInfo,
 )
 from storage.durable import remove_stale_temporaries
 from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN
 from storage.sessions.file import FORMAT_KEY, NOTES_KEY, SessionReader, SessionWriter
+from tests.builders.arrays import PERIOD_NS, make_array
+from tests.builders.frames import any_frames, assert_same_bits, make_frames
+from tests.storage.faulty_disk import disk_with_room_for
 
 
-def array(tiles: int = 2) -> ArrayInfo:
-    return ArrayInfo(
-        node="bench",
-        boot_id="0" * 32,
-        tiles=tuple(
-            TileInfo(
-                serial=f"T{i + 1:02}",
-                mux=0x70,
-                channel=i,
-                coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-                x_m=0.1 / 3 * i,
-                y_m=0.0,
-                z_m=-0.15,
-                reference=False,
-                conversion_ms=1.6,
-            )
-            for i in range(tiles)
-        ),
-        servo=None,
-        schedule="simultaneous",
-        nominal_rate_hz=500.0,
-        utc_offset_ns=10**18,
-        clock_set=True,
-        software="test",
-        scene="test",
-        models=("unwrap", "static"),
-    )
-
-
-def frames(rows: int, tiles: int = 2, *, seed: int = 0, period_ns: int = 2_000_000) -> FrameBatch:
+def frames(rows: int, tiles: int = 2, *, seed: int = 0, period_ns: int = PERIOD_NS) -> FrameBatch:
     rng = np.random.default_rng(seed)
-    t_mono_ns = period_ns * np.arange(rows, dtype=np.int64)
     shape = (rows, tiles)
-    return FrameBatch(
-        seq=np.arange(rows, dtype=np.uint64),
-        t_mono_ns=t_mono_ns,
-        t_ns=t_mono_ns + 10**18,
-        padc=rng.integers(250, 420, shape).astype(np.uint16),
-        tadc=rng.integers(470, 490, shape).astype(np.uint16),
-        sample_offset_us=rng.integers(-100, 3000, shape).astype(np.int32),
-        servo_counts=rng.integers(-5000, 5000, rows).astype(np.int32),
-        servo_age_us=rng.integers(0, 20000, rows).astype(np.int32),
-        status=rng.integers(0, 64, shape).astype(np.uint8),
-        frame_status=rng.integers(0, 32, rows).astype(np.uint8),
-        reference_force_n=rng.normal(0, 30, rows).astype(np.float32),
+    return make_frames(
+        rows,
+        tiles,
+        period_ns=period_ns,
+        padc=rng.integers(250, 420, shape),
+        tadc=rng.integers(470, 490, shape),
+        sample_offset_us=rng.integers(-100, 3000, shape),
+        servo_counts=rng.integers(-5000, 5000, rows),
+        servo_age_us=rng.integers(0, 20000, rows),
+        status=rng.integers(0, 64, shape),
+        frame_status=rng.integers(0, 32, rows),
+        reference_force_n=rng.normal(0, 30, rows),
     )
-
-
-def anything(rows: int, tiles: int, seed: int) -> FrameBatch:
-    """Any bits, the ends of every type and what stands for "not known" among them."""
-    rng = np.random.default_rng(seed)
-    columns: dict[str, Any] = {}
-    for name, (dtype, per_tile) in FRAME_COLUMNS.items():
-        shape = (rows, tiles) if per_tile else (rows,)
-        if np.issubdtype(dtype, np.floating):
-            values = rng.choice([np.nan, np.inf, -np.inf, -0.0, 1e-40, 29.97], shape).astype(dtype)
-        else:
-            ends = np.iinfo(dtype)
-            values = rng.integers(ends.min, ends.max, shape, dtype=dtype, endpoint=True)
-            values[rng.random(shape) < 0.3] = ends.max
-            values[rng.random(shape) < 0.3] = ends.min
-        columns[name] = values
-    t_mono_ns = np.sort(rng.integers(0, 10**15, rows))
-    return FrameBatch(**columns | {"t_mono_ns": t_mono_ns})
-
-
-def same(one: FrameBatch, other: FrameBatch) -> None:
-    for f in fields(FrameBatch):
-        a, b = getattr(one, f.name), getattr(other, f.name)
-        assert (a.dtype, a.shape) == (b.dtype, b.shape), f.name
-        np.testing.assert_array_equal(a, b, err_msg=f.name)
 
 
 def write(
     path: Path, batch: FrameBatch, notes: dict[str, object] | None = None, **extra: np.ndarray
 ) -> Path:
-    with SessionWriter(path, array(batch.tile_count), notes or {}) as writer:
+    with SessionWriter(path, make_array(batch.tile_count), notes or {}) as writer:
         writer.append(batch, extra)
     return path
 
@@ -121,10 +62,9 @@ def read(path: Path) -> FrameBatch:
 
 def rewritten(path: Path, table: pa.Table, **metadata: bytes | None) -> Path:
     """The table as a Parquet file with these metadata changed; None takes an entry out."""
-    kept = dict(table.schema.metadata) | {
-        f"foottile.{key}".encode(): value for key, value in metadata.items()
-    }
-    kept = {key: value for key, value in kept.items() if value is not None}
+    said = {f"foottile.{key}".encode(): value for key, value in metadata.items()}
+    merged = {**table.schema.metadata, **said}
+    kept = {key: value for key, value in merged.items() if value is not None}
     pq.write_table(table.replace_schema_metadata(kept), path)
     return path
 
@@ -149,15 +89,23 @@ def test_frames_survive_the_file(
     tmp_path_factory: pytest.TempPathFactory, rows: int, tiles: int, seed: int, cut: int
 ) -> None:
     path = tmp_path_factory.mktemp("round") / "session.parquet"
-    batch = anything(rows, tiles, seed)
-    with SessionWriter(path, array(tiles), {}) as writer:
+    rng = np.random.default_rng(seed)
+    batch = any_frames(
+        rows,
+        tiles,
+        seed,
+        t_mono_ns=np.sort(rng.integers(0, 10**15, rows)),
+        # Of all that is not a number the file keeps only that it is none.
+        reference_force_n=rng.choice([np.nan, np.inf, -np.inf, -0.0, 1e-40, 29.97], rows),
+    )
+    with SessionWriter(path, make_array(tiles), {}) as writer:
         for piece in (batch.rows(0, cut), batch.rows(cut, rows)):
             if len(piece):
                 writer.append(piece, {})
     with SessionReader(path) as session:
-        assert session.info == array(tiles)
+        assert session.info == make_array(tiles)
         assert session.frame_count == rows
-        same(session.frames(), batch)
+        assert_same_bits(session.frames(), batch)
 
 
 def test_the_columns_are_flat_and_those_of_the_contract_in_order(tmp_path: Path) -> None:
@@ -177,11 +125,10 @@ def test_the_columns_are_flat_and_those_of_the_contract_in_order(tmp_path: Path)
 
 def test_units_survive_the_file(tmp_path: Path) -> None:
     schema = pq.read_schema(write(tmp_path / "s.parquet", frames(5)))
-    for field in schema:
-        assert field.metadata[b"unit"], field.name
-        assert field.metadata[b"description"], field.name
-    assert schema.field("t_ns").metadata[b"unit"] == b"ns"
-    assert schema.field("padc_1").metadata[b"unit"] == b"counts"
+    said = {field.name: field.metadata or {} for field in schema}
+    assert all(metadata[b"unit"] and metadata[b"description"] for metadata in said.values())
+    assert said["t_ns"][b"unit"] == b"ns"
+    assert said["padc_1"][b"unit"] == b"counts"
 
 
 def test_integers_are_delta_encoded_floats_split_and_all_of_it_zstd(tmp_path: Path) -> None:
@@ -240,7 +187,7 @@ def test_what_is_not_known_is_null_in_the_file_and_what_it_was_in_memory(tmp_pat
     path = write(tmp_path / "s.parquet", batch, contact=contact, grf_n=grf_n)
     table = pq.read_table(path)
 
-    def nulls(name: str) -> list[bool]:
+    def nulls(name: str) -> list[bool | None]:
         return table.column(name).is_null().to_pylist()
 
     assert nulls("padc_0") == [False] * 4
@@ -254,7 +201,7 @@ def test_what_is_not_known_is_null_in_the_file_and_what_it_was_in_memory(tmp_pat
     assert not any(table.column("seq").is_null().to_pylist())
     with SessionReader(path) as session:
         ((back, extra),) = session.batches("contact", "grf_n")
-    same(back, batch)
+    assert_same_bits(back, batch)
     assert extra["contact"].tolist() == contact.tolist()
     np.testing.assert_array_equal(extra["grf_n"], grf_n)
 
@@ -286,7 +233,7 @@ def test_estimates_are_kept_in_single_truth_in_double_precision_and_notes_as_tex
         ((_, extra),) = session.batches("force_n", "true_grf_n", "pressed_tile", "estimate_status")
     assert extra["force_n"].dtype == np.float32
     np.testing.assert_array_equal(
-        extra["force_n"], np.float32([[1 / 3, np.nan], [2e-3, 0.1], [1e9, -1.0]])
+        extra["force_n"], np.array([[1 / 3, np.nan], [2e-3, 0.1], [1e9, -1.0]], np.float32)
     )
     assert extra["true_grf_n"].tobytes() == third.tobytes()
     assert extra["pressed_tile"].tolist() == ["T01", None, "T02"]
@@ -295,7 +242,7 @@ def test_estimates_are_kept_in_single_truth_in_double_precision_and_notes_as_tex
 
 def test_notes_survive_and_may_be_added_before_the_first_group(tmp_path: Path) -> None:
     path = tmp_path / "s.parquet"
-    with SessionWriter(path, array(), {"seed": 7, "scene": {"name": "mud"}}) as writer:
+    with SessionWriter(path, make_array(), {"seed": 7, "scene": {"name": "mud"}}) as writer:
         writer.append(frames(3), {})
         writer.add_notes({"lag_ms": 9.2})
     with SessionReader(path) as session:
@@ -342,13 +289,13 @@ def group_seconds(path: Path) -> list[float]:
 def test_a_row_group_is_about_a_minute(tmp_path: Path) -> None:
     # 150 s in pieces of a second
     path, batch = tmp_path / "s.parquet", frames(3000, period_ns=50_000_000)
-    with SessionWriter(path, array(), {}) as writer:
+    with SessionWriter(path, make_array(), {}) as writer:
         for begin in range(0, 3000, 20):
             writer.append(batch.rows(begin, begin + 20), {})
     seconds = group_seconds(path)
     assert len(seconds) == 3
     assert all(59.0 <= s <= 62.0 for s in seconds[:-1])
-    same(read(path), batch)
+    assert_same_bits(read(path), batch)
 
 
 def test_one_long_batch_is_cut_into_row_groups_of_a_minute_too(tmp_path: Path) -> None:
@@ -356,7 +303,7 @@ def test_one_long_batch_is_cut_into_row_groups_of_a_minute_too(tmp_path: Path) -
     batch = frames(3000, period_ns=200_000_000)  # ten minutes
     path = write(tmp_path / "s.parquet", batch)
     assert all(s <= 62.0 for s in group_seconds(path))
-    same(read(path), batch)
+    assert_same_bits(read(path), batch)
 
 
 def test_a_gap_of_an_hour_is_no_reason_for_a_group_of_its_own_for_every_frame(
@@ -365,7 +312,7 @@ def test_a_gap_of_an_hour_is_no_reason_for_a_group_of_its_own_for_every_frame(
     batch = frames(300)
     t_mono_ns = batch.t_mono_ns + np.where(np.arange(300) >= 150, 3_600_000_000_000, 0)
     path = tmp_path / "s.parquet"
-    with SessionWriter(path, array(), {}) as writer:
+    with SessionWriter(path, make_array(), {}) as writer:
         for begin in range(0, 300, 10):
             writer.append(replace(batch, t_mono_ns=t_mono_ns).rows(begin, begin + 10), {})
     assert pq.ParquetFile(path).num_row_groups <= 3
@@ -382,7 +329,7 @@ def test_the_file_appears_only_when_it_is_sealed_and_nothing_stays_beside_it(
     tmp_path: Path,
 ) -> None:
     path, batch = tmp_path / "s.parquet", frames(3000, period_ns=50_000_000)
-    with SessionWriter(path, array(), {}) as writer:
+    with SessionWriter(path, make_array(), {}) as writer:
         for begin in range(0, 3000, 300):
             writer.append(batch.rows(begin, begin + 300), {})
             assert not path.exists()
@@ -392,7 +339,7 @@ def test_the_file_appears_only_when_it_is_sealed_and_nothing_stays_beside_it(
 
 def fail(path: Path, batch: FrameBatch | None, error: type[BaseException]) -> None:
     """Write the batch, if there is one, and then fail within the block."""
-    with SessionWriter(path, array(), {}) as writer:
+    with SessionWriter(path, make_array(), {}) as writer:
         if batch is not None:
             writer.append(batch, {})
         raise error
@@ -412,7 +359,7 @@ def test_an_exception_in_the_block_leaves_nothing_behind(
 def test_a_file_that_is_there_stays_until_the_new_one_is_sealed(tmp_path: Path) -> None:
     path = write(tmp_path / "s.parquet", frames(5))
     old = path.read_bytes()
-    with SessionWriter(path, array(), {}) as writer:
+    with SessionWriter(path, make_array(), {}) as writer:
         writer.append(frames(1300, period_ns=50_000_000), {})
         assert path.read_bytes() == old
     assert len(read(path)) == 1300
@@ -429,7 +376,7 @@ def test_a_file_that_is_there_survives_a_failure(tmp_path: Path) -> None:
 
 def test_a_session_without_frames_is_refused_and_leaves_nothing_behind(tmp_path: Path) -> None:
     path = tmp_path / "s.parquet"
-    with pytest.raises(FileFormatError, match="no frames"), SessionWriter(path, array(), {}):
+    with pytest.raises(FileFormatError, match="no frames"), SessionWriter(path, make_array(), {}):
         pass
     assert names_in(tmp_path) == []
 
@@ -451,23 +398,12 @@ def test_it_is_synced_before_it_gets_its_name_and_the_folder_after(
 
 
 def test_while_it_is_written_its_name_says_whose_it_is(tmp_path: Path) -> None:
-    with SessionWriter(tmp_path / "s.parquet", array(), {}) as writer:
+    with SessionWriter(tmp_path / "s.parquet", make_array(), {}) as writer:
         writer.append(frames(3000, period_ns=50_000_000), {})
         (name,) = names_in(tmp_path)
         assert name.startswith(f".s.parquet.{os.getpid()}.")
         assert remove_stale_temporaries(tmp_path) == []
     assert names_in(tmp_path) == ["s.parquet"]
-
-
-@contextmanager
-def disk_with_room_for(size: int) -> Iterator[None]:
-    """No file may grow beyond `size` bytes: a write fails as it does on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("room", [0, 1, 100, 4000, 9000])
@@ -569,7 +505,7 @@ def test_a_later_format_says_so_even_if_it_describes_its_array_in_a_new_way(
     tmp_path: Path,
 ) -> None:
     table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
-    info = json.loads(array().model_dump_json()) | {"hall_sensors": 4}
+    info = json.loads(make_array().model_dump_json()) | {"hall_sensors": 4}
     path = tmp_path / "later.parquet"
     rewritten(path, table, format=b"3", array_info=json.dumps(info).encode())
     refused(path, "Update foottile")
@@ -648,13 +584,13 @@ def test_a_file_with_more_columns_than_ours_is_read(tmp_path: Path) -> None:
     batch = frames(5)
     table = pq.read_table(write(tmp_path / "s.parquet", batch))
     table = table.append_column("my_filter_n", pa.array(np.arange(5.0)))
-    same(read(rewritten(tmp_path / "more.parquet", table)), batch)
+    assert_same_bits(read(rewritten(tmp_path / "more.parquet", table)), batch)
 
 
 def test_a_file_that_describes_fewer_tiles_than_it_has_is_refused(tmp_path: Path) -> None:
     # a COP of half of the foot would look right
     table = pq.read_table(write(tmp_path / "s.parquet", frames(5, 4)))
-    two = array(2).model_dump_json().encode()
+    two = make_array(2).model_dump_json().encode()
     refused(rewritten(tmp_path / "two.parquet", table, array_info=two), "2 tiles")
 
 

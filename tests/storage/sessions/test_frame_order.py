@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.frames import FRAME_COLUMNS, FrameBatch
+from devices.frames import FrameBatch
 from storage.intervals import Intervals
 from storage.sessions.frame_order import FrameOrder, in_order
+from tests.builders.frames import make_frames
 
 
 def columns(seq: list[int], part: list[int] | None = None) -> dict[str, Any]:
@@ -77,16 +78,12 @@ def test_of_a_thousand_disorders_a_few_are_named_and_all_counted() -> None:
 
 
 def batch(seq: list[int]) -> FrameBatch:
-    content = columns(seq)
-    rest = {
-        name: np.zeros((len(seq), 1) if per_tile else len(seq), dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-    }
-    return FrameBatch(**rest | content)
+    return make_frames(seq, 1)
 
 
 def test_who_relies_on_order_is_given_frames_up_to_the_first_disorder() -> None:
     given_out = []
+    pieces: list[tuple[FrameBatch, dict[str, np.ndarray]]]
     pieces = [(batch([0, 1]), {}), (batch([2, 3]), {}), (batch([3, 4]), {})]
     ordered = in_order(pieces, where="walk.parquet")
     given_out += [int(next(ordered)[0].seq[0]) for _ in range(2)]

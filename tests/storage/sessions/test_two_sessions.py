@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, ArrayInfo, FrameBatch, TileInfo
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
 from storage.formats.export import Slice, export
+from tests.builders.arrays import make_array
+from tests.builders.frames import make_frames
 
 ROOT = Path(__file__).resolve().parents[3]
 SECOND = 1_000_000_000
@@ -52,44 +52,16 @@ class Node:
 
     def export(self, path: Path, seed: int, *, measured_parts: int) -> None:
         """Write what `foottile export --clock server` does, of two parts, measured or not."""
-        info = ArrayInfo(
+        info = make_array(
+            1,
             node=self.name,
             boot_id="first",
-            tiles=(
-                TileInfo(
-                    serial="T01",
-                    mux=0x70,
-                    channel=0,
-                    coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-                    x_m=0.0,
-                    y_m=0.0,
-                    z_m=-0.15,
-                    reference=False,
-                    conversion_ms=1.6,
-                ),
-            ),
-            servo=None,
-            schedule="simultaneous",
             nominal_rate_hz=1e9 / PERIOD_NS,
             utc_offset_ns=self._utc_offset_ns,
             clock_set=False,
-            software="test",
-            scene="test",
-            models=("static",),
         )
-        t_mono_ns = self.read_ns(self.taken_ns)
-        frames = FrameBatch(
-            seq=np.arange(FRAMES, dtype=np.uint64),
-            t_mono_ns=t_mono_ns,
-            t_ns=t_mono_ns + self._utc_offset_ns,
-            padc=np.full((FRAMES, 1), 400, dtype=np.uint16),
-            tadc=np.full((FRAMES, 1), 480, dtype=np.uint16),
-            sample_offset_us=np.zeros((FRAMES, 1), dtype=np.int32),
-            servo_counts=np.full(FRAMES, NO_SERVO_COUNTS, dtype=np.int32),
-            servo_age_us=np.full(FRAMES, NO_SERVO_AGE, dtype=np.int32),
-            status=np.zeros((FRAMES, 1), dtype=np.uint8),
-            frame_status=np.zeros(FRAMES, dtype=np.uint8),
-            reference_force_n=np.full(FRAMES, np.nan, dtype=np.float32),
+        frames = make_frames(
+            FRAMES, 1, t_mono_ns=self.read_ns(self.taken_ns), utc_offset_ns=self._utc_offset_ns
         )
         part = (np.arange(FRAMES) >= FRAMES - 100).astype(np.uint16)
         names = ["first", "second"]
@@ -100,7 +72,7 @@ class Node:
 
 
 @pytest.fixture
-def nodes(tmp_path: Path) -> Iterator[tuple[Node, Node]]:
+def nodes(tmp_path: Path) -> tuple[Node, Node]:
     """The left one is an hour behind and slow, the right one fast, and it was never set."""
     left = Node("left", behind_ns=3600 * SECOND, drift_ppm=40.0, late_ns=0)
     right = Node("right", behind_ns=BEGIN_NS - SECOND, drift_ppm=-25.0, late_ns=3_000_000)

@@ -15,51 +15,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
+from devices.frames import FrameBatch
 from storage.sessions.file import FORMAT_KEY, SessionReader, SessionWriter
 from storage.sessions.folder import Ledger, Part, PartLedger
 from storage.verify.file import ledger_problems, verify_file
+from tests.builders.arrays import UTC_NS, make_array
+from tests.builders.frames import make_frames
 
-UTC_NS = 10**18
 BOOTS = ("a" * 32, "b" * 32)
 
 
-def array() -> ArrayInfo:
-    tile = TileInfo(
-        serial="T01",
-        mux=0x70,
-        channel=0,
-        coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-        x_m=0.0,
-        y_m=0.0,
-        z_m=-0.15,
-        reference=False,
-        conversion_ms=1.6,
-    )
-    return ArrayInfo(
-        node="bench",
-        boot_id=BOOTS[0],
-        tiles=(tile,),
-        servo=None,
-        schedule="simultaneous",
-        nominal_rate_hz=500.0,
-        utc_offset_ns=UTC_NS,
-        clock_set=True,
-        software="test",
-        scene="test",
-        models=("static",),
-    )
-
-
 def frames(*numbers: int, offset_ns: int = UTC_NS) -> FrameBatch:
-    seq = np.array(numbers, dtype=np.uint64)
+    """Frames in which everything is known."""
     rng = np.random.default_rng(len(numbers))
-    columns: dict[str, Any] = {
-        name: rng.integers(0, 100, (len(seq), 1) if per_tile else len(seq)).astype(dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-    }
-    columns |= {"seq": seq, "t_mono_ns": 2_000_000 * seq.astype(np.int64)}
-    return FrameBatch(**columns | {"t_ns": columns["t_mono_ns"] + offset_ns})
+    padc, tadc = rng.integers(0, 100, (2, len(numbers), 1))
+    known: dict[str, Any] = {"servo_counts": 5, "servo_age_us": 7, "reference_force_n": 9.0}
+    return make_frames(numbers, 1, utc_offset_ns=offset_ns, padc=padc, tadc=tadc, **known)
 
 
 def counted(first: int, last: int, boot: int = 0, **lost: int) -> PartLedger:
@@ -86,7 +57,7 @@ def notes_of(*parts: PartLedger) -> dict[str, Any]:
 
 
 def write(path: Path, notes: dict[str, Any], *parts: FrameBatch) -> Path:
-    with SessionWriter(path, array(), notes) as writer:
+    with SessionWriter(path, make_array(1, boot_id=BOOTS[0]), notes) as writer:
         for number, batch in enumerate(parts):
             if len(batch):
                 writer.append(batch, {"part": np.full(len(batch), number, np.uint16)})
@@ -205,7 +176,7 @@ def test_bytes_behind_its_end_are_damage(tmp_path: Path) -> None:
 def test_a_file_that_another_program_wrote_anew_says_so(tmp_path: Path) -> None:
     path = walk(tmp_path / "s.parquet")
     pq.write_table(pq.read_table(path), path)
-    assert problems(path) == "it has no hashes: another program has written it anew"
+    assert problems(path) == "it has no hashes: another program has rewritten it"
 
 
 def test_a_row_group_that_is_gone_is_missed(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
+from devices.frames import ArrayInfo, FrameBatch
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.segment import SegmentWriter
@@ -22,48 +22,19 @@ from storage.schema import wire_schema
 from storage.verify.journal import verify_stream
 from storage.verify.segment import verify_segment
 from storage.wire import EncodedBatch, encode
+from tests.builders.arrays import PERIOD_NS, make_array
+from tests.builders.frames import make_frames
 
 BOOT = "a" * 32
-UTC_NS = 10**18
 
 
 def array(**changes: Any) -> ArrayInfo:
-    tile = TileInfo(
-        serial="T01",
-        mux=0x70,
-        channel=0,
-        coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-        x_m=0.0,
-        y_m=0.0,
-        z_m=-0.15,
-        reference=False,
-        conversion_ms=1.6,
-    )
-    content: dict[str, Any] = {
-        "node": "bench",
-        "boot_id": BOOT,
-        "tiles": (tile,),
-        "servo": None,
-        "schedule": "simultaneous",
-        "nominal_rate_hz": 500.0,
-        "utc_offset_ns": UTC_NS,
-        "clock_set": True,
-        "software": "test",
-        "scene": "test",
-        "models": ("static",),
-    }
-    return ArrayInfo(**content | changes)
+    return make_array(1, **{"boot_id": BOOT} | changes)
 
 
-def frames(first: int, last: int, *, at_ns: int | None = None) -> FrameBatch:
-    seq = np.arange(first, last + 1, dtype=np.uint64)
-    columns: dict[str, Any] = {
-        name: np.full((len(seq), 1) if per_tile else len(seq), 7, dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-    }
-    t_mono_ns = 2_000_000 * seq.astype(np.int64) + (0 if at_ns is None else at_ns)
-    columns |= {"seq": seq, "t_mono_ns": t_mono_ns, "t_ns": t_mono_ns + UTC_NS}
-    return FrameBatch(**columns)
+def frames(first: int, last: int, *, at_ns: int = 0) -> FrameBatch:
+    seq = np.arange(first, last + 1)
+    return make_frames(seq, 1, t_mono_ns=PERIOD_NS * seq + at_ns)
 
 
 def stream(root: Path, *, next_seq: int | None = None) -> Path:
@@ -205,6 +176,16 @@ def test_one_flipped_bit_anywhere_in_a_closed_segment_or_its_index_is_found(
     # A header has padding, and bytes that nobody reads.
     harmless = path.suffix == ".arrows" and at < ends(folder)[0] and report.held.count == 40
     assert report.problems or harmless
+
+
+def test_a_column_whose_name_is_damaged_beyond_reading_is_a_problem(tmp_path: Path) -> None:
+    folder = opened(stream(tmp_path))
+    path = segment_of(folder)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"frame_status", b"\xf2rame_status", 1))
+    report = verify_stream(folder)
+    assert "its columns are not those of a stream of frames" in "; ".join(report.problems)
+    assert report.held == Intervals([(0, 39)])
 
 
 def test_a_damaged_batch_costs_itself_only_and_is_named(tmp_path: Path) -> None:

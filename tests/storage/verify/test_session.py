@@ -14,61 +14,35 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch, TileInfo
-from service.sessions.sealing import Sources, seal
+from devices.frames import ArrayInfo, FrameBatch
+from service.sessions.sealing import seal
+from service.sessions.sources import Sources
 from storage.checked_json import with_check
 from storage.clock.offset import ClockOffset
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.losses import Losses
 from storage.sessions.folder import Event, Part, Session, SessionFolder
-from storage.sessions.ledger import StreamState, ledger_of
+from storage.sessions.ledger import ledger_of
+from storage.sessions.states import StreamState
 from storage.verify.data import as_dict, verdict_of, verify
-from storage.verify.session import verify_session
+from storage.verify.file import verify_file
+from storage.verify.session import SessionReport, verify_session
+from tests.builders.arrays import UTC_NS, make_array
+from tests.builders.frames import make_frames
 
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
 BOOTS = ("a" * 32, "b" * 32)
-UTC_NS = 10**18
 EVENTS = (Event(id="e1", label="slip", t_ns=UTC_NS + 5),)
 
 
 def array(boot: int = 0) -> ArrayInfo:
-    tile = TileInfo(
-        serial="T01",
-        mux=0x70,
-        channel=0,
-        coefficient_words=(0x3ECE, 0xB3F9, 0xC517, 0x33C8),
-        x_m=0.0,
-        y_m=0.0,
-        z_m=-0.15,
-        reference=False,
-        conversion_ms=1.6,
-    )
-    return ArrayInfo(
-        node="bench",
-        boot_id=BOOTS[boot],
-        tiles=(tile,),
-        servo=None,
-        schedule="simultaneous",
-        nominal_rate_hz=500.0,
-        utc_offset_ns=UTC_NS + boot,
-        clock_set=True,
-        software="test",
-        scene="test",
-        models=("static",),
-    )
+    return make_array(1, boot_id=BOOTS[boot], utc_offset_ns=UTC_NS + boot)
 
 
 def frames(first: int, last: int, boot: int = 0) -> FrameBatch:
-    seq = np.arange(first, last + 1, dtype=np.uint64)
-    columns: dict[str, Any] = {
-        name: np.full((len(seq), 1) if per_tile else len(seq), 7, dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-    }
-    t_mono_ns = 2_000_000 * seq.astype(np.int64)
-    columns |= {"seq": seq, "t_mono_ns": t_mono_ns, "t_ns": t_mono_ns + UTC_NS + boot}
-    return FrameBatch(**columns)
+    return make_frames(np.arange(first, last + 1), 1, utc_offset_ns=UTC_NS + boot)
 
 
 def journal(data: Path, boot: int, *runs: tuple[int, int], **notes: Any) -> Journal:
@@ -211,6 +185,7 @@ def test_a_session_that_was_pulled_is_proven_too(tmp_path: Path) -> None:
 def test_a_lone_file_says_what_it_cannot_prove(tmp_path: Path) -> None:
     path = sealed(tmp_path) / "frames.parquet"
     report = verify(path)
+    assert isinstance(report, SessionReport)
     assert as_dict(report)["id"] == ID
     assert verdict_of(report) == "lossy"
     assert "session.json" in " ".join(report.unproven)
@@ -410,12 +385,12 @@ def test_what_changes_while_it_is_read_is_read_again(
     edited(folder, raised("sha256", "0" * 64))
     from storage.verify import session as module
 
-    real, calls = module.verify_file, []
+    calls = []
 
     def meanwhile(path: Path) -> Any:
         calls.append(path)
         (folder / "session.json").write_bytes(before)
-        return real(path)
+        return verify_file(path)
 
     monkeypatch.setattr(module, "verify_file", meanwhile)
     assert verify_session(folder).problems == []

@@ -39,7 +39,7 @@ def test_a_golden_status_is_unpacked() -> None:
     assert packet == Packet(1, 0x24, b"", True, STATUS_ERROR_24)
     status = PROTOCOL_1.status(packet)
     assert status is not None
-    assert (status.servo_id, status.data, status.alert, status.refusal) == (1, b"", True, "")
+    assert (status.packet.servo_id, status.data, status.alert, status.refusal) == (1, b"", True, "")
 
 
 @pytest.mark.parametrize("bit", range(8))

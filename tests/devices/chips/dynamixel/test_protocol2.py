@@ -41,7 +41,7 @@ def test_a_golden_status_is_unpacked() -> None:
     assert packet == expected
     status = PROTOCOL_2.status(packet)
     assert status is not None
-    assert (status.servo_id, status.data, status.alert, status.refusal) == (
+    assert (status.packet.servo_id, status.data, status.alert, status.refusal) == (
         2,
         b"\x1f\x08\x00\x00",
         False,
@@ -53,7 +53,7 @@ def test_a_whole_instruction_is_no_status_and_a_damaged_one_may_have_been() -> N
     assert PROTOCOL_2.status(PROTOCOL_2.unpack(PING_1)) is None
     damaged = PROTOCOL_2.status(PROTOCOL_2.unpack(PING_1[:-1] + b"\x00"))
     assert damaged is not None
-    assert not damaged.intact
+    assert not damaged.packet.intact
 
 
 def test_a_header_within_the_parameters_is_stuffed_and_counted_in_the_length() -> None:

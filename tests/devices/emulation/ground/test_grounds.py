@@ -9,13 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from devices.emulation.ground.grounds import (
-    Ground,
-    Rolling,
-    TraceLoad,
-    make_ground,
-    tile_positions_m,
-)
+from devices.emulation.ground.ground import Ground
+from devices.emulation.ground.grounds import Rolling, TraceLoad, make_ground, tile_positions_m
 from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation
 from devices.errors import SceneError, UsageError
@@ -273,6 +268,7 @@ def test_a_looped_load_comes_again_after_a_second_in_the_air() -> None:
         np.testing.assert_allclose(made.forces_n(again), once[1:], atol=1e-9)
         angle, before = made.angle_rad(again), made.angle_rad(t_s[1:])
         assert angle is not None
+        assert before is not None
         np.testing.assert_allclose(angle, before)
 
 

@@ -54,7 +54,7 @@ def all_of(ground: Hopping, step_s: float = STEP_S) -> Floats:
 def bound(ground: Hopping, t_s: Floats) -> npt.NDArray[np.bool_]:
     """In the ground, from first touch to last."""
     stances = zip(ground.touch_s, ground.leave_s, strict=True)
-    return np.any([(t_s >= a) & (t_s <= b) for a, b in stances], axis=0)
+    return np.asarray(np.any([(t_s >= a) & (t_s <= b) for a, b in stances], axis=0))
 
 
 @BOTH

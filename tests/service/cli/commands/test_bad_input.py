@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 import pytest
 
-STANDING = (resources.files("devices.scene") / "builtin" / "standing.toml").read_text("utf-8")
+from tests.builders.calibrations import make_calibration
+from tests.service.cli.outcome import Run, scene_text
+
+STANDING = scene_text("standing")
 GOOD_TRACE = "time_s,fz_n,cop_x_m,cop_y_m\n" + "".join(
     f"{0.01 * i:.2f},{10 + i},0.0,0.0\n" for i in range(50)
 )
@@ -34,7 +36,9 @@ def left(folder: Path, *given: str) -> list[str]:
         (('name = "standing"', 'name = "standing"\ncalibration = "gone.json"'), ["gone.json"]),
     ],
 )
-def test_a_wrong_scene_names_the_key(run, tmp_path, change, says):
+def test_a_wrong_scene_names_the_key(
+    run: Run, tmp_path: Path, change: tuple[str, str], says: list[str]
+) -> None:
     assert change[0] in STANDING
     (tmp_path / "scene.toml").write_text(STANDING.replace(*change, 1))
     outcome = run("simulate", "--scene", "scene.toml", "--seconds", 2, "--out", "s.parquet")
@@ -62,7 +66,9 @@ def test_a_wrong_scene_names_the_key(run, tmp_path, change, says):
         ("\x00\xff\x00", ["cannot be read", "expected"]),
     ],
 )
-def test_a_wrong_load_trace_names_the_place(run, tmp_path, text, says):
+def test_a_wrong_load_trace_names_the_place(
+    run: Run, tmp_path: Path, text: str, says: list[str]
+) -> None:
     (tmp_path / "load.csv").write_bytes(text.encode("latin-1"))
     outcome = run("simulate", "--scene", "standing", "--load", "load.csv", "--out", "s.parquet")
     assert outcome.code == 1
@@ -88,7 +94,9 @@ def test_a_wrong_load_trace_names_the_place(run, tmp_path, text, says):
         (["--scene", "standing", "--seconds", "0.02"], 1, ["T01", "20"]),
     ],
 )
-def test_simulate_refuses(run, tmp_path, arguments, code, says):
+def test_simulate_refuses(
+    run: Run, tmp_path: Path, arguments: list[object], code: int, says: list[str]
+) -> None:
     outcome = run("simulate", *arguments)
     assert outcome.code == code, outcome.err
     for word in says:
@@ -96,14 +104,14 @@ def test_simulate_refuses(run, tmp_path, arguments, code, says):
     assert left(tmp_path) == []
 
 
-def test_an_axis_name_that_is_none_is_refused(run, tmp_path):
+def test_an_axis_name_that_is_none_is_refused(run: Run, tmp_path: Path) -> None:
     (tmp_path / "load.csv").write_text(GOOD_TRACE)
     outcome = run("simulate", "--scene", "standing", "--load", "load.csv", "--cop-axes", "xx")
     assert outcome.code == 2
     assert "--cop-axes" in outcome.err
 
 
-def made_once(run, folder: Path, name: str, *arguments: object) -> bytes:
+def made_once(run: Run, folder: Path, name: str, *arguments: object) -> bytes:
     """What `foottile simulate` writes; the same command always gives the same bytes."""
     kept = folder / name
     if not kept.exists():
@@ -112,12 +120,12 @@ def made_once(run, folder: Path, name: str, *arguments: object) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory) -> Path:
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("kept")
 
 
 @pytest.fixture
-def session(run, tmp_path, kept) -> Path:
+def session(run: Run, tmp_path: Path, kept: Path) -> Path:
     arguments = ("--scene", "standing", "--seconds", 2, "--no-estimates")
     path = tmp_path / "s.parquet"
     path.write_bytes(made_once(run, kept, "s.parquet", *arguments))
@@ -125,7 +133,7 @@ def session(run, tmp_path, kept) -> Path:
 
 
 @pytest.fixture
-def bench(run, kept) -> bytes:
+def bench(run: Run, kept: Path) -> bytes:
     """A recording of tile T01 under the mill."""
     return made_once(run, kept, "bench.parquet", "--scene", "indentation", "--tiles", "T01")
 
@@ -149,18 +157,12 @@ def bench(run, kept) -> bytes:
         ),
     ],
 )
-def test_estimate_refuses(run, tmp_path, session, arguments, code, says):
-    from service.estimation.calibration import Calibration, paper_eq2_shape
-
-    preset = paper_eq2_shape()
-    other = Calibration(
-        name="other",
-        reference="none",
-        date=preset.date,
-        tiles=(preset.tiles[0].model_copy(update={"serial": "T09"}),),
-    )
-    (tmp_path / "other.json").write_text(other.to_json())
-    (tmp_path / "broken.json").write_text(other.to_json().replace("15.0", "16.0"))
+def test_estimate_refuses(
+    run: Run, tmp_path: Path, session: Path, arguments: list[object], code: int, says: list[str]
+) -> None:
+    other = make_calibration("T09").to_json()
+    (tmp_path / "other.json").write_text(other)
+    (tmp_path / "broken.json").write_text(other.replace("by hand", "by foot"))
     outcome = run("estimate", session, "--out", "e.parquet", *arguments)
     assert outcome.code == code, outcome.err
     for word in says:
@@ -168,7 +170,7 @@ def test_estimate_refuses(run, tmp_path, session, arguments, code, says):
     assert left(tmp_path, "s.parquet", "other.json", "broken.json") == []
 
 
-def test_estimate_refuses_what_is_no_session(run, tmp_path):
+def test_estimate_refuses_what_is_no_session(run: Run, tmp_path: Path) -> None:
     (tmp_path / "x.parquet").write_bytes(b"PAR1 not really PAR1")
     for name in ("x.parquet", "gone.parquet"):
         outcome = run("estimate", name, "--out", "e.parquet")
@@ -177,15 +179,19 @@ def test_estimate_refuses_what_is_no_session(run, tmp_path):
     assert left(tmp_path, "x.parquet") == []
 
 
-def test_calibrate_refuses_a_session_that_is_no_indentation(run, tmp_path, session):
+def test_calibrate_refuses_a_session_that_is_no_indentation(
+    run: Run, tmp_path: Path, session: Path
+) -> None:
     outcome = run("calibrate", session, "--out", "cal.json")
     assert outcome.code == 1
     assert "not an indentation" in outcome.err
     assert left(tmp_path, "s.parquet") == []
 
 
-def test_calibrate_refuses_an_indentation_that_never_loads_the_tile(run, tmp_path):
-    text = (resources.files("devices.scene") / "builtin" / "indentation.toml").read_text("utf-8")
+def test_calibrate_refuses_an_indentation_that_never_loads_the_tile(
+    run: Run, tmp_path: Path
+) -> None:
+    text = scene_text("indentation")
     text = text.replace('kind = "indentation"', 'kind = "indentation"\nload_n = 0.2')
     (tmp_path / "scene.toml").write_text(text)
     run("simulate", "--scene", "scene.toml", "--tiles", "T01", "--out", "bench.parquet")
@@ -196,7 +202,7 @@ def test_calibrate_refuses_an_indentation_that_never_loads_the_tile(run, tmp_pat
     assert left(tmp_path, "scene.toml", "bench.parquet") == []
 
 
-def test_calibrate_refuses_one_tile_from_two_files(run, tmp_path, bench):
+def test_calibrate_refuses_one_tile_from_two_files(run: Run, tmp_path: Path, bench: bytes) -> None:
     for name in ("a.parquet", "b.parquet"):
         (tmp_path / name).write_bytes(bench)
     outcome = run("calibrate", "a.parquet", "b.parquet", "--out", "cal.json")
@@ -206,7 +212,9 @@ def test_calibrate_refuses_one_tile_from_two_files(run, tmp_path, bench):
     assert "b.parquet" in outcome.err
 
 
-def test_a_full_disk_is_an_error_and_leaves_nothing(run, tmp_path, monkeypatch):
+def test_a_full_disk_is_an_error_and_leaves_nothing(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import os
 
     def full(descriptor: int) -> None:
@@ -221,7 +229,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(run, tmp_path, monkeypatch):
     assert left(tmp_path) == []
 
 
-def test_a_tare_under_load_is_refused(run, tmp_path):
+def test_a_tare_under_load_is_refused(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "standing", "--seconds", 4, "--out", "s.parquet")
     outcome = run("estimate", "s.parquet", "--tare-s", "2,3", "--out", "e.parquet")
     assert outcome.code == 1
@@ -229,7 +237,7 @@ def test_a_tare_under_load_is_refused(run, tmp_path):
     assert left(tmp_path, "s.parquet") == []
 
 
-def test_no_output_takes_the_place_of_an_input_or_a_device(run, tmp_path):
+def test_no_output_takes_the_place_of_an_input_or_a_device(run: Run, tmp_path: Path) -> None:
     (tmp_path / "foot.toml").write_text(STANDING)
     (tmp_path / "load.csv").write_text(GOOD_TRACE)
     (tmp_path / "folder").mkdir()
@@ -245,7 +253,7 @@ def test_no_output_takes_the_place_of_an_input_or_a_device(run, tmp_path):
     assert (tmp_path / "load.csv").read_text() == GOOD_TRACE
 
 
-def test_an_output_through_a_link_lands_where_the_link_points(run, tmp_path):
+def test_an_output_through_a_link_lands_where_the_link_points(run: Run, tmp_path: Path) -> None:
     (tmp_path / "real.parquet").write_bytes(b"")
     (tmp_path / "link.parquet").symlink_to("real.parquet")
     simulate = ("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out")
@@ -255,14 +263,16 @@ def test_an_output_through_a_link_lands_where_the_link_points(run, tmp_path):
 
 
 @pytest.mark.parametrize("tiles", ["", "T01,T01", "../x"])
-def test_a_wrong_list_of_tiles_is_refused(run, tmp_path, tiles):
+def test_a_wrong_list_of_tiles_is_refused(run: Run, tmp_path: Path, tiles: str) -> None:
     outcome = run("simulate", "--scene", "indentation", "--tiles", tiles)
     assert outcome.code == 2
     assert outcome.err.startswith("foottile: ")
     assert left(tmp_path) == []
 
 
-def test_a_reference_with_brackets_is_printed_as_it_is(run, tmp_path, bench):
+def test_a_reference_with_brackets_is_printed_as_it_is(
+    run: Run, tmp_path: Path, bench: bytes
+) -> None:
     (tmp_path / "bench.parquet").write_bytes(bench)
     reference = "load cell [/dev/ttyUSB0]"
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--reference", reference)
@@ -270,7 +280,9 @@ def test_a_reference_with_brackets_is_printed_as_it_is(run, tmp_path, bench):
     assert reference in outcome.out
 
 
-def test_a_calibration_of_another_part_with_the_same_serial_is_refused(run, tmp_path, bench):
+def test_a_calibration_of_another_part_with_the_same_serial_is_refused(
+    run: Run, tmp_path: Path, bench: bytes
+) -> None:
     (tmp_path / "bench.parquet").write_bytes(bench)
     assert run("calibrate", "bench.parquet", "--out", "cal.json").code == 0
     other = ("--tiles", "T01", "--parts-seed", 3, "--seconds", 2, "--out", "other.parquet")

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from devices.errors import FootTileError
+from service.estimation.calibration import Calibration
 from service.offline.benchmark import draws
+from service.offline.calibrations import find_calibration
+from tests.service.cli.outcome import Run, scene_text
 
 QUICK = ("--quick", "--frames", 2000, "--seconds", 2, "--jobs", 1)
 
@@ -17,14 +21,13 @@ QUICK = ("--quick", "--frames", 2000, "--seconds", 2, "--jobs", 1)
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
     """`rolling` with the paper's curve, and the models that go with it."""
-    text = (resources.files("devices.scene") / "builtin" / "rolling.toml").read_text("utf-8")
     path = tmp_path / "rolling.toml"
-    text = re.sub(r"(?m)^models = .*$", 'models = ["unwrap", "static"]', text)
+    text = re.sub(r"(?m)^models = .*$", 'models = ["unwrap", "static"]', scene_text("rolling"))
     path.write_text('calibration = "paper-eq2-shape"\n' + text)
     return path
 
 
-def test_bench_writes_json_tables_and_plot(run, scene, tmp_path):
+def test_bench_writes_json_tables_and_plot(run: Run, scene: Path, tmp_path: Path) -> None:
     outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "new/folder", "--json")
     assert outcome.code == 0, outcome.err
     assert "rolling: 2 of 2 draws" in outcome.err
@@ -48,7 +51,7 @@ def test_bench_writes_json_tables_and_plot(run, scene, tmp_path):
     assert (folder / "bench.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_goals_that_are_not_met_are_named_and_code_3_if_asked_for(run, scene):
+def test_goals_that_are_not_met_are_named_and_code_3_if_asked_for(run: Run, scene: Path) -> None:
     outcome = run("bench", "--scene", scene, "--draws", 1, *QUICK, "--out", "o", "--check-goals")
     assert outcome.code == 3
     assert outcome.out.startswith("# Speed against error")
@@ -57,13 +60,13 @@ def test_goals_that_are_not_met_are_named_and_code_3_if_asked_for(run, scene):
     assert "| NO |" in outcome.out
 
 
-def test_a_draw_that_fails_is_reported_and_the_others_count(run, scene, tmp_path, monkeypatch):
-    real = draws.find_calibration
-
-    def refuses(name, serials, *, parts_seed, **others):
+def test_a_draw_that_fails_is_reported_and_the_others_count(
+    run: Run, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuses(*asked: Any, parts_seed: int, **others: Any) -> Calibration:
         if parts_seed == 1:
-            raise draws.FootTileError("tile T03 does not rise")
-        return real(name, serials, parts_seed=parts_seed, **others)
+            raise FootTileError("tile T03 does not rise")
+        return find_calibration(*asked, parts_seed=parts_seed, **others)
 
     monkeypatch.setattr(draws, "find_calibration", refuses)
     outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
@@ -75,7 +78,9 @@ def test_a_draw_that_fails_is_reported_and_the_others_count(run, scene, tmp_path
     assert len(rolling["failures"]) == 1
 
 
-def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(run, scene, tmp_path):
+def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(
+    run: Run, scene: Path, tmp_path: Path
+) -> None:
     scene.write_text(scene.read_text().replace("paper-eq2-shape", "nowhere.json"))
     outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
     assert outcome.code == 1
@@ -93,20 +98,24 @@ def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(run, scene, 
         (("--scene", "rolling", "--draws", "0"), "draws"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_before_anything_takes_time(run, arguments, says):
+def test_what_cannot_be_meant_is_refused_before_anything_takes_time(
+    run: Run, arguments: tuple[object, ...], says: str
+) -> None:
     outcome = run("bench", *arguments, "--out", "o")
     assert outcome.code == 2
     assert says in outcome.err
 
 
-def test_a_scene_of_real_hardware_is_refused(run, scene):
+def test_a_scene_of_real_hardware_is_refused(run: Run, scene: Path) -> None:
     scene.write_text(scene.read_text() + '\n[array]\nbus = "/dev/i2c-1"\n')
     outcome = run("bench", "--scene", scene, "--out", "o")
     assert outcome.code == 2
     assert "only emulates" in outcome.err
 
 
-def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(run, monkeypatch):
+def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import sys
 
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
+
+from tests.service.cli.outcome import Run, scene_text
 
 
-def scene_text(name: str) -> str:
-    return (resources.files("devices.scene") / "builtin" / f"{name}.toml").read_text("utf-8")
-
-
-def test_calibrate_merges_files_and_its_tables_fit_a_narrow_terminal(run, monkeypatch):
+def test_calibrate_merges_files_and_its_tables_fit_a_narrow_terminal(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     short = scene_text("indentation").replace(
         'kind = "indentation"', 'kind = "indentation"\nrepeats = 2\nstroke_s = 1.5'
     )
@@ -40,8 +40,7 @@ def test_calibrate_merges_files_and_its_tables_fit_a_narrow_terminal(run, monkey
     assert not Path("other.json").exists()
 
 
-def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run):
-    # The amplifier has no volt left beyond 10 N, and T02 is the one that is pressed with more.
+def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run) -> None:
     run("simulate", "--scene", "indentation", "--tiles", "T01,T02", "--out", "bench.parquet")
     table = pq.read_table("bench.parquet")
     force = table["reference_force_n"].to_numpy().copy()
@@ -62,7 +61,7 @@ def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run):
     assert "no calibration for tile T02: it was refused" in estimate.err
 
 
-def test_an_assumed_scale_is_said_in_text_json_and_file(run):
+def test_an_assumed_scale_is_said_in_text_json_and_file(run: Run) -> None:
     scene = 'calibration = "paper-eq2-shape"\n' + scene_text("standing")
     Path("paper.toml").write_text(scene)
     arguments = ("simulate", "--scene", "paper.toml", "--seconds", 1, "--out", "paper.parquet")

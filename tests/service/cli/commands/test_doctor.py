@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-from importlib import resources
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from devices.scene.file import load_scene
-
-
-def scene_text(name: str) -> str:
-    return (resources.files("devices.scene") / "builtin" / f"{name}.toml").read_text("utf-8")
+from tests.service.cli.outcome import Outcome, Run, scene_text
 
 
 def faulty(kind: str, **keys: object) -> str:
@@ -20,11 +19,14 @@ def faulty(kind: str, **keys: object) -> str:
     return f'\n[[fault]]\nkind = "{kind}"\nt_s = 0.0\nduration_s = 1000.0\n{lines}'
 
 
+Doctor = Callable[..., tuple[Outcome, Any]]
+
+
 @pytest.fixture
-def doctor(run, tmp_path):
+def doctor(run: Run, tmp_path: Path) -> Doctor:
     """Run the doctor with --json on a scene of this text."""
 
-    def examine(text: str, *arguments: object):
+    def examine(text: str, *arguments: object) -> tuple[Outcome, Any]:
         (tmp_path / "scene.toml").write_text(text)
         outcome = run("doctor", "--scene", "scene.toml", "--json", *arguments)
         return outcome, json.loads(outcome.out) if outcome.out else None
@@ -32,7 +34,7 @@ def doctor(run, tmp_path):
     return examine
 
 
-def test_a_healthy_bus_is_said_to_be_well_and_how_fast_it_is(run):
+def test_a_healthy_bus_is_said_to_be_well_and_how_fast_it_is(run: Run) -> None:
     outcome = run("doctor", "--bus", "emulated", "--json")
     assert outcome.code == 0, outcome.err
     found = json.loads(outcome.out)
@@ -49,14 +51,14 @@ def test_a_healthy_bus_is_said_to_be_well_and_how_fast_it_is(run):
     assert "repeated" not in found["verdict"], "channels without a tile are no disturbance"
 
 
-def test_what_people_read_says_the_same(run):
+def test_what_people_read_says_the_same(run: Run) -> None:
     outcome = run("doctor", "--bus", "emulated")
     assert outcome.code == 0
     for word in ("T03", "0x70", "1.609 ms", "400.0 kHz", "541.5", "best", "pipelined gives"):
         assert word in outcome.out
 
 
-def test_a_rate_that_will_not_hold_is_said_with_what_would(run):
+def test_a_rate_that_will_not_hold_is_said_with_what_would(run: Run) -> None:
     outcome = run("doctor", "--scene", "standing", "--rate-hz", 700, "--json")
     assert outcome.code == 3
     found = json.loads(outcome.out)
@@ -64,14 +66,14 @@ def test_a_rate_that_will_not_hold_is_said_with_what_would(run):
     assert "700 frames/s asked for will not hold: ask for 531 or less" in found["verdict"]
 
 
-def test_a_rate_that_another_schedule_would_hold_is_said_with_its_name(doctor):
+def test_a_rate_that_another_schedule_would_hold_is_said_with_its_name(doctor: Doctor) -> None:
     text = scene_text("standing").replace("[array]", '[array]\nschedule = "sequential"')
     outcome, found = doctor(text, "--rate-hz", 300)
     assert outcome.code == 3
     assert "will not hold: use schedule simultaneous" in found["verdict"]
 
 
-def test_the_raspberry_pi_that_runs_at_five_eighths_is_recognised(doctor):
+def test_the_raspberry_pi_that_runs_at_five_eighths_is_recognised(doctor: Doctor) -> None:
     outcome, found = doctor(scene_text("standing") + "\n[emulation]\nscl_part = 0.625\n")
     assert outcome.code == 0
     assert found["scl_hz"] == pytest.approx(250_000, rel=1e-3)
@@ -79,7 +81,7 @@ def test_the_raspberry_pi_that_runs_at_five_eighths_is_recognised(doctor):
     assert "core_freq" in found["verdict"]
 
 
-def test_a_slow_part_is_named_with_what_it_costs(run):
+def test_a_slow_part_is_named_with_what_it_costs(run: Run) -> None:
     outcome = run("doctor", "--scene", "rolling", "--servo", "none", "--json")
     assert outcome.code == 0
     slowest = max(json.loads(outcome.out)["tiles"], key=lambda tile: tile["conversion_ms"])
@@ -87,7 +89,7 @@ def test_a_slow_part_is_named_with_what_it_costs(run):
 
 
 @pytest.mark.parametrize("kind", ["no_answer", "unplugged"])
-def test_a_tile_that_is_not_there_needs_attention(doctor, kind):
+def test_a_tile_that_is_not_there_needs_attention(doctor: Doctor, kind: str) -> None:
     outcome, found = doctor(scene_text("standing") + faulty(kind, tile="T02"))
     assert outcome.code == 3
     assert [tile["serial"] for tile in found["tiles"] if tile["problem"]] == ["T02"]
@@ -95,7 +97,7 @@ def test_a_tile_that_is_not_there_needs_attention(doctor, kind):
     assert found["rates_hz"]["pipelined"] is not None, "the others are measured all the same"
 
 
-def test_a_part_that_does_not_convert_needs_attention(doctor):
+def test_a_part_that_does_not_convert_needs_attention(doctor: Doctor) -> None:
     outcome, found = doctor(scene_text("standing") + faulty("stale", tile="T03"))
     assert outcome.code == 3
     (tile,) = [tile for tile in found["tiles"] if tile["problem"]]
@@ -104,12 +106,12 @@ def test_a_part_that_does_not_convert_needs_attention(doctor):
     assert "never change" in tile["problem"]
 
 
-def test_a_part_that_does_not_convert_is_not_said_to_set_the_pace(doctor):
+def test_a_part_that_does_not_convert_is_not_said_to_set_the_pace(doctor: Doctor) -> None:
     _, found = doctor(scene_text("standing") + faulty("stale", tile="T03"))
     assert "converts slowest" not in found["verdict"]
 
 
-def test_a_bus_on_which_nobody_answers_is_a_failure_with_advice(doctor):
+def test_a_bus_on_which_nobody_answers_is_a_failure_with_advice(doctor: Doctor) -> None:
     outcome, found = doctor(scene_text("standing") + faulty("sda_high"))
     assert outcome.code == 1
     assert found["scl_hz"] is None
@@ -117,7 +119,7 @@ def test_a_bus_on_which_nobody_answers_is_a_failure_with_advice(doctor):
 
 
 @pytest.mark.parametrize(("kind", "word"), [("sda_low", "SDA is stuck low"), ("scl_low", "bus")])
-def test_a_stuck_bus_is_a_failure_in_one_line(doctor, kind, word):
+def test_a_stuck_bus_is_a_failure_in_one_line(doctor: Doctor, kind: str, word: str) -> None:
     outcome, _ = doctor(scene_text("standing") + faulty(kind))
     assert outcome.code == 1
     assert outcome.out == ""
@@ -126,34 +128,36 @@ def test_a_stuck_bus_is_a_failure_in_one_line(doctor, kind, word):
     assert "Traceback" not in outcome.err
 
 
-def test_more_channels_than_allowed_at_once_is_no_schedule(run):
+def test_more_channels_than_allowed_at_once_is_no_schedule(run: Run) -> None:
     found = json.loads(run("doctor", "--scene", "grid", "--json").out)
     assert found["rates_hz"]["simultaneous"] is None
     assert found["schedule"] == "per_mux"
     assert len(found["tiles"]) == len(load_scene("grid").tile) == 64
 
 
-def test_which_bus_has_to_be_said(run):
+def test_which_bus_has_to_be_said(run: Run) -> None:
     outcome = run("doctor")
     assert outcome.code == 2
     assert "--bus" in outcome.err
 
 
-def test_a_bus_that_does_not_exist_is_a_failure_in_one_line(run):
+def test_a_bus_that_does_not_exist_is_a_failure_in_one_line(run: Run) -> None:
     outcome = run("doctor", "--bus", "/dev/i2c-99")
     assert outcome.code == 1
     assert outcome.err.count("\n") == 1
 
 
 @pytest.mark.real_time
-def test_the_servo_of_the_scene_is_found_and_named(run):
+def test_the_servo_of_the_scene_is_found_and_named(run: Run) -> None:
     found = json.loads(run("doctor", "--scene", "rolling", "--json").out)["servo"]
     assert found["is_well"] is True
     assert found["verdict"].startswith("MX-28, protocol 2, 1000000 baud, id 1.")
 
 
 @pytest.mark.real_time
-def test_a_servo_that_is_not_what_the_scene_says_is_said(run, tmp_path, monkeypatch):
+def test_a_servo_that_is_not_what_the_scene_says_is_said(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from devices.clock import SystemClock
     from devices.emulation.chips.dynamixel import EmulatedServo
 
@@ -165,32 +169,36 @@ def test_a_servo_that_is_not_what_the_scene_says_is_said(run, tmp_path, monkeypa
     assert "The scene says MX-28, protocol 2" in found["verdict"]
 
 
-def test_a_wait_that_the_scene_fixes_is_the_one_that_counts(doctor):
+def test_a_wait_that_the_scene_fixes_is_the_one_that_counts(doctor: Doctor) -> None:
     text = scene_text("standing").replace("[array]", "[array]\nwait_ms = 3.0")
     _, found = doctor(text)
     assert found["rates_hz"]["pipelined"] == pytest.approx(309.0, rel=0.005)  # hardware.md 4
 
 
-def test_beside_a_reference_sensor_tiles_are_asked_at_once(run):
+def test_beside_a_reference_sensor_tiles_are_asked_at_once(run: Run) -> None:
     verdict = json.loads(run("doctor", "--scene", "indentation", "--json").out)["verdict"]
     assert "simultaneous gives" in verdict
 
 
-def test_single_lost_acknowledges_do_not_make_tiles_look_ill(doctor):
+def test_single_lost_acknowledges_do_not_make_tiles_look_ill(doctor: Doctor) -> None:
     outcome, found = doctor(scene_text("standing") + faulty("nack_storm", rate=0.002))
     assert outcome.code == 0, found
     assert not any(tile["problem"] for tile in found["tiles"])
     assert re.search(r"\d+ transfers were acknowledged only when repeated", found["verdict"])
 
 
-def test_a_bus_that_hangs_since_the_last_run_is_freed_before_the_start(run, tmp_path):
+def test_a_bus_that_hangs_since_the_last_run_is_freed_before_the_start(
+    run: Run, tmp_path: Path
+) -> None:
     text = scene_text("standing") + faulty("sda_low") + "\n[recovery]\nreset_line = 17\n"
     (tmp_path / "scene.toml").write_text(text)
     outcome = run("simulate", "--scene", "scene.toml", "--seconds", 1, "--no-estimates")
     assert outcome.code == 0, outcome.err
 
 
-def test_without_help_a_bus_that_hangs_is_named_and_no_tile_is_blamed(run, tmp_path):
+def test_without_help_a_bus_that_hangs_is_named_and_no_tile_is_blamed(
+    run: Run, tmp_path: Path
+) -> None:
     (tmp_path / "scene.toml").write_text(scene_text("standing") + faulty("sda_low"))
     outcome = run("simulate", "--scene", "scene.toml", "--seconds", 1, "--no-estimates")
     assert outcome.code == 1

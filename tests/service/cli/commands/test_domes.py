@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 
+from tests.service.cli.outcome import Run
 
-def test_domes_names_one_for_a_load_and_says_what_is_an_estimate(run):
+
+def test_domes_names_one_for_a_load_and_says_what_is_an_estimate(run: Run) -> None:
     outcome = run("domes", "--load-n", 24)
     assert outcome.code == 0
     assert "For 24 N: v60-11 (paper)." in outcome.out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -11,8 +12,7 @@ import pytest
 
 from service.offline.simulate import START_NS
 from storage.schema import ESTIMATES, FRAMES, TRUTH
-
-Run = Callable[..., object]
+from tests.service.cli.outcome import Run, scene_text
 
 QUIET = """
 [emulation]
@@ -23,14 +23,7 @@ hysteresis = false
 """
 
 
-def scene_text(name: str, *, without: str = "") -> str:
-    from importlib import resources
-
-    text = (resources.files("devices.scene") / "builtin" / f"{name}.toml").read_text("utf-8")
-    return text.split(without)[0] if without else text
-
-
-def test_the_same_command_gives_the_same_bytes(run, tmp_path):
+def test_the_same_command_gives_the_same_bytes(run: Run, tmp_path: Path) -> None:
     for name in ("a.parquet", "b.parquet"):
         outcome = run(
             "simulate", "--scene", "rolling", "--seconds", 3, "--truth", "--seed", 5, "--out", name
@@ -52,7 +45,9 @@ def test_the_same_command_gives_the_same_bytes(run, tmp_path):
     assert (tmp_path / "a.parquet").read_bytes() != (tmp_path / "c.parquet").read_bytes()
 
 
-def test_a_fresh_bench_and_a_kept_one_give_the_same_bytes(run, tmp_path, monkeypatch):
+def test_a_fresh_bench_and_a_kept_one_give_the_same_bytes(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     arguments = ("simulate", "--scene", "standing", "--seconds", 2, "--out")
     assert run(*arguments, "kept.parquet").code == 0
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "empty"))
@@ -64,7 +59,9 @@ def test_a_fresh_bench_and_a_kept_one_give_the_same_bytes(run, tmp_path, monkeyp
     ("schedule", "limit_hz"),
     [("sequential", 132.45), ("simultaneous", 394.87), ("pipelined", 544.2)],
 )
-def test_frames_come_at_the_limit_of_the_bus(run, tmp_path, schedule, limit_hz):
+def test_frames_come_at_the_limit_of_the_bus(
+    run: Run, tmp_path: Path, schedule: str, limit_hz: float
+) -> None:
     outcome = run(
         *("simulate", "--scene", "standing", "--seconds", 4, "--schedule", schedule, "--json"),
         *("--out", "s.parquet"),
@@ -77,7 +74,7 @@ def test_frames_come_at_the_limit_of_the_bus(run, tmp_path, schedule, limit_hz):
     assert np.median(np.diff(t_ns)) == pytest.approx(1e9 / limit_hz, rel=0.01)
 
 
-def test_a_session_has_raw_columns_then_estimates_then_truth(run, tmp_path):
+def test_a_session_has_raw_columns_then_estimates_then_truth(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "standing", "--seconds", 2, "--truth", "--out", "s.parquet")
     names = pq.read_schema(tmp_path / "s.parquet").names
     expected = [flat for c in (*FRAMES, *ESTIMATES, *TRUTH) for flat in c.flat_names(4)]
@@ -86,15 +83,14 @@ def test_a_session_has_raw_columns_then_estimates_then_truth(run, tmp_path):
     assert names.index("padc_0") < names.index("gauge_kpa_0")
 
 
-def test_no_estimates_leaves_raw_frames_only(run, tmp_path):
+def test_no_estimates_leaves_raw_frames_only(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
     names = pq.read_schema(tmp_path / "s.parquet").names
     assert sorted(names) == sorted(flat for c in FRAMES for flat in c.flat_names(4))
 
 
-def test_bench_to_session_to_estimate_closes_on_a_quiet_dome(run, tmp_path):
-    # Static effects only: what is left is the cubic's misfit and rounding to counts.
-    bench = scene_text("indentation", without="[emulation]") + QUIET
+def test_bench_to_session_to_estimate_closes_on_a_quiet_dome(run: Run, tmp_path: Path) -> None:
+    bench = scene_text("indentation").split("[emulation]")[0] + QUIET
     (tmp_path / "bench.toml").write_text(bench)
     assert run("simulate", "--scene", "bench.toml", "--out", "bench.parquet").code == 0
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--json")
@@ -122,7 +118,9 @@ def test_bench_to_session_to_estimate_closes_on_a_quiet_dome(run, tmp_path):
     assert accuracy["cop_p95_m"] < 0.0005
 
 
-def test_measured_jumps_through_all_effects_stay_within_the_papers_errors(run, recording):
+def test_measured_jumps_through_all_effects_stay_within_the_papers_errors(
+    run: Run, recording: Callable[[str], Path]
+) -> None:
     outcome = run(
         *("simulate", "--scene", "standing", "--truth", "--json"),
         *("--load", recording("squat_jump_plate1.csv"), "--load-scale", 0.03, "--cop-scale", 0.2),
@@ -134,7 +132,9 @@ def test_measured_jumps_through_all_effects_stay_within_the_papers_errors(run, r
     assert accuracy["stances"] >= 3
 
 
-def test_measured_walking_is_pressed_cell_by_cell(run, recording, tmp_path):
+def test_measured_walking_is_pressed_cell_by_cell(
+    run: Run, recording: Callable[[str], Path], tmp_path: Path
+) -> None:
     outcome = run(
         *("simulate", "--scene", "insole", "--load", recording("insole_walk_left.csv")),
         *("--load-scale", 0.05, "--truth", "--seconds", 6, "--json", "--out", "walk.parquet"),
@@ -151,7 +151,7 @@ def test_measured_walking_is_pressed_cell_by_cell(run, recording, tmp_path):
         np.testing.assert_allclose(pressed, wanted, atol=1e-6)
 
 
-def test_estimating_anew_gives_the_bits_of_the_simulation(run, tmp_path):
+def test_estimating_anew_gives_the_bits_of_the_simulation(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "rolling", "--seconds", 4, "--out", "s.parquet")
     assert run("estimate", "s.parquet", "--out", "e.parquet").code == 0
     before, after = (pq.read_table(tmp_path / name) for name in ("s.parquet", "e.parquet"))
@@ -159,7 +159,7 @@ def test_estimating_anew_gives_the_bits_of_the_simulation(run, tmp_path):
         assert before[name].equals(after[name]), name
 
 
-def test_an_assumed_scale_is_said_on_the_terminal_and_in_the_file(run, tmp_path):
+def test_an_assumed_scale_is_said_on_the_terminal_and_in_the_file(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
     outcome = run("estimate", "s.parquet", "--out", "e.parquet", "--calibration", "paper-eq2-shape")
     assert outcome.code == 0, outcome.err
@@ -169,7 +169,9 @@ def test_an_assumed_scale_is_said_on_the_terminal_and_in_the_file(run, tmp_path)
     assert json.loads(table.schema.metadata[b"foottile.notes"])["absolute_scale"] == "assumed"
 
 
-def test_a_fault_of_the_scene_is_null_and_flagged_while_the_others_go_on(run, tmp_path):
+def test_a_fault_of_the_scene_is_null_and_flagged_while_the_others_go_on(
+    run: Run, tmp_path: Path
+) -> None:
     (tmp_path / "faulty.toml").write_text(
         scene_text("standing")
         + '[[fault]]\nkind = "no_answer"\ntile = "T02"\nt_s = 1.5\nduration_s = 0.5\n'
@@ -185,8 +187,9 @@ def test_a_fault_of_the_scene_is_null_and_flagged_while_the_others_go_on(run, tm
     assert (table["estimate_status"].to_numpy()[silent] & 32 == 32).all()
 
 
-def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touch(run, tmp_path):
-    # T09 is a part whose padc falls through zero at 95 N; face value would be about 23 kPa.
+def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touch(
+    run: Run, tmp_path: Path
+) -> None:
     (tmp_path / "foot.toml").write_text(scene_text("standing").replace("T01", "T09"))
     rows = "".join(f"{0.01 * i:.2f},110,5,5,5\n" for i in range(100))
     (tmp_path / "load.csv").write_text("time_s,cell1_n,cell2_n,cell3_n,cell4_n\n" + rows)
@@ -206,7 +209,9 @@ def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touc
     assert np.isnan(pq.read_table(tmp_path / "e.parquet")["force_n_0"].to_numpy()[wrapped]).all()
 
 
-def test_a_rate_that_the_bus_cannot_keep_is_said_and_gives_exit_code_3(run, tmp_path):
+def test_a_rate_that_the_bus_cannot_keep_is_said_and_gives_exit_code_3(
+    run: Run, tmp_path: Path
+) -> None:
     text = scene_text("standing").replace('name = "standing"', 'name = "fast"\nrate_hz = 1000')
     (tmp_path / "fast.toml").write_text(text)
     outcome = run("simulate", "--scene", "fast.toml", "--seconds", 3, "--out", "s.parquet")
@@ -220,12 +225,12 @@ def test_a_rate_that_the_bus_cannot_keep_is_said_and_gives_exit_code_3(run, tmp_
     assert table["contact"].to_numpy().max() == 1
 
 
-def test_json_is_on_stdout_alone(run):
+def test_json_is_on_stdout_alone(run: Run) -> None:
     outcome = run("simulate", "--scene", "standing", "--seconds", 2, "--json")
     assert json.loads(outcome.out)["frames"] > 700
 
 
-def test_calibrate_prints_the_contract_and_draws(run, tmp_path):
+def test_calibrate_prints_the_contract_and_draws(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "indentation", "--tiles", "T01,T02", "--out", "bench.parquet")
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--plot", "cal.png", "--json")
     assert outcome.code == 0, outcome.err
@@ -245,7 +250,7 @@ def test_calibrate_prints_the_contract_and_draws(run, tmp_path):
     assert (tmp_path / "cal.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_befell_a_tile_is_said_on_the_terminal(run, tmp_path):
+def test_what_befell_a_tile_is_said_on_the_terminal(run: Run, tmp_path: Path) -> None:
     (tmp_path / "faulty.toml").write_text(
         scene_text("standing")
         + '[[fault]]\nkind = "unplugged"\ntile = "T02"\nt_s = 0.5\nduration_s = 0.5\n'
@@ -258,7 +263,9 @@ def test_what_befell_a_tile_is_said_on_the_terminal(run, tmp_path):
     assert 250 < flags["T02"]["no_answer"] < 500
 
 
-def test_a_part_that_could_not_be_measured_is_said_on_the_terminal(run, tmp_path):
+def test_a_part_that_could_not_be_measured_is_said_on_the_terminal(
+    run: Run, tmp_path: Path
+) -> None:
     (tmp_path / "faulty.toml").write_text(
         scene_text("standing")
         + '[[fault]]\nkind = "stale"\ntile = "T03"\nt_s = 0.0\nduration_s = 0.5\n'

@@ -4,35 +4,22 @@ from __future__ import annotations
 
 import fcntl
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.file import SessionReader, SessionWriter
 from storage.sessions.folder import Part, Session, SessionFolder
-from tests.builders.arrays import make_array
+from tests.builders.arrays import UTC_NS, make_array
+from tests.builders.frames import make_frames
+from tests.service.cli.outcome import Run
 
 ID = "20200101T000000Z-00000a"
 OTHER_ID = "20200101T000000Z-00000b"
 BOOT = "a" * 32
-UTC_NS = 10**18
-
-
-def frames(first: int, last: int) -> FrameBatch:
-    seq = np.arange(first, last + 1, dtype=np.uint64)
-    columns = {
-        name: np.full((len(seq), 2) if per_tile else len(seq), 7, dtype)
-        for name, (dtype, per_tile) in FRAME_COLUMNS.items()
-    }
-    t_mono_ns = 2_000_000 * seq.astype(np.int64)
-    return FrameBatch(**columns | {"seq": seq, "t_mono_ns": t_mono_ns, "t_ns": t_mono_ns + UTC_NS})
 
 
 @pytest.fixture
@@ -41,7 +28,7 @@ def data(tmp_path: Path) -> Path:
     root, info = tmp_path / "data", make_array(boot_id=BOOT)
     folder = root / "journal" / "bench" / BOOT
     journal = Journal(folder, info)
-    journal.append(frames(0, 99))
+    journal.append(make_frames(100, status=7))
     journal.close()
     StreamNotes(array_info=info, next_seq=100).save(folder)
     begun(root)
@@ -61,7 +48,7 @@ def begun(root: Path, session_id: str = ID, *, last: int | None = None) -> None:
     SessionFolder(root / "sessions").save(kept)
 
 
-def test_a_crash_is_recovered_and_proven(run: Callable[..., Any], data: Path) -> None:
+def test_a_crash_is_recovered_and_proven(run: Run, data: Path) -> None:
     before = run("verify", ID, "--data", data)
     assert before.code == 3
     assert "pending, 100 recorded" in before.out
@@ -79,7 +66,7 @@ def test_a_crash_is_recovered_and_proven(run: Callable[..., Any], data: Path) ->
     assert after.out.splitlines()[-1] == "Everything is whole and complete."
 
 
-def test_json_of_one_session_is_its_ledger(run: Callable[..., Any], data: Path) -> None:
+def test_json_of_one_session_is_its_ledger(run: Run, data: Path) -> None:
     recovered = json.loads(run("recover", data, "--json").out)
     (one,) = recovered["sessions"]
     assert (one["outcome"], one["complete"], one["parts"][0]["recorded"]) == ("sealed", True, 100)
@@ -100,7 +87,7 @@ def test_json_of_one_session_is_its_ledger(run: Callable[..., Any], data: Path) 
     assert folder["journals"][0]["held"] == [[0, 99]]
 
 
-def test_damage_is_said_and_is_exit_code_1(run: Callable[..., Any], data: Path) -> None:
+def test_damage_is_said_and_is_exit_code_1(run: Run, data: Path) -> None:
     run("recover", data)
     path = data / "sessions" / ID / "frames.parquet"
     content = bytearray(path.read_bytes())
@@ -114,7 +101,7 @@ def test_damage_is_said_and_is_exit_code_1(run: Callable[..., Any], data: Path) 
     assert json.loads(run("verify", path, "--json").out)["complete"] is False
 
 
-def test_a_loss_is_exit_code_3(run: Callable[..., Any], data: Path) -> None:
+def test_a_loss_is_exit_code_3(run: Run, data: Path) -> None:
     begun(data, OTHER_ID, last=149)
     recovered = run("recover", data)
     assert recovered.code == 3
@@ -125,7 +112,7 @@ def test_a_loss_is_exit_code_3(run: Callable[..., Any], data: Path) -> None:
     assert "lossy, 100 recorded, 50 lost (node_restarted)" in found.out
 
 
-def test_a_journal_and_its_segment_are_proven_alone(run: Callable[..., Any], data: Path) -> None:
+def test_a_journal_and_its_segment_are_proven_alone(run: Run, data: Path) -> None:
     stream = data / "journal" / "bench" / BOOT
     assert "100 frames in 1 segments" in run("verify", stream).out
     (segment,) = stream.glob("*.arrows")
@@ -133,7 +120,7 @@ def test_a_journal_and_its_segment_are_proven_alone(run: Callable[..., Any], dat
     assert json.loads(run("verify", segment, "--json").out)["held"] == [[0, 99]]
 
 
-def test_what_is_lone_says_what_it_does_not_prove(run: Callable[..., Any], data: Path) -> None:
+def test_what_is_lone_says_what_it_does_not_prove(run: Run, data: Path) -> None:
     run("recover", data)
     found = run("verify", data / "sessions" / ID / "frames.parquet")
     assert found.code == 0
@@ -141,13 +128,11 @@ def test_what_is_lone_says_what_it_does_not_prove(run: Callable[..., Any], data:
 
 
 @pytest.mark.parametrize("command", ["verify", "recover"])
-def test_a_name_of_nothing_is_wrong_usage(run: Callable[..., Any], command: str) -> None:
+def test_a_name_of_nothing_is_wrong_usage(run: Run, command: str) -> None:
     assert run(command, "nowhere").code == 2
 
 
-def test_what_foottile_did_not_write_is_exit_code_1(
-    run: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_what_foottile_did_not_write_is_exit_code_1(run: Run, tmp_path: Path) -> None:
     (tmp_path / "some").mkdir()
     (tmp_path / "some" / "notes.txt").write_text("a walk")
     assert run("verify", "some").code == 1
@@ -156,9 +141,7 @@ def test_what_foottile_did_not_write_is_exit_code_1(
     assert run("recover", "some").code == 2
 
 
-def test_a_folder_that_is_used_is_not_recovered_but_verified(
-    run: Callable[..., Any], data: Path
-) -> None:
+def test_a_folder_that_is_used_is_not_recovered_but_verified(run: Run, data: Path) -> None:
     with (data / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         refused = run("recover", data)
@@ -166,9 +149,7 @@ def test_a_folder_that_is_used_is_not_recovered_but_verified(
     assert "a foottile server or node uses this folder" in refused.err
 
 
-def test_on_a_server_what_may_come_is_waited_for_unless_given_up(
-    run: Callable[..., Any], data: Path
-) -> None:
+def test_on_a_server_what_may_come_is_waited_for_unless_given_up(run: Run, data: Path) -> None:
     (data / "nodes").mkdir()
     waiting = run("recover", data)
     assert waiting.code == 3
@@ -177,7 +158,7 @@ def test_on_a_server_what_may_come_is_waited_for_unless_given_up(
     assert "sealed and proven" in run("recover", data, "--give-up").out
 
 
-def test_frames_of_no_session_are_recovered_if_asked(run: Callable[..., Any], data: Path) -> None:
+def test_frames_of_no_session_are_recovered_if_asked(run: Run, data: Path) -> None:
     (data / "sessions" / ID / "session.json").unlink()
     assert "nothing to recover" in run("recover", data).out
     found = run("recover", data, "--streams")
@@ -185,9 +166,7 @@ def test_frames_of_no_session_are_recovered_if_asked(run: Callable[..., Any], da
     assert f"(recovered bench {BOOT}): sealed and proven, 100 frames" in found.out
 
 
-def test_estimates_of_frames_out_of_order_are_refused(
-    run: Callable[..., Any], data: Path, tmp_path: Path
-) -> None:
+def test_estimates_of_frames_out_of_order_are_refused(run: Run, data: Path, tmp_path: Path) -> None:
     run("recover", data)
     path = data / "sessions" / ID / "frames.parquet"
     with SessionReader(path) as reader:

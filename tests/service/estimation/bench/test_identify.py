@@ -55,10 +55,11 @@ def programme(
 
 def pressed_by_model(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     """Pressures whose parameters are those above."""
-    effects = (np.array(values) for values in (PART, CREEP_S, LOOP))
+    part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
     kpa = pressed(
-        t_s, force_n, CURVE, SCALE_KPA, BASE_KPA, GAMMA, TAU_S, WALL_PER_KPA, *effects, WIDTHS_N
-    )
+        t_s, force_n, CURVE, SCALE_KPA, BASE_KPA, GAMMA, TAU_S, WALL_PER_KPA, part, creep_s, loop,
+        WIDTHS_N,
+    )  # fmt: skip
     return np.asarray(kpa[:, 0])
 
 
@@ -68,9 +69,10 @@ def pressed_by_dome(serial: str, **effects: bool) -> Callable[[np.ndarray, np.nd
     def press(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
         class Spindle:
             def forces_n(self, at_s: np.ndarray) -> np.ndarray:
-                return np.interp(at_s, t_s, force_n)[:, None]
+                return np.array(np.interp(at_s, t_s, force_n))[:, None]
 
-        scene = EmulationScene(**{"gas": False, "rubber": False, "hysteresis": False, **effects})
+        off = {"gas": False, "rubber": False, "hysteresis": False}
+        scene = EmulationScene.model_validate(off | effects)
         parts = [draw_dome(serial, 0)]
         domes = Domes(parts, [serial], Spindle(), scene, Surroundings(scene), "bench")
         return np.array([domes.pressure_kpa(0, float(t)) for t in t_s])

@@ -102,7 +102,7 @@ def test_without_effects_it_is_the_curve_turned_round() -> None:
 
 def test_a_trial_curve_that_turns_over_still_has_pressures() -> None:
     out = pressed(
-        np.arange(50) * 0.002, np.linspace(0, 60, 50), np.array([20.0, -40.0, 5.0]), SCALE_KPA,
+        np.linspace(0, 0.098, 50), np.linspace(0, 60, 50), np.array([20.0, -40.0, 5.0]), SCALE_KPA,
         BASE_KPA, 1.3, 0.011, WALL, np.array(PART), np.array(CREEP_S), np.array(LOOP), WIDTHS_N,
     )  # fmt: skip
     assert np.isfinite(out).all()

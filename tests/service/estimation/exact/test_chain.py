@@ -66,7 +66,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         [None if p is None else p - base[i] for p in kpa[i]] for i in range(4)
     ]
     around = equations.smoothed(gauge[3], frame_ns)
-    effects = [plan.calibration.of(plan.info.tiles[i].serial).effects for i in domes]
+    effects: list[Any] = [plan.calibration.of(plan.info.tiles[i].serial).effects for i in domes]
     walls = [e.temperature.wall_per_kpa for e in effects]
     doubt = max(mpf(w.sigma) / mpf(w.value) for w in walls)
     forces, errors = [], []
@@ -105,7 +105,10 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         )
         settled = [p if b else s for p, b, s in zip(dry, bound, settled, strict=True)]
         memory_ns = 5 * mpf(hot.gamma.value) * mpf(hot.tau_s.value) * 10**9
-        apparent, single, beyond, own = [], [], [], []
+        apparent: list[Exact] = []
+        single: list[Exact] = []
+        beyond: list[bool] = []
+        own: list[Exact] = []
         heat_n: list[Exact] = [None] * n
         for k in range(n):
             p = settled[k]
@@ -122,7 +125,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             beyond.append(p - base[i] > mpf(entry.range_kpa[1]) or lately)
             heat_n[k] = slope * mpf(hot.misfit) * (p - dry[k])
             own.append(slope**2 * variance[k] + fit)
-        averaged = equations.denoised(
+        averaged: list[Any] = equations.denoised(
             [None if b else f for f, b in zip(apparent, beyond, strict=True)],
             single,
             t_ns[i],
@@ -268,7 +271,7 @@ def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int)
     assert equations.apart(e.grf_n, grf) < 1e-9
     sigma_n = [sigma_of(exact.errors, k, 3 * one) for k in range(ROWS)]
     assert equations.apart(e.grf_sigma_n, sigma_n) < 1e-9
-    stated = np.flatnonzero(np.isfinite(e.cop_x_m))
+    stated = np.flatnonzero(np.isfinite(e.cop_x_m)).tolist()
     assert len(stated) > 20
     for axis, name in enumerate(("x", "y")):
         places = [mpf(position[axis]) for position in POSITIONS_M[:3]]

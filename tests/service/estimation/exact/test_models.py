@@ -166,7 +166,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str) -> None:
         t_ns[:, None],
         frame_ns,
         frame_ns[:, None].copy(),
-        run,
+        run.astype(np.int64),
         0,
         n,
         look_ms * 1_000_000,

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from devices.frames import ServoInfo
 from service.estimation.foot.geometry import angle_rad, grid_indices, hull, to_ground_x_m
+from tests.builders.arrays import make_servo
 
 coordinates = st.integers(-100, 100).map(lambda mm: mm / 1000)
 points = st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=8, unique=True)
@@ -23,19 +24,6 @@ def beyond_m(positions: list[tuple[float, float]], point: tuple[float, float]) -
     assert normals.shape == (len(offsets_m), 2)
     np.testing.assert_allclose(np.hypot(*normals.T), 1.0, atol=1e-12)
     return float((normals @ np.array(point) - offsets_m).max(initial=-np.inf))
-
-
-def servo(
-    *, zero: int = 2048, sign: int = 1, ratio: float = 1.0, travel: float | None = None
-) -> ServoInfo:
-    return ServoInfo(
-        model="MX-28",
-        counts_per_turn=4096,
-        zero_counts=zero,
-        sign=sign,
-        ratio=ratio,
-        ankle_travel_m_per_rad=travel,
-    )
 
 
 def angle_at(info: ServoInfo, counts: float) -> float:
@@ -141,15 +129,17 @@ def test_tiles_that_fill_no_grid_have_no_indices(positions: list[tuple[float, fl
     ],
 )
 def test_counts_become_an_angle_over_any_number_of_turns(counts: int, expected_rad: float) -> None:
-    assert angle_at(servo(), counts) == pytest.approx(expected_rad, rel=1e-15, abs=1e-15)
+    assert angle_at(make_servo(), counts) == pytest.approx(expected_rad, rel=1e-15, abs=1e-15)
 
 
 def test_sign_ratio_and_zero_are_the_scenes() -> None:
-    assert angle_at(servo(zero=0, sign=-1, ratio=0.1), 4096) == pytest.approx(-0.2 * math.pi)
+    assert angle_at(make_servo(zero_counts=0, sign=-1, ratio=0.1), 4096) == pytest.approx(
+        -0.2 * math.pi
+    )
 
 
 def test_unknown_counts_have_no_angle() -> None:
-    assert math.isnan(angle_at(servo(), math.nan))
+    assert math.isnan(angle_at(make_servo(), math.nan))
 
 
 # --- ground frame ---------------------------------------------------------------------------------

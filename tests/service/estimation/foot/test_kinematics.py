@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus, ServoInfo
+from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.foot.kinematics import Readings, counts_at, readings_of
-from tests.builders.arrays import array_at
+from tests.builders.arrays import array_at, make_servo
 from tests.builders.estimates import newton_plan
 from tests.builders.frames import loaded_frames
 
@@ -210,14 +210,7 @@ def test_batches_do_not_change_where_a_reading_begins() -> None:
 
 
 def test_an_estimate_turns_with_the_servo_between_its_readings() -> None:
-    servo = ServoInfo(
-        model="MX-28",
-        counts_per_turn=TURN,
-        zero_counts=100,
-        sign=-1,
-        ratio=0.1,
-        ankle_travel_m_per_rad=0.15,
-    )
+    servo = make_servo(counts_per_turn=TURN, zero_counts=100, sign=-1, ratio=0.1)
     plan = newton_plan(array_at([(0.0, 0.0, -0.15), (0.02, 0.0, -0.15)], servo=servo), lag_ms=6)
     frames = carried(T_NS, SLOW, tiles=2)
     estimates, state = step(plan, frames, EstimationState())

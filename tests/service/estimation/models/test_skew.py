@@ -23,7 +23,7 @@ def lined_up(
     column = np.array(values, dtype=float)[:, None]
     instants = np.array(t_ns)[:, None]
     out, _ = aligned(column, instants, np.array(frame_t_ns), gaps, at_rest(1))
-    return out[:, 0].tolist()
+    return [float(value) for value in out[:, 0]]
 
 
 @given(

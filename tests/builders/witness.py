@@ -1,6 +1,6 @@
 """What every conversion of every emulated part really gave, to judge what a driver made of it.
 
-No driver has this. It is attached to a world after start-up and listens to its parts.
+It is attached to a world after start-up and listens to its parts; no driver can.
 """
 
 from __future__ import annotations

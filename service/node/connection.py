@@ -1,0 +1,116 @@
+"""A connection on which a server has welcomed a node: what goes each way as long as it stands."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from typing import Any
+
+from pydantic import ValidationError
+
+from devices.errors import LinkError
+from service.link import (
+    SUBPROTOCOL,
+    Ack,
+    FromServer,
+    Lost,
+    Probe,
+    Wanted,
+    Welcome,
+    heard,
+    say,
+)
+from service.node.clock_probes import ClockProbes
+from service.node.sending import Greeted, Sending
+
+STATUS_EVERY_S = 1.0
+
+
+class Connection:
+    """What goes each way on one connection."""
+
+    def __init__(self, link: Greeted) -> None:
+        self._link = link
+        self._sending = Sending(link)
+        self._probes = ClockProbes(link.socket, link.hello.array_info.utc_offset_ns)
+        self._take_wanted(link.welcome.wanted)
+
+    async def run(self, renewed: asyncio.Event) -> None:
+        """Until it breaks, or the node has another stream to say hello with.
+
+        Raises:
+            LinkError, OSError, WebSocketException: it is broken.
+        """
+        await _until_one_ends(
+            self._receive(),
+            self._sending.run(),
+            self._sending.watch(),
+            self._probes.run(),
+            self._tell_status(),
+            renewed.wait(),
+        )
+
+    async def _receive(self) -> None:
+        while True:
+            message = parse(await self._link.socket.recv())
+            match message:
+                case Ack(boot_id=boot_id, seq_first=first, seq_last=last):
+                    stream = self._link.source.streams().get(boot_id)
+                    if stream is not None:
+                        stream.acknowledge(self._link.welcome.server_id, first, last)
+                case Wanted():
+                    self._take_wanted(message)
+                case Probe():
+                    self._probes.answered(message)
+                case Welcome():
+                    raise LinkError("welcome was said before")
+
+    def _take_wanted(self, wanted: Wanted) -> None:
+        earlier = (stream.array_info.boot_id for stream in self._link.hello.earlier)
+        known = (*earlier, self._link.hello.array_info.boot_id)
+        self._link.source.wanted(self._link.welcome.server_id, wanted, known)
+
+    async def _tell_status(self) -> None:
+        said = {stream.array_info.boot_id: stream.lost for stream in self._link.hello.earlier}
+        said[self._link.hello.array_info.boot_id] = self._link.hello.lost
+        while True:
+            for boot_id, stream in self._link.source.streams().items():
+                lost = stream.lost.as_pairs()
+                if boot_id in said and lost != said[boot_id]:
+                    said[boot_id] = lost
+                    await self._link.socket.send(say(Lost(boot_id=boot_id, lost=lost)))
+            await self._link.socket.send(say(self._link.source.status(self._sending.backlog.count)))
+            await asyncio.sleep(STATUS_EVERY_S)
+
+
+def parse(message: str | bytes) -> Welcome | Ack | Wanted | Probe:
+    """What a server has said.
+
+    Raises:
+        LinkError: it is no message of the link.
+    """
+    try:
+        return FromServer.validate_json(heard(message))
+    except ValidationError as error:
+        raise LinkError(
+            "the server said something that is no message",
+            expected=f"{SUBPROTOCOL} messages",
+            remedy="Is it a foottile server of this version?",
+        ) from error
+
+
+async def _until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
+    """Do all of it at once until one ends, and fail as that one failed.
+
+    Not by a TaskGroup: before Python 3.13 one that ends while its owner is about to go on may leave
+    the owner cancelled (CPython 117407), and a node without its link.
+    """
+    tasks = [asyncio.create_task(each) for each in work]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    for task in done:
+        task.result()

@@ -1,0 +1,62 @@
+"""What the estimates of a session come to: stances and, where the truth is known, their error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.frames import FrameBatch
+from service.estimation.foot.stances import Stance, Stances
+from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
+
+if TYPE_CHECKING:
+    from service.estimation.plan import EstimationPlan
+
+Columns = Mapping[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Of a session without estimates: nothing."""
+
+    stances: tuple[Stance, ...] = ()
+    accuracy: Accuracy | None = None
+    """None without the truth."""
+    assumed_scale: bool | None = None
+    """Whether newtons rest on an assumed scale."""
+
+
+class FindingsOf:
+    """Gathers them from consecutive frames with estimates.
+
+    Args:
+        judging: the columns bring the truth.
+    """
+
+    def __init__(self, *, judging: bool) -> None:
+        self._stances = Stances()
+        self._judging = judging
+        self._judged: list[Columns] = []
+
+    def feed(self, batch: FrameBatch, columns: Columns) -> None:
+        """Take the next frames."""
+        self._stances.feed(batch.t_ns, columns["grf_n"], columns["contact"])
+        if self._judging:
+            known = {"t_ns": batch.t_ns, **columns}
+            self._judged.append({name: known[name] for name in COMPARED})
+
+    def finish(self, plan: EstimationPlan) -> Findings:
+        """All of it; `plan` is what the estimates were made with."""
+        accuracy = None
+        if self._judged:
+            accuracy = accuracy_of(joined(self._judged), lag_ms=plan.lag_ns * 1e-6)
+        return Findings(self._stances.finish(), accuracy, plan.assumed_scale)
+
+
+def joined(pieces: Sequence[Columns]) -> dict[str, npt.NDArray[Any]]:
+    """Columns of all pieces, one after another."""
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}

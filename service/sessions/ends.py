@@ -1,0 +1,146 @@
+"""Where the parts of a session end: rules on what is known of its streams, nothing kept here.
+
+A session ends with the last frame that was taken before it was stopped, by the clock of whoever
+stopped it. A stream that ended before that ends its part. Where frames are missing, the end is
+placed by the rate; where a node has not said how its stream ended, the frames that it may have
+taken unheard are bounded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from service.sessions.streams import SessionStream
+from storage.intervals import NO_END, Intervals
+from storage.journal.stream_notes import unsynced_tail_max
+from storage.sessions.folder import Part, Session
+
+RATE_MAX_HZ = 1000.0
+"""Of a stream of which not even the description is left: no bus is faster."""
+
+Streams = Mapping[str, SessionStream]
+
+
+def at_stop(session: Session, streams: Streams, *, waiting: bool = False) -> Session:
+    """The session with the parts ended whose stream has passed the stop.
+
+    Args:
+        session: the session.
+        streams: by boot_id, of all of its parts.
+        waiting: leave a part open while frames may come that were taken nearer to the stop.
+
+    Raises:
+        DamagedFramesError: the frames that tell are damaged.
+    """
+    for part in session.parts:
+        if part.seq_last is None:
+            last = _seq_at_stop(session, part, streams[part.boot_id], waiting=waiting)
+            if last is not None:
+                session = ended(session, part, last)
+    return session
+
+
+def at_end(session: Session, streams: Streams, now_t_ns: int | None = None) -> Session:
+    """The session with every open part ended where its stream ended.
+
+    Args:
+        session: the session.
+        streams: by boot_id, of all of its parts.
+        now_t_ns: until when a stream may have gone on that has not said how it ended; None: its
+            session ends with the newest frame there is.
+    """
+    for part in session.parts:
+        if part.seq_last is None:
+            stream = streams[part.boot_id]
+            newest = stream.held.last
+            beyond = 0 if newest is None else newest + 1
+            if stream.next_seq is None:
+                session = ended(session, part, beyond - 1, _unheard(session, stream, now_t_ns))
+            else:
+                # What a node lost with its power may have come here before.
+                tail = stream.unsynced_tail_max - max(0, beyond - stream.next_seq)
+                session = ended(session, part, max(stream.next_seq, beyond) - 1, max(0, tail))
+    return session
+
+
+def broken_off(session: Session, streams: Streams, now_t_ns: int | None = None) -> Session:
+    """The session with every part ended by what is here: nothing more will come to tell.
+
+    If it was never stopped, it was stopped with its newest frame.
+
+    Args:
+        session: the session.
+        streams: by boot_id, of all of its parts.
+        now_t_ns: as for `at_end`.
+
+    Raises:
+        DamagedFramesError: the frames that tell are damaged.
+    """
+    session = at_end(at_stop(session, streams), streams, now_t_ns)
+    if session.stopped_t_ns is None:
+        stream = streams[session.parts[-1].boot_id]
+        newest_t_ns = stream.t_ns_near(session.parts[-1].seq_last or 0, newest=True)
+        stopped_t_ns = session.started_t_ns
+        if newest_t_ns is not None:
+            stopped_t_ns = newest_t_ns + (stream.offset_ns or 0)
+        session = session.model_copy(update={"stopped_t_ns": stopped_t_ns})
+    return session
+
+
+def ended(session: Session, part: Part, seq_last: int, tail: int = 0) -> Session:
+    """The session with this end of a part, behind which `tail` frames may have been."""
+    closed = part.model_copy(update={"seq_last": max(seq_last, part.seq_first - 1)})
+    parts = tuple(closed if each is part else each for each in session.parts)
+    update: dict[str, object] = {"parts": parts}
+    if tail:
+        update["unsynced_tail_max"] = {**session.unsynced_tail_max, part.boot_id: tail}
+    return session.model_copy(update=update)
+
+
+def open_tail(stream: SessionStream) -> int:
+    """How many frames a stream may have had behind its newest, as far as that is known of it."""
+    if stream.next_seq is not None:
+        return stream.unsynced_tail_max
+    return max(stream.unsynced_tail_max, unsynced_tail_max(_rate_hz(stream)))
+
+
+def _seq_at_stop(
+    session: Session, part: Part, stream: SessionStream, *, waiting: bool
+) -> int | None:
+    """The last frame of a stream before the stop; None if the stream has not passed it."""
+    if session.stopped_t_ns is None or stream.around is None or stream.offset_ns is None:
+        return None
+    stop_t_ns = session.stopped_t_ns - stream.offset_ns
+    found = stream.around(stop_t_ns, at_least=part.seq_first, waiting=waiting)
+    if found is None:
+        return None
+    last, after = found
+    if after == last + 1:
+        return last
+    if waiting and stream.may_come & Intervals([(last + 1, after - 1)]):
+        return None
+    # The stop lies among frames that are lost: by the rate, so many of them came after it.
+    after_t_ns = stream.t_ns_near(after, newest=False) or stop_t_ns
+    late = math.ceil((after_t_ns - stop_t_ns) * 1e-9 * _rate_hz(stream))
+    return min(after - 1, max(last, after - late))
+
+
+def _unheard(session: Session, stream: SessionStream, now_t_ns: int | None) -> int:
+    """How many frames there may have been behind the last that is known of.
+
+    Until the stop or now, whichever was first; if neither is known, until the newest was synced.
+    """
+    known = [t_ns for t_ns in (session.stopped_t_ns, now_t_ns) if t_ns is not None]
+    if not known:
+        return open_tail(stream)
+    # Frames that were sent late came later than they were taken.
+    newest_t_ns, seen_t_ns = stream.t_ns_near(NO_END, newest=True), stream.last_seen_t_ns
+    if newest_t_ns is not None and (stream.offset_ns is not None or seen_t_ns is None):
+        seen_t_ns = newest_t_ns + (stream.offset_ns or 0)
+    silent_s = (min(known) - (seen_t_ns or session.started_t_ns)) / 1e9
+    return max(1, stream.unsynced_tail_max, math.ceil(silent_s * _rate_hz(stream)))
+
+
+def _rate_hz(stream: SessionStream) -> float:
+    return stream.info.nominal_rate_hz if stream.info is not None else RATE_MAX_HZ

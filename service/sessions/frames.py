@@ -1,0 +1,105 @@
+"""Frames of a session with their estimates; where the estimator is not installed, raw frames.
+
+They are what is sealed, and what a session that is still recorded or pending gives away as CSV or
+Arrow. This is the only door to the estimator for a node: it seals, and so does `foottile recover`,
+where neither numba nor scipy is installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.errors import FootTileError
+from devices.extras import needs_extra
+from devices.frames import FrameBatch
+from service.estimation import OFFLINE_LAG_MS
+from service.sessions.sources import Sources
+
+Columns = Mapping[str, npt.NDArray[Any]]
+
+_GATHER_FRAMES = 4096
+
+
+class SessionFrames:
+    """Frames of a session, with the column `part` and, where possible, estimates.
+
+    Once the first frames are there, `notes` is what a file says of their estimates, and `problem`
+    why there are none.
+    """
+
+    def __init__(self, sources: Sources) -> None:
+        self.notes: dict[str, Any] = {}
+        self.problem: str | None = None
+        self._sources = sources
+
+    def __iter__(self) -> Iterator[tuple[FrameBatch, Columns]]:
+        if self._sources.calibration is None:
+            self._without_estimates(self._sources.problem)
+            yield from self._raw()
+            return
+        try:
+            pieces = self._estimated()
+            first = next(pieces, None)
+        except FootTileError as error:  # no tare, a calibration of other tiles, no estimator
+            self._without_estimates(error)
+            yield from self._raw()
+            return
+        if first is not None:
+            yield first
+            yield from pieces
+
+    def _estimated(self) -> Iterator[tuple[FrameBatch, Columns]]:
+        sources = self._sources
+        with needs_extra("server", "the estimator", remedy=_LATER):
+            from service.sessions.pipeline import EstimateOptions, EstimateStream, notes_of
+        assert sources.calibration is not None  # noqa: S101  # or there is nothing to estimate with
+        options = EstimateOptions(
+            sources.calibration, sources.info.models, OFFLINE_LAG_MS, tares=sources.tares
+        )
+        stream = EstimateStream(sources.info, options)
+        for frames, columns in stream.run(self._raw()):
+            if not self.notes and stream.plan is not None:
+                self.notes = notes_of(stream.plan, sources.tares)
+            yield frames, columns
+
+    def _without_estimates(self, reason: object) -> None:
+        """Say why there are none, and keep what `foottile estimate` can make them with later."""
+        calibration, tares = self._sources.calibration, self._sources.tares
+        self.problem = f"no estimates: {reason}"
+        self.notes = {"estimates": self.problem}
+        if calibration is not None:
+            self.notes["calibration"] = calibration.model_dump(mode="json")
+        if tares:
+            self.notes["tares"] = [tare.as_dict() for tare in tares]
+
+    def _raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
+        for number, part in enumerate(self._sources.session.parts):
+            journal = self._sources.journals.get(part.boot_id)
+            if journal is None:
+                continue
+            last = part.seq_last if part.seq_last is not None else journal.held.last
+            if last is None:
+                continue
+            for batch in _gathered(journal.read(part.seq_first, last)):
+                yield batch, {"part": np.full(len(batch), number, dtype=np.uint16)}
+
+
+_LATER = "`foottile estimate` adds them where foottile[server] is installed"
+
+
+def _gathered(batches: Iterator[FrameBatch]) -> Iterator[FrameBatch]:
+    """Fewer and longer batches: estimates of ten rows cost nearly what those of thousands do."""
+    waiting: list[FrameBatch] = []
+    count = 0
+    for batch in batches:
+        waiting.append(batch)
+        count += len(batch)
+        if count >= _GATHER_FRAMES:
+            yield FrameBatch.concatenate(waiting)
+            waiting, count = [], 0
+    if waiting:
+        yield FrameBatch.concatenate(waiting)

@@ -1,0 +1,152 @@
+"""The streams of a data folder that nothing uses: every journal opened, mended and described."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from devices.errors import DamagedFramesError, FileFormatError
+from service.sessions.streams import SessionStream, around_in
+from storage.durable import remove_stale_temporaries
+from storage.intervals import NO_END, Intervals
+from storage.journal.journal import Journal
+from storage.journal.segment import SUFFIX
+from storage.journal.stream_notes import NOTES_FILE, StreamNotes
+from storage.losses import CORRUPT, Losses
+from storage.sessions.folder import Session
+
+
+@dataclass
+class OpenedStream:
+    """One stream's journal, opened after a crash.
+
+    Attributes:
+        journal: its frames.
+        notes: its `stream.json`; None if there is none.
+        damaged: numbers that were here and cannot be read any more.
+        is_local: is it in its own node's folder?
+    """
+
+    journal: Journal
+    notes: StreamNotes | None
+    damaged: Intervals
+    is_local: bool
+
+    @property
+    def lost(self) -> Losses:
+        """Numbers that are known not to come, by reason."""
+        lost = Losses(self.notes.lost if self.notes is not None else None)
+        if self.is_local:
+            lost.add(self.damaged, CORRUPT)
+        lost.found(self.journal.held)
+        return lost
+
+    def for_session(self, session: Session) -> SessionStream:
+        """What a session knows of it."""
+        notes, lost = self.notes or StreamNotes(array_info=self.journal.info), self.lost
+        rows = [row for row in session.clock if row.boot_id == self.journal.info.boot_id]
+        measured_ns = rows[-1].server_minus_node_ns if rows else None
+        return SessionStream(
+            held=self.journal.held,
+            lost=lost,
+            damaged=self.damaged,
+            may_come=Intervals(() if self.is_local else [(0, NO_END)]) - lost.all,
+            next_seq=notes.next_seq,
+            unsynced_tail_max=notes.unsynced_tail_max,
+            missed_slots=notes.missed_slots,
+            info=self.journal.info,
+            journal=self.journal,
+            around=partial(around_in, self.journal),
+            offset_ns=0 if self.is_local else measured_ns,  # a node stops by its own clock
+        )
+
+    def note_losses(self) -> None:
+        """Write down what was found damaged: once it is cut off, nothing else says so.
+
+        A server does not: its node may have these frames, and says what it has lost itself.
+
+        Raises:
+            StorageError: the disk is full or not writable.
+        """
+        notes = self.notes or StreamNotes(array_info=self.journal.info)
+        lost = self.lost.as_pairs()
+        if self.is_local and lost != Losses(notes.lost).as_pairs():
+            self.notes = notes.model_copy(update={"lost": lost})
+            self.notes.save(self.journal.folder)
+
+    def disown_damaged(self, first: int, last: int) -> None:
+        """Read what is held from `first` to `last`; what does not agree with its checksum is lost.
+
+        Raises:
+            StorageError: it cannot be read.
+        """
+        at = first
+        while at <= last:
+            try:
+                for _ in self.journal.messages(at, last):
+                    pass
+            except DamagedFramesError as error:
+                damaged = Intervals([(error.seq_first, error.seq_last)])
+                self.journal.disown(damaged)
+                self.damaged = self.damaged | (damaged - self.journal.held)
+                at = error.seq_last + 1
+            else:
+                return
+
+
+def open_streams(
+    data: Path, tell: Callable[[str], None], *, is_local: bool
+) -> tuple[dict[tuple[str, str], OpenedStream], list[str]]:
+    """Open every journal of a data folder, which cuts off what is not whole and syncs the rest.
+
+    Args:
+        data: the data folder.
+        tell: told what is being done.
+        is_local: is it a node's own folder?
+
+    Returns:
+        Streams by node and boot_id, and what could not be opened, in words.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    streams: dict[tuple[str, str], OpenedStream] = {}
+    problems: list[str] = []
+    for folder in sorted((data / "journal").glob("*/*")):
+        if not folder.is_dir() or not (
+            (folder / NOTES_FILE).exists() or any(folder.glob("*" + SUFFIX))
+        ):
+            continue
+        tell(f"journal {folder.parent.name}/{folder.name}")
+        remove_stale_temporaries(folder)
+        try:
+            journal = Journal.open(folder)
+            notes = _notes_of(folder, problems)
+        except FileFormatError as error:
+            problems.append(f"journal {folder.parent.name}/{folder.name}: {error}")
+            continue
+        stream = OpenedStream(journal, notes, journal.lost.all, is_local)
+        stream.note_losses()
+        streams[(folder.parent.name, folder.name)] = stream
+    return streams, problems
+
+
+def hello_of(data: Path, node: str) -> dict[str, Any]:
+    """What a server kept of what a node said last; empty if there is nothing."""
+    try:
+        content = json.loads((data / "nodes" / node / "hello.json").read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _notes_of(folder: Path, problems: list[str]) -> StreamNotes | None:
+    try:
+        return StreamNotes.load(folder)
+    except FileFormatError as error:  # what it says is bounded without it
+        problems.append(str(error))
+        return None

@@ -1,0 +1,155 @@
+"""What a session is made from: its frames, the array, calibration, tares, notes for its file.
+
+The same for a session that is sealed, given away before that, recovered, or recorded on a node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from devices.errors import FootTileError
+from devices.frames import ArrayInfo
+from service.estimation.calibration import Calibration
+from service.estimation.tare.tare import Tare
+from service.sessions.ends import RATE_MAX_HZ
+from service.sessions.streams import SessionStream
+from service.sessions.tares import TareHistory
+from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
+from storage.intervals import NO_END
+from storage.journal.journal import Journal
+from storage.sessions.folder import Session
+from storage.sessions.ledger import lost_numbers
+from storage.sessions.states import states_of
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What a session is sealed from.
+
+    Attributes:
+        session: intervals, events, clock.
+        info: description of the array in its first part.
+        journals: by boot_id.
+        calibration: to estimate with; None: raw frames only.
+        problem: why there is none.
+        tares: that were in force, oldest first.
+        notes: more for the file's metadata.
+    """
+
+    session: Session
+    info: ArrayInfo
+    journals: Mapping[str, Journal]
+    calibration: Calibration | None
+    problem: str | None
+    tares: tuple[Tare, ...]
+    notes: Mapping[str, object]
+
+    @property
+    def streams(self) -> tuple[StreamFacts, ...]:
+        """What is known of the clocks of the session's streams."""
+        boot_ids = dict.fromkeys(part.boot_id for part in self.session.parts)
+        known = {boot_id: journal.info for boot_id, journal in self.journals.items()}
+        known[self.info.boot_id] = self.info
+        return tuple(
+            StreamFacts(boot_id, info.utc_offset_ns, info.clock_set)
+            if (info := known.get(boot_id)) is not None
+            else StreamFacts(boot_id)
+            for boot_id in boot_ids
+        )
+
+    def clock_table(self) -> ClockTable:
+        """The clock table of a session that is not sealed yet."""
+        parts = [part.boot_id for part in self.session.parts]
+        where = f"session {self.session.id}"
+        rows = rows_by_stream(self.session.clock, where=where)
+        return ClockTable(rows, self.streams, parts, where=where)
+
+
+def sources_of(
+    session: Session,
+    streams: Mapping[str, SessionStream],
+    *,
+    tares: Callable[[], TareHistory] | None,
+    emulated: bool | None,
+    no_array: ArrayInfo | None = None,
+) -> Sources:
+    """What a session is made from.
+
+    Args:
+        session: the session.
+        streams: by boot_id, of all of its parts.
+        tares: gives those of its node; None: nothing is kept of them.
+        emulated: are its frames emulated? None: not known.
+        no_array: stands for the array where no stream tells of one.
+    """
+    infos = [streams[part.boot_id].info for part in session.parts]
+    info = next((info for info in infos if info is not None), no_array or _no_array(session))
+    calibration, problem = _calibration_of(session)
+    in_force: tuple[Tare, ...] = ()
+    if calibration is not None and tares is not None:
+        try:
+            in_force, problem = _tares_of(session, streams, tares(), info)
+        except FootTileError as error:  # their file is damaged
+            problem = str(error)
+    notes: dict[str, object] = {
+        "scene": session.scene_content,
+        "lost": lost_numbers(session.parts, states_of(session, streams)),
+    }
+    if emulated is not None:
+        notes["emulated"] = emulated
+    return Sources(
+        session=session,
+        info=info,
+        journals={b: s.journal for b, s in streams.items() if s.journal is not None},
+        calibration=calibration if problem is None else None,
+        problem=problem,
+        tares=in_force,
+        notes=notes,
+    )
+
+
+def _calibration_of(session: Session) -> tuple[Calibration | None, str | None]:
+    if session.calibration is None:
+        return None, "the node had no calibration"
+    try:
+        return Calibration.model_validate(session.calibration), None
+    except (FootTileError, ValueError) as error:
+        return None, f"its calibration is not readable: {error}"
+
+
+def _tares_of(
+    session: Session, streams: Mapping[str, SessionStream], history: TareHistory, info: ArrayInfo
+) -> tuple[tuple[Tare, ...], str | None]:
+    """Tares that were in force while it was recorded, by the frames' own instants.
+
+    Returns:
+        The tares, oldest first; none, and a reason, if there are tares, but none of that time.
+    """
+    first, last = session.parts[0], session.parts[-1]
+    seq_last = last.seq_last if last.seq_last is not None else NO_END
+    begin_t_ns = streams[first.boot_id].t_ns_near(first.seq_first, newest=False)
+    end_t_ns = streams[last.boot_id].t_ns_near(seq_last, newest=True)
+    if begin_t_ns is None or end_t_ns is None:
+        return (), None
+    tares = history.during(info, begin_t_ns, end_t_ns)
+    if not tares and history.in_force(info) is not None:
+        return (), "all tares of the node were taken after this session"
+    return tares, None
+
+
+def _no_array(session: Session) -> ArrayInfo:
+    """In place of the array of a session that has no frames left."""
+    return ArrayInfo(
+        node=session.node,
+        boot_id=session.parts[0].boot_id,
+        tiles=(),
+        servo=None,
+        schedule="",
+        nominal_rate_hz=RATE_MAX_HZ,
+        utc_offset_ns=0,
+        clock_set=False,
+        software="",
+        scene=session.scene,
+        models=(),
+    )

@@ -1,0 +1,126 @@
+"""The segments of one journal that are being written, and those that are to be closed.
+
+Frames may come out of order, newest first and what was missed behind them: two segments are open,
+and each takes only what follows its last frame, so that within a file time never runs back.
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+from devices.errors import StorageError
+from storage.durable import storage_errors, sync_folder
+from storage.journal.segment import SUFFIX, SegmentWriter
+from storage.wire import EncodedBatch
+
+SEGMENT_NS = 60_000_000_000
+"""A segment is closed after a minute of frames: what is not needed is deleted by segments."""
+_OPEN_MAX = 2
+
+
+class OpenSegments:
+    """One thread appends; `sync` may run in another one.
+
+    Args:
+        folder: the journal's.
+        header: schema message with which a segment begins.
+    """
+
+    def __init__(self, folder: Path, header: bytes) -> None:
+        self._folder = folder
+        self._header = header
+        self._open: list[SegmentWriter] = []
+        self._closing: list[SegmentWriter] = []
+        self._has_new_names = False
+        self._lock = threading.Lock()
+        """Guards the lists; never held while the disk works."""
+
+    @property
+    def paths(self) -> set[Path]:
+        """Files that are open or not closed yet."""
+        with self._lock:
+            return {writer.segment.path for writer in (*self._open, *self._closing)}
+
+    def append(self, message: EncodedBatch) -> SegmentWriter:
+        """Write a batch to the segment in which it may follow; all of it, or none.
+
+        Raises:
+            StorageError: the disk is full or not writable.
+        """
+        writer = self._writer_for(message.seq_first, message.t_ns_first)
+        try:
+            with storage_errors(writer.segment.path):
+                writer.append(message)
+        except StorageError:
+            # Whatever stands at the end of the file now: the next batch begins another one.
+            self._retire(writer)
+            raise
+        return writer
+
+    def sync(self) -> None:
+        """Return when everything appended before is on the disk.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        with self._lock:
+            closing, self._closing = self._closing, []
+            writers = [writer for writer in self._open if writer.has_news]
+            has_new_names, self._has_new_names = self._has_new_names, False
+        failed: OSError | None = None
+        for writer in closing:
+            try:
+                writer.close()
+            except OSError as error:
+                failed = error
+        with storage_errors(self._folder):
+            for writer in writers:
+                # A segment that is closed meanwhile was synced when it was closed.
+                with suppress(ValueError):
+                    writer.sync()
+            if has_new_names:
+                sync_folder(self._folder)
+            if failed is not None:
+                raise failed
+
+    def retire_all(self) -> None:
+        """Take nothing more into these segments; the next sync closes them."""
+        with self._lock:
+            self._closing += self._open
+            self._open = []
+
+    def _writer_for(self, seq_first: int, t_ns: int) -> SegmentWriter:
+        """An open segment that these frames may follow in: the one that ends nearest before."""
+        fitting = [w for w in self._open if w.segment.span[1] < seq_first]
+        if fitting:
+            writer = max(fitting, key=lambda w: w.segment.span[1])
+            if t_ns - writer.segment.t_ns_first < SEGMENT_NS:
+                return writer
+            self._retire(writer)
+        if len(self._open) >= _OPEN_MAX:
+            self._retire(self._open[0])
+        # After a failed write the name may be taken.
+        path = self._folder / f"{seq_first:020d}{SUFFIX}"
+        taken = 1
+        while path.exists():
+            path = self._folder / f"{seq_first:020d}-{taken}{SUFFIX}"
+            taken += 1
+        with storage_errors(path):
+            writer = SegmentWriter(path, self._header)
+        with self._lock:
+            self._open.append(writer)
+            self._has_new_names = True
+        return writer
+
+    def _retire(self, writer: SegmentWriter) -> None:
+        """Take nothing more into this segment; the next sync closes it."""
+        with self._lock:
+            self._open.remove(writer)
+            if writer.segment.held:
+                self._closing.append(writer)
+                return
+        writer.abandon()
+        with suppress(OSError):
+            writer.segment.delete()

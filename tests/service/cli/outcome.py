@@ -1,0 +1,24 @@
+"""What a run of `foottile` gives, and what several tests of commands feed it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import resources
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Exit code and the two streams."""
+
+    code: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Outcome]
+
+
+def scene_text(name: str) -> str:
+    """The file of a built-in scene."""
+    return (resources.files("devices.scene") / "builtin" / f"{name}.toml").read_text("utf-8")

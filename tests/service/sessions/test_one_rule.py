@@ -1,0 +1,248 @@
+"""The same facts give the same session, whoever asks: server, node alone, recovery or verify."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.frames import FrameStatus
+from service.link import PROTOCOL, Hello
+from service.node.recording import NodeRecording
+from service.server import following
+from service.server.nodes import Node, Nodes
+from service.server.recorder import Recorder
+from service.server.trash import Trash
+from service.sessions.recover import recover
+from service.sessions.tares import TareHistory
+from storage.clock.offset import ClockOffset
+from storage.journal.journal import Journal
+from storage.journal.node_journal import NodeJournal
+from storage.journal.stream_notes import StreamNotes
+from storage.losses import Losses
+from storage.sessions.folder import Part, Session, SessionFolder
+from storage.sessions.ledger import ledger_of
+from storage.sessions.states import states_of
+from storage.verify.session import verify_session
+from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
+from tests.builders.calibrations import make_calibration, make_tare
+from tests.builders.frames import make_frames
+
+ID = "20200101T000000Z-00000a"
+BOOT, PRESENT = "a" * 32, "b" * 32
+INFO = make_array(boot_id=BOOT)
+BATCH, BATCHES = 5, 8
+LEAD = 10
+SERVER_MINUS_NODE_NS = 7_000_000_000
+REASONS = ("disk_full", "evicted", "corrupt")
+FATES = st.sampled_from(("held", "held", "missing", *REASONS))
+CALIBRATIONS: list[dict[str, Any] | None] = [
+    None,
+    {"this": "is none"},
+    make_calibration("T01", "T02").model_dump(mode="json"),
+]
+
+
+def t_ns(seq: int) -> int:
+    return UTC_NS + PERIOD_NS * seq
+
+
+@dataclass
+class Stream:
+    """A stream as it lies on a disk: what became of each batch, and what is said of its end."""
+
+    fates: list[str]
+    notes: dict[str, Any]
+
+    def write(self, data: Path) -> None:
+        folder = data / "journal" / "bench" / BOOT
+        journal = Journal(folder, INFO)
+        lost: dict[str, list[tuple[int, int]]] = {}
+        for number, fate in enumerate(self.fates):
+            first, last = number * BATCH, number * BATCH + BATCH - 1
+            if fate == "held":
+                lead = int(FrameStatus.LEAD) if last < LEAD else 0
+                journal.append(make_frames(np.arange(first, last + 1), frame_status=lead))
+            elif fate in REASONS:
+                lost.setdefault(fate, []).append((first, last))
+        StreamNotes(array_info=INFO, lost=Losses(lost).as_pairs(), **self.notes).save(folder)
+        journal.close()
+
+
+@st.composite
+def streams(draw: st.DrawFn, *, has_ended: bool) -> Stream:
+    fates = draw(st.lists(FATES, min_size=1, max_size=BATCHES))
+    if "held" not in fates:
+        fates[0] = "held"
+    notes = {"missed_slots": draw(st.integers(0, 9))}
+    if has_ended or draw(st.booleans()):
+        beyond = draw(st.integers(0, 3))
+        notes |= {"next_seq": len(fates) * BATCH + beyond}
+        notes |= {"unsynced_tail_max": draw(st.sampled_from((0, 0, 40)))}
+    return Stream(fates, notes)
+
+
+def session(**content: Any) -> Session:
+    facts: dict[str, Any] = {
+        "id": ID,
+        "name": "walk",
+        "node": "bench",
+        "started_t_ns": t_ns(0),
+        "scene": "test",
+    }
+    return Session(**facts | {"state": "pending", "scene_content": {"name": "test"}} | content)
+
+
+SEQ = st.integers(0, BATCHES * BATCH)
+
+
+def keep(data: Path, kept: Session) -> Path:
+    folder = SessionFolder(data / "sessions")
+    folder.save(kept)
+    return folder.path(kept.id)
+
+
+def loaded(data: Path) -> Session:
+    return SessionFolder(data / "sessions").load(ID)
+
+
+def what_it_is(done: Session) -> dict[str, Any]:
+    names = {"parts", "stopped_t_ns", "unsynced_tail_max", "problem", "calibration_id", "frames"}
+    return {"ledger": done.ledger, **done.model_dump(include=names)}
+
+
+@given(
+    stream=streams(has_ended=True),
+    first=SEQ,
+    length=st.none() | SEQ,
+    calibration=st.sampled_from(CALIBRATIONS),
+)
+@settings(max_examples=25, deadline=None)
+def test_a_node_alone_and_recovery_in_its_folder_seal_the_same_session(
+    stream: Stream, first: int, length: int | None, calibration: dict[str, Any] | None
+) -> None:
+    end = None if length is None else first + length - 1
+    begun = session(
+        state="recording",
+        parts=(Part(boot_id=BOOT, seq_first=first, seq_last=end),),
+        calibration=calibration,
+    )
+    with TemporaryDirectory() as path:
+        alone, recovered = Path(path) / "alone", Path(path) / "recovered"
+        stream.write(alone)
+        folder = keep(alone, begun)
+        counted = verify_session(folder).ledger
+        shutil.copytree(alone, recovered)
+        journal = NodeJournal(alone, "bench")
+        recording = NodeRecording(
+            alone, "bench", journal, name=None, calibration=None, notes={}, report=lambda _: None
+        )
+        recording.seal_what_was_left()
+        journal.close()
+        recover(recovered)
+        done = loaded(alone)
+        assert done.state == "sealed"
+        assert what_it_is(done) == what_it_is(loaded(recovered))
+        if end is not None:
+            assert counted is not None
+            assert done.ledger is not None
+            assert counted.parts == done.ledger.parts
+            assert counted.missed_slots == done.ledger.missed_slots
+
+
+@given(
+    stream=streams(has_ended=False),
+    first=SEQ,
+    length=st.none() | SEQ,
+    stopped=SEQ,
+    is_measured=st.booleans(),
+    missed_slots_at_stop=st.none() | st.integers(0, 9),
+    calibration=st.sampled_from(CALIBRATIONS),
+    tared=st.none() | SEQ,
+)
+@settings(max_examples=25, deadline=None)
+def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
+    stream: Stream,
+    first: int,
+    length: int | None,
+    stopped: int,
+    is_measured: bool,
+    missed_slots_at_stop: int | None,
+    calibration: dict[str, Any] | None,
+    tared: int | None,
+) -> None:
+    end = None if length is None else first + length - 1
+    row = ClockOffset(
+        boot_id=BOOT,
+        t_mono_ns=0,
+        server_minus_node_ns=SERVER_MINUS_NODE_NS if is_measured else 0,
+        uncertainty_ns=1,
+    )
+    begun = session(
+        stopped_t_ns=t_ns(stopped) + row.server_minus_node_ns,
+        parts=(Part(boot_id=BOOT, seq_first=first, seq_last=end),),
+        clock=(row,) if is_measured else (),
+        missed_slots_at_start=2,
+        missed_slots_at_stop={} if missed_slots_at_stop is None else {BOOT: missed_slots_at_stop},
+        calibration=calibration,
+    )
+    with TemporaryDirectory() as path:
+        data = Path(path)
+        stream.write(data)
+        if tared is not None:
+            history = TareHistory(data / "nodes" / "bench" / "tares.json")
+            history.add(make_tare(t_ns=t_ns(tared)), INFO)
+        recorder, node = server_on(data, begun)
+        made = recorder.sources(ID)
+        waiting = recorder.ledger(ID)
+        if end is not None:
+            counted = verify_session(data / "sessions" / ID).ledger
+            assert counted is not None
+            assert (counted.parts, counted.missed_slots) == (waiting.parts, waiting.missed_slots)
+            (one,) = recover(data).sessions
+            assert one.outcome == "sealed" or one.ledger == waiting
+            keep(data, begun)
+        given_up = following.given_up(begun, node)
+        (one,) = recover(data, give_up=True).sessions
+        done = one.session
+        assert done.state == "sealed"
+        assert (done.parts, done.given_up) == (given_up.parts, True)
+        assert done.unsynced_tail_max == given_up.unsynced_tail_max
+        streams_then = following.streams_of(given_up, node)
+        ledger = ledger_of(given_up.parts, states_of(given_up, streams_then), finished=True)
+        assert done.ledger == ledger
+        if done.frames and made.problem is not None:
+            assert done.problem == f"no estimates: {made.problem}"
+        assert (made.calibration is None) == (made.problem is not None)
+
+
+def server_on(data: Path, begun: Session) -> tuple[Recorder, Node]:
+    """A server that was started on this folder, whose node has not connected since."""
+    nodes = Nodes(data)
+    hello = Hello(
+        protocol=PROTOCOL,
+        array_info=make_array(boot_id=PRESENT),
+        held=(),
+        next_seq=0,
+        scene={},
+        emulated=True,
+        calibration=None,
+        calibration_problem="for this test",
+    )
+    node = nodes.greet(hello)
+    node.keep()
+    keep(data, begun)
+    recorder = Recorder(
+        SessionFolder(data / "sessions"),
+        Trash(data / "trash"),
+        nodes,
+        changed=lambda _: None,
+        ask_again=lambda _: None,
+    )
+    return recorder, node

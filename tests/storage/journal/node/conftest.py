@@ -1,0 +1,52 @@
+"""A node's journal that writes, and the stream that it was begun with."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from storage.journal import node_journal, retention
+from storage.journal.node_journal import NodeJournal
+from storage.journal.node_stream import NodeStream
+from tests.builders.arrays import make_array
+from tests.storage.journal.node.leg import Start
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_journal, "SYNC_S", 0.02)
+    monkeypatch.setattr(node_journal, "_TIDY_S", 0.02)
+    monkeypatch.setattr(node_journal, "_AGAIN_S", 0.02)
+    monkeypatch.setattr(retention, "_WEIGH_S", 0.02)
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """A node's journal that writes; ended with the test."""
+    running: list[NodeJournal] = []
+
+    def begin(**options: Any) -> NodeJournal:
+        running.append(NodeJournal(tmp_path, "leg", **options))
+        running[-1].start()
+        return running[-1]
+
+    yield begin
+    for journal in running:
+        journal.close()
+    assert not any(thread.name == "journal" for thread in threading.enumerate())
+
+
+@pytest.fixture
+def journal(start: Start) -> NodeJournal:
+    """A journal that writes."""
+    return start()
+
+
+@pytest.fixture
+def stream(journal: NodeJournal) -> NodeStream:
+    """Its stream, of which nothing has been taken yet."""
+    return journal.begin(make_array())

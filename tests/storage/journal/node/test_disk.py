@@ -1,0 +1,153 @@
+"""A disk that is full, slow or failing: what that costs, and that it is named."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from storage.intervals import Intervals
+from storage.journal import node_journal, segment
+from storage.journal.node_journal import NodeJournal
+from storage.journal.node_stream import NodeStream
+from tests.builders.arrays import make_array
+from tests.storage.faulty_disk import before_each_sync_of_frames
+from tests.storage.journal.node.leg import Start, fill, given, store
+from tests.waiting import until
+
+
+@pytest.mark.parametrize(
+    ("number", "reason", "words"),
+    [
+        (errno.ENOSPC, "disk_full", "is full"),
+        (errno.EROFS, "read_only", "Read-only file system"),
+        (errno.EIO, "read_only", "Input/output error"),
+    ],
+)
+def test_a_disk_that_takes_nothing_costs_what_memory_cannot_hold_and_goes_on_when_it_does(
+    journal: NodeJournal,
+    stream: NodeStream,
+    monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    reason: str,
+    words: str,
+) -> None:
+    monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
+    fill(journal, stream, 0, 49)
+    until(lambda: stream.stored.last == 49 and stream.is_synced)
+
+    def refuse(file: Any, data: bytes) -> None:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(segment, "write_all", refuse)
+        fill(journal, stream, 50, 69)
+        until(lambda: journal.troubles)
+        assert words in journal.troubles[0]
+        fill(journal, stream, 70, 999)
+        lost = stream.lost.by_reason[reason]
+        assert next(iter(lost))[0] == 50
+        assert stream.held.count + lost.count == 1000
+        assert given(stream, 990, 999) == [990]  # the live picture, and what still waits
+    until(lambda: journal.troubles == ())
+    until(lambda: stream.stored.last == 999)
+    assert stream.stored.count + stream.lost.by_reason[reason].count == 1000
+
+
+def test_a_slow_disk_holds_up_nobody_and_what_does_not_fit_is_named(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
+    go_on = threading.Event()
+    stuck = threading.Event()
+
+    def slow() -> None:
+        stuck.set()
+        go_on.wait(10.0)
+
+    before_each_sync_of_frames(monkeypatch, slow)
+    fill(journal, stream, 0, 9)
+    assert stuck.wait(5.0)
+    fill(journal, stream, 10, 999)
+    assert stream.lost.by_reason["disk_slow"].count > 500
+    assert stream.recent(990)
+    go_on.set()
+    until(lambda: stream.stored.last == 999)
+    assert stream.stored.count + stream.lost.all.count == 1000
+
+
+def test_what_the_disk_could_not_sync_is_written_once_more(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """After a failed fsync the kernel may have forgotten the pages, and says so only once."""
+    fill(journal, stream, 0, 49)
+    until(lambda: stream.stored.last == 49 and stream.is_synced)
+    failures = 1
+
+    def fail_once() -> None:
+        nonlocal failures
+        if failures:
+            failures -= 1
+            raise OSError(errno.EIO, "Input/output error")
+
+    before_each_sync_of_frames(monkeypatch, fail_once)
+    fill(journal, stream, 50, 99)
+    until(lambda: not failures and stream.is_synced)
+    assert stream.stored == Intervals([(0, 99)])
+    names = sorted(path.name for path in stream.folder.glob("*.arrows"))
+    assert len(names) >= 2
+
+
+def test_frames_that_turn_out_damaged_are_named_and_given_no_more(
+    journal: NodeJournal, stream: NodeStream
+) -> None:
+    store(journal, stream, 0, 49)
+    journal.damaged(stream, Intervals([(20, 29)]))
+    until(lambda: stream.lost.by_reason.get("corrupt") == Intervals([(20, 29)]))
+    assert given(stream, 0, 49) == [0, 10, 30, 40]
+
+
+def test_the_bound_is_the_age_of_the_oldest_frame_when_it_is_on_the_disk(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame that comes during one sync waits for that one and for the next."""
+    stuck = threading.Event()
+
+    def slow() -> None:
+        stuck.set()
+        time.sleep(0.35)
+
+    before_each_sync_of_frames(monkeypatch, slow)
+    fill(journal, stream, 0, 9)
+    assert stuck.wait(5.0)
+    fill(journal, stream, 10, 19)
+    until(lambda: stream.stored.last == 19 and stream.is_synced)
+    assert stream.notes.sync_max_s > 0.6
+
+
+def test_over_the_bound_of_memory_the_oldest_goes_first_of_whichever_stream(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stream that ended while the disk took nothing does not leave the next one without room."""
+    monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
+
+    def refuse(file: Any, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(segment, "write_all", refuse)
+    journal = start()
+    before = journal.begin(make_array())
+    fill(journal, before, 0, 149)
+    until(lambda: journal.troubles)
+    present = journal.begin(make_array(boot_id="1" * 32))
+    fill(journal, present, 0, 99)
+    assert present.held == Intervals([(0, 99)])
+    assert "disk_full" in before.lost.as_pairs()
+    fill(journal, present, 100, 499)
+    assert not before.held
+    assert present.held.last == 499

@@ -1,0 +1,134 @@
+"""What a node keeps: everything, for as long as a session needs it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from devices.errors import StorageError
+from storage.intervals import NO_END, Intervals
+from storage.journal import node_journal, retention
+from storage.journal.node_journal import NodeJournal
+from storage.journal.node_stream import NodeStream
+from storage.journal.wanted import ServerWants
+from tests.builders.arrays import make_array
+from tests.storage.journal.node.leg import Start, fill, given, store
+from tests.waiting import until
+
+
+def test_every_frame_is_on_disk_within_the_promise_and_can_be_given_at_any_time(
+    journal: NodeJournal, stream: NodeStream
+) -> None:
+    fill(journal, stream, 0, 99)
+    assert given(stream, 15, 44) == [10, 20, 30, 40]
+    until(lambda: stream.stored == Intervals([(0, 99)]))
+    assert given(stream, 15, 44) == [10, 20, 30, 40]
+    assert stream.held == Intervals([(0, 99)])
+    assert journal.troubles == ()
+
+
+def test_two_processes_do_not_use_one_nodes_folder(start: Start, tmp_path: Path) -> None:
+    start()
+    with pytest.raises(StorageError, match="another foottile process"):
+        NodeJournal(tmp_path, "leg")
+    NodeJournal(tmp_path, "arm").close()
+
+
+def test_an_empty_stream_leaves_nothing(journal: NodeJournal, stream: NodeStream) -> None:
+    until(lambda: stream.journal is not None)
+    journal.close()
+    assert not stream.folder.exists()
+
+
+def wants(*numbers: tuple[int, int | None]) -> ServerWants:
+    return ServerWants(streams={"0" * 32: numbers}, known=("0" * 32,))
+
+
+def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention, "RING_NS", 200_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
+    journal.want("laptop", wants((200, 249)))
+    fill(journal, stream, 0, 599)
+    stream.acknowledge("laptop", 100, 149)
+    until(lambda: stream.stored.within(0, 489) == Intervals([(200, 249)]))
+    assert stream.lost.by_reason == {"evicted": Intervals([(0, 99), (150, 199), (250, 489)])}
+    stream.acknowledge("laptop", 200, 249)
+    until(lambda: not stream.stored.within(0, 489))
+    until(lambda: "evicted" in stream.notes.lost)
+
+
+def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
+    monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
+    journal = start(budget_bytes=60_000)
+    stream = journal.begin(make_array())
+    fill(journal, stream, 0, 99)
+    until(lambda: not stream.waiting_bytes)
+    journal.want("laptop", wants((100, None)))
+    for first in range(100, 1000, 50):
+        fill(journal, stream, first, first + 49)
+        until(lambda: not stream.waiting_bytes or journal.troubles)
+    assert "is full" in journal.troubles[0]
+    fill(journal, stream, 1000, 1999)
+    lost = stream.lost.by_reason
+    assert lost["evicted"] == Intervals([(0, 99)])
+    full = lost["disk_full"].count
+    assert full > 500
+    held = stream.held
+    assert held.count + full + 100 == 2000
+    # A server has taken some of them after all: there is room, and it goes on.
+    stream.acknowledge("laptop", 100, 1999)
+    fill(journal, stream, 2000, 2009)
+    until(lambda: journal.troubles == () and stream.stored.last == 2009)
+    assert "disk_full" not in stream.lost.as_pairs()
+
+
+def test_what_sessions_need_and_no_server_has_is_undelivered(
+    journal: NodeJournal, stream: NodeStream
+) -> None:
+    journal.want("laptop", wants((50, None)))
+    fill(journal, stream, 0, 99)
+    assert journal.undelivered(stream) == Intervals([(50, 99)])
+    stream.acknowledge("laptop", 0, 79)
+    assert journal.undelivered(stream) == Intervals([(80, 99)])
+    assert journal.wanted.numbers("0" * 32) == Intervals([(50, NO_END)])
+
+
+def test_what_the_nodes_own_session_needs_stays_whoever_has_it_besides(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention, "RING_NS", 100_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
+    journal.wanted.say_local({stream.boot_id: Intervals([(0, NO_END)])})
+    fill(journal, stream, 0, 399)
+    stream.acknowledge("laptop", 0, 399)
+    until(lambda: stream.stored.last == 399)
+    time.sleep(0.2)  # several looks
+    assert stream.stored == Intervals([(0, 399)])
+
+
+def test_what_one_server_has_another_still_gets(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention, "RING_NS", 100_000_000)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
+    journal.want("laptop", wants((0, 199)))
+    store(journal, stream, 0, 399)
+    stream.acknowledge("other", 0, 399)
+    until(lambda: not stream.stored.within(200, 299))
+    assert stream.stored.within(0, 199) == Intervals([(0, 199)])
+    assert journal.undelivered(stream) == Intervals([(0, 199)])
+
+
+def test_frames_that_were_not_handed_over_are_named(
+    journal: NodeJournal, stream: NodeStream
+) -> None:
+    fill(journal, stream, 0, 9)
+    fill(journal, stream, 30, 39)
+    assert stream.lost.as_pairs() == {"node_busy": ((10, 29),)}

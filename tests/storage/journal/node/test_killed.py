@@ -1,0 +1,123 @@
+"""A node that was killed, or lost its power: what it has, and how much may be lost."""
+
+from __future__ import annotations
+
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from devices.frames import TileStatus
+from storage.intervals import Intervals
+from storage.journal import in_flight, node_journal, retention
+from storage.journal.journal import Journal
+from storage.journal.node_journal import NodeJournal
+from storage.journal.node_stream import NodeStream
+from storage.journal.stream_notes import StreamNotes
+from tests.builders.arrays import make_array
+from tests.storage.faulty_disk import before_each_sync_of_frames
+from tests.storage.journal.node.leg import Start, fill, killed, store
+from tests.storage.stream import frames, take_in_flight
+from tests.waiting import until
+
+
+def test_a_stream_that_ended_in_order_is_known_to_its_end_after_a_restart(
+    journal: NodeJournal, stream: NodeStream, start: Start
+) -> None:
+    fill(journal, stream, 0, 99)
+    journal.close()
+    again = start()
+    (found,) = again.streams
+    assert (found.next_seq, found.notes.unsynced_tail_max, found.is_settled) == (100, 0, True)
+    assert found.held == Intervals([(0, 99)])
+    assert again.begin(make_array(boot_id="1" * 32)).notes.number == found.notes.number + 1
+
+
+def test_a_killed_node_has_lost_nothing(
+    journal: NodeJournal, stream: NodeStream, start: Start, tmp_path: Path
+) -> None:
+    """What was in the pipe, or in a batch that was being filled, was in flight."""
+    store(journal, stream, 0, 99)
+    batch = frames(0, 117)
+    batch.padc[110] = 0  # out of range, which is flagged when a batch is whole
+    take_in_flight(stream.folder, batch)
+    again = NodeJournal(killed(journal, tmp_path), "leg")
+    again.start()
+    (found,) = again.streams
+    assert (found.next_seq, found.notes.unsynced_tail_max) == (118, 0)
+    assert again.settle()
+    assert found.stored == Intervals([(0, 117)])
+    assert found.journal is not None
+    rescued = next(found.journal.read(110, 110))
+    assert (rescued.status & TileStatus.OVER_RANGE).all()
+    assert not (found.folder / "in_flight").exists()
+    again.close()
+
+
+def test_a_power_cut_costs_what_was_not_synced_and_says_how_much_that_may_be(
+    journal: NodeJournal, stream: NodeStream, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store(journal, stream, 0, 99)
+    take_in_flight(stream.folder, frames(0, 117))
+    folder = killed(journal, tmp_path)
+    monkeypatch.setattr(in_flight, "kernel_boot_id", lambda: "another start of the machine")
+    again = NodeJournal(folder, "leg")
+    (found,) = again.streams
+    assert found.next_seq == 100
+    assert found.notes.unsynced_tail_max == 0.5 * 500 + 17
+    again.close()
+
+
+def test_a_disk_that_was_slower_than_the_promise_widens_the_bound(
+    journal: NodeJournal, stream: NodeStream, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        before_each_sync_of_frames(patch, lambda: time.sleep(0.6))
+        fill(journal, stream, 0, 9)
+        until(lambda: (n := StreamNotes.load(stream.folder)) and n.sync_max_s > 0.6)
+    folder = killed(journal, tmp_path)
+    again = NodeJournal(folder, "leg")
+    assert again.streams[0].notes.unsynced_tail_max > 0.6 * 500
+    again.close()
+
+
+def test_killed_before_its_notes_were_written_a_stream_is_found_by_what_was_in_flight(
+    start: Start, tmp_path: Path
+) -> None:
+    folder = tmp_path / "journal" / "leg" / ("2" * 32)
+    take_in_flight(folder, frames(0, 5), make_array(boot_id="2" * 32))
+    journal = start()
+    (found,) = journal.streams
+    assert (found.boot_id, found.next_seq) == ("2" * 32, 6)
+    assert journal.settle()
+    assert found.stored == Intervals([(0, 5)])
+
+
+def test_recovery_writes_what_was_in_flight_and_drops_nothing(
+    journal: NodeJournal, stream: NodeStream, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store(journal, stream, 0, 99)
+    take_in_flight(stream.folder, frames(0, 117))
+    folder = killed(journal, tmp_path)
+    monkeypatch.setattr(retention, "RING_NS", 0)
+    monkeypatch.setattr(node_journal, "BUDGET_BYTES", 0)
+    node_journal.settle_left_over(folder)
+    notes = StreamNotes.load(folder / "journal" / "leg" / ("0" * 32))
+    assert notes is not None
+    assert notes.next_seq == 118
+    with closing(Journal.open(folder / "journal" / "leg" / ("0" * 32))) as found:
+        assert found.held == Intervals([(0, 117)])
+    assert not list(folder.rglob("in_flight"))
+
+
+def test_what_acquisition_had_taken_when_it_was_killed_is_taken_over(
+    journal: NodeJournal, stream: NodeStream
+) -> None:
+    """Its last batches never came through the pipe; the node itself lives on."""
+    fill(journal, stream, 0, 89)
+    take_in_flight(stream.folder, frames(0, 99))
+    stream.end()
+    assert journal.settle()
+    assert stream.stored == Intervals([(0, 99)])
+    assert (stream.next_seq, stream.lost.as_pairs()) == (100, {})

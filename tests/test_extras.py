@@ -1,0 +1,113 @@
+"""An installation without the extra `server`: what it does, and what it says of the rest.
+
+Packages are really kept from being imported, in child processes, too.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tomllib
+from contextlib import closing
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from storage.sessions.folder import FRAMES_NAME, SessionFolder
+from tests.service.process import Process
+
+ROOT = Path(__file__).resolve().parents[1]
+BLOCKER = """
+import sys
+absent = ["fastapi", "httptools", "httpx", "numba", "pydantic_settings", "starlette", "uvicorn"]
+absent += ["matplotlib", "uvloop"]
+if not any("spawn_main" in word for word in sys.orig_argv):
+    absent += ["scipy"]  # which emulated domes need, where a robot has real ones
+sys.modules.update(dict.fromkeys(absent))
+"""
+
+
+@pytest.fixture
+def without_server(tmp_path: Path) -> dict[str, str]:
+    """Environment of a process that has what `pip install foottile` brings."""
+    folder = tmp_path / "blocker"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(BLOCKER)
+    return {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+
+
+def foottile(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from service.cli.main import main; main()"]
+    return subprocess.run(
+        [*command, *map(str, words)],
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_later(
+    tmp_path: Path, without_server: dict[str, str]
+) -> None:
+    scene = (ROOT / "devices" / "scene" / "builtin" / "standing.toml").read_text()
+    (tmp_path / "foot.toml").write_text('calibration = "paper-eq2-shape"\n' + scene)
+    words = ("--scene", tmp_path / "foot.toml", "--record", "trial", "--journal", tmp_path / "node")
+    with closing(Process("node", *words, folder=tmp_path / "run", **without_server)) as node:
+        node.said("tiles at")
+        folder = SessionFolder(tmp_path / "node" / "sessions")
+        node.said("schedule")
+        with pytest.raises(subprocess.TimeoutExpired):  # some seconds of frames: lead and load
+            node.process.wait(4.0)
+        node.process.send_signal(signal.SIGINT)
+        assert node.ended(60.0) == 0, node.err
+    (session_id,) = folder.ids()
+    session = folder.load(session_id)
+    assert session.problem is not None
+    assert session.problem.startswith("no estimates: the estimator needs numba")
+    assert "`foottile estimate`" in session.problem
+    assert session.calibration_id is None
+
+    proof = foottile("verify", tmp_path / "node", **without_server)
+    assert proof.returncode == 0, proof.stdout
+    assert "complete" in proof.stdout
+
+    frames = folder.path(session_id) / FRAMES_NAME
+    estimated = foottile("estimate", frames, "--out", tmp_path / "estimated.parquet")
+    assert estimated.returncode == 0, estimated.stderr
+    grf_n = pq.read_table(tmp_path / "estimated.parquet")["grf_n"].to_numpy()
+    assert len(grf_n) == session.frames
+    assert grf_n[-50:].mean() > 3.0
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        (("serve",), "server"),
+        (("demo",), "server"),
+        (("simulate", "--scene", "standing"), "server"),
+        (("estimate", "in.parquet", "--out", "out.parquet"), "server"),
+        (("calibrate", "in.parquet", "--out", "out.json"), "server"),
+        (("bench", "--out", "."), "server"),
+        (("sessions",), "server"),
+        (("pull", "id", "--out", "."), "server"),
+        (("doctor", "--bus", "emulated"), "emulation"),
+    ],
+)
+def test_what_is_missing_is_named_with_the_extra_that_brings_it(
+    words: tuple[str, ...], extra: str, tmp_path: Path, without_server: dict[str, str]
+) -> None:
+    done = foottile(*words, **without_server)
+    assert done.returncode == 2
+    assert f"pip install 'foottile[{extra}]'" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_the_lock_is_compiled_from_every_extra_that_has_wheels() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    command = (ROOT / "requirements.lock").read_text().splitlines()[1]
+    for extra in project["optional-dependencies"].keys() - {"rig", "bench"}:
+        assert f"--extra {extra}" in command
