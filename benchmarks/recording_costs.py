@@ -18,6 +18,7 @@ from pathlib import Path
 
 from recording_data import Recording, batches
 
+from devices.acquisition import FrameRow
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.intervals import Intervals
 from storage.journal.in_flight import InFlight
@@ -27,9 +28,6 @@ from storage.schema import wire_schema
 from storage.wire import EncodedBatch, decode, encode
 
 SYNCS_PER_S = 4
-_IN_ORDER = ("seq", "t_mono_ns", "t_ns", "servo_counts", "servo_age_us", "reference_force_n",
-             "frame_status", "padc", "tadc", "sample_offset_us", "status")  # fmt: skip
-
 Batches = list[tuple[FrameBatch, bytes]]
 
 
@@ -151,8 +149,8 @@ def node_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
 
 def in_flight_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
     """`InFlight.put` for each frame, as the loop that takes frames calls it."""
-    columns = [getattr(recording.frames, name).tolist() for name in _IN_ORDER]
-    rows = list(zip(*columns, strict=True))
+    columns = [getattr(recording.frames, name).tolist() for name in FrameRow._fields]
+    rows = [FrameRow(*values) for values in zip(*columns, strict=True)]
     keeper = InFlight(folder, recording.info)
     tiles = recording.frames.tile_count
     size = 4 + sum(
@@ -171,7 +169,7 @@ def in_flight_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
                 bare[at : at + size] = row_bytes
         with costs["InFlight.put"].measured():
             for row in rows[begin : begin + rate]:
-                keeper.put(*row)
+                keeper.put(row)
     keeper.close()
     bare.close()
     return costs

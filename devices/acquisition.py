@@ -7,7 +7,7 @@ be waited for here: whoever iterates must be quick, and what was missed is count
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -49,23 +49,26 @@ class ServoSource(Protocol):
         """Age from which a position is older than it should be."""
 
 
+class FrameRow(NamedTuple):
+    """One frame as it is taken: a row of the columns of `FrameBatch`."""
+
+    seq: int
+    t_mono_ns: int
+    t_ns: int
+    servo_counts: int
+    servo_age_us: int
+    reference_force_n: float
+    frame_status: int
+    padc: Sequence[int]
+    tadc: Sequence[int]
+    sample_offset_us: Sequence[int]
+    status: Sequence[int]
+
+
 class FrameKeeper(Protocol):
     """Is given every frame as it is taken, before its batch is whole."""
 
-    def put(
-        self,
-        seq: int,
-        t_mono_ns: int,
-        t_ns: int,
-        servo_counts: int,
-        servo_age_us: int,
-        reference_force_n: float,
-        frame_status: int,
-        padc: Sequence[int],
-        tadc: Sequence[int],
-        sample_offset_us: Sequence[int],
-        status: Sequence[int],
-    ) -> None:
+    def put(self, frame: FrameRow) -> None:
         """Keep one frame; quick, for the loop waits."""
 
 
@@ -181,25 +184,23 @@ class Acquisition:
                 servo_age_us = min(age_ns // 1000, _AGE_MAX_US)
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_status |= FrameStatus.SERVO_STALE
-        offsets_us = [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns]
-        t_ns = t_mono_ns + self._anchor.offset_ns
-        columns["seq"][row] = self._next_seq
-        columns["t_mono_ns"][row] = t_mono_ns
-        columns["t_ns"][row] = t_ns
-        columns["padc"][row] = scan.padc
-        columns["tadc"][row] = scan.tadc
-        columns["sample_offset_us"][row] = offsets_us
-        columns["servo_counts"][row] = servo_counts
-        columns["servo_age_us"][row] = servo_age_us
-        columns["status"][row] = scan.status
-        columns["frame_status"][row] = frame_status
-        columns["reference_force_n"][row] = scan.reference_n
+        frame = FrameRow(
+            seq=self._next_seq,
+            t_mono_ns=t_mono_ns,
+            t_ns=t_mono_ns + self._anchor.offset_ns,
+            servo_counts=servo_counts,
+            servo_age_us=servo_age_us,
+            reference_force_n=scan.reference_n,
+            frame_status=frame_status,
+            padc=scan.padc,
+            tadc=scan.tadc,
+            sample_offset_us=[(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
+            status=scan.status,
+        )
+        for name, value in zip(FrameRow._fields, frame, strict=True):
+            columns[name][row] = value
         if self._keeper is not None:
-            self._keeper.put(
-                *(self._next_seq, t_mono_ns, t_ns, servo_counts, servo_age_us),
-                *(scan.reference_n, frame_status),
-                *(scan.padc, scan.tadc, offsets_us, scan.status),
-            )
+            self._keeper.put(frame)
         self._next_seq += 1
 
     def _batch(self, columns: dict[str, np.ndarray], rows: int) -> FrameBatch:

@@ -27,7 +27,7 @@ from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Silic
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.dome import Domes
 from devices.emulation.faults import Faults
-from devices.emulation.ground.grounds import Rolling, make_ground, tile_positions_m
+from devices.emulation.ground.grounds import make_ground, tile_positions_m
 from devices.emulation.ground.hopping import Hopping
 from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation, Mill
@@ -212,19 +212,15 @@ class World:
         forces_n = self.ground.forces_n(t_s)
         angle = self.ground.angle_rad(t_s)
         angle_rad = np.full(len(t_s), np.nan) if angle is None else angle
-        if isinstance(self.ground, Rolling | Hopping):
+        vertical_n = forces_n
+        if self.ground.arc_rad is not None:
             vertical_n = forces_n * np.cos(self.ground.arc_rad - angle_rad[:, None])
-        else:
-            vertical_n = forces_n
         grf_n = vertical_n.sum(axis=1)
-        plate_n = grf_n
-        if isinstance(self.ground, Hopping):
-            plate_n = grf_n + self.ground.rest_n(t_s)
         weight = vertical_n / np.where(grf_n > 0.0, grf_n, np.nan)[:, None]
         return Truth(
             true_force_n=forces_n,
             true_grf_n=grf_n,
-            true_plate_n=plate_n,
+            true_plate_n=grf_n + self.ground.rest_n(t_s),
             true_cop_x_m=(weight * self._positions_m[:, 0]).sum(axis=1),
             true_cop_y_m=(weight * self._positions_m[:, 1]).sum(axis=1),
             true_angle_rad=angle_rad,

@@ -7,14 +7,12 @@ from collections.abc import Coroutine
 from typing import Any
 
 from pydantic import ValidationError
-from websockets.asyncio.client import ClientConnection
 
 from devices.errors import LinkError
 from service.link import (
     SUBPROTOCOL,
     Ack,
     FromServer,
-    Hello,
     Lost,
     Probe,
     Wanted,
@@ -23,37 +21,19 @@ from service.link import (
     say,
 )
 from service.node.clock_probes import ClockProbes
-from service.node.sending import Sending, Source
+from service.node.sending import Greeted, Sending
 
 STATUS_EVERY_S = 1.0
 
 
 class Connection:
-    """One connection.
+    """What goes each way on one connection."""
 
-    Args:
-        socket: it.
-        source: the node.
-        hello: what it has said.
-        welcome: what the server has answered.
-        wake: set whenever there are new frames.
-    """
-
-    def __init__(
-        self,
-        socket: ClientConnection,
-        source: Source,
-        hello: Hello,
-        welcome: Welcome,
-        wake: asyncio.Event,
-    ) -> None:
-        self._socket = socket
-        self._source = source
-        self._hello = hello
-        self._server_id = welcome.server_id
-        self._sending = Sending(socket, source, hello, welcome, wake)
-        self._probes = ClockProbes(socket, hello.array_info.utc_offset_ns)
-        self._take_wanted(welcome.wanted)
+    def __init__(self, link: Greeted) -> None:
+        self._link = link
+        self._sending = Sending(link)
+        self._probes = ClockProbes(link.socket, link.hello.array_info.utc_offset_ns)
+        self._take_wanted(link.welcome.wanted)
 
     async def run(self, renewed: asyncio.Event) -> None:
         """Until it breaks, or the node has another stream to say hello with.
@@ -72,12 +52,12 @@ class Connection:
 
     async def _receive(self) -> None:
         while True:
-            message = parse(await self._socket.recv())
+            message = parse(await self._link.socket.recv())
             match message:
                 case Ack(boot_id=boot_id, seq_first=first, seq_last=last):
-                    stream = self._source.streams().get(boot_id)
+                    stream = self._link.source.streams().get(boot_id)
                     if stream is not None:
-                        stream.acknowledge(self._server_id, first, last)
+                        stream.acknowledge(self._link.welcome.server_id, first, last)
                 case Wanted():
                     self._take_wanted(message)
                 case Probe():
@@ -86,20 +66,20 @@ class Connection:
                     raise LinkError("welcome was said before")
 
     def _take_wanted(self, wanted: Wanted) -> None:
-        earlier = (stream.array_info.boot_id for stream in self._hello.earlier)
-        known = (*earlier, self._hello.array_info.boot_id)
-        self._source.wanted(self._server_id, wanted, known)
+        earlier = (stream.array_info.boot_id for stream in self._link.hello.earlier)
+        known = (*earlier, self._link.hello.array_info.boot_id)
+        self._link.source.wanted(self._link.welcome.server_id, wanted, known)
 
     async def _tell_status(self) -> None:
-        said = {stream.array_info.boot_id: stream.lost for stream in self._hello.earlier}
-        said[self._hello.array_info.boot_id] = self._hello.lost
+        said = {stream.array_info.boot_id: stream.lost for stream in self._link.hello.earlier}
+        said[self._link.hello.array_info.boot_id] = self._link.hello.lost
         while True:
-            for boot_id, stream in self._source.streams().items():
+            for boot_id, stream in self._link.source.streams().items():
                 lost = stream.lost.as_pairs()
                 if boot_id in said and lost != said[boot_id]:
                     said[boot_id] = lost
-                    await self._socket.send(say(Lost(boot_id=boot_id, lost=lost)))
-            await self._socket.send(say(self._source.status(self._sending.backlog.count)))
+                    await self._link.socket.send(say(Lost(boot_id=boot_id, lost=lost)))
+            await self._link.socket.send(say(self._link.source.status(self._sending.backlog.count)))
             await asyncio.sleep(STATUS_EVERY_S)
 
 

@@ -19,7 +19,7 @@ from service.link import MESSAGE_BYTES_MAX, SILENCE_S, SUBPROTOCOL, Hello, Welco
 from service.node.back_off import BackOff, reason_of
 from service.node.connection import Connection, parse
 from service.node.dial import dial, ingest_url
-from service.node.sending import Source
+from service.node.sending import Greeted, Source
 
 
 class Publisher:
@@ -88,7 +88,8 @@ class Publisher:
             proxy=None,
         ) as socket:
             hello, welcome = await self._greet(socket)
-            connection = Connection(socket, self._source, hello, welcome, self._wake)
+            link = Greeted(socket, self._source, hello, welcome, self._wake)
+            connection = Connection(link)
             self._say(f"connected to {self._url}")
             back_off.succeeded()
             self._connected = True

@@ -53,53 +53,54 @@ class Source:
     damaged: Callable[[NodeStream, Intervals], None]
 
 
-class Sending:
-    """Sends the frames of a node over one connection.
+@dataclass(frozen=True)
+class Greeted:
+    """A connection on which both sides have greeted each other.
 
-    Args:
+    Attributes:
         socket: the connection.
         source: the node.
         hello: what it has said.
         welcome: what the server has answered.
-        wake: set whenever there are new frames.
+        wake: set whenever there may be something to send.
     """
 
-    def __init__(
-        self,
-        socket: ClientConnection,
-        source: Source,
-        hello: Hello,
-        welcome: Welcome,
-        wake: asyncio.Event,
-    ) -> None:
-        self._socket = socket
-        self._source = source
-        self._hello = hello
-        self._wake = wake
+    socket: ClientConnection
+    source: Source
+    hello: Hello
+    welcome: Welcome
+    wake: asyncio.Event
+
+
+class Sending:
+    """Sends the frames of a node over one connection."""
+
+    def __init__(self, link: Greeted) -> None:
+        self._link = link
         self._flow = Flow()
         self._asked: dict[int, float] = {}
         """Questions that were not answered yet, and when they were asked."""
         self._numbers = count()
         self.backlog = Backlog(
             # In the server's order: what sessions need comes first.
-            (lacks.boot_id, _before(pair, hello, lacks.boot_id))
-            for lacks in welcome.lacks
+            (lacks.boot_id, _before(pair, link.hello, lacks.boot_id))
+            for lacks in link.welcome.lacks
             for pair in lacks.numbers
         )
         """What is still to be sent of the past."""
 
     async def run(self) -> None:
         """The newest frames as they come, and behind them what the server lacks."""
-        present, hello = self._source.present(), self._hello
+        present, hello = self._link.source.present(), self._link.hello
         at = hello.next_seq
         behind_frames = max(1, round(_LIVE_BEHIND_S * hello.array_info.nominal_rate_hz))
         chunk: deque[tuple[str, EncodedBatch]] = deque()
         named = hello.array_info.boot_id
         reading: asyncio.Task[list[tuple[str, EncodedBatch]]] | None = None
         while True:
-            self._wake.clear()  # what comes while sending is seen in the next round
+            self._link.wake.clear()  # what comes while sending is seen in the next round
             if not self._flow.is_open:
-                await self._wake.wait()
+                await self._link.wake.wait()
                 continue
             newest = present.recent(at)
             if newest:
@@ -116,17 +117,17 @@ class Sending:
                 if reading is None and self.backlog.count:
                     chunk_of = asyncio.to_thread(self._next_chunk)
                     reading = asyncio.create_task(chunk_of)
-                    reading.add_done_callback(lambda _: self._wake.set())
+                    reading.add_done_callback(lambda _: self._link.wake.set())
                 elif reading is not None and reading.done():
                     chunk += reading.result()
                     reading = None
                 else:
-                    await self._wake.wait()
+                    await self._link.wake.wait()
                 continue
             if boot_id != named:
                 named = boot_id
-                await self._socket.send(say(FramesOf(boot_id=boot_id)))
-            await self._socket.send(with_check(batch.payload))
+                await self._link.socket.send(say(FramesOf(boot_id=boot_id)))
+            await self._link.socket.send(with_check(batch.payload))
             self._flow.sent(len(batch.payload))
             if self._flow.wants_mark:
                 await self.ask()
@@ -151,9 +152,9 @@ class Sending:
             asked.pop(number, None)
             if not answer.cancelled() and answer.exception() is None:
                 flow.answered(number, time.monotonic())
-                self._wake.set()
+                self._link.wake.set()
 
-        asyncio.ensure_future(await self._socket.ping()).add_done_callback(answered)
+        asyncio.ensure_future(await self._link.socket.ping()).add_done_callback(answered)
 
     def _next_chunk(self) -> list[tuple[str, EncodedBatch]]:
         """Batches of the backlog, read from where they are."""
@@ -162,13 +163,13 @@ class Sending:
         if wanted is None:
             return []
         boot_id, first, last = wanted
-        stream = self._source.streams().get(boot_id)
+        stream = self._link.source.streams().get(boot_id)
         found: list[EncodedBatch] = []
         if stream is not None:
             try:
                 found.extend(stream.batches(first, last))
             except DamagedFramesError as error:
-                self._source.damaged(stream, Intervals([(error.seq_first, error.seq_last)]))
+                self._link.source.damaged(stream, Intervals([(error.seq_first, error.seq_last)]))
                 backlog.done(boot_id, error.seq_first, error.seq_last)
                 last = max(first, error.seq_first) - 1
             except StorageError:

@@ -12,13 +12,12 @@ import mmap
 import os
 import struct
 import zlib
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from devices.acquisition import RangeFlag
+from devices.acquisition import FrameRow, RangeFlag
 from devices.errors import StorageError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from storage.durable import make_folder, storage_errors
@@ -30,8 +29,7 @@ ROWS = 8192
 _MAGIC = b"FootTile in flight 1\n"
 _HEAD = struct.Struct("<21sHII36sI")
 """Magic, tiles, rows, length of the description, kernel's boot id, CRC-32 of all that follows."""
-_ORDER = ("seq", "t_mono_ns", "t_ns", "servo_counts", "servo_age_us", "reference_force_n",
-          "frame_status", "padc", "tadc", "sample_offset_us", "status")  # fmt: skip
+_ORDER = FrameRow._fields
 _CODES = {"uint64": "Q", "int64": "q", "int32": "i", "float32": "f", "uint16": "H", "uint8": "B"}
 
 
@@ -71,29 +69,11 @@ class InFlight:
         head = _HEAD.pack(_MAGIC, tiles, ROWS, len(description), boot_id, check)
         self._map[: self._begin] = head + description
 
-    def put(
-        self,
-        seq: int,
-        t_mono_ns: int,
-        t_ns: int,
-        servo_counts: int,
-        servo_age_us: int,
-        reference_force_n: float,
-        frame_status: int,
-        padc: Sequence[int],
-        tadc: Sequence[int],
-        sample_offset_us: Sequence[int],
-        status: Sequence[int],
-    ) -> None:
+    def put(self, frame: FrameRow) -> None:
         """Keep one frame, as it was taken."""
-        row = self._row.pack(
-            *(seq, t_mono_ns, t_ns, servo_counts, servo_age_us, reference_force_n, frame_status),
-            *padc,
-            *tadc,
-            *sample_offset_us,
-            *status,
-        )
-        at = self._begin + (seq % ROWS) * self._size
+        *scalars, padc, tadc, sample_offset_us, status = frame
+        row = self._row.pack(*scalars, *padc, *tadc, *sample_offset_us, *status)
+        at = self._begin + (frame.seq % ROWS) * self._size
         self._map[at : at + self._size] = row + zlib.crc32(row).to_bytes(4, "little")
 
     def close(self) -> None:
@@ -104,7 +84,7 @@ class InFlight:
 def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     """What a killed process left, in order; None if there is nothing that can be trusted.
 
-    Nothing can be if the machine was started anew since: the file was never synced. The frames end
+    Nothing can be if the machine was restarted since: the file was never synced. The frames end
     where the first one is missing, counted back from the newest.
 
     Raises:

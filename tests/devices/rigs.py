@@ -23,10 +23,7 @@ from devices.recovery.recovery import BusRecovery
 from devices.scene.emulation import ReadDuringConversion
 from devices.scene.faults import BUS, FaultKind, TileFault
 from devices.scene.hardware import ScheduleName
-from tests.builders.arrays import make_tile
-
-DATA_SHEET = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
-FORUM = (0x3591, 0xC0A2, 0xC625, 0x2C18)
+from tests.builders.arrays import DATA_SHEET_CHIP, make_tile
 
 # SCL periods per transaction, hardware.md 4
 SELECT, CONVERT, READ, READ_PRESSURE, COEFFICIENTS, NOT_ACKNOWLEDGED = 20, 29, 66, 48, 102, 11
@@ -78,7 +75,7 @@ class Wires:
     ) -> None:
         self.plugs = plugs
         self.scl_hz = scl_hz
-        self.words = [(words or {}).get(i, DATA_SHEET) for i in range(len(plugs))]
+        self.words = [(words or {}).get(i, DATA_SHEET_CHIP) for i in range(len(plugs))]
         self.tc_ns = [tc_ns] * len(plugs) if isinstance(tc_ns, int) else list(tc_ns)
         self.clock = VirtualClock(7_000_000_000)
         self._faults = Faults(())

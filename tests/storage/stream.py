@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
+from devices.acquisition import FrameRow
+from devices.frames import ArrayInfo, FrameBatch
 from storage.journal.in_flight import InFlight
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, encode
@@ -31,5 +32,5 @@ def take_in_flight(folder: Path, batch: FrameBatch, info: ArrayInfo | None = Non
     """Take these frames as acquisition does, whose process then ends."""
     keeper = InFlight(folder, info or make_array())
     for row in range(len(batch)):
-        keeper.put(**{name: getattr(batch, name)[row].tolist() for name in FRAME_COLUMNS})
+        keeper.put(FrameRow(*(getattr(batch, name)[row].tolist() for name in FrameRow._fields)))
     keeper.close()

@@ -1,16 +1,14 @@
-"""What the foot stands on: forces on the domes as a function of time, and nothing else.
+"""The ground of a scene: a foot in the air, on a plate, rolling, or under a recorded load.
 
-Every ground is preceded by `lead_s` seconds without load. Forces are along each dome's axis, times
-in seconds since power-up. What is said here is the ground truth of a scene.
+Every ground is preceded by `lead_s` seconds without load.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from devices.arrays import Bools, Floats
+from devices.emulation.ground.ground import Ground, in_round
 from devices.emulation.ground.hopping import Hopping
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace, press
 from devices.emulation.ground.mill import Indentation
@@ -29,24 +27,8 @@ from devices.scene.grounds import (
 from devices.scene.hardware import TileScene
 
 
-class Ground(Protocol):
-    """A load on all domes of a foot."""
-
-    @property
-    def duration_s(self) -> float | None:
-        """When its programme is over; None for one that goes on."""
-
-    def forces_n(self, t_s: Floats) -> Floats:
-        """Force on each dome along its axis, (len(t_s), tiles)."""
-
-    def angle_rad(self, t_s: Floats) -> Floats | None:
-        """Angle of the foot segment; None for a foot without a moving segment."""
-
-
-class NoLoad:
+class NoLoad(Ground):
     """A foot in the air."""
-
-    duration_s = None
 
     def __init__(self, tiles: int) -> None:
         self._tiles = tiles
@@ -55,14 +37,9 @@ class NoLoad:
         """Zero."""
         return np.zeros((len(t_s), self._tiles))
 
-    def angle_rad(self, t_s: Floats) -> None:
-        """None: it does not turn."""
 
-
-class Standing:
+class Standing(Ground):
     """A constant load whose centre of pressure sways slowly, as in quiet standing."""
-
-    duration_s = None
 
     _LOWERING_S = 0.3
     _SWAY_HZ = (0.23, 0.61)  # incommensurate, so that it does not repeat soon
@@ -102,18 +79,15 @@ class Standing:
         )
         return np.asarray(load_n[:, None] * (self._even + np.outer(sway_m, self._per_m)))
 
-    def angle_rad(self, t_s: Floats) -> None:
-        """None: the segment stands still."""
 
-
-class Rolling:
+class Rolling(Ground):
     """The foot's arc rolls over a rigid plate at constant speed, is lifted, and rolls again.
 
     Axes as in the design: rolling forward turns the segment by a positive angle, and the contact
     moves forward on the foot to the place whose arc angle is the segment's.
     """
 
-    duration_s = None
+    arc_rad: Floats
 
     _LOWERING_S = 0.2
     _BACK_S = 1.0
@@ -162,7 +136,7 @@ class Rolling:
         return np.asarray(self._from_rad + (self._to_rad - self._from_rad) * (rolled - back))
 
 
-class TraceLoad:
+class TraceLoad(Ground):
     """A recorded load, linear between its samples; over and over again if it is `looped`."""
 
     _PAUSE_S = 1.0
@@ -181,7 +155,7 @@ class TraceLoad:
     def forces_n(self, t_s: Floats) -> Floats:
         """The trace's forces; zero before and after it."""
         time_s, forces_n = self._pressed.time_s, self._pressed.forces_n
-        at_s = self._in_trace(t_s)
+        at_s = in_round(t_s, self._lead_s, self._round_s)
         return np.stack(
             [np.interp(at_s, time_s, f, left=0.0, right=0.0) for f in forces_n.T], axis=1
         )
@@ -190,13 +164,8 @@ class TraceLoad:
         """The trace's angle, if it has one."""
         if self._pressed.angle_rad is None:
             return None
-        return np.interp(self._in_trace(t_s), self._pressed.time_s, self._pressed.angle_rad)
-
-    def _in_trace(self, t_s: Floats) -> Floats:
-        if not np.isfinite(self._round_s):
-            return t_s
-        since_s = np.asarray(t_s) - self._lead_s
-        return np.where(since_s < 0.0, t_s, np.mod(since_s, self._round_s) + self._lead_s)
+        at_s = in_round(t_s, self._lead_s, self._round_s)
+        return np.interp(at_s, self._pressed.time_s, self._pressed.angle_rad)
 
 
 def make_ground(

@@ -16,6 +16,7 @@ from bisect import bisect_right
 import numpy as np
 
 from devices.arrays import Bools, Floats
+from devices.emulation.ground.ground import Ground, in_round
 from devices.emulation.ground.hopping_leg import STEP_S, HoppingLeg, Leg, Strip
 from devices.emulation.ground.soft_ground import SoftGround
 from devices.emulation.parts import random_of
@@ -35,7 +36,7 @@ _PITCH = 0.1
 _STEEPEST_RAD = 0.7
 
 
-class Hopping:
+class Hopping(Ground):
     """A leg's three hops on soft ground.
 
     Args:
@@ -49,6 +50,8 @@ class Hopping:
     Raises:
         SceneError: the tiles are not on an arc below the ankle, or the leg gets stuck.
     """
+
+    arc_rad: Floats
 
     def __init__(
         self,
@@ -173,8 +176,4 @@ class Hopping:
         return np.stack(pa, axis=1)[:, self._strip_of]
 
     def _in_round(self, t_s: Floats) -> Floats:
-        t_s = np.asarray(t_s)
-        if not math.isfinite(self._round_s):
-            return t_s
-        since_s = t_s - self._lead_s
-        return np.where(since_s < 0.0, t_s, np.mod(since_s, self._round_s) + self._lead_s)
+        return in_round(t_s, self._lead_s, self._round_s)

@@ -15,13 +15,14 @@ import numpy.typing as npt
 from devices.arrays import Floats, Ints, Times
 from devices.clock import Clock
 from devices.emulation.chips.mcp3208 import EmulatedMcp3208, amplifier_volts
+from devices.emulation.ground.ground import Ground
 from devices.scene.grounds import IndentationGround
 from devices.scene.hardware import ReferenceScene, TileScene
 
 _MILL_NOISE_N = 0.02
 
 
-class Indentation:
+class Indentation(Ground):
     """The mill: slow repeats, held loads released at once, taps, and a soak at two temperatures.
 
     One tile after another is pressed by the spindle; `phases` says what the spindle does.
@@ -108,9 +109,6 @@ class Indentation:
     def phase(self, t_s: Floats) -> npt.NDArray[np.intp]:
         """Index into `PHASES`."""
         return np.asarray(self._phases_of[self._segment(t_s)])
-
-    def angle_rad(self, t_s: Floats) -> None:
-        """None: the tile lies on the table."""
 
 
 class Mill:

@@ -93,8 +93,8 @@ def refuse_saturated_reference(recordings: Sequence[Indentation], blocks: Stroke
     """
     where = place(recordings[0])
     remedy = "Press less, or turn the amplifier's gain down"
-    for repeat in np.unique(blocks.repeat):
-        rows = blocks.select((blocks.repeat == repeat) & blocks.loading)
+    for each in blocks.by_repeat():
+        rows = each.select(each.loading)
         if not len(rows.force_n):
             continue
         top_n, full_kpa = float(rows.force_n.max()), float(np.ptp(rows.gauge_kpa))
@@ -102,7 +102,8 @@ def refuse_saturated_reference(recordings: Sequence[Indentation], blocks: Stroke
         if np.ptp(flat) > _MOVING_PART * full_kpa:
             raise CalibrationError(
                 f"the reference stands still at {top_n:.2f} N while the tile's pressure goes on "
-                f"rising by {np.ptp(flat):.2f} kPa, in repeat {repeat + 1}: it is saturated",
+                f"rising by {np.ptp(flat):.2f} kPa, in repeat {each.repeat[0] + 1}: it is "
+                "saturated",
                 where=where,
                 remedy=remedy,
             )
@@ -134,8 +135,8 @@ def before_saturation(
     )
     limit_kpa = np.inf
     full_n = float(blocks.force_n.max())
-    for repeat in np.unique(blocks.repeat):
-        rows = blocks.select((blocks.repeat == repeat) & blocks.loading)
+    for each in blocks.by_repeat():
+        rows = each.select(each.loading)
         if not len(rows.force_n):
             continue
         top_kpa = float(rows.gauge_kpa.max())

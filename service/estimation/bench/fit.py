@@ -151,7 +151,7 @@ def _left_out(cubic: _Cubic, blocks: Strokes) -> _LeftOut:
     # Errors within a repeat go together, so uncertainty comes from leaving whole repeats out.
     repeats = np.unique(blocks.repeat)
     without = np.stack([cubic.solve(blocks.select(blocks.repeat != r)) for r in repeats])
-    parts = [blocks.select(blocks.repeat == r) for r in repeats]
+    parts = blocks.by_repeat()
     deviation = without - without.mean(axis=0)
     return _LeftOut(
         force_n=np.concatenate([part.force_n for part in parts]),

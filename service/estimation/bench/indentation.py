@@ -65,6 +65,10 @@ class Strokes(Arrays):
     repeat: Ints
     loading: Bools
 
+    def by_repeat(self) -> list[Strokes]:
+        """The blocks of each repeat."""
+        return [self.select(self.repeat == repeat) for repeat in np.unique(self.repeat)]
+
 
 @dataclass(frozen=True)
 class Unloaded:

@@ -7,11 +7,11 @@ hide; holds, releases and taps are kept reading by reading. Spikes are left out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from devices.arrays import Bools, Floats, Ints
+from devices.arrays import Arrays, Bools, Floats, Ints
 from service.estimation.bench.indentation import Indentation, Unloaded
 from service.estimation.models.outliers import spikes
 
@@ -23,7 +23,7 @@ _APART_S = 600.0
 
 
 @dataclass(frozen=True)
-class Presses:
+class Presses(Arrays):
     """m points in the order of time.
 
     Attributes:
@@ -101,17 +101,9 @@ def _kpa_per_n(kpa: Floats, force_n: Floats) -> float:
 def joined(parts: Sequence[Presses]) -> Presses:
     """Several recordings as one run of loadings, far enough apart to know nothing of each other."""
     begin_s, loadings = 0.0, 0
-    t_s, loading = [], []
+    shifted = []
     for part in parts:
-        t_s.append(part.t_s + begin_s)
-        loading.append(part.loading + loadings)
-        begin_s = float(t_s[-1][-1]) + _APART_S
+        shifted.append(replace(part, t_s=part.t_s + begin_s, loading=part.loading + loadings))
+        begin_s = float(shifted[-1].t_s[-1]) + _APART_S
         loadings += part.loadings
-    return Presses(
-        t_s=np.concatenate(t_s),
-        force_n=np.concatenate([part.force_n for part in parts]),
-        kpa=np.concatenate([part.kpa for part in parts]),
-        weight=np.concatenate([part.weight for part in parts]),
-        loading=np.concatenate(loading),
-        fast=np.concatenate([part.fast for part in parts]),
-    )
+    return Presses.concatenate(shifted)

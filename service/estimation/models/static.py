@@ -15,12 +15,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import CalibrationError
-from service.estimation.calibration import (
-    BASIS,
-    CURVE_OPENS_N,
-    LOOP_OPENS_N,
-    TileCalibration,
-)
+from service.estimation.calibration import BASIS, CURVE_OPENS_N, LOOP_OPENS_N, TileCalibration
 from service.estimation.compiled import compiled
 from service.estimation.effects import RubberEffect
 
@@ -45,64 +40,51 @@ class StaticCurves:
     """
 
     def __init__(self, tiles: Sequence[TileCalibration], *, lasting: bool = False) -> None:
-        self._scatter = self._curve_n = np.zeros(len(tiles))
+        scatter = curve_misfit_n = np.zeros(len(tiles))
         if lasting:
-            self._scatter = np.array([_rubber(t).scatter for t in tiles])
-            self._curve_n = np.array([_rubber(t).curve_misfit_n for t in tiles])
+            rubbers = [_rubber(tile) for tile in tiles]
+            scatter = np.array([rubber.scatter for rubber in rubbers])
+            curve_misfit_n = np.array([rubber.curve_misfit_n for rubber in rubbers])
             tiles = [
-                t.model_copy(
+                tile.model_copy(
                     update={
-                        "coefficients": _rubber(t).coefficients,
-                        "covariance": _rubber(t).covariance,
+                        "coefficients": rubber.coefficients,
+                        "covariance": rubber.covariance,
                         "relative_misfit": 0.0,
                         "loop_misfit_n": 0.0,
                     }
                 )
-                for t in tiles
+                for tile, rubber in zip(tiles, rubbers, strict=True)
             ]
-        self._offset_kpa = np.array([t.p_offset_kpa for t in tiles])
-        self._scale_kpa = np.array([t.p_scale_kpa for t in tiles])
-        self._c1, self._c2, self._c3 = (
-            np.array([t.coefficients[k] * t.f_scale_n for t in tiles]) for k in (1, 2, 3)
-        )
-        self._misfit = np.array([t.relative_misfit for t in tiles])
-        self._loop_n = np.array([t.loop_misfit_n for t in tiles])
-        self._covariance = np.array([t.covariance for t in tiles]) * np.array(
-            [[[t.f_scale_n**2]] for t in tiles]
-        )
+        offset_kpa = np.array([t.p_offset_kpa for t in tiles])
+        scale_kpa = np.array([t.p_scale_kpa for t in tiles])
+        c1, c2, c3 = (np.array([t.coefficients[k] * t.f_scale_n for t in tiles]) for k in (1, 2, 3))
+        u0 = -offset_kpa / scale_kpa
+        zero_n = [
+            t.f_offset_n + t.f_scale_n * _horner(t, u) if t.zero_mode == "as_fitted" else 0.0
+            for t, u in zip(tiles, u0, strict=True)
+        ]
         self.low_kpa = np.array([t.range_kpa[0] for t in tiles])
         self.high_kpa = np.array([t.range_kpa[1] for t in tiles])
-        self._u0 = -self._offset_kpa / self._scale_kpa
-        self._zero_n = np.array(
-            [
-                t.f_offset_n + t.f_scale_n * _horner(t, u0) if t.zero_mode == "as_fitted" else 0.0
-                for t, u0 in zip(tiles, self._u0, strict=True)
-            ]
+        self.slope_at_zero_n_per_kpa = (c1 + u0 * (2.0 * c2 + u0 * (3.0 * c3))) / scale_kpa
+        self._constants = (
+            self.high_kpa,
+            offset_kpa,
+            scale_kpa,
+            u0,
+            np.stack([c1, c2, c3]),
+            np.array(zero_n),
+            self.slope_at_zero_n_per_kpa,
+            np.array([np.array(t.covariance) * t.f_scale_n**2 for t in tiles]),
+            np.array([t.relative_misfit for t in tiles]),
+            scatter,
+            np.array([t.loop_misfit_n for t in tiles]),
+            curve_misfit_n,
         )
-        self.slope_at_zero_n_per_kpa = self._slope(self._u0)
 
     def force(self, gauge_kpa: Floats) -> StaticForce:
         """Force, slope and calibration uncertainty at gauge pressures of shape (n, tiles)."""
-        force_n, slope_n_per_kpa, sigma_n = _curve(
-            np.ascontiguousarray(gauge_kpa),
-            self.high_kpa,
-            self._offset_kpa,
-            self._scale_kpa,
-            self._u0,
-            np.stack([self._c1, self._c2, self._c3]),
-            self._zero_n,
-            self.slope_at_zero_n_per_kpa,
-            self._covariance,
-            self._misfit,
-            self._scatter,
-            self._loop_n,
-            self._curve_n,
-        )
-        return StaticForce(force_n, slope_n_per_kpa, sigma_n)
-
-    def _slope(self, u: Floats) -> Floats:
-        slope = self._c1 + u * (2.0 * self._c2 + u * (3.0 * self._c3))
-        return np.asarray(slope / self._scale_kpa)
+        return StaticForce(*_curve(np.ascontiguousarray(gauge_kpa), *self._constants))
 
 
 @compiled

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from devices.array.health import TileHealth, is_impossible
 from devices.frames import NOT_READ, TileStatus
-from tests.devices.rigs import DATA_SHEET, ONE, Wires
+from tests.builders.arrays import DATA_SHEET_CHIP
+from tests.devices.rigs import ONE, Wires
 
 MS = 1_000_000
 COUNT_KPA = 0.1255  # the data sheet's part, hardware.md 1.3
@@ -218,7 +219,7 @@ def test_what_went_wrong_is_counted_by_reason() -> None:
 
 
 def test_it_knows_the_bytes_that_its_coefficients_are() -> None:
-    assert health().coefficient_words == DATA_SHEET
+    assert health().coefficient_words == DATA_SHEET_CHIP
     assert health().coefficient_bytes.hex() == "3eceb3f9c51733c8"
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from devices.array.array import TileArray
 from devices.frames import TileStatus
-from tests.devices.rigs import FORUM, FOUR, LOOK_FRAMES, Wires, settled
+from tests.builders.arrays import FORUM_CHIP
+from tests.devices.rigs import FOUR, LOOK_FRAMES, Wires, settled
 
 Tamper = Callable[[int, list[int]], None]
 
@@ -124,7 +125,7 @@ def test_a_true_jump_is_believed_at_once_if_it_comes_twice(foot: tuple[Wires, Ti
 
 
 def test_a_jump_that_is_another_tiles_word_is_noticed_by_its_coefficients() -> None:
-    wires = Wires(FOUR, words={3: FORUM})
+    wires = Wires(FOUR, words={3: FORUM_CHIP})
     array = settled(wires)
     quiet_frame(array)
     array.scan()

@@ -23,8 +23,9 @@ from devices.emulation.parts import draw_chip, random_of
 from devices.emulation.world import World
 from devices.errors import BusFaultError, TileSetupError
 from devices.scene.emulation import ReadDuringConversion
+from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 from tests.builders.scenes import make_scene
-from tests.devices.rigs import DATA_SHEET, FORUM, FOUR, ONE, TWO_MUXES, Plugs, Wires
+from tests.devices.rigs import FOUR, ONE, TWO_MUXES, Plugs, Wires
 
 THIRD = (0x3000, 0xB000, 0xC000, 0x3000)
 
@@ -35,11 +36,11 @@ THIRD = (0x3000, 0xB000, 0xC000, 0x3000)
 def test_every_tile_is_identified_in_the_order_of_the_scene() -> None:
     plugs: Plugs = ((0x73, 7), (0x70, 2), (0x73, 0))
     scene = make_scene(plugs)
-    wires = Wires(plugs, words={0: FORUM, 1: DATA_SHEET, 2: THIRD})
+    wires = Wires(plugs, words={0: FORUM_CHIP, 1: DATA_SHEET_CHIP, 2: THIRD})
     found = identify(wires.bus, scene.tile)
     assert [tile.serial for tile in found] == ["T01", "T02", "T03"]
     assert [(tile.mux, tile.channel) for tile in found] == list(plugs)
-    assert [tile.coefficient_words for tile in found] == [FORUM, DATA_SHEET, THIRD]
+    assert [tile.coefficient_words for tile in found] == [FORUM_CHIP, DATA_SHEET_CHIP, THIRD]
     assert [(t.x_m, t.y_m, t.z_m) for t in found] == [(t.x_m, t.y_m, t.z_m) for t in scene.tile]
 
 
@@ -64,11 +65,16 @@ def test_coefficients_are_read_three_times_from_each_tile_alone() -> None:
 
 
 def test_tiles_are_told_apart_although_every_channel_was_left_open() -> None:
-    wires = Wires(TWO_MUXES, words={0: FORUM, 3: FORUM})
+    wires = Wires(TWO_MUXES, words={0: FORUM_CHIP, 3: FORUM_CHIP})
     for mux in (0x70, 0x73):  # somebody else used the bus before
         wires.adapter.i2c_rdwr(i2c_msg.write(mux, [0xFF]))
     found = identify(wires.bus, make_scene(TWO_MUXES).tile)
-    assert [t.coefficient_words for t in found] == [FORUM, DATA_SHEET, DATA_SHEET, FORUM]
+    assert [t.coefficient_words for t in found] == [
+        FORUM_CHIP,
+        DATA_SHEET_CHIP,
+        DATA_SHEET_CHIP,
+        FORUM_CHIP,
+    ]
 
 
 def test_a_tile_that_is_absent_at_start_up_is_named_with_its_plug() -> None:
@@ -121,10 +127,15 @@ def test_a_bus_that_fails_at_start_up_is_no_fault_of_a_tile() -> None:
 
 def test_every_plug_of_every_mux_is_looked_behind() -> None:
     plugs: Plugs = ((0x70, 1), (0x72, 0), (0x72, 7), (0x77, 3))
-    wires = Wires(plugs, words={1: FORUM, 2: THIRD})
+    wires = Wires(plugs, words={1: FORUM_CHIP, 2: THIRD})
     found = find_tiles(wires.bus)
     assert [(plug.mux, plug.channel) for plug in found] == list(plugs)
-    assert [plug.coefficient_words for plug in found] == [DATA_SHEET, FORUM, THIRD, DATA_SHEET]
+    assert [plug.coefficient_words for plug in found] == [
+        DATA_SHEET_CHIP,
+        FORUM_CHIP,
+        THIRD,
+        DATA_SHEET_CHIP,
+    ]
     assert [plug.problem for plug in found] == [""] * 4
 
 
@@ -201,7 +212,7 @@ def part_with(
     tc_ns: int, mode: ReadDuringConversion, sense: Callable[[int], tuple[int, int]], scl_hz: int
 ) -> Wires:
     wires = Wires(ONE, scl_hz)
-    part = EmulatedMpl115a2(Silicon(DATA_SHEET, tc_ns, sense), mode)
+    part = EmulatedMpl115a2(Silicon(DATA_SHEET_CHIP, tc_ns, sense), mode)
     wires.tiles[0] = part
     wires.muxes[0]._channels[0] = part
     wires.adapter._wires.clear()
@@ -254,7 +265,7 @@ def test_a_tile_is_measured_alone_whatever_another_mux_was_left_with() -> None:
     wires = Wires(TWO_MUXES, tc_ns=[1_400_000, 1_500_000, 2_400_000, 2_300_000])
     for tile, label in zip(wires.tiles, "abcd", strict=True):
         silicon = tile._silicon
-        tile._silicon = Silicon(DATA_SHEET, silicon.conversion_ns, noisy(label))
+        tile._silicon = Silicon(DATA_SHEET_CHIP, silicon.conversion_ns, noisy(label))
     for order in ((0, 2, 1, 3), (3, 0, 2, 1)):
         for i in order:
             wires.adapter.i2c_rdwr(i2c_msg.write(0x70, [0xFF]))
@@ -269,10 +280,10 @@ def test_a_tile_is_measured_alone_whatever_another_mux_was_left_with() -> None:
 def test_a_tile_is_identified_alone_whatever_a_mux_without_tiles_of_the_scene_was_left_with() -> (
     None
 ):
-    wires = Wires(TWO_MUXES, words={0: FORUM})
+    wires = Wires(TWO_MUXES, words={0: FORUM_CHIP})
     wires.adapter.i2c_rdwr(i2c_msg.write(0x73, [0xFF]))
     found = identify(wires.bus, make_scene(ONE).tile)
-    assert found[0].coefficient_words == FORUM
+    assert found[0].coefficient_words == FORUM_CHIP
 
 
 def test_a_part_whose_words_never_change_is_not_measured() -> None:

@@ -23,8 +23,8 @@ from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_se
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import estimate, newton_plan
 from tests.builders.frames import LAYOUTS, assert_same_bits, cut_up, loaded_frames, with_columns
+from tests.service.estimation.feet import SQUARE
 
-SQUARE = [(0.0, 0.0, -0.15), (0.02, 0.0, -0.15), (0.0, 0.01, -0.15), (0.02, 0.01, -0.15)]
 CHIPS = [DATA_SHEET_CHIP, FORUM_CHIP] * 3
 BARE = (0.05, 0.05, -0.1)
 EXTREME_CHIPS = [
@@ -123,7 +123,7 @@ def troubled(frames: FrameBatch, seed: int) -> FrameBatch:
     cuts=st.one_of(st.just(range(90)), st.sets(st.integers(1, 89))),
     how=st.sampled_from(list(LAYOUTS)),
 )
-def test_any_split_in_any_memory_order_gives_the_assert_same_bits(
+def test_any_split_in_any_memory_order_gives_the_same_bits(
     lag_ms: float,
     rows: int,
     tiles: int,

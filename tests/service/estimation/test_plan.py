@@ -11,7 +11,7 @@ import pytest
 from devices.errors import CalibrationError, FootTileError, UsageError
 from service.estimation.calibration import paper_eq2_shape
 from service.estimation.plan import make_plan
-from tests.builders.arrays import array_at
+from tests.builders.arrays import DATA_SHEET_CHIP, array_at
 from tests.builders.calibrations import newton_tile
 from tests.builders.estimates import newton_plan
 
@@ -87,7 +87,7 @@ def test_a_tile_without_calibration_is_refused_by_serial() -> None:
 
 
 def test_another_chip_under_the_same_serial_is_refused() -> None:
-    chips = [(0x3ECE, 0xB3F9, 0xC517, 0x33C8)] * 3
+    chips = [DATA_SHEET_CHIP] * 3
     own = [newton_tile(f"T0{i}", coefficient_words=chips[0]) for i in (1, 2, 3)]
     assert newton_plan(array_at(LINE, chips=chips), tiles=own).calibration.tiles == tuple(own)
     chips[1] = (0x3ECE, 0xB3F9, 0xC517, 0x33C4)

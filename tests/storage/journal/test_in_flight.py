@@ -104,12 +104,14 @@ def test_a_killed_process_has_left_every_frame_that_it_had_taken(tmp_path: Path)
     code = """
 import json, sys
 from pathlib import Path
+from devices.acquisition import FrameRow
 from devices.frames import ArrayInfo
 from storage.journal.in_flight import InFlight
 info = ArrayInfo.model_validate_json(sys.stdin.readline())
 keeper = InFlight(Path(sys.argv[1]), info)
 for seq in range(10_000_000):
-    keeper.put(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
+    row = FrameRow(seq, seq + 1, seq + 1, 0, 0, 0.0, 0, [1, 2], [3, 4], [5, 6], [0, 0])
+    keeper.put(row)
     if seq % 1000 == 999:
         print(seq, flush=True)
 """

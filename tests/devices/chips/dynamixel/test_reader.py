@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import pickle
-from collections.abc import Callable, Iterator
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.chips.dynamixel.packets import Instruction
 from devices.chips.dynamixel.protocol1 import PROTOCOL_1, Error
 from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 from devices.chips.dynamixel.reader import Dynamixel, ServoIdentity, open_servo
-from devices.clock import SystemClock, VirtualClock
+from devices.clock import VirtualClock
 from devices.emulation.chips.dynamixel import EmulatedServo
 from devices.errors import (
     ServoPacketError,
@@ -22,38 +21,13 @@ from devices.errors import (
     ServoStatusError,
     ServoTimeoutError,
 )
+from tests.devices.chips.dynamixel.lines import SHORT_S, both_protocols, emulated
 
 # hardware.md 5.1, from the e-manual
 PING_1 = bytes.fromhex("FFFFFD00 01 0300 01 194E")
 READ_POSITION_OF_1 = bytes.fromhex("FFFFFD00 01 0700 02 84000400 1D15")
 STATUS_OF_1_AT_166 = bytes.fromhex("FFFFFD00 01 0800 55 00 A6000000 8CC0")
 STATUS_OF_2_AT_2079 = bytes.fromhex("FFFFFD00 02 0800 55 00 1F080000 BABE")
-
-# In real time. No test waits for the ample one; where a time-out is to happen, it is short.
-AMPLE_S = 5.0
-SHORT_S = 0.02
-
-
-@contextlib.contextmanager
-def emulated(
-    position: Callable[[int], int] = lambda _: 0,
-    baudrate: int = 1_000_000,
-    timeout_s: float = AMPLE_S,
-    asked_id: int = 1,
-    protocol: int = 2,
-) -> Iterator[tuple[EmulatedServo, Dynamixel, VirtualClock]]:
-    clock = VirtualClock(t_ns=1_000_000_000)
-    with EmulatedServo(position, clock, baudrate=baudrate, protocol=protocol) as servo:
-        driver = open_servo(
-            servo.port,
-            baudrate=baudrate,
-            clock=clock,
-            servo_id=asked_id,
-            timeout_s=timeout_s,
-            protocol=protocol,
-        )
-        with contextlib.closing(driver):
-            yield servo, driver, clock
 
 
 class ScriptedPort:
@@ -103,9 +77,6 @@ def status(*parameters: int, servo_id: int = 1) -> bytes:
 
 def status_1(error: int, *data: int, servo_id: int = 1) -> bytes:
     return PROTOCOL_1.pack(servo_id, error, bytes(data))
-
-
-both_protocols = pytest.mark.parametrize("protocol", [1, 2])
 
 
 # The driver against scripted bytes
@@ -300,142 +271,6 @@ def test_an_answer_of_protocol_1_is_checked() -> None:
     ):
         with pytest.raises(ServoPacketError, match=text):
             servo_on(ScriptedPort(answer), protocol=1).read_position()
-
-
-# The driver against an emulated servo
-
-
-@pytest.mark.parametrize("counts", [0, 166, -5, 4095, 4096, 2**31 - 1, -(2**31), 0x00FDFFFF])
-def test_positions_are_signed_and_may_need_stuffing(counts: int) -> None:
-    with emulated(lambda _: counts) as (_, driver, _):
-        reading = driver.read_position()
-        assert (reading.counts, reading.half_width_ns) == (counts, 250_000)
-
-
-@both_protocols
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(positions=st.lists(st.integers(-28_672, 28_672), min_size=1, max_size=10))
-def test_positions_below_zero_and_beyond_a_turn_pass_unharmed(
-    protocol: int, positions: list[int]
-) -> None:
-    here = [0]
-    with emulated(lambda _: here[0], protocol=protocol) as (_, driver, _):
-        for counts in positions:
-            here[0] = counts
-            assert driver.read_position().counts == counts
-
-
-@pytest.mark.parametrize(
-    ("protocol", "baudrate", "request_ns", "answer_ns", "table_ms"),
-    [
-        (2, 1_000_000, 140_000, 150_000, "0.79"),
-        (2, 57_600, 2_430_555, 2_604_166, "5.53"),
-        (1, 1_000_000, 80_000, 90_000, "0.67"),  # a byte more than the table's 8 + 8
-        (1, 57_600, 1_388_888, 1_562_500, "3.45"),
-    ],
-)
-def test_the_time_stamp_is_midway_between_request_and_answer(
-    protocol: int, baudrate: int, request_ns: int, answer_ns: int, table_ms: str
-) -> None:
-    def run() -> list[tuple[int, int, int, int]]:
-        sampled: list[int] = []
-
-        def position(t_ns: int) -> int:
-            sampled.append(t_ns)
-            return t_ns % 5000 - 2500
-
-        stamps = []
-        with emulated(position, baudrate, protocol=protocol) as (_, driver, clock):
-            for _ in range(5):
-                t_ns = clock.now_ns()
-                reading = driver.read_position()
-                sample_ns = sampled[-1] - t_ns
-                stamps.append(
-                    (
-                        sample_ns,
-                        reading.t_mono_ns - t_ns,
-                        reading.half_width_ns,
-                        reading.done_ns - t_ns,
-                    )
-                )
-                assert reading.counts == position(t_ns + sample_ns)
-                assert reading.done_ns == clock.now_ns()
-        return stamps
-
-    exchange_ns = request_ns + 500_000 + answer_ns
-    expected = (request_ns + 500_000, request_ns + 250_000, 250_000, exchange_ns)
-    assert run() == run() == [expected] * 5
-    assert f"{exchange_ns / 1e6:.2f}" == table_ms  # hardware.md 5.2
-
-
-def test_on_a_system_clock_an_answer_takes_the_time_of_the_wire() -> None:
-    clock = SystemClock()
-    with EmulatedServo(lambda _: 7, clock, baudrate=57_600) as servo:
-        driver = open_servo(servo.port, baudrate=57_600, clock=clock, timeout_s=AMPLE_S)
-        with contextlib.closing(driver):
-            t_ns = clock.now_ns()
-            reading = driver.read_position()
-    assert reading.done_ns - t_ns >= 5_534_721
-    assert reading.half_width_ns >= 250_000
-
-
-@both_protocols
-def test_garbage_before_an_answer_does_no_more_than_widen_the_interval(protocol: int) -> None:
-    with (
-        emulated(lambda _: -5, protocol=protocol) as (servo, driver, _),
-        servo.garbage_before_reply(b"\x00\xff\xff\xfd\xff"),
-    ):
-        reading = driver.read_position()
-        assert reading.counts == -5
-        assert reading.half_width_ns == 250_000 + 25_000
-
-
-@both_protocols
-def test_a_corrupted_answer_is_refused_at_once(protocol: int) -> None:
-    with emulated(protocol=protocol) as (servo, driver, clock):
-        t_ns = clock.now_ns()
-        with servo.corrupt_crc(), pytest.raises(ServoPacketError, match="damaged"):
-            driver.read_position()
-        assert clock.now_ns() - t_ns < 1_000_000
-        assert driver.read_position().counts == 0
-
-
-def test_a_silent_servo_times_out_and_is_well_again_afterwards() -> None:
-    with emulated(timeout_s=SHORT_S) as (servo, driver, clock):
-        t_ns = clock.now_ns()
-        with servo.silent(), pytest.raises(ServoTimeoutError):
-            driver.read_position()
-        assert clock.now_ns() == t_ns + 20_000_000
-    with emulated() as (servo, driver, _):
-        with servo.silent():
-            pass
-        assert driver.identify().model_number == 311
-
-
-def test_a_servo_of_another_id_is_silent() -> None:
-    with (
-        emulated(timeout_s=SHORT_S, asked_id=2) as (_, driver, _),
-        pytest.raises(ServoTimeoutError, match="servo 2 at 1000000 baud"),
-    ):
-        driver.identify()
-
-
-def test_a_servo_at_another_baud_rate_is_silent() -> None:
-    clock = VirtualClock()
-    with EmulatedServo(lambda _: 0, clock, baudrate=57_600) as servo:
-        driver = open_servo(servo.port, baudrate=1_000_000, clock=clock, timeout_s=SHORT_S)
-        with contextlib.closing(driver), pytest.raises(ServoTimeoutError, match="baud rate"):
-            driver.identify()
-
-
-@both_protocols
-def test_an_alert_keeps_the_value(protocol: int) -> None:
-    with emulated(lambda _: -5, protocol=protocol) as (servo, driver, _):
-        with servo.alert():
-            reading = driver.read_position()
-            assert (reading.counts, reading.alert) == (-5, True)
-            assert driver.identify().model_number == {1: 310, 2: 311}[protocol]
-        assert not driver.read_position().alert
 
 
 # The port

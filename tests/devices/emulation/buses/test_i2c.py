@@ -6,8 +6,8 @@ What is expected comes from hardware.md 1 to 4; SCL periods per transaction from
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Iterable
-from functools import partial, reduce
+from collections.abc import Iterable
+from functools import reduce
 from operator import and_
 
 import pytest
@@ -17,82 +17,19 @@ from smbus2 import i2c_msg
 
 from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
-from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
-from devices.emulation.chips.tca9548a import EmulatedTca9548a
+from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2
 from devices.scene.emulation import ReadDuringConversion
-
-MUX, OTHER_MUX, TILE = 0x70, 0x71, 0x60
-TC_NS = 1_600_000
-DATA_SHEET = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
-FORUM = (0x3591, 0xC0A2, 0xC625, 0x2C18)
-
-
-def chip(
-    *results: tuple[int, int],
-    words: tuple[int, int, int, int] = DATA_SHEET,
-    mode: ReadDuringConversion = "stale",
-) -> EmulatedMpl115a2:
-    """A part whose conversions give `results`, one after another."""
-    coming = iter(results)
-    return EmulatedMpl115a2(Silicon(words, TC_NS, lambda _: next(coming)), mode)
-
-
-class Reader:
-    """What somebody with smbus2 and the data sheets would write."""
-
-    def __init__(
-        self, muxes: dict[int, dict[int, EmulatedMpl115a2]], scl_hz: float = 400_000
-    ) -> None:
-        self.clock = VirtualClock(5_000_000_000)
-        self.muxes = [EmulatedTca9548a(address, tiles) for address, tiles in muxes.items()]
-        self.adapter = EmulatedI2cAdapter(self.muxes, self.clock, scl_hz)
-
-    def select(self, mask: int, mux: int = MUX) -> None:
-        self.adapter.i2c_rdwr(i2c_msg.write(mux, [mask]))
-
-    def selected(self, mux: int = MUX) -> int:
-        message = i2c_msg.read(mux, 1)
-        self.adapter.i2c_rdwr(message)
-        return bytes(message)[0]
-
-    def convert(self) -> None:
-        self.adapter.i2c_rdwr(i2c_msg.write(TILE, [0x12, 0x00]))
-
-    def convert_and_wait(self) -> None:
-        self.convert()
-        self.wait(TC_NS)
-
-    def wait(self, t_ns: int) -> None:
-        self.clock.sleep_until_ns(self.clock.now_ns() + t_ns)
-
-    def read(self, register: int, count: int) -> bytes:
-        message = i2c_msg.read(TILE, count)
-        self.adapter.i2c_rdwr(i2c_msg.write(TILE, [register]), message)
-        return bytes(message)
-
-    def words(self) -> tuple[int, int, int, int]:
-        raw = self.read(0x04, 8)
-        a0, b1, b2, c12 = (raw[i] << 8 | raw[i + 1] for i in range(0, 8, 2))
-        return a0, b1, b2, c12
-
-    def counts(self) -> tuple[int, int]:
-        raw = self.read(0x00, 4)
-        return (raw[0] << 8 | raw[1]) >> 6, (raw[2] << 8 | raw[3]) >> 6
-
-
-def alone(part: EmulatedMpl115a2, scl_hz: float = 400_000) -> Reader:
-    """One tile on channel 0, selected."""
-    reader = Reader({MUX: {0: part}}, scl_hz)
-    reader.select(0b1)
-    return reader
-
-
-def refusal(transact: Callable[[], object]) -> int | None:
-    with pytest.raises(OSError) as caught:  # noqa: PT011  # the number is what it is about
-        transact()
-    assert type(caught.value) is OSError, "the kernel knows nothing of our errors"
-    return caught.value.errno
-
+from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
+from tests.devices.emulation.buses.readers import (
+    MUX,
+    OTHER_MUX,
+    TC_NS,
+    TILE,
+    Reader,
+    alone,
+    chip,
+    refusal,
+)
 
 # The multiplexer
 
@@ -104,13 +41,13 @@ def test_at_power_up_no_tile_is_connected() -> None:
 
 
 def test_a_select_takes_effect_only_after_the_stop() -> None:
-    reader = Reader({MUX: {0: chip(words=DATA_SHEET), 1: chip(words=FORUM)}})
+    reader = Reader({MUX: {0: chip(words=DATA_SHEET_CHIP), 1: chip(words=FORUM_CHIP)}})
     reader.select(0b01)
     answer = i2c_msg.read(TILE, 8)
     # Select and access joined by repeated STARTs: the access still goes to the old channel.
     reader.adapter.i2c_rdwr(i2c_msg.write(MUX, [0b10]), i2c_msg.write(TILE, [0x04]), answer)
     assert bytes(answer).hex() == "3eceb3f9c51733c8"
-    assert reader.words() == FORUM
+    assert reader.words() == FORUM_CHIP
 
 
 def test_a_select_before_which_nothing_was_open_finds_nobody_in_the_same_transaction() -> None:
@@ -118,7 +55,7 @@ def test_a_select_before_which_nothing_was_open_finds_nobody_in_the_same_transac
     joined = (i2c_msg.write(MUX, [1]), i2c_msg.write(TILE, [0x04]), i2c_msg.read(TILE, 8))
     assert refusal(lambda: reader.adapter.i2c_rdwr(*joined)) == 121
     # The STOP behind the missing acknowledge brings it into force all the same.
-    assert reader.words() == DATA_SHEET
+    assert reader.words() == DATA_SHEET_CHIP
 
 
 def test_a_convert_joined_to_a_select_goes_to_the_old_tile() -> None:
@@ -132,17 +69,17 @@ def test_a_convert_joined_to_a_select_goes_to_the_old_tile() -> None:
 
 
 def test_a_select_and_a_deselect_in_one_transaction_leave_the_last_word() -> None:
-    reader = Reader({MUX: {0: chip(), 1: chip(words=FORUM)}})
+    reader = Reader({MUX: {0: chip(), 1: chip(words=FORUM_CHIP)}})
     reader.adapter.i2c_rdwr(i2c_msg.write(MUX, [0b01]), i2c_msg.write(MUX, [0b10]))
-    assert reader.words() == FORUM
+    assert reader.words() == FORUM_CHIP
 
 
 def test_of_several_bytes_to_a_mux_the_last_one_counts() -> None:
-    reader = Reader({MUX: {0: chip(), 3: chip(words=FORUM)}})
+    reader = Reader({MUX: {0: chip(), 3: chip(words=FORUM_CHIP)}})
     # As SMBus write_byte_data does it: a register number first, which the part does not have.
     reader.adapter.i2c_rdwr(i2c_msg.write(MUX, [0b0000_0001, 0b0000_0010, 0b0000_1000]))
     assert reader.selected() == 0b0000_1000
-    assert reader.words() == FORUM
+    assert reader.words() == FORUM_CHIP
 
 
 def test_an_empty_write_to_a_mux_finds_it_and_changes_nothing() -> None:
@@ -150,7 +87,7 @@ def test_an_empty_write_to_a_mux_finds_it_and_changes_nothing() -> None:
     reader.select(1)
     reader.adapter.i2c_rdwr(i2c_msg.write(MUX, []))
     assert reader.selected() == 1
-    assert reader.words() == DATA_SHEET
+    assert reader.words() == DATA_SHEET_CHIP
 
 
 @settings(max_examples=50)
@@ -298,7 +235,7 @@ def test_a_stop_between_register_address_and_read_does_no_harm() -> None:
 def test_a_write_to_a_read_only_register_is_acknowledged_and_ignored() -> None:
     reader = alone(chip())
     reader.adapter.i2c_rdwr(i2c_msg.write(TILE, [0x04, 0x00, 0x00, 0x00]))
-    assert reader.words() == DATA_SHEET
+    assert reader.words() == DATA_SHEET_CHIP
 
 
 def test_a_message_object_can_be_used_again() -> None:
@@ -316,7 +253,7 @@ def test_a_message_object_can_be_used_again() -> None:
 
 
 def test_two_open_channels_read_as_the_bitwise_and() -> None:
-    reader = Reader({MUX: {0: chip((410, 507)), 5: chip((272, 521), words=FORUM)}})
+    reader = Reader({MUX: {0: chip((410, 507)), 5: chip((272, 521), words=FORUM_CHIP)}})
     reader.select(0b10_0001)
     reader.convert_and_wait()
     assert reader.counts() == (410 & 272, 507 & 521)
@@ -324,12 +261,12 @@ def test_two_open_channels_read_as_the_bitwise_and() -> None:
 
 
 def test_two_muxes_left_open_read_as_the_bitwise_and() -> None:
-    reader = Reader({MUX: {0: chip()}, OTHER_MUX: {7: chip(words=FORUM)}})
+    reader = Reader({MUX: {0: chip()}, OTHER_MUX: {7: chip(words=FORUM_CHIP)}})
     reader.select(0x01)
     reader.select(0x80, mux=OTHER_MUX)  # and forgets to close the one it leaves
     assert reader.words() == (0x3480, 0x80A0, 0xC405, 0x2008)
     reader.select(0x00)
-    assert reader.words() == FORUM
+    assert reader.words() == FORUM_CHIP
 
 
 plugs = st.tuples(st.sampled_from([MUX, OTHER_MUX]), st.integers(0, 7))
@@ -437,134 +374,3 @@ def test_a_data_byte_is_acknowledged_if_any_device_acknowledges_it() -> None:
     adapter = EmulatedI2cAdapter(ports, VirtualClock(), 400_000)
     adapter.i2c_rdwr(i2c_msg.write(0x20, [1, 2]))
     assert [port.heard for port in ports] == [["write", 1, 2, "stop"]] * 2
-
-
-# What a Raspberry Pi's adapter refuses
-
-
-def write() -> i2c_msg:
-    return i2c_msg.write(TILE, [0x00])
-
-
-def read() -> i2c_msg:
-    return i2c_msg.read(TILE, 4)
-
-
-def convert() -> i2c_msg:
-    return i2c_msg.write(TILE, [0x12, 0x00])
-
-
-@pytest.mark.parametrize(
-    "messages",
-    [
-        [write, read, write, read],
-        [write, read, convert],
-        [read, write],
-        [read, read],
-    ],
-    ids=["W R W R", "W R W", "R W", "R R"],
-)
-def test_only_one_read_is_allowed_and_it_must_be_last(
-    messages: list[Callable[[], i2c_msg]],
-) -> None:
-    reader = alone(chip((410, 507)))
-    before_ns = reader.clock.now_ns()
-    assert refusal(lambda: reader.adapter.i2c_rdwr(*(make() for make in messages))) == 95
-    assert reader.clock.now_ns() == before_ns, "refused before it touches the bus"
-
-
-def test_several_writes_may_come_before_the_read() -> None:
-    reader = alone(chip((410, 507)))
-    answer = read()
-    reader.adapter.i2c_rdwr(convert(), write(), answer)
-    assert bytes(answer) == bytes(4)
-    reader.wait(TC_NS)
-    assert reader.counts() == (410, 507)
-
-
-def test_more_than_42_messages_are_refused() -> None:
-    reader = alone(chip())
-    reader.adapter.i2c_rdwr(*(write() for _ in range(42)))
-    before_ns = reader.clock.now_ns()
-    assert refusal(lambda: reader.adapter.i2c_rdwr(*(write() for _ in range(43)))) == 22
-    assert reader.clock.now_ns() == before_ns
-
-
-def test_no_message_at_all_is_refused() -> None:
-    assert refusal(alone(chip()).adapter.i2c_rdwr) == errno.EINVAL
-
-
-def test_a_message_of_more_than_8192_bytes_is_refused() -> None:
-    adapter = alone(chip()).adapter
-    adapter.i2c_rdwr(i2c_msg.read(TILE, 8192))
-    assert refusal(lambda: adapter.i2c_rdwr(i2c_msg.read(TILE, 8193))) == errno.EINVAL
-
-
-@pytest.mark.parametrize("address", [0x00, 0x5F, 0x61, 0x6F, 0x78])
-def test_nobody_answers_at_another_address_nor_at_the_general_call(address: int) -> None:
-    reader = Reader({MUX: {0: chip((410, 507))}, OTHER_MUX: {}})
-    reader.select(1)
-    for message in (i2c_msg.write(address, [0x12, 0]), i2c_msg.read(address, 1)):
-        assert refusal(partial(reader.adapter.i2c_rdwr, message)) == 121
-    reader.wait(TC_NS)
-    assert reader.counts() == (0, 0)
-
-
-def test_a_missing_acknowledge_lets_what_came_before_it_happen() -> None:
-    reader = alone(chip((410, 507)))
-    joined = (convert(), i2c_msg.write(0x61, [0]))
-    assert refusal(lambda: reader.adapter.i2c_rdwr(*joined)) == 121
-    reader.wait(TC_NS)
-    assert reader.counts() == (410, 507)
-
-
-# Time on the bus, in SCL periods (hardware.md 4)
-
-PERIODS = [
-    ("mux select", lambda: [i2c_msg.write(MUX, [1])], 20),
-    ("mux read-back", lambda: [i2c_msg.read(MUX, 1)], 20),
-    ("convert", lambda: [convert()], 29),
-    ("read pressure", lambda: [write(), i2c_msg.read(TILE, 2)], 48),
-    ("read both", lambda: [write(), read()], 66),
-    ("read coefficients", lambda: [i2c_msg.write(TILE, [4]), i2c_msg.read(TILE, 8)], 102),
-    ("restart and read", lambda: [convert(), write(), read()], 94),
-]
-
-
-@pytest.mark.parametrize(("scl_hz", "ns_per_period"), [(400_000, 2_500), (250_000, 4_000)])
-@pytest.mark.parametrize(("_what", "messages", "periods"), PERIODS, ids=[p[0] for p in PERIODS])
-def test_a_transaction_takes_its_scl_periods_to_the_nanosecond(
-    _what: str,
-    messages: Callable[[], list[i2c_msg]],
-    periods: int,
-    scl_hz: float,
-    ns_per_period: int,
-) -> None:
-    reader = alone(chip((410, 507)), scl_hz)
-    before_ns = reader.clock.now_ns()
-    reader.adapter.i2c_rdwr(*messages())
-    assert reader.clock.now_ns() - before_ns == periods * ns_per_period
-
-
-@pytest.mark.parametrize(("scl_hz", "ns_per_period"), [(400_000, 2_500), (250_000, 4_000)])
-def test_an_address_that_is_not_acknowledged_takes_11_periods(
-    scl_hz: float, ns_per_period: int
-) -> None:
-    reader = Reader({MUX: {0: chip()}}, scl_hz)
-    before_ns = reader.clock.now_ns()
-    assert refusal(reader.convert) == 121
-    assert reader.clock.now_ns() - before_ns == 11 * ns_per_period
-
-
-def test_a_conversion_begins_at_the_stop_of_its_convert() -> None:
-    sampled_ns: list[int] = []
-
-    def sense(t_ns: int) -> tuple[int, int]:
-        sampled_ns.append(t_ns)
-        return 410, 507
-
-    reader = alone(EmulatedMpl115a2(Silicon(DATA_SHEET, TC_NS, sense)))
-    begin_ns = reader.clock.now_ns()
-    reader.convert()
-    # 29 periods of 2.5 us to the STOP; sampled a quarter into the conversion (hardware.md 1.4)
-    assert sampled_ns == [begin_ns + 72_500 + TC_NS // 4]

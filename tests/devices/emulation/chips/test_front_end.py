@@ -19,10 +19,11 @@ from devices.emulation.faults import Fault
 from devices.emulation.parts import ChipPart, DomePart
 from devices.emulation.surroundings import Surroundings
 from devices.scene.emulation import EmulationScene
+from tests.builders.arrays import DATA_SHEET_CHIP
 
 Floats = npt.NDArray[np.float64]
 
-DATA_SHEET = Coefficients.from_words((0x3ECE, 0xB3F9, 0xC517, 0x33C8))
+DATA_SHEET = Coefficients.from_words(DATA_SHEET_CHIP)
 # With -5.35 counts per kelvin this chip reads 507, the data sheet's example, at 21 degC.
 CHIP = ChipPart(DATA_SHEET, conversion_ns=1_600_000, tadc_at_25_degc=507 - 4 * 5.35)
 DOME = DomePart(

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
 from devices.emulation.faults import Fault
 from devices.scene.emulation import ReadDuringConversion
+from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 
-WORDS = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 TC_NS = 1_900_000
 
 
@@ -33,7 +33,9 @@ def part(
     faults: PartFaults | None = None,
     spare: Callable[[], Silicon] | None = None,
 ) -> EmulatedMpl115a2:
-    return EmulatedMpl115a2(Silicon(WORDS, TC_NS, sense or Samples()), mode, faults, spare)
+    return EmulatedMpl115a2(
+        Silicon(DATA_SHEET_CHIP, TC_NS, sense or Samples()), mode, faults, spare
+    )
 
 
 def between(begin_ns: int, end_ns: int) -> Fault:
@@ -150,7 +152,9 @@ def test_a_read_past_the_last_register_begins_again_at_the_first(first: int, cou
     chip.start(False, 0)
     chip.write(first)
     chip.start(True, 0)
-    registers = bytes(4) + b"".join(word.to_bytes(2, "big") for word in WORDS) + bytes(116)
+    registers = (
+        bytes(4) + b"".join(word.to_bytes(2, "big") for word in DATA_SHEET_CHIP) + bytes(116)
+    )
     assert chip.read(count) == bytes(registers[(first + i) % 128] for i in range(count))
 
 
@@ -245,9 +249,8 @@ def test_a_part_that_nobody_asked_while_it_was_unplugged_is_empty_all_the_same()
 
 
 def test_a_replaced_part_is_another_one_from_then_on() -> None:
-    forum = (0x3591, 0xC0A2, 0xC625, 0x2C18)
     faults = PartFaults(replaced=between(TC_NS, 2 * TC_NS))
-    chip = part(faults=faults, spare=lambda: Silicon(forum, TC_NS, lambda _: (7, 700)))
+    chip = part(faults=faults, spare=lambda: Silicon(FORUM_CHIP, TC_NS, lambda _: (7, 700)))
     convert(chip, 0)
     assert not chip.start(False, TC_NS), "its channel is empty for a while"
     assert counts(chip, 2 * TC_NS) == (0, 0)

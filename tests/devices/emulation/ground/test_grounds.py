@@ -9,13 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from devices.emulation.ground.grounds import (
-    Ground,
-    Rolling,
-    TraceLoad,
-    make_ground,
-    tile_positions_m,
-)
+from devices.emulation.ground.ground import Ground
+from devices.emulation.ground.grounds import Rolling, TraceLoad, make_ground, tile_positions_m
 from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation
 from devices.errors import SceneError, UsageError

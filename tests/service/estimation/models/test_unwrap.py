@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
 from service.estimation.models.unwrap import unwrap
+from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 
-DATA_SHEET_PART = Coefficients.from_words((0x3ECE, 0xB3F9, 0xC517, 0x33C8))
-FORUM_PART = Coefficients.from_words((0x3591, 0xC0A2, 0xC625, 0x2C18))
+DATA_SHEET_PART = Coefficients.from_words(DATA_SHEET_CHIP)
+FORUM_PART = Coefficients.from_words(FORUM_CHIP)
 
 
 def kpa(counts: float, tadc: int, c: Coefficients) -> float:

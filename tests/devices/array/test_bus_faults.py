@@ -1,0 +1,189 @@
+"""A bus that fails, as an array sees it: told from a silent tile, and said in words."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import pairwise
+
+import pytest
+from smbus2 import i2c_msg
+
+from devices.errors import BusMisuseError, BusSetupError
+from devices.frames import NOT_READ, TileStatus
+from devices.scene.hardware import ScheduleName
+from tests.devices.array.wiring import every_schedule, failing, frames, to_tiles
+from tests.devices.rigs import (
+    FOUR,
+    ONE,
+    SETTLED,
+    TWO_MUXES,
+    Plugs,
+    Wires,
+    array_on,
+    settled,
+)
+
+
+@pytest.mark.parametrize("number", [5, 110, 11, 16])
+@every_schedule
+def test_a_fault_of_the_bus_is_told_from_a_silent_tile(schedule: ScheduleName, number: int) -> None:
+    wires = Wires(FOUR)
+    array = settled(wires, schedule)
+    wires.on_transaction = failing(number, lambda _, __: True)
+    for _ in range(3):
+        scan = array.scan()
+        assert scan.bus_fault
+        assert scan.padc == [NOT_READ] * 4
+        assert all(status & TileStatus.NO_ANSWER for status in scan.status)
+    assert "stuck" in array.troubles()[""]
+    wires.on_transaction = lambda _, __: None
+    for _ in range(3):
+        scan = array.scan()
+    assert not scan.bus_fault
+    assert scan.status == [0] * 4
+    assert array.troubles() == {}
+
+
+def test_a_stuck_bus_is_asked_for_once_a_frame_and_no_more() -> None:
+    # Each transfer may cost the adapter's 30 ms.
+    wires = Wires(FOUR)
+    array = settled(wires)
+    wires.on_transaction = failing(110, lambda _, __: True)
+    wires.log.clear()
+    array.scan()
+    assert len(wires.log) == 2, "after two time-outs stop (hardware.md 8)"
+    for _ in range(5):
+        wires.log.clear()
+        array.scan()
+        assert len(wires.log) == 1
+
+
+def test_a_fault_of_the_bus_shows_although_the_second_attempt_succeeded() -> None:
+    wires = Wires(FOUR)
+    array = settled(wires)
+    last = array.scan().padc
+    wires.log.clear()
+    wires.on_transaction = failing(11, lambda count, _: count == 4)  # the first tile's read
+    scan = array.scan()
+    assert scan.bus_fault
+    assert scan.status == [TileStatus.RETRIED, 0, 0, 0]
+    assert scan.padc == [padc + 1 for padc in last]
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"), [(22, BusMisuseError), (95, BusMisuseError), (19, BusSetupError)]
+)
+@every_schedule
+def test_a_bug_of_ours_and_a_bus_that_is_gone_are_raised_and_not_flagged(
+    schedule: ScheduleName, number: int, kind: type[Exception]
+) -> None:
+    wires = Wires(FOUR)
+    array = array_on(wires, schedule)
+    array.scan()
+    wires.on_transaction = failing(number, to_tiles)
+    with pytest.raises(kind):
+        array.scan()
+
+
+@every_schedule
+def test_a_bus_that_is_gone_is_raised_wherever_it_is_noticed(schedule: ScheduleName) -> None:
+    for after in range(60):
+        wires = Wires(FOUR)
+        array = settled(wires, schedule)
+        with wires.fault("no_answer", "T02"):  # one tile is looked for, too
+            array.scan()
+        wires.log.clear()
+        wires.on_transaction = failing(19, partial(later_than, after))
+        with pytest.raises(BusSetupError):
+            frames(array, 20)
+
+
+@every_schedule
+@pytest.mark.parametrize("plugs", [ONE, FOUR, TWO_MUXES])
+def test_a_bus_on_which_nobody_answers_is_a_fault_of_the_bus_from_the_first_frame_on(
+    schedule: ScheduleName, plugs: Plugs
+) -> None:
+    wires = Wires(plugs)
+    array = settled(wires, schedule)
+    with wires.fault("sda_high"):
+        for _ in range(10):
+            scan = array.scan()
+            assert scan.bus_fault
+            assert all(status & TileStatus.NO_ANSWER for status in scan.status)
+    for _ in range(SETTLED + 2):
+        scan = array.scan()
+    assert scan.status == [0] * len(plugs)
+
+
+@every_schedule
+@pytest.mark.parametrize("plugs", [ONE, FOUR, TWO_MUXES])
+def test_a_bus_that_acknowledges_everything_and_reads_as_zeros_is_stuck(
+    schedule: ScheduleName, plugs: Plugs
+) -> None:
+    # hardware.md 8: 0/0 on several tiles, 50.00 kPa with all-zero coefficients
+    wires = Wires(plugs)
+    array = settled(wires, schedule)
+    with wires.fault("sda_low"):
+        for _ in range(10):
+            scan = array.scan()
+            assert scan.bus_fault
+            assert all(status & TileStatus.UNUSABLE for status in scan.status)
+    for _ in range(SETTLED + 2):
+        scan = array.scan()
+    assert scan.status == [0] * len(plugs)
+    assert not scan.bus_fault
+
+
+@every_schedule
+@pytest.mark.parametrize("broken", [0x70, 0x73])
+def test_the_tiles_of_the_other_mux_go_on_while_one_is_without_supply(
+    schedule: ScheduleName, broken: int
+) -> None:
+    wires = Wires(TWO_MUXES)
+    array = settled(wires, schedule)
+    others = array.by_mux[1 if broken == 0x70 else 0]
+    with wires.fault("brown_out", f"0x{broken:02x}"):
+        scans = [array.scan() for _ in range(100)]
+    for scan in scans:
+        for i in range(4):
+            if i not in others:
+                assert scan.status[i] & TileStatus.NO_ANSWER
+                assert scan.padc[i] == NOT_READ
+    for before, after in pairwise(scans[5:]):
+        for i in others:
+            assert after.status[i] == 0
+            assert after.padc[i] == before.padc[i] + 1
+    for _ in range(200):
+        scan = array.scan()
+    assert scan.status == [0] * 4
+
+
+def later_than(after: int, count: int, _: tuple[i2c_msg, ...]) -> bool:
+    return count > after
+
+
+# What is wrong, in words
+
+
+class NoLines:
+    """A recovery whose lines are somebody else's."""
+
+    def clock_out(self) -> bool:
+        raise BusSetupError("GPIO lines cannot be used (EBUSY)", where="/dev/gpiochip0, lines 2, 3")
+
+    def reset_muxes(self) -> bool:
+        return False
+
+
+def test_a_stuck_bus_is_said_and_what_kept_it_from_being_helped() -> None:
+    wires = Wires(FOUR)
+    plain, helped = array_on(wires), array_on(wires, recovery=NoLines())
+    for array in (plain, helped):
+        with wires.fault("sda_low"):
+            frames(array, 3)
+            assert list(array.troubles()) == [""]
+            text = array.troubles()[""]
+        frames(array, 200)
+        assert array.troubles() == {}
+        assert text.startswith("the bus is stuck or cut")
+        assert ("GPIO lines cannot be used" in text) == (array is helped)

@@ -1,0 +1,136 @@
+"""The loop of a dome, and the gain that each loading draws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.devices.emulation.domes import (
+    PART,
+    Floats,
+    domes_of,
+    felt_n,
+    grid,
+    kpa_at,
+    lost,
+    static_kpa,
+)
+
+# Hysteresis
+
+
+def triangle(t_s: Floats, peak_n: float = 30.0, half_s: float = 2.0) -> Floats:
+    return np.interp(t_s, [0, half_s, 2 * half_s], [0.0, peak_n, 0.0])
+
+
+def loop(half_s: float, loads_n: Floats, peak_n: float = 30.0) -> tuple[Floats, Floats]:
+    """Forces felt at the same loads on the way up and on the way down."""
+    domes = domes_of(lambda t_s: triangle(t_s, peak_n, half_s), hysteresis=True)
+    up_s = loads_n / peak_n * half_s
+    up, down = kpa_at(domes, up_s), kpa_at(domes, (2 * half_s - up_s)[::-1])[::-1]
+    return felt_n(up), felt_n(down)
+
+
+def test_the_loop_closes_at_zero_load() -> None:
+    domes = domes_of(triangle, hysteresis=True)
+    assert domes.pressure_kpa(0, 0.0) == pytest.approx(100.0, abs=1e-12)
+    np.testing.assert_allclose(kpa_at(domes, grid(4.0, 5.0, every=100)), 100.0, atol=1e-9)
+
+
+def test_the_unloading_branch_lies_above_and_the_loop_is_as_wide_as_the_part_says() -> None:
+    loads_n = np.linspace(1.0, 20.0, 20)
+    up, down = loop(2.0, loads_n)
+    width_n = down - up
+    assert (width_n > 0).all()
+    np.testing.assert_allclose((up + down) / 2, loads_n, atol=0.02)
+    middle = width_n[np.searchsorted(loads_n, 15.0)]
+    assert 0.75 * 2 * PART.loop_n < middle < 1.05 * 2 * PART.loop_n
+    assert middle / 30.0 == pytest.approx(0.03, abs=0.006), "3 % of full scale, hardware.md 9"
+
+
+def test_a_part_without_a_loop_shows_none() -> None:
+    part = replace(PART, loop_n=0.0)
+    t_s = grid(0.0, 4.0, every=50)
+    kpa = kpa_at(domes_of(triangle, part, hysteresis=True), t_s)
+    np.testing.assert_allclose(kpa, static_kpa(triangle(t_s)), atol=1e-9)
+
+
+def test_the_loop_does_not_depend_on_the_speed() -> None:
+    loads_n = np.array([2.0, 8.0, 15.0, 22.0])
+    for slow, fast in zip(loop(4.0, loads_n), loop(0.5, loads_n), strict=True):
+        np.testing.assert_allclose(slow, fast, atol=2e-5)
+
+
+def test_a_held_load_stays_where_it_is_on_the_loop() -> None:
+    hold = domes_of(lambda t_s: np.interp(t_s, [0, 1, 1.5], [0.0, 30.0, 15.0]), hysteresis=True)
+    kpa = kpa_at(hold, grid(1.5, 4.0, every=100))
+    np.testing.assert_allclose(kpa, kpa[0], atol=1e-12)
+    assert kpa[0] > float(static_kpa(15.0)) + 0.05
+
+
+def test_a_small_reversal_makes_a_smaller_loop_inside_the_large_one() -> None:
+    loads_n = np.array([10.0])
+    up, down = loop(2.0, loads_n)
+    small_up, small_down = loop(2.0, loads_n, peak_n=11.0)
+    assert small_up == pytest.approx(up)
+    assert up[0] < small_down[0] < down[0]
+
+
+# Repeatability
+
+
+def pulses(t_s: Floats) -> Floats:
+    """Loads of 20 N, half a second each, once a second."""
+    phase = np.mod(t_s, 1.0)
+    return np.interp(phase, [0.2, 0.25, 0.7, 0.75], [0.0, 20.0, 20.0, 0.0])
+
+
+def peaks(loadings: int, **options: Any) -> Floats:
+    """Volume lost in the middle of each loading, relative to what the load should take."""
+    kpa = kpa_at(domes_of(pulses, **options), np.arange(loadings) + 0.5)
+    v = PART.seal_kpa / (kpa * (1 + PART.wall_per_kpa * (kpa - PART.seal_kpa)))
+    return np.asarray((1 - v) / float(lost(20.0)))
+
+
+def test_without_repeatability_every_loading_is_the_same() -> None:
+    np.testing.assert_allclose(peaks(5), 1.0, atol=1e-9)
+
+
+def test_every_loading_draws_a_gain_of_its_own() -> None:
+    gains = peaks(200, repeatability=0.03)
+    assert len(np.unique(gains.round(9))) == 200
+    # Standard error of a standard deviation from 200: 5 %
+    assert gains.std(ddof=1) == pytest.approx(0.03, rel=0.2)
+    assert gains.mean() == pytest.approx(1.0, abs=0.007)
+
+
+def test_within_one_loading_the_gain_does_not_change() -> None:
+    domes = domes_of(pulses, repeatability=0.03)
+    kpa = kpa_at(domes, grid(2.3, 2.65, every=10))
+    np.testing.assert_allclose(kpa, kpa[0], atol=1e-9)
+    assert abs(kpa[0] - float(static_kpa(20.0))) > 0.01
+
+
+def test_many_loadings_a_second_keep_their_gains_apart() -> None:
+    def drumming(t_s: Floats) -> Floats:
+        return pulses(t_s / 0.3)  # 0.15 s each, every 0.3 s: some last across a whole second
+
+    domes = domes_of(drumming, repeatability=0.03)
+    centres = 0.3 * (np.arange(20) + 0.475)
+    early, late = (
+        kpa_at(domes, centres - 0.06),
+        kpa_at(domes_of(drumming, repeatability=0.03), centres + 0.06),
+    )
+    np.testing.assert_allclose(early, late, atol=1e-9)
+    assert len(np.unique(early.round(6))) == 20
+
+
+def test_gains_come_with_the_label_and_the_serial() -> None:
+    first = peaks(5, repeatability=0.03, label="one")
+    np.testing.assert_array_equal(first, peaks(5, repeatability=0.03, label="one"))
+    assert (np.abs(first - peaks(5, repeatability=0.03, label="two")) > 1e-6).all()
+    both = domes_of(pulses, PART, PART, repeatability=0.03)
+    assert abs(both.pressure_kpa(0, 0.5) - both.pressure_kpa(1, 0.5)) > 1e-6
