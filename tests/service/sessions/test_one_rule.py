@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -97,6 +98,8 @@ def session(**content: Any) -> Session:
 
 
 SEQ = st.integers(0, BATCHES * BATCH)
+# One frame is no interval to tare from, and numpy says so before it is refused.
+pytestmark = pytest.mark.filterwarnings("ignore:Degrees of freedom:RuntimeWarning")
 
 
 def keep(data: Path, kept: Session) -> Path:
