@@ -1,6 +1,6 @@
 """A JSON object that carries a hash of its own text as its last key, so that an edit is seen.
 
-Anything reads it as JSON; who does not know the key may drop it.
+Any program reads it as JSON; one that does not know the key may drop it.
 """
 
 from __future__ import annotations

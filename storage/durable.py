@@ -95,7 +95,7 @@ def _is_stale(name: str) -> bool:
 def _started(process: int) -> int | None:
     """When a process started, in ticks since the machine did; None if there is none of this number.
 
-    One that has ended and that nobody has asked for its end is none.
+    A zombie, which has ended and was not waited for, is none.
     """
     try:
         fields = Path(f"/proc/{process}/stat").read_text("utf-8", "replace").rsplit(") ", 1)[1]

@@ -127,7 +127,7 @@ MILL = (
 """What the operator of an indentation rig writes down beside the frames."""
 
 PARTS = (Column("part", pa.uint16(), "1", "which part of the session, one for each start"),)
-"""A recorded session goes on when its node is switched on anew; `seq` then begins again."""
+"""A recorded session goes on when its node is restarted; `seq` then begins at 0 again."""
 
 NO_INSTANT = -(2**63)
 
@@ -198,7 +198,7 @@ def from_record_batch(record: pa.RecordBatch) -> FrameBatch:
 
 def _view(record: pa.RecordBatch, column: Column) -> Array:
     array = record.column(column.name)
-    if array.null_count:  # an empty row hides its values: what is left would be dealt out anew
+    if array.null_count:  # an empty row hides its values: what is left would shift to other rows
         raise ValueError(f"column {column.name} has {array.null_count} empty rows")
     if isinstance(array, pa.FixedSizeListArray):
         values = array.flatten().to_numpy(zero_copy_only=True)

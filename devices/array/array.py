@@ -55,8 +55,8 @@ class TileArray:
         temperature_every: temperature is read in every so many frames.
         broadcast_channels: how many channels may be open at once.
         recovery: frees a stuck bus; None: nobody can.
-        beside: called once in a frame at the first tile's sample instant, while the bus waits; what
-            it gives is the frame's reference force in newtons.
+        reference_n: gives the reference force in newtons; called once in a frame at the first
+            tile's sample instant, while the bus waits.
 
     Raises:
         SceneError: the schedule would open more channels than allowed.
@@ -73,7 +73,7 @@ class TileArray:
         temperature_every: int = 1,
         broadcast_channels: int = 8,
         recovery: BusRecovery | None = None,
-        beside: Callable[[], float] | None = None,
+        reference_n: Callable[[], float] | None = None,
     ) -> None:
         muxes = [tile.mux for tile in tiles]
         check_broadcast(schedule, muxes, broadcast_channels)
@@ -98,7 +98,7 @@ class TileArray:
         self._turns_ns = [round(turn_s * 1e9) for turn_s in turns_s(timing)]
         self._waits_for_slow_ones = schedule != "pipelined" or len(tiles) == 1
         self._temperature_every = temperature_every
-        self._beside = beside
+        self._reference_n = reference_n
         self._frame_ns = round(frame_s(schedule, timing) * 1e9)
         # Where a tile is started anew as soon as it was read, there is nothing to look at again.
         self._look_frames = 0
@@ -293,10 +293,10 @@ class TileArray:
 
     def _wait(self, scan: Scan, ready_ns: int) -> None:
         """Sleep until a conversion is finished, and do what is to be done at the sample instant."""
-        if self._beside is not None and scan.reference_ns is None:
+        if self._reference_n is not None and scan.reference_ns is None:
             scan.reference_ns = self._started_ns[0] + self.sample_delay_ns[0]
             self._clock.sleep_until_ns(scan.reference_ns)
-            scan.reference_n = self._beside()
+            scan.reference_n = self._reference_n()
         self._clock.sleep_until_ns(ready_ns)
         self._busy_since_ns = self._clock.now_ns()  # who waits spends nothing
 

@@ -21,24 +21,36 @@ from devices.scene.hardware import AnySchedule, ArrayScene
 
 
 @dataclass(frozen=True)
-class Ready:
+class Measured:
+    """The tiles of a scene as found on its bus.
+
+    Attributes:
+        tiles: as identified, with the conversion times measured.
+        timing: of the bus and the parts.
+        unmeasured: serials whose conversion time could not be measured; they are given 3 ms.
+    """
+
+    tiles: tuple[TileInfo, ...]
+    timing: BusTiming
+    unmeasured: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Ready(Measured):
     """An array that was identified and measured.
 
     Attributes:
         array: takes frames.
-        tiles: as identified, with the conversion times measured.
-        timing: of the bus and the parts.
         choice: the schedule, and why.
-        predicted_hz: frames a second that it should give.
-        unmeasured: serials whose conversion time could not be measured; they are given 3 ms.
     """
 
     array: TileArray
-    tiles: tuple[TileInfo, ...]
-    timing: BusTiming
     choice: Choice
-    predicted_hz: float
-    unmeasured: tuple[str, ...]
+
+    @property
+    def predicted_hz(self) -> float:
+        """Frames a second that it should give."""
+        return 1.0 / frame_s(self.choice.schedule, self.timing)
 
 
 def make_ready(
@@ -48,7 +60,7 @@ def make_ready(
     *,
     schedule: AnySchedule | None = None,
     recovery: BusRecovery | None = None,
-    beside: Callable[[], float] | None = None,
+    reference_n: Callable[[], float] | None = None,
 ) -> Ready:
     """Identify the tiles of a scene, measure bus and parts, and choose how to ask them.
 
@@ -58,7 +70,7 @@ def make_ready(
         clock: virtual or real.
         schedule: instead of the scene's.
         recovery: frees a stuck bus.
-        beside: as for `TileArray`.
+        reference_n: as for `TileArray`.
 
     Raises:
         TileSetupError, I2cError: a tile or the bus does not work.
@@ -66,8 +78,8 @@ def make_ready(
     """
     free_bus(bus, scene, recovery)
     found = measured(bus, scene, clock)
-    choice = chosen(scene, found.timing, schedule, has_reference=beside is not None)
-    return _ready(bus, scene, clock, found, choice, recovery, beside)
+    choice = chosen(scene, found.timing, schedule, has_reference=reference_n is not None)
+    return _ready(bus, scene, clock, found, choice, recovery, reference_n)
 
 
 def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
@@ -111,7 +123,7 @@ def renew(
     before: Ready,
     *,
     recovery: BusRecovery | None = None,
-    beside: Callable[[], float] | None = None,
+    reference_n: Callable[[], float] | None = None,
 ) -> Ready:
     """The array with the parts that are there now in place of those that were replaced.
 
@@ -134,7 +146,7 @@ def renew(
         ),
         unmeasured=(*(s for s in before.unmeasured if s not in by_serial), *found.unmeasured),
     )
-    return _ready(bus, scene, clock, parts, before.choice, recovery, beside)
+    return _ready(bus, scene, clock, parts, before.choice, recovery, reference_n)
 
 
 def _ready(
@@ -144,7 +156,7 @@ def _ready(
     found: Measured,
     choice: Choice,
     recovery: BusRecovery | None,
-    beside: Callable[[], float] | None,
+    reference_n: Callable[[], float] | None,
 ) -> Ready:
     array = TileArray(
         bus,
@@ -155,12 +167,11 @@ def _ready(
         temperature_every=scene.array.temperature_every,
         broadcast_channels=scene.array.broadcast_channels,
         recovery=recovery,
-        beside=beside,
+        reference_n=reference_n,
     )
     # Schedules that read what the frame before has started have to be started once.
     array.scan()
-    predicted_hz = 1.0 / frame_s(choice.schedule, found.timing)
-    return Ready(array, found.tiles, found.timing, choice, predicted_hz, found.unmeasured)
+    return Ready(found.tiles, found.timing, found.unmeasured, array, choice)
 
 
 def chosen(
@@ -185,7 +196,7 @@ def chosen(
     """
     asked = schedule or scene.array.schedule
     if has_reference:
-        return _beside_reference(asked)
+        return _with_reference(asked)
     if asked == "auto":
         return choose(
             timing,
@@ -195,7 +206,7 @@ def chosen(
     return Choice(asked, "as the scene says" if schedule is None else "as asked for")
 
 
-def _beside_reference(asked: AnySchedule) -> Choice:
+def _with_reference(asked: AnySchedule) -> Choice:
     if asked in ("auto", "simultaneous"):
         return Choice("simultaneous", "the reference force is read while all tiles convert at once")
     if asked == "sequential":
@@ -205,15 +216,6 @@ def _beside_reference(asked: AnySchedule) -> Choice:
         where="array.schedule",
         expected='"simultaneous" or "sequential", in which the reference is read with the tiles',
     )
-
-
-@dataclass(frozen=True)
-class Measured:
-    """The tiles of a scene as found, the timing of bus and parts, and who could not be measured."""
-
-    tiles: tuple[TileInfo, ...]
-    timing: BusTiming
-    unmeasured: tuple[str, ...]
 
 
 def measured(bus: I2cBus, scene: Scene, clock: Clock) -> Measured:

@@ -1,7 +1,7 @@
 """Acquisition in a process of its own, so that nothing else on the node disturbs its pace.
 
 The child opens the array, takes frames and encodes them; a thread of it sends them through a pipe.
-Whoever started it gets `Started`, then `Batch` after `Batch`, and `Started` again when the array
+The parent gets `Started`, then `Batch` after `Batch`, and `Started` again when the array
 has become another one, with which a new stream begins; a `Failed` ends it. The child ends when it
 is told to, or when the pipe breaks because its parent died.
 """

@@ -72,7 +72,7 @@ async def dial(url: str) -> socket.socket:
         for left in await asyncio.gather(*attempts, return_exceptions=True):
             if isinstance(left, socket.socket):  # two came through at once
                 left.close()
-    raise refused or TimeoutError(f"nobody answered for {GIVE_UP_S:g} s")
+    raise refused or TimeoutError(f"no answer for {GIVE_UP_S:g} s")
 
 
 async def _attempt(host: str, port: int) -> socket.socket:

@@ -3,7 +3,7 @@
 Every message counts as under way until an answer shows that the other side has read past it. From
 the pace at which that happens follows how much the link carries in `QUEUE_S`, and no more than that
 is sent ahead: a slow link has half a second of frames in its buffers, not a minute. Pure
-arithmetic; who sends tells it what happened, and when.
+arithmetic; the sender tells it what happened, and when.
 """
 
 from __future__ import annotations

@@ -146,7 +146,7 @@ class RunningNode:
                 self._publish(self._options.server)
             while not isinstance(message := await self._messages.get(), Failed):
                 if isinstance(message, Started):
-                    self._report("the tiles are described anew: a new stream begins")
+                    self._report("the tiles have a new description: a new stream begins")
                     await self._begin(message)
                 elif self._present is not None:
                     self._take(self._present, message)
@@ -225,7 +225,7 @@ class RunningNode:
         options, present = self._options, self._present_stream()
         next_seq = present.next_seq  # before what is held, which may go on meanwhile
         others = [stream for stream in self._journal.streams if stream is not present]
-        # As many as fit into a message, those that somebody waits for first.
+        # As many as fit into a message, those that a session waits for first.
         waited_for = [stream for stream in others if self._journal.undelivered(stream)]
         rest = [stream for stream in others if stream not in waited_for]
         chosen = (*waited_for[:_EARLIER_MAX], *rest[-_EARLIER_MAX:])[:_EARLIER_MAX]
@@ -349,5 +349,5 @@ def _hand_over(
 ) -> None:
     try:
         loop.call_soon_threadsafe(messages.put_nowait, message)
-    except RuntimeError:  # the loop has ended; nobody listens any more
+    except RuntimeError:  # the loop has ended, and with it all who listen
         return

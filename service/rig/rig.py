@@ -78,7 +78,11 @@ class Rig:
         self._recovery = open_recovery_lines(scene, self._clock, world)
         self._reference_n = open_reference_sensor(scene, self._clock, world, stack)
         self._ready = make_ready(
-            self._bus, scene, self._clock, recovery=self._recovery, beside=self._reference_n
+            self._bus,
+            scene,
+            self._clock,
+            recovery=self._recovery,
+            reference_n=self._reference_n,
         )
         self.remarks = [f"schedule {self._ready.choice.schedule}: {self._ready.choice.reason}"]
         """What a user should hear about it."""
@@ -169,7 +173,7 @@ class Rig:
                 self._clock,
                 self._ready,
                 recovery=self._recovery,
-                beside=self._reference_n,
+                reference_n=self._reference_n,
             )
         except (I2cError, TileSetupError):  # it is being plugged: go on with the others
             self._renew_at_ns = self._clock.now_ns() + _RENEW_AGAIN_NS

@@ -42,7 +42,7 @@ _STEADY_ROWS_MIN = 4
 
 @dataclass(frozen=True)
 class Rows:
-    """Measurements in order of time: int64[n] each; what they may be is checked by whoever reads.
+    """Measurements in order of time: int64[n] each; their ranges are checked where they are read.
 
     Attributes:
         t_mono_ns: when, by the node's clock that never steps.

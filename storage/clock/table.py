@@ -1,6 +1,6 @@
 """A session's clock table: from every stream's own time to the server's UTC, applied when reading.
 
-Raw instants stay as they are. A stream whose offset nobody measured gets no server's time at all:
+Raw instants stay as they are. A stream whose offset was not measured gets no server's time at all:
 an offset is never invented, nor taken over from another stream, whose anchor is another one.
 """
 

@@ -84,7 +84,7 @@ class InFlight:
 def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     """What a killed process left, in order; None if there is nothing that can be trusted.
 
-    Nothing can be if the machine was started anew since: the file was never synced. The frames end
+    Nothing can be if the machine was restarted since: the file was never synced. The frames end
     where the first one is missing, counted back from the newest.
 
     Raises:

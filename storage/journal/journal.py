@@ -2,7 +2,7 @@
 
 `<folder>/<first_seq>.arrows` begins with the schema message; each batch is appended as the bytes in
 which it came. Appending does not wait for the disk; `sync` does, and only what was synced may be
-promised to anybody. Opening a journal takes in the segments that are there and cuts off what is not
+promised. Opening a journal takes in the segments that are there and cuts off what is not
 whole. Nothing is held twice: a number that is there already is left as it is.
 """
 
@@ -131,7 +131,7 @@ class Journal:
     def disown(self, doubtful: Intervals) -> None:
         """Hold batches within `doubtful` no longer: they could not be synced, or are damaged.
 
-        A segment that was closed forgets them for ever, so that a copy that comes later is the one
+        A segment that was closed forgets them for good, so that a copy that comes later is the one
         that counts after a restart.
         """
         written = self._open.paths
@@ -145,7 +145,7 @@ class Journal:
                 with suppress(StorageError, OSError):
                     segment.rewrite_index()
         self._segments = [segment for segment in self._segments if segment.held]
-        self._count_anew()
+        self._recount()
         self._open.retire_all()
 
     def read(self, seq_first: int, seq_last: int) -> Iterator[FrameBatch]:
@@ -269,7 +269,7 @@ class Journal:
             self._segments.remove(segment)
             gone = gone | segment.held
         if gone:
-            self._count_anew()
+            self._recount()
         return gone
 
     def evict(self, keep: Intervals) -> Intervals:
@@ -308,7 +308,7 @@ class Journal:
             self._segments.append(segment)
             self.held = self.held | segment.held
 
-    def _count_anew(self) -> None:
+    def _recount(self) -> None:
         self.held = union(segment.held for segment in self._segments)
 
     def _write(self, message: EncodedBatch) -> None:

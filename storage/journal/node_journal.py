@@ -1,6 +1,6 @@
-"""What a node keeps on its disk: every frame, always, whether anybody listens or not.
+"""What a node keeps on its disk: every frame, always, with or without a server.
 
-A thread writes, so that a slow card holds up nobody; what it could not write waits in memory as
+A thread writes, so that a slow card delays nothing else; what it could not write waits in memory as
 long as there is room, and what does not fit is counted under its reason. Frames that a session
 needs stay until a server has them on its disk; others are a ring of ten minutes.
 """
@@ -48,7 +48,7 @@ class NodeJournal:
         root: the node's folder.
         node: its name.
         budget_bytes: what its journals may take.
-        is_recovery: nothing is dropped, and whoever uses this holds the folder's locks already.
+        is_recovery: nothing is dropped, and the caller holds the folder's locks already.
 
     Raises:
         StorageError: another process uses it.

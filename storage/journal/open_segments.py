@@ -77,7 +77,7 @@ class OpenSegments:
                 failed = error
         with storage_errors(self._folder):
             for writer in writers:
-                # A segment that is closed meanwhile was synced by whoever closed it.
+                # A segment that is closed meanwhile was synced when it was closed.
                 with suppress(ValueError):
                     writer.sync()
             if has_new_names:

@@ -21,7 +21,7 @@ _NEVER_NS = 2**62
 
 
 class Retention:
-    """Deletes what nobody needs, oldest first.
+    """Deletes what no session needs, oldest first.
 
     Args:
         folder: the node's journals.
@@ -72,7 +72,7 @@ class Retention:
         return [stream for stream in streams if self._may_drop and self._tidy(stream)]
 
     def _tidy(self, stream: NodeStream) -> bool:
-        """Delete what has outlasted the ring; was it all, and nobody asks for the stream?"""
+        """Delete what has outlasted the ring; is nothing of the stream left or asked for?"""
         journal = stream.journal
         if journal is None:
             return False

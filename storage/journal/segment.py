@@ -2,7 +2,7 @@
 
 Beside it lies an index: for each batch where it is, which frames it holds and its CRC-32, because
 Arrow does not notice a flipped bit, nor a page that a power cut left empty. A batch that is not in
-the index was never promised to anybody. An index that is missing altogether is made anew.
+the index was never promised to a server or a session. An index that is missing is rebuilt.
 """
 
 from __future__ import annotations
@@ -114,13 +114,13 @@ class Segment:
         Raises:
             OSError: they cannot be deleted.
         """
-        # Who is killed in between leaves a segment, whose index is made anew, and no orphan.
+        # In this order: a segment without an index is recovered, an index without a segment is not.
         self.path.with_suffix(INDEX_SUFFIX).unlink(missing_ok=True)
         self.path.unlink(missing_ok=True)
 
 
 class SegmentWriter:
-    """Appends to a new segment. Nothing is synced here: whoever promises anything calls `sync`.
+    """Appends to a new segment. Nothing is synced here: what is promised needs `sync` first.
 
     Args:
         path: the file, which must not be there.
@@ -231,7 +231,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
     try:
         index = read_index(path)
     except FileNotFoundError:
-        index, was_closed = _index_anew(path, end, schema), False
+        index, was_closed = _rebuilt_index(path, end, schema), False
     else:
         batches = batches_in(index)
         was_closed = is_closed(index) and len(batches) == len(index) - 1 and end_of(batches) == size
@@ -243,7 +243,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
                 doubtful.add(*numbers(record))
             elif found is not None:
                 # What is damaged before something whole was damaged later; at the end of a file
-                # that was not closed it never was on the disk, and nobody was promised it.
+                # that was not closed it never was on the disk, and was never promised.
                 damaged, doubtful = damaged | doubtful, Intervals()
                 if found["count"]:
                     good.append(found)
@@ -297,7 +297,7 @@ def _checked(descriptor: int, path: Path, record: Any, end: int, schema: pa.Sche
     return record_of(message, end)[0]
 
 
-def _index_anew(path: Path, begin: int, schema: pa.Schema) -> Records:
+def _rebuilt_index(path: Path, begin: int, schema: pa.Schema) -> Records:
     records = [np.zeros(0, RECORD)]
     # Without a whole header nothing behind it is known to be a batch.
     for message in messages_from(path, begin, schema) if begin else ():

@@ -39,9 +39,9 @@ class StreamNotes(BaseModel):
     kernel_boot_id: str | None = None
     """Which start of the machine it was taken in; None if that is not known here."""
     next_seq: int | None = None
-    """The number after its last frame; None while it runs, or if nobody knows."""
+    """The number after its last frame; None while it runs, or if that is not known."""
     unsynced_tail_max: int = 0
-    """How many more frames there may have been when it ended without a word."""
+    """How many more frames there may have been when it ended without saying so."""
     missed_slots: int = 0
     """Slots in which no frame was taken; they never had a number."""
     sync_max_s: float = 0.0

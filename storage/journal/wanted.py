@@ -78,7 +78,7 @@ class Wanted:
     def unmet(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
         """What is needed and not delivered: of each server by its own acknowledgements.
 
-        What the node's own session needs is here only, whoever has it besides.
+        What the node's own session needs is needed here even if a server has it as well.
         """
         return self.local(boot_id) | self.undelivered(boot_id, acked_by)
 

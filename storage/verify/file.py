@@ -190,7 +190,7 @@ def _read_through(reader: SessionReader, report: FileReport, *, has_file_hash: b
                 "that nothing in it was edited: an older foottile wrote it, without hashes"
             )
         else:
-            report.problems.append("it has no hashes: another program has written it anew")
+            report.problems.append("it has no hashes: another program has rewritten it")
     _check_offset(report, reader.info.utc_offset_ns)
 
 

@@ -69,7 +69,7 @@ class StreamReport:
     def missing(self) -> Intervals:
         """Numbers up to the stream's end that are neither here nor known to be lost.
 
-        They were deleted when nobody needed them any more, or are still to come.
+        They were deleted when no session needed them any more, or are still to come.
         """
         last = self.held.last
         if self.notes is not None and self.notes.next_seq is not None:
@@ -165,7 +165,7 @@ def _segments(folder: Path) -> list[SegmentReport]:
 
 
 def _if_there(path: Path) -> SegmentReport | None:
-    """The segment's report; None if it was deleted meanwhile, as those are that nobody needs."""
+    """The segment's report; None if it was deleted meanwhile because no session needs it."""
     try:
         report = verify_segment(path)
     except FileFormatError:

@@ -2,7 +2,7 @@
 
 It may be written meanwhile, or have been until the power failed: behind the last batch of a segment
 that was not closed there may be half a batch, and its index may name some that never came to the
-disk. Nobody was promised those. Everything else has to agree with its checksum.
+disk. Those were never promised. Everything else has to agree with its checksum.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class SegmentReport:
         held: numbers of frames whose bytes agree with their checksum.
         damaged: numbers of frames whose bytes do not.
         unsynced: numbers that the index names at the end of a segment that was not closed, and that
-            are not on the disk: nobody was promised them.
+            are not on the disk: they were never promised.
         is_closed: was it closed in order?
         info: the array it is of; None if that cannot be read.
         index: records of the batches that are held.
@@ -77,7 +77,7 @@ def verify_segment(path: Path) -> SegmentReport:
 
 def _verify(path: Path, report: SegmentReport) -> None:
     try:
-        # In this order, for whoever writes appends to the segment first: what was there before the
+        # In this order, for a writer appends to the segment first: what was there before the
         # index was read, and is not in the index, is one batch at most.
         size = path.stat().st_size
         index: Records | None = read_index(path)
@@ -96,7 +96,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
         if size > header_bytes:
             report.problems.append(
                 f"its index {path.with_suffix(INDEX_SUFFIX).name} is missing: nothing proves its "
-                "frames; it is made anew when the journal is next opened"
+                "frames; it is rebuilt when the journal is next opened"
             )
         return
     _check_batches(report, index, schema, header_bytes)
@@ -159,7 +159,7 @@ def _check_batches(
     elif said:
         report.unsynced = doubtful
         report.remarks.append(
-            f"{len(said)} batches at its end were not yet on the disk: nobody was promised them"
+            f"{len(said)} batches at its end were not yet on the disk: they were never promised"
         )
 
 
@@ -186,7 +186,7 @@ def _holds_any(path: Path, index: Records) -> bool:
 
 
 def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int]:
-    """Schema at a segment's beginning, and how many bytes it takes."""
+    """Schema that a segment should begin with, and how many bytes it takes; None: it has none."""
     schema, length = read_header(path)
     if schema is None:
         return None, 0
@@ -194,6 +194,7 @@ def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int
         report.info = array_info(schema, where=str(path))
     except FileFormatError:
         return None, 0
-    if not schema.equals(wire_schema(report.info), check_metadata=True):
+    expected = wire_schema(report.info)
+    if not schema.equals(expected, check_metadata=True):
         report.problems.append("its columns are not those of a stream of frames")
-    return schema, length
+    return expected, length

@@ -155,7 +155,7 @@ def array_on(
     temperature_every: int = 1,
     broadcast_channels: int = 64,
     recovery: BusRecovery | None = None,
-    beside: Callable[[], float] | None = None,
+    reference_n: Callable[[], float] | None = None,
 ) -> TileArray:
     """An array that waits exactly as long as each part converts, unless it is told otherwise."""
     timing = BusTiming(
@@ -173,7 +173,7 @@ def array_on(
         temperature_every=temperature_every,
         broadcast_channels=broadcast_channels,
         recovery=recovery,
-        beside=beside,
+        reference_n=reference_n,
     )
 
 

@@ -255,7 +255,7 @@ def test_the_force_beside_the_array_goes_with_the_frame() -> None:
         one.clock,
         schedule="simultaneous",
         timing=timing,
-        beside=lambda: one.clock.now_ns() * 1e-9,
+        reference_n=lambda: one.clock.now_ns() * 1e-9,
     )
     one.stream = Acquisition(array, array.tiles, one.clock, ANCHOR)
     batch = one.take(3)

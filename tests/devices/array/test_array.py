@@ -131,11 +131,11 @@ def test_what_stands_beside_is_read_once_a_frame_at_the_first_tiles_sample_insta
     wires = Wires(FOUR)
     asked_ns: list[int] = []
 
-    def beside() -> float:
+    def reference_n() -> float:
         asked_ns.append(wires.clock.now_ns())
         return 0.25 * len(asked_ns)
 
-    array = array_on(wires, beside=beside)
+    array = array_on(wires, reference_n=reference_n)
     for frame in range(1, 8):
         scan = array.scan()
         assert scan.reference_n == 0.25 * frame
@@ -144,7 +144,7 @@ def test_what_stands_beside_is_read_once_a_frame_at_the_first_tiles_sample_insta
 
 
 def test_what_stands_beside_costs_no_time_on_the_bus() -> None:
-    array = settled(wires := Wires(FOUR), beside=lambda: 1.0)
+    array = settled(wires := Wires(FOUR), reference_n=lambda: 1.0)
     assert timed_scan(array, wires)[1] == WHOLE_NS
 
 

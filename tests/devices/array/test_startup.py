@@ -149,7 +149,7 @@ def test_what_was_asked_for_goes_before_what_the_scene_says() -> None:
 @pytest.mark.parametrize("asked", ["auto", "simultaneous", "sequential"])
 def test_beside_a_reference_force_tiles_are_sampled_with_it(asked: str) -> None:
     array = {"schedule": asked, "wait_ms": 1.6}
-    ready, *_ = started(make_scene(array=array), beside=lambda: 7.0)
+    ready, *_ = started(make_scene(array=array), reference_n=lambda: 7.0)
     assert ready.choice.schedule == ("sequential" if asked == "sequential" else "simultaneous")
     assert ready.array.scan().reference_n == 7.0
 
@@ -157,7 +157,7 @@ def test_beside_a_reference_force_tiles_are_sampled_with_it(asked: str) -> None:
 @pytest.mark.parametrize("asked", ["pipelined", "per_mux"])
 def test_what_cannot_be_sampled_with_a_reference_force_is_refused(asked: str) -> None:
     with pytest.raises(SceneError, match="beside a reference sensor"):
-        started(make_scene(array={"schedule": asked, "wait_ms": 1.6}), beside=lambda: 7.0)
+        started(make_scene(array={"schedule": asked, "wait_ms": 1.6}), reference_n=lambda: 7.0)
 
 
 def test_an_array_that_reads_less_temperature_is_predicted_to_be_faster() -> None:

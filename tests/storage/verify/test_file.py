@@ -176,7 +176,7 @@ def test_bytes_behind_its_end_are_damage(tmp_path: Path) -> None:
 def test_a_file_that_another_program_wrote_anew_says_so(tmp_path: Path) -> None:
     path = walk(tmp_path / "s.parquet")
     pq.write_table(pq.read_table(path), path)
-    assert problems(path) == "it has no hashes: another program has written it anew"
+    assert problems(path) == "it has no hashes: another program has rewritten it"
 
 
 def test_a_row_group_that_is_gone_is_missed(tmp_path: Path) -> None:

@@ -178,6 +178,16 @@ def test_one_flipped_bit_anywhere_in_a_closed_segment_or_its_index_is_found(
     assert report.problems or harmless
 
 
+def test_a_column_whose_name_is_damaged_beyond_reading_is_a_problem(tmp_path: Path) -> None:
+    folder = opened(stream(tmp_path))
+    path = segment_of(folder)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"frame_status", b"\xf2rame_status", 1))
+    report = verify_stream(folder)
+    assert "its columns are not those of a stream of frames" in "; ".join(report.problems)
+    assert report.held == Intervals([(0, 39)])
+
+
 def test_a_damaged_batch_costs_itself_only_and_is_named(tmp_path: Path) -> None:
     folder = opened(stream(tmp_path))
     path = segment_of(folder)
