@@ -15,12 +15,7 @@ from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 from devices.chips.dynamixel.reader import Dynamixel, ServoIdentity, open_servo
 from devices.clock import VirtualClock
 from devices.emulation.chips.dynamixel import EmulatedServo
-from devices.errors import (
-    ServoPacketError,
-    ServoSetupError,
-    ServoStatusError,
-    ServoTimeoutError,
-)
+from devices.errors import ServoPacketError, ServoSetupError, ServoStatusError, ServoTimeoutError
 from tests.devices.chips.dynamixel.lines import SHORT_S, both_protocols, emulated
 
 # hardware.md 5.1, from the e-manual

@@ -11,10 +11,7 @@ from hypothesis import strategies as st
 from devices.chips.dynamixel.reader import open_servo
 from devices.clock import SystemClock, VirtualClock
 from devices.emulation.chips.dynamixel import EmulatedServo
-from devices.errors import (
-    ServoPacketError,
-    ServoTimeoutError,
-)
+from devices.errors import ServoPacketError, ServoTimeoutError
 from tests.devices.chips.dynamixel.lines import AMPLE_S, SHORT_S, both_protocols, emulated
 
 # The driver against an emulated servo
