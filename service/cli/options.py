@@ -50,6 +50,13 @@ def pair(text: str | None, option: str) -> tuple[float, float] | None:
     return first, second
 
 
+def data_folder(given: Path | None) -> Path:
+    """The data folder that an option names, or the user's."""
+    from platformdirs import user_data_path
+
+    return given if given is not None else user_data_path("foottile")
+
+
 def output_path(path: Path, *inputs: Path) -> Path:
     """Where to write, links resolved, after a look whether it can be, before anything takes time.
 
@@ -99,18 +106,11 @@ def print_json(value: object) -> None:
 
 
 @contextmanager
-def progress(message: str) -> Iterator[None]:
-    """Say what takes time, on a terminal only."""
-    if not stderr.is_terminal:
-        yield
-        return
-    with stderr.status(message):
-        yield
+def progress(message: str) -> Iterator[Callable[[str], None]]:
+    """Say what takes time, on a terminal only.
 
-
-@contextmanager
-def telling(message: str) -> Iterator[Callable[[str], None]]:
-    """A function that says how far it is: in one line on a terminal, else a line each on stderr."""
+    What it gives says how far it is: in the same line on a terminal, else a line each on stderr.
+    """
     if not stderr.is_terminal:
         yield remark
         return

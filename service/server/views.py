@@ -287,21 +287,16 @@ class SessionView(View):
     def of(cls, session: Session, recorder: Recorder) -> SessionView:
         """Of a session as it is now."""
         ledger = recorder.ledger_of(session)
-        frames = sum(part.recorded for part in ledger.parts)
-        lost: dict[str, int] = {}
-        for part in ledger.parts:
-            for reason, count in part.lost.items():
-                lost[reason] = lost.get(reason, 0) + count
         made = {"frames", "pending_frames", "lost", "tail_frames_max", "duration_s", "problem"}
         content = session.model_dump(include=set(cls.model_fields) - made)
         return cls(
             **content | {"complete": "lossy" if ledger.lossy else ledger.complete},
-            frames=frames,
-            pending_frames=sum(part.pending for part in ledger.parts),
-            lost=lost,
-            tail_frames_max=sum(part.unsynced_tail_max for part in ledger.parts),
+            frames=ledger.recorded,
+            pending_frames=ledger.pending,
+            lost=ledger.lost,
+            tail_frames_max=ledger.unsynced_tail_max,
             problem=recorder.problem_of(session),
-            duration_s=recorder.duration_s(session, frames),
+            duration_s=recorder.duration_s(session, ledger.recorded),
         )
 
 

@@ -159,7 +159,7 @@ def _complete(
             stream.note_losses()
     streams = _described(session, own, is_local=is_local)
     ledger = ledger_of(session.parts, states_of(session, streams), finished=True)
-    if pending := sum(part.pending for part in ledger.parts):
+    if pending := ledger.pending:
         text = f"{pending} frames may still come from node {session.node}"
         return Recovered(session, "waiting", text, ledger)
     folder = sessions.path(session.id)

@@ -26,7 +26,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
         FootTileError: the disk is full, or a journal is damaged. The journals are untouched.
     """
     session = sources.session
-    if not any(part.recorded for part in ledger.parts):
+    if not ledger.recorded:
         update = {"state": "sealed", "ledger": ledger, "problem": "not one frame was recorded"}
         return session.model_copy(update=update)
     frames = SessionFrames(sources)
@@ -49,10 +49,9 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
                 last_part, part_begin_ns = part, int(batch.t_mono_ns[0])
                 earlier_ns = duration_ns
             duration_ns = earlier_ns + int(batch.t_mono_ns[-1]) - part_begin_ns
-    recorded = sum(part.recorded for part in ledger.parts)
-    if count != recorded:
+    if count != ledger.recorded:
         raise FileFormatError(
-            f"{count} frames were sealed, the ledger has {recorded}", where=str(path)
+            f"{count} frames were sealed, the ledger has {ledger.recorded}", where=str(path)
         )
     write_events(session, folder)
     write_clock(folder / CLOCK_NAME, session.clock, sources.streams)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import secrets
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -60,6 +61,26 @@ class Ledger(_Record):
     parts: tuple[PartLedger, ...]
     missed_slots: int
     """Slots in which the node took no frame; they never had a number."""
+
+    @property
+    def recorded(self) -> int:
+        """Frames that are here."""
+        return sum(part.recorded for part in self.parts)
+
+    @property
+    def pending(self) -> int:
+        """Frames that are still to come."""
+        return sum(part.pending for part in self.parts)
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """Frames that never come, by reason."""
+        return dict(sum((Counter(part.lost) for part in self.parts), Counter()))
+
+    @property
+    def unsynced_tail_max(self) -> int:
+        """How many more frames there may have been where a part broke off."""
+        return sum(part.unsynced_tail_max for part in self.parts)
 
 
 class Event(_Record):

@@ -9,12 +9,7 @@ from devices.acquisition import Acquisition
 from devices.array.array import TileArray
 from devices.array.budget import BusTiming
 from devices.buses.i2c import I2cBus
-from devices.frames import (
-    NO_SERVO_AGE,
-    NO_SERVO_COUNTS,
-    FrameBatch,
-    FrameStatus,
-)
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, FrameBatch, FrameStatus
 from devices.scene.file import Scene
 from devices.scene.hardware import ScheduleName
 from tests.builders.scenes import make_scene

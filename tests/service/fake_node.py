@@ -172,8 +172,7 @@ class FakeNode:
 
     def greet(self, **changes: Any) -> list[tuple[int, int | None]]:
         """As `connect`, without a word about clocks."""
-        self.open()
-        self.socket.send(self.hello(**changes).model_dump_json())
+        self.open_with_hello(**changes)
         welcome = self.receive("welcome")
         self.wanted = welcome.wanted
         self.lacks = {each.boot_id: [*each.numbers] for each in welcome.lacks}
@@ -203,6 +202,10 @@ class FakeNode:
             )
         )
         return self.socket
+
+    def open_with_hello(self, **changes: Any) -> None:
+        """Connect and say hello, which may be refused."""
+        self.open().send(self.hello(**changes).model_dump_json())
 
     def receive(self, kind: str, timeout_s: float = 8.0) -> Any:
         """The next message of a kind; acknowledgements on the way are noted."""

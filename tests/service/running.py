@@ -16,6 +16,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from devices.frames import FrameBatch
 from service.api.app import make_app
 from service.api.serve import listen, serving, urls_of
 from service.link import SUBPROTOCOL
@@ -133,6 +134,10 @@ class Running:
         copy = self.data.with_name(f"copy-{uuid.uuid4().hex}")
         shutil.copytree(self.data / "journal" / name / boot_id, copy)
         return Journal.open(copy)
+
+    def held(self, boot_id: str, name: str = "bench") -> FrameBatch:
+        """All that its journal holds, in order."""
+        return FrameBatch.concatenate(list(self.journal(boot_id, name).read(0, 2**61)))
 
     def _run(self, ready: threading.Event) -> None:
         try:

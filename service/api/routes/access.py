@@ -1,11 +1,13 @@
-"""What routes share: the server they serve, and the problems they document."""
+"""What routes share: the server they serve, its files, and the problems they document."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
 
+from devices.errors import UnknownError
 from service.api.problems import MEDIA_TYPE
 from service.server.server import Server
 from service.server.views import Problem
@@ -19,6 +21,17 @@ def problems(**meanings: str) -> dict[int | str, dict[str, Any]]:
         int(status.removeprefix("_")): {"description": meaning, **_SCHEMA}
         for status, meaning in meanings.items()
     }
+
+
+def present(path: Path) -> Path:
+    """A file of a sealed session, which somebody may have taken away.
+
+    Raises:
+        UnknownError: it is not there.
+    """
+    if not path.is_file():
+        raise UnknownError(f"the file {path.name} has been taken away", where=str(path))
+    return path
 
 
 def _server(request: Request) -> Server:

@@ -9,8 +9,8 @@ from fastapi import APIRouter, Response
 from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 
-from devices.errors import StateError, UnknownError
-from service.api.routes.access import ServerState, problems
+from devices.errors import StateError
+from service.api.routes.access import ServerState, present, problems
 from storage.clock.file import CLOCK_NAME
 from storage.clock.summary import ClockSummary
 from storage.formats.export import MEDIA_TYPES
@@ -60,15 +60,10 @@ def _table(session: Session, path: Path) -> FileResponse:
             f"session {session.id} is {session.state}, and its clock table is not written yet",
             remedy="Stop it, or ask for format=json",
         )
-    if not path.is_file():
-        raise UnknownError(f"the file {path.name} has been taken away", where=str(path))
-    return FileResponse(path, media_type=_PARQUET, filename=f"{session.id}.{path.name}")
+    return FileResponse(present(path), media_type=_PARQUET, filename=f"{session.id}.{path.name}")
 
 
 def _sealed(path: Path) -> ClockSummary:
-    if not path.is_file():
-        raise UnknownError(f"the file {path.name} has been taken away", where=str(path))
-    if not path.with_name(CLOCK_NAME).is_file():
-        raise UnknownError(f"the file {CLOCK_NAME} has been taken away", where=str(path.parent))
-    with SessionReader(path) as reader:
+    present(path.with_name(CLOCK_NAME))
+    with SessionReader(present(path)) as reader:
         return clock_beside(reader).summary()

@@ -20,7 +20,7 @@ from starlette.datastructures import MutableHeaders
 from devices.errors import StateError, UnknownError, UsageError
 from devices.frames import FRAME_COLUMNS
 from service.api.problems import problem
-from service.api.routes.access import ServerState, problems
+from service.api.routes.access import ServerState, present, problems
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from service.version import SOFTWARE
@@ -134,9 +134,7 @@ async def data(
 def _stored(
     session: Session, sha256: str, request: Request, server: Server, headers: dict[str, str]
 ) -> Response:
-    path = server.recorder.folder.path(session.id) / FRAMES_NAME
-    if not path.is_file():
-        raise UnknownError(f"the file of session {session.id} has been taken away", where=str(path))
+    path = present(server.recorder.folder.path(session.id) / FRAMES_NAME)
     headers |= {
         "ETag": f'"{sha256}"',
         "Cache-Control": f"private, max-age={_YEAR_S}, immutable",
@@ -176,14 +174,13 @@ async def _made(
     if query.clock == "server":
         clocks = await run_in_threadpool(_clocks_hash, session, server)
     if session.sha256 is not None:
-        about = f"{session.sha256}|{query.canonical}|{clocks}|{SOFTWARE}|{pa.__version__}"
-        tag = hashlib.sha256(about.encode()).hexdigest()
-        headers |= {"ETag": f'"{tag}"'}
+        weak, content = "", f"{session.sha256}|{pa.__version__}"
     else:
-        frames = sum(part.recorded for part in server.recorder.ledger(session.id).parts)
-        about = f"{session.id}|{session.state}|{frames}|{query.canonical}|{clocks}|{SOFTWARE}"
-        tag = hashlib.sha256(about.encode()).hexdigest()
-        headers |= {"ETag": f'W/"{tag}"'}
+        recorded = server.recorder.ledger(session.id).recorded
+        weak, content = "W/", f"{session.id}|{session.state}|{recorded}"
+    about = f"{content}|{query.canonical}|{clocks}|{SOFTWARE}"
+    tag = hashlib.sha256(about.encode()).hexdigest()
+    headers |= {"ETag": f'{weak}"{tag}"'}
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
     if _matches(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
@@ -231,4 +228,4 @@ def _chunks_of_file(path: Path, query: DataQuery) -> Iterator[bytes]:
 
 def _matches(request: Request, tag: str) -> bool:
     given = request.headers.get("if-none-match", "")
-    return any(one.strip().removeprefix("W/") in (f'"{tag}"', "*") for one in given.split(","))
+    return any(t.strip().removeprefix("W/") in (f'"{tag}"', "*") for t in given.split(","))

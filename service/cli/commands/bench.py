@@ -12,7 +12,7 @@ from devices.errors import UsageError
 from devices.extras import needs_extra
 from devices.scene.file import load_scene
 from service.cli.emulation import check_emulated
-from service.cli.options import JsonOption, json_text, print_json, remark, say, telling
+from service.cli.options import JsonOption, json_text, print_json, progress, remark, say
 
 SCENES = ("rolling", "poppy", "mud")
 DRAWS, QUICK_DRAWS = 20, 3
@@ -111,7 +111,7 @@ def bench_command(
         repeatability=repeatability,
         correlated_ms=correlated_ms,
     )
-    with telling("starting") as tell:
+    with progress("starting") as tell:
         bench = run_bench(options, tell)
         text, png = markdown(bench), plot_bench(bench.scenes)
     content = json_text(bench.as_dict())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError
-from service.cli.options import JsonOption, print_json, remark, say, telling
+from service.cli.options import JsonOption, print_json, progress, remark, say
 
 if TYPE_CHECKING:
     from service.sessions.recover import Recovered, Recovery
@@ -45,7 +45,7 @@ def recover_command(
             f"no data folder {str(folder)!r}",
             expected="a folder with `journal` and `sessions`, of a server or a node",
         )
-    with locked(folder), telling("opening journals") as tell:
+    with locked(folder), progress("opening journals") as tell:
         recovery = recover(folder, streams=streams, give_up=give_up, tell=tell)
     if as_json:
         print_json(_as_dict(recovery))
@@ -100,9 +100,7 @@ def _outcome(found: Recovered) -> str:
     ledger = found.ledger
     if found.outcome != "sealed" or ledger is None:
         return {"waiting": "waits for its node"}.get(found.outcome, "NOT recovered")
-    recorded = sum(part.recorded for part in ledger.parts)
-    lost = sum(sum(part.lost.values()) for part in ledger.parts)
-    tail = sum(part.unsynced_tail_max for part in ledger.parts)
-    text = f"sealed and proven, {recorded} frames"
-    text += f", {lost} lost" if lost else ""
+    lost = sum(ledger.lost.values())
+    text = f"sealed and proven, {ledger.recorded} frames" + (f", {lost} lost" if lost else "")
+    tail = ledger.unsynced_tail_max
     return text + (f", at most {tail} more when it broke off" if tail else "")

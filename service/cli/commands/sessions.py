@@ -9,7 +9,16 @@ import typer
 
 from devices.errors import UsageError
 from devices.extras import needs_extra
-from service.cli.options import JsonOption, output_path, print_json, progress, remark, say, stdout
+from service.cli.options import (
+    JsonOption,
+    data_folder,
+    output_path,
+    print_json,
+    progress,
+    remark,
+    say,
+    stdout,
+)
 
 if TYPE_CHECKING:
     from storage.formats.export import Format
@@ -164,16 +173,13 @@ def _in_folder(data: Path) -> list[dict[str, Any]]:
 
 
 def _sealed_file(session: str, data: Path | None) -> Path:
-    from platformdirs import user_data_path
-
     from storage.sessions.folder import FRAMES_NAME, SessionFolder
 
     path = Path(session)
     if path.is_file():
         return path
     if not path.is_dir():
-        root = data if data is not None else user_data_path("foottile")
-        path = SessionFolder(root / "sessions").path(session)
+        path = SessionFolder(data_folder(data) / "sessions").path(session)
     if not (path / FRAMES_NAME).is_file():
         raise UsageError(
             f"no sealed session {session!r}",

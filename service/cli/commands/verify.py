@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import UsageError
-from service.cli.options import JsonOption, print_json, progress, remark, say
+from service.cli.options import JsonOption, data_folder, print_json, progress, remark, say
 
 if TYPE_CHECKING:
     from storage.sessions.folder import Ledger
     from storage.verify.data import Report, Verdict
     from storage.verify.journal import StreamReport
-    from storage.verify.segment import SegmentReport
     from storage.verify.session import SessionReport
 
 _EXIT = {"complete": 0, "lossy": 3, "pending": 3, "damaged": 1}
@@ -60,12 +59,10 @@ def verify_command(
 
 
 def _path_of(target: str, data: Path | None) -> Path:
-    from platformdirs import user_data_path
-
     path = Path(target)
     if path.exists():
         return path
-    root = data if data is not None else user_data_path("foottile")
+    root = data_folder(data)
     for place in ("sessions", "trash"):
         if "/" not in target and (root / place / target).is_dir():
             return root / place / target
@@ -76,71 +73,60 @@ def _path_of(target: str, data: Path | None) -> Path:
     )
 
 
-def _tell(report: Report) -> None:
+def _tell(report: Report, *, is_part: bool = False) -> None:
     from storage.verify.data import FolderReport
     from storage.verify.segment import SegmentReport
     from storage.verify.session import SessionReport
 
+    remarks: list[str] = []
     if isinstance(report, FolderReport):
-        for session in report.sessions:
-            _tell_session(session)
-        for stream in report.streams:
-            _tell_stream(stream)
-        for problem in report.problems:
-            say(f"  damaged: {problem}")
+        parts: list[Report] = [*report.sessions, *report.streams]
+        for part in parts:
+            _tell(part, is_part=True)
     elif isinstance(report, SessionReport):
-        _tell_session(report)
+        say(_session_line(report))
+    elif isinstance(report, SegmentReport):
+        closed = "closed" if report.is_closed else "not closed"
+        say(f"segment {report.path.name}: {report.held.count} frames, {closed}")
+        remarks = report.remarks
+    else:
+        say(_stream_line(report))
+        remarks = report.remarks
+    for problem in report.problems:
+        say(f"  damaged: {problem}")
+    for text in remarks:
+        say(f"  {text}")
+    if isinstance(report, SessionReport) and not is_part:
         for what in report.unproven:
             remark(f"not proven: {what}")
-    elif isinstance(report, SegmentReport):
-        _tell_segment(report)
-    else:
-        _tell_stream(report)
 
 
-def _tell_session(report: SessionReport) -> None:
+def _session_line(report: SessionReport) -> str:
     from storage.verify.data import verdict_of
 
     verdict: Verdict = verdict_of(report)
     said = "in the trash" if report.in_trash and verdict != "damaged" else verdict
     name = f" ({report.name})" if report.name else ""
-    say(f"session {report.id or report.path.name}{name}: {said}, {_counts(report.ledger)}")
-    for problem in report.problems:
-        say(f"  damaged: {problem}")
+    return f"session {report.id or report.path.name}{name}: {said}, {_counts(report.ledger)}"
 
 
 def _counts(ledger: Ledger | None) -> str:
     if ledger is None:
         return "nothing can be said of its frames"
-    counts = {"recorded": sum(part.recorded for part in ledger.parts)}
-    for part in ledger.parts:
-        for reason, lost in part.lost.items():
-            counts[f"lost ({reason})"] = counts.get(f"lost ({reason})", 0) + lost
-    counts["pending"] = sum(part.pending for part in ledger.parts)
-    text = ", ".join(f"{n} {what}" for what, n in counts.items() if n or what == "recorded")
-    tail = sum(part.unsynced_tail_max for part in ledger.parts)
+    counts = {f"lost ({reason})": count for reason, count in ledger.lost.items()}
+    counts["pending"] = ledger.pending
+    text = f"{ledger.recorded} recorded"
+    text += "".join(f", {count} {what}" for what, count in counts.items() if count)
+    tail = ledger.unsynced_tail_max
     text += f", and at most {tail} more when it broke off" if tail else ""
     return text + (f", {ledger.missed_slots} slots missed" if ledger.missed_slots else "")
 
 
-def _tell_stream(report: StreamReport) -> None:
+def _stream_line(report: StreamReport) -> str:
     lost = sum(numbers.count for numbers in report.lost.by_reason.values())
-    say(
+    return (
         f"journal {report.node}/{report.boot_id}: {report.held.count} frames in "
         f"{report.segments} segments"
         + (f", {lost} lost" if lost else "")
         + (f", {report.missing.count} not here" if report.missing else "")
     )
-    for problem in report.problems:
-        say(f"  damaged: {problem}")
-    for text in report.remarks:
-        say(f"  {text}")
-
-
-def _tell_segment(report: SegmentReport) -> None:
-    closed = "closed" if report.is_closed else "not closed"
-    say(f"segment {report.path.name}: {report.held.count} frames, {closed}")
-    for problem in report.problems:
-        say(f"  damaged: {problem}")
-    for text in report.remarks:
-        say(f"  {text}")

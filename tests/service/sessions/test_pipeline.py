@@ -1,14 +1,10 @@
-"""A recording that comes in pieces: which tare it gets, and that every frame comes out once.
-
-Chips are such that a count is 130/1023 kPa and a newton; unloaded they read 500 counts.
-"""
+"""Estimates of a recording, piece by piece: one for every frame, whatever the pieces."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,85 +13,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import CalibrationError, TareError, UsageError
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus, TileStatus
+from devices.frames import FrameBatch, TileStatus
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
 from service.estimation.plan import make_plan
 from service.estimation.tare.tare import Tare
 from service.sessions import pipeline
-from service.sessions.pipeline import EstimateOptions, EstimateStream, estimate_columns, notes_of
+from service.sessions.pipeline import EstimateStream, estimate_columns, notes_of
 from storage.schema import ESTIMATES
-from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, make_array
-from tests.builders.calibrations import make_calibration, newton_tile
-from tests.builders.frames import loaded_frames
-
-Piece = tuple[FrameBatch, dict[str, np.ndarray]]
-
-
-def array(rate_hz: float = 500.0) -> ArrayInfo:
-    return make_array(nominal_rate_hz=rate_hz)
-
-
-def calibration(*serials: str, **changes: Any) -> Calibration:
-    entry = {
-        "coefficients": (0.0, 1.0, 0.001, 0.0),
-        "covariance": ((1e-4, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-9)),
-        "relative_misfit": 0.01,
-    }
-    return make_calibration(*(newton_tile(s, **entry | changes) for s in serials or ("T01", "T02")))
-
-
-def options(**changes: Any) -> EstimateOptions:
-    chosen: dict[str, Any] = {
-        "calibration": calibration(),
-        "models": ("unwrap", "static"),
-        "lag_ms": 10.0,
-    }
-    return EstimateOptions(**chosen | changes)
-
-
-def frames(
-    forces_n: np.ndarray, *, lead: int = 0, period_ns: int = PERIOD_NS, **columns: Any
-) -> FrameBatch:
-    status = np.where(np.arange(len(forces_n)) < lead, FrameStatus.LEAD, 0)
-    return loaded_frames(forces_n, period_ns=period_ns, frame_status=status, **columns)
-
-
-def hopping(n: int, *, loaded_from: int, seed: int = 0) -> np.ndarray:
-    """Noise, and from frame `loaded_from` on hops of 30 ms, for two tiles."""
-    rng = np.random.default_rng(seed)
-    at = np.arange(n)
-    load = np.where((at >= loaded_from) & (at // 15 % 2 == 1), 20.0, 0.0)
-    return load[:, None] + rng.normal(0.0, 1.0, (n, 2))
-
-
-def cut(batch: FrameBatch, cuts: Sequence[int]) -> list[Piece]:
-    """The batch in pieces, each with an extra column that tells its frames apart."""
-    edges = [0, *sorted(set(cuts) & set(range(1, len(batch)))), len(batch)]
-    return [
-        (batch.rows(a, b), {"true_grf_n": 1000.0 + np.arange(a, b)}) for a, b in pairwise(edges)
-    ]
-
-
-def run(
-    pieces: Sequence[Piece], info: ArrayInfo | None = None, **changes: Any
-) -> tuple[EstimateStream, FrameBatch, dict[str, np.ndarray]]:
-    stream = EstimateStream(info or array(), options(**changes))
-    out = list(stream.run(pieces))
-    for batch, columns in out:
-        assert {len(values) for values in columns.values()} == {len(batch)}
-    columns = {name: np.concatenate([c[name] for _, c in out]) for name in out[0][1]}
-    return stream, FrameBatch.concatenate([batch for batch, _ in out]), columns
-
-
-def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
-    assert list(one) == list(other)
-    for name, values in one.items():
-        assert values.tobytes() == other[name].tobytes(), name
-
-
-# --- every frame once -----------------------------------------------------------------------------
+from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA
+from tests.service.sessions.pieces import (
+    Piece,
+    array,
+    calibration,
+    cut,
+    frames,
+    hopping,
+    options,
+    run,
+    same,
+)
 
 
 @settings(max_examples=40, deadline=None)
@@ -153,9 +91,6 @@ def test_all_columns_of_the_schema_are_there_in_its_order_and_double_precision()
     assert {columns[c.name].dtype for c in ESTIMATES[:-2]} == {np.dtype(np.float64)}
     assert columns["contact"].dtype == np.uint8
     assert columns["estimate_status"].dtype == np.uint16
-
-
-# --- the tare -------------------------------------------------------------------------------------
 
 
 def test_the_lead_is_taken_to_its_end_even_over_many_pieces() -> None:
@@ -242,9 +177,6 @@ def test_an_interval_after_the_end_is_refused() -> None:
         run([(frames(np.zeros((100, 2))), {})], tare_s=(10.0, 11.0))
 
 
-# --- refused before the first frame ---------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -275,9 +207,6 @@ def test_the_plan_is_there_with_the_first_estimates() -> None:
     assert stream.plan is None
     next(stream.run([(frames(hopping(100, loaded_from=50), lead=50), {})]))
     assert stream.plan is not None
-
-
-# --- notes ----------------------------------------------------------------------------------------
 
 
 def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
@@ -365,138 +294,3 @@ def test_faults_in_the_lead_leave_the_rest_of_it_as_tare() -> None:
     assert stream.plan is not None
     assert stream.plan.tare.baseline_kpa == pytest.approx([UNLOADED_KPA] * 2, abs=0.1)
     assert np.isnan(columns["grf_n"]).sum() == 30
-
-
-# --- tares that were taken while it ran -----------------------------------------------------------
-
-
-def taken_at(t_ns: int, counts: float) -> Tare:
-    """A tare that was taken at `t_ns`, with the baseline so many counts above 500."""
-    return Tare(
-        baseline_kpa=np.full(2, UNLOADED_KPA + counts * COUNT_KPA),
-        baseline_sigma_kpa=np.full(2, 0.001),
-        noise_kpa=np.full(2, COUNT_KPA),
-        tadc_counts=np.full(2, 480.0),
-        t_ns=10**18 + t_ns,
-        begin_s=0.0,
-        end_s=0.25,
-        frames=125,
-        source="unloaded",
-    )
-
-
-def baselines(batch: FrameBatch, columns: dict[str, np.ndarray]) -> list[int]:
-    """Counts above 500 of the baseline with which each frame was estimated."""
-    counts = 500 - batch.padc.astype(np.float64)
-    return [round(c) for c in (counts - columns["gauge_kpa"] / COUNT_KPA)[:, 0].tolist()]
-
-
-@settings(max_examples=20, deadline=None)
-@given(
-    instants=st.lists(st.integers(-10, 130), min_size=1, max_size=4).map(sorted),
-    between=st.integers(0, 1),
-    cuts=st.sets(st.integers(1, 119), max_size=12),
-    lag_ms=st.sampled_from([0.0, 10.0, 5000.0]),
-)
-def test_a_tare_is_in_force_from_the_frame_after_its_instant_whatever_the_pieces(
-    instants: list[int], between: int, cuts: Sequence[int], lag_ms: float
-) -> None:
-    # Instants in frames of 2 ms, exactly at one or a nanosecond before.
-    batch = frames(hopping(120, loaded_from=30))
-    tares = tuple(
-        taken_at(2_000_000 * at - between, 3.0 * number) for number, at in enumerate(instants)
-    )
-    stream, out, columns = run(cut(batch, cuts), lag_ms=lag_ms, tares=tares)
-    assert out.seq.tolist() == list(range(120))
-    assert columns["true_grf_n"].tolist() == [1000.0 + i for i in range(120)]
-    expected = []
-    for t_ns in batch.t_ns:
-        in_force = [number for number, tare in enumerate(tares) if tare.t_ns < t_ns]
-        expected.append(3 * (in_force[-1] if in_force else 0))  # before all of them, the first
-    assert baselines(out, columns) == expected
-    assert stream.plan is not None
-    assert stream.plan.tare is tares[0]
-    _, _, whole = run(cut(batch, []), lag_ms=lag_ms, tares=tares)
-    same(columns, whole)
-
-
-def test_tares_that_were_taken_win_over_a_lead_and_need_no_wait() -> None:
-    batch = frames(hopping(300, loaded_from=100), lead=100)
-    stream = EstimateStream(array(), options(lag_ms=0.0, tares=(taken_at(0, 7.0),)))
-    first, columns = next(stream.run(cut(batch, range(1, 300))))
-    assert len(first) == 1
-    assert baselines(first, columns) == [7]
-
-
-def test_a_tare_after_the_last_frame_changes_nothing() -> None:
-    batch = frames(hopping(120, loaded_from=30))
-    one, later = taken_at(0, 0.0), taken_at(2_000_000 * 119, 5.0)
-    _, _, columns = run(cut(batch, [50]), tares=(one,))
-    _, _, again = run(cut(batch, [50]), tares=(one, later))
-    same(columns, again)
-
-
-def test_all_tares_are_in_the_notes_and_none_if_none_were_taken() -> None:
-    tares = (taken_at(0, 0.0), taken_at(10**8, 5.0))
-    stream, _, _ = run([(frames(hopping(99, loaded_from=50)), {})], tares=tares)
-    assert stream.plan is not None
-    notes = json.loads(json.dumps(notes_of(stream.plan, tares), allow_nan=False))
-    assert [kept["t_ns"] for kept in notes["tares"]] == [tare.t_ns for tare in tares]
-    assert notes["tare"] == notes["tares"][0]
-    assert "tares" not in notes_of(stream.plan)
-
-
-# --- parts ----------------------------------------------------------------------------------------
-
-
-def later_part(batch: FrameBatch, after_ns: int) -> FrameBatch:
-    """The node was switched on anew: its clock and numbers begin again, UTC goes on."""
-    return replace(batch, t_ns=batch.t_ns + after_ns)
-
-
-@settings(max_examples=20, deadline=None)
-@given(
-    cuts=st.tuples(
-        st.sets(st.integers(1, 59), max_size=8), st.sets(st.integers(1, 89), max_size=8)
-    ),
-    tared=st.booleans(),
-    second_at=st.integers(-10, 200),
-    lag_ms=st.sampled_from([0.0, 10.0, 100.0]),
-)
-def test_a_recording_that_goes_on_after_a_restart_has_one_estimate_a_frame(
-    cuts: tuple[set[int], set[int]], tared: bool, second_at: int, lag_ms: float
-) -> None:
-    first = frames(hopping(60, loaded_from=30), lead=25)
-    second = later_part(frames(hopping(90, loaded_from=5, seed=1)), 10**9)
-    tares = (taken_at(0, 1.0), taken_at(2_000_000 * second_at + 800_000_000, 4.0)) if tared else ()
-
-    def parts(*where: set[int]) -> list[Piece]:
-        return [
-            piece
-            for part, at in zip((first, second), where, strict=True)
-            for piece in cut(part, [*at])
-        ]
-
-    stream, out, columns = run(parts(*cuts), lag_ms=lag_ms, tares=tares)
-    assert out.seq.tolist() == [*range(60), *range(90)]
-    assert out.t_ns.tolist() == [*first.t_ns.tolist(), *second.t_ns.tolist()]
-    assert {len(values) for values in columns.values()} == {150}
-    assert columns["true_grf_n"].tolist() == [*range(1000, 1060), *range(1000, 1090)]
-    _, _, whole = run(parts(set(), set()), lag_ms=lag_ms, tares=tares)
-    same(columns, whole)
-    assert stream.plan is not None
-    if not tared:
-        counts = 500 - out.padc.astype(np.float64)
-        gauge = counts - (stream.plan.tare.baseline_kpa - UNLOADED_KPA) / COUNT_KPA
-        np.testing.assert_allclose(columns["gauge_kpa"] / COUNT_KPA, gauge, atol=1e-9)
-
-
-def test_what_comes_after_a_restart_knows_nothing_of_what_was_before() -> None:
-    # The first part ends in contact; the second is estimated as if it were all there is.
-    first = frames(np.full((60, 2), 30.0))
-    second = later_part(frames(hopping(90, loaded_from=200)), 10**9)
-    tares = (taken_at(0, 0.0),)
-    _, _, both = run([*cut(first, []), *cut(second, [40])], tares=tares)
-    _, _, alone = run(cut(second, []), tares=tares)
-    assert both["contact"][59] == 1
-    same({name: values[60:] for name, values in both.items()}, alone)

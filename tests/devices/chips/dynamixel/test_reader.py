@@ -14,12 +14,7 @@ from devices.chips.dynamixel.protocol1 import PROTOCOL_1, Error
 from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 from devices.chips.dynamixel.reader import Dynamixel, ServoIdentity, open_servo
 from devices.clock import VirtualClock
-from devices.errors import (
-    ServoPacketError,
-    ServoSetupError,
-    ServoStatusError,
-    ServoTimeoutError,
-)
+from devices.errors import ServoPacketError, ServoSetupError, ServoStatusError, ServoTimeoutError
 from tests.builders.servo import FaultyServo
 from tests.devices.chips.dynamixel.lines import SHORT_S, both_protocols, emulated
 

@@ -10,10 +10,7 @@ from hypothesis import strategies as st
 
 from devices.chips.dynamixel.reader import open_servo
 from devices.clock import SystemClock, VirtualClock
-from devices.errors import (
-    ServoPacketError,
-    ServoTimeoutError,
-)
+from devices.errors import ServoPacketError, ServoTimeoutError
 from tests.builders.servo import FaultyServo
 from tests.devices.chips.dynamixel.lines import AMPLE_S, SHORT_S, both_protocols, emulated
 

@@ -1,0 +1,14 @@
+"""Nodes of tests try again soon."""
+
+from __future__ import annotations
+
+import pytest
+
+import service.node.back_off
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Try again soon."""
+    monkeypatch.setattr(service.node.back_off, "BACK_OFF_S", (0.05, 0.1))
+    monkeypatch.setattr(service.node.back_off, "REFUSED_BACK_OFF_S", (0.05, 0.1))

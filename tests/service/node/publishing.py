@@ -1,0 +1,111 @@
+"""A publisher that runs while a block of a test does, and its checks."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from service.link import (
+    EarlierStream,
+    Hello,
+    Status,
+    Wanted,
+)
+from service.node.publisher import Publisher
+from service.node.sending import Source
+from storage.intervals import Intervals
+from storage.journal.node_stream import NodeStream
+from storage.journal.stream_notes import StreamNotes
+from storage.wire import EncodedBatch
+from tests.service.fake_node import FakeNode
+from tests.service.running import Running
+
+
+class Publishing:
+    """A publisher that runs while a test's block does, with a fake node as its source of frames."""
+
+    def __init__(
+        self,
+        node: FakeNode,
+        server: str,
+        token: str | None = None,
+        earlier: Sequence[NodeStream] = (),
+    ) -> None:
+        self.node = node
+        self.stream = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
+        self.earlier = tuple(earlier)
+        self.reports: list[str] = []
+        self.wanted: list[tuple[str, Wanted, tuple[str, ...]]] = []
+        self.behind: list[int] = []
+        self.damaged: list[Intervals] = []
+        self.publisher = Publisher(
+            server,
+            Source(
+                present=lambda: self.stream,
+                streams=lambda: {s.boot_id: s for s in (*self.earlier, self.stream)},
+                hello=self._hello,
+                status=self._status,
+                wanted=lambda *said: self.wanted.append(said),
+                damaged=lambda stream, numbers: self.damaged.append(numbers),
+            ),
+            token=token,
+            report=self.reports.append,
+        )
+
+    async def __aenter__(self) -> Publishing:
+        self._before = asyncio.all_tasks()
+        self._task = asyncio.create_task(self.publisher.run())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        assert not self._task.done(), self._task
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+        await self.until(lambda: asyncio.all_tasks() <= self._before)
+
+    def take(self, n: int) -> None:
+        for batch in batches(self.node, n):
+            self.stream.put(batch, 0)
+        self.publisher.notify()
+
+    async def until(self, condition: Callable[[], object], timeout_s: float = 5.0) -> None:
+        end_s = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < end_s, (self.reports, self.stream.acked)
+            await asyncio.sleep(0.005)
+
+    async def emptied(self) -> None:
+        await self.until(lambda: self.stream.acked.count == self.stream.next_seq)
+
+    def _hello(self) -> Hello:
+        hello: Hello = self.node.hello(
+            held=tuple(self.stream.held),
+            next_seq=self.stream.next_seq,
+            lost=self.stream.lost.as_pairs(),
+            earlier=tuple(
+                EarlierStream(array_info=s.info, held=tuple(s.held), next_seq=s.next_seq)
+                for s in self.earlier
+            ),
+        )
+        return hello
+
+    def _status(self, behind: int) -> Status:
+        self.behind.append(behind)
+        return Status(missed_slots=0, backlog_frames=behind)
+
+
+def batches(node: FakeNode, n: int) -> list[EncodedBatch]:
+    frames = node.frames(n)
+    return [
+        EncodedBatch.of(rows, node.payload(rows))
+        for rows in (frames.rows(begin, begin + 10) for begin in range(0, n, 10))
+    ]
+
+
+def assert_all_arrived(running: Running, node: FakeNode) -> None:
+    found = np.concatenate([b.seq for b in running.journal(node.boot_id).read(0, 2**61)])
+    np.testing.assert_array_equal(found, np.arange(node.seq))

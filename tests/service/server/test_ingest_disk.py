@@ -1,0 +1,245 @@
+"""A server whose disk is full or failing acknowledges nothing that is not on it, and asks again."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from typing import Any
+
+import pytest
+
+import service.server
+import service.server.ingest
+import service.server.nodes
+import service.server.streams
+import storage.journal.segment
+from storage.intervals import Intervals
+from storage.journal.journal import Journal
+from tests.builders.frames import assert_same_bits
+from tests.service.fake_node import FakeNode
+from tests.service.running import Running, closed
+from tests.waiting import until
+
+
+def gated_sync(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Have the first sync wait: an event that says that it was asked for, and one that lets it."""
+    asked, may_sync = threading.Event(), threading.Event()
+    sync = Journal.sync
+
+    def gated(journal: Journal) -> None:
+        asked.set()
+        assert may_sync.wait(20.0)
+        sync(journal)
+
+    monkeypatch.setattr(Journal, "sync", gated)
+    return asked, may_sync
+
+
+def test_nothing_is_acknowledged_before_it_is_synced(
+    node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, may_sync = gated_sync(monkeypatch)
+    try:
+        node.connect()
+        node.send(100)
+        assert asked.wait(5.0)
+        node.socket.send('{"type":"probe","id":7}')
+        assert node.receive("probe").id == 7
+        assert not node.acked
+    finally:
+        may_sync.set()
+    node.acknowledged(99)
+
+
+def test_frames_that_come_during_a_sync_wait_for_the_next_one(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, may_sync = gated_sync(monkeypatch)
+    try:
+        node.connect()
+        node.send(10)
+        assert asked.wait(5.0)
+        node.send(10)
+        until(lambda: running.node()["last_seq"] == 19)
+    finally:
+        may_sync.set()
+    first = node.receive("ack")
+    assert (first.seq_first, first.seq_last) == (0, 9)
+    node.acknowledged(19)
+
+
+def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_all = storage.journal.segment.write_all
+    check_storage = running.server.check_storage
+    full = threading.Event()
+
+    def refusing(file: Any, data: bytes) -> None:
+        if full.is_set():
+            raise OSError(28, "No space left on device")
+        write_all(file, data)
+
+    def check() -> None:
+        if full.is_set():
+            from devices.errors import StorageError
+
+            raise StorageError("No space left on device")
+        check_storage()
+
+    monkeypatch.setattr(storage.journal.segment, "write_all", refusing)
+    monkeypatch.setattr(running.server, "check_storage", check)
+    node.connect()
+    node.tared()
+    node.acknowledged(69)
+    with running.socket("/api/v1/live?rate_hz=60") as live:
+        full.set()
+        lost = node.send(30, 20.0)
+        until(lambda: running.node()["storage_problem"])
+        assert "No space left" in running.node()["storage_problem"]
+        shown = -1
+        while shown < 90:  # all but those that wait for their look-ahead
+            message = json.loads(live.recv(timeout=5.0))
+            shown = message["seq"] if message["type"] == "frame" else shown
+        assert message["force_n"] == pytest.approx([20.0, 20.0], abs=0.5)
+        node.socket.send('{"type":"probe","id":1}')
+        node.receive("probe")
+        assert node.acked == Intervals([(0, 69)])
+        assert running.journal(node.boot_id).held == Intervals([(0, 69)])
+    full.clear()
+    assert closed(node.socket)[0] == 1012
+    until(lambda: not running.node()["connected"])
+    assert node.connect() == [(70, None)]
+    node.send_again(lost)
+    node.deliver(10, 20.0)
+    assert running.node()["storage_problem"] is None
+    assert_same_bits(running.held(node.boot_id), node.all_sent())
+
+
+def test_one_message_that_a_full_disk_did_not_take_is_asked_for_again(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Space is there again before the server's next tick has seen that there was none.
+    write_all = storage.journal.segment.write_all
+    node.connect()
+    node.deliver(10)
+    lost = node.frames(10)
+    refused = node.payload(lost)
+
+    def refusing(file: Any, data: bytes) -> None:
+        if data == refused:
+            raise OSError(28, "No space left on device")
+        write_all(file, data)
+
+    monkeypatch.setattr(service.server.server, "TICK_S", 0.5)
+    node.send(10)
+    node.acknowledged(29, first=20)  # the next tick is half a second away
+    monkeypatch.setattr(storage.journal.segment, "write_all", refusing)
+    node.send_again(lost)
+    node.send(10)
+    until(lambda: running.node()["last_seq"] == 39)
+    monkeypatch.setattr(storage.journal.segment, "write_all", write_all)
+    assert closed(node.socket)[0] == 1012
+    assert node.connect() == [(10, 19), (40, None)]
+
+
+def test_a_disk_that_refuses_to_sync_acknowledges_nothing(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from devices.errors import StorageError
+
+    sync = Journal.sync
+    broken = threading.Event()
+
+    def refusing(journal: Journal) -> None:
+        if broken.is_set():
+            broken.clear()
+            raise StorageError("Input/output error")
+        sync(journal)
+
+    monkeypatch.setattr(Journal, "sync", refusing)
+    node.connect()
+    broken.set()
+    node.send(20)
+    assert closed(node.socket)[0] == 1012
+    assert not node.acked
+    # Whatever it is asked for now, in the end everything has to be acknowledged.
+    for first, last in node.connect():
+        if last is None:
+            node.send_again(node.all_sent().rows(first, 20)) if first < 20 else None
+    node.deliver(10)
+    assert_same_bits(running.held(node.boot_id), node.all_sent())
+
+
+def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from devices.errors import StorageError
+
+    node.connect()
+    node.deliver(10)
+    node.leave()
+    node.reboot()
+    node.tiles += 1
+    full = threading.Event()
+    full.set()
+    keep = service.server.nodes.Node.keep
+
+    def refusing(kept: service.server.nodes.Node) -> None:
+        if full.is_set():
+            raise StorageError("No space left on device")
+        keep(kept)
+
+    monkeypatch.setattr(service.server.nodes.Node, "keep", refusing)
+    node.connect()
+    shown = running.node()
+    assert len(shown["tiles"]) == node.tiles
+    calibration = node.hello().calibration
+    assert calibration is not None
+    assert shown["calibration"]["id"] == calibration.id
+    full.clear()
+
+
+def test_what_could_not_be_synced_is_sent_again(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node.connect()
+    node.deliver(10)
+    broken = threading.Event()
+    broken.set()
+    fsync = os.fsync
+
+    def failing(descriptor: int) -> None:
+        if broken.is_set() and "arrows" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            broken.clear()
+            raise OSError(5, "Input/output error")
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", failing)
+    lost = node.send(10)
+    assert closed(node.socket)[0] == 1012
+    assert node.connect() == [(10, None)]
+    node.send_again(lost)
+    node.acknowledged(19)
+    running.restart()
+    assert_same_bits(running.held(node.boot_id), node.all_sent())
+
+
+def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from devices.errors import StorageError
+
+    def refuse(*_: object) -> None:
+        raise StorageError("No space left on device")
+
+    monkeypatch.setattr(service.server.streams, "Journal", refuse)  # not even a folder
+    monkeypatch.setattr(running.server, "check_storage", refuse)
+    node.connect()
+    node.send(10)
+    until(lambda: running.node()["storage_problem"] is not None)
+    monkeypatch.setattr(service.server.streams, "Journal", Journal)
+    monkeypatch.setattr(running.server, "check_storage", lambda: None)
+    assert closed(node.socket)[0] == 1012
+    assert node.connect() == [(0, None)]

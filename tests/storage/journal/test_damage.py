@@ -1,0 +1,258 @@
+"""A journal that was cut off or damaged: every whole batch is kept, and never another frame."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import DamagedFramesError, FileFormatError, StorageError
+from storage.intervals import Intervals
+from storage.journal.journal import Journal
+from storage.schema import wire_schema
+from storage.wire import encode
+from tests.builders.arrays import make_array
+from tests.builders.frames import assert_same_bits
+from tests.storage.journal.journals import (
+    HEADER,
+    OPENED,
+    SCHEMA,
+    assert_holds,
+    begun,
+    filled,
+    members,
+    part,
+    reopened,
+    segments,
+    stream,
+)
+
+
+def test_a_cut_anywhere_keeps_every_whole_message_before_it(tmp_path: Path) -> None:
+    whole = tmp_path / "whole"
+    filled(whole, (0, 9), (10, 10), (11, 12)).close()
+    (path,) = segments(whole)
+    content = path.read_bytes()
+    header = len(SCHEMA.serialize().to_pybytes())
+    edges, held = [header], [0, 10, 11, 13]
+    for first, last in ((0, 9), (10, 10), (11, 12)):
+        edges.append(edges[-1] + len(encode(part(first, last), SCHEMA)))
+    assert edges[-1] == len(content)
+    cuts = [*range(0, header, 97), *range(edges[1] - 9, len(content) + 1)]
+    for cut in cuts:
+        folder = tmp_path / f"cut-{cut}"
+        folder.mkdir()
+        (folder / path.name).write_bytes(content[:cut])
+        journal = begun(folder)
+        kept = set(range(held[sum(cut >= edge for edge in edges[1:])]))
+        assert members(journal.held) == kept, cut
+        if cut % 13 == 0 or cut in edges:  # it can be appended to, and read again
+            assert_holds(journal, kept)
+            journal.append(part(5, 19))
+            assert_holds(journal, kept | set(range(5, 20)))
+            journal.close()
+            assert_holds(reopened(folder), kept | set(range(5, 20)))
+
+
+def test_a_cut_in_the_first_message_leaves_an_empty_journal_that_can_be_appended_to(
+    tmp_path: Path,
+) -> None:
+    filled(tmp_path, (0, 9)).close()
+    (path,) = segments(tmp_path)
+    content = path.read_bytes()
+    for cut in (0, 1, 7, 8, 100, len(SCHEMA.serialize().to_pybytes()), len(content) - 1):
+        path.write_bytes(content[:cut])
+        journal = begun(tmp_path)
+        assert_holds(journal, set())
+        journal.append(part(0, 9))
+        journal.close()
+        assert segments(tmp_path) == [path]
+        assert path.read_bytes() == content
+
+
+def test_a_segment_that_was_cut_is_a_stream_for_arrow_again(tmp_path: Path) -> None:
+    filled(tmp_path, (0, 9), (10, 19)).close()
+    (path,) = segments(tmp_path)
+    path.write_bytes(path.read_bytes()[:-3])
+    assert_holds(begun(tmp_path), set(range(10)))
+    assert pa.ipc.open_stream(path.read_bytes()).read_all().num_rows == 10
+
+
+@settings(max_examples=80, deadline=None)
+@given(tail=st.binary(min_size=1, max_size=300), framed=st.booleans())
+def test_garbage_behind_whole_messages_is_cut_off(
+    tmp_path_factory: pytest.TempPathFactory, tail: bytes, framed: bool
+) -> None:
+    folder = tmp_path_factory.mktemp("garbage")
+    filled(folder, (0, 9)).close()
+    (path,) = segments(folder)
+    content = path.read_bytes()
+    # Framed: it begins as messages do, and the length of its metadata is garbage too.
+    path.write_bytes(content + (b"\xff\xff\xff\xff" if framed else b"") + tail)
+    journal = reopened(folder)
+    assert_holds(journal, set(range(10)))
+    assert path.read_bytes() == content
+    journal.append(part(10, 19))
+    assert_holds(journal, set(range(20)))
+
+
+def test_a_tail_of_another_array_is_cut_off(tmp_path: Path) -> None:
+    filled(tmp_path, (0, 9)).close()
+    (path,) = segments(tmp_path)
+    with path.open("ab") as file:
+        file.write(encode(stream(5, 3), wire_schema(make_array(3))))
+    assert_holds(reopened(tmp_path), set(range(10)))
+
+
+def test_a_file_that_is_no_segment_at_all_does_not_hide_the_others(tmp_path: Path) -> None:
+    filled(tmp_path, (0, 9)).close()
+    for name, content in (("00.arrows", b""), ("01.arrows", b"\0" * 500), ("99.arrows", b"PAR1")):
+        (tmp_path / name).write_bytes(content)
+    assert_holds(reopened(tmp_path), set(range(10)))
+    assert len(segments(tmp_path)) == 1
+
+
+def test_a_batch_that_was_damaged_since_is_refused_when_it_is_read(tmp_path: Path) -> None:
+    journal = filled(tmp_path, (0, 9), (10, 19))
+    journal.sync()
+    (path,) = segments(tmp_path)
+    content = bytearray(path.read_bytes())
+    second = len(content) - len(encode(part(10, 19), SCHEMA))
+    content[second : second + 8] = bytes(8)
+    path.write_bytes(content)
+    reading = journal.read(0, 19)
+    assert_same_bits(next(reading), part(0, 9))
+    with pytest.raises(FileFormatError):
+        next(reading)
+
+
+def index_of(path: Path) -> Path:
+    return path.with_suffix(".idx")
+
+
+def crashed(folder: Path, *parts: tuple[int, int]) -> Path:
+    """The only segment of a journal that was never closed."""
+    journal = begun(folder)
+    for first, last in parts:
+        journal.append(part(first, last))
+    copy = folder.with_name(folder.name + "-crashed")
+    shutil.copytree(folder, copy)
+    (path,) = segments(copy)
+    return path
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_a_flipped_bit_is_found_wherever_it_is_and_costs_its_own_batch_only(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = crashed(tmp_path_factory.mktemp("flip") / "j", (0, 9), (10, 19), (20, 29))
+    content = bytearray(path.read_bytes())
+    at = data.draw(st.integers(HEADER, len(content) - 1))
+    content[at] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(content)
+    length = len(encode(part(0, 9), SCHEMA))
+    hit = (at - HEADER) // length
+    journal = reopened(path.parent)
+    gone = set(range(10 * hit, 10 * hit + 10))
+    assert_holds(journal, set(range(30)) - gone)
+    # What stood at the end of a file that was not closed may never have been on the disk.
+    named = members(journal.lost.by_reason.get("corrupt", Intervals()))
+    assert named == (gone if hit < 2 else set())
+    journal.append(part(0, 29))
+    assert_holds(journal, set(range(30)))
+    assert not journal.lost
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_a_flipped_bit_in_the_index_costs_nothing_or_one_batch_and_never_gives_wrong_frames(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = crashed(tmp_path_factory.mktemp("flip") / "j", (0, 9), (10, 19), (20, 29))
+    index = bytearray(index_of(path).read_bytes())
+    at = data.draw(st.integers(0, len(index) - 1))
+    index[at] ^= 1 << data.draw(st.integers(0, 7))
+    index_of(path).write_bytes(index)
+    journal = reopened(path.parent)
+    held = members(journal.held)
+    assert len(held) >= 20
+    assert_holds(journal, held)
+
+
+def test_a_segment_that_was_closed_is_not_read_through_but_its_frames_are_checked_when_read(
+    tmp_path: Path,
+) -> None:
+    filled(tmp_path, (0, 9), (10, 19), (20, 29)).close()
+    (path,) = segments(tmp_path)
+    content = bytearray(path.read_bytes())
+    content[HEADER + len(encode(part(0, 9), SCHEMA)) + 200] ^= 8
+    path.write_bytes(content)
+    journal = reopened(tmp_path)
+    assert members(journal.held) == set(range(30))
+    with pytest.raises(DamagedFramesError, match="frames 10 to 19") as caught:
+        list(journal.read(0, 29))
+    assert (caught.value.seq_first, caught.value.seq_last) == (10, 19)
+    journal.disown(Intervals([(10, 19)]))
+    assert_holds(journal, {*range(10), *range(20, 30)})
+    # A copy that comes later is the one that counts, after a restart, too.
+    journal.append(part(10, 19))
+    journal.close()
+    assert_holds(reopened(tmp_path), set(range(30)))
+
+
+def test_a_truncation_exactly_at_a_batch_is_seen_by_the_index(tmp_path: Path) -> None:
+    filled(tmp_path, (0, 9), (10, 19), (20, 29)).close()
+    (path,) = segments(tmp_path)
+    os.truncate(path, HEADER + 2 * len(encode(part(0, 9), SCHEMA)))
+    journal = reopened(tmp_path)
+    assert_holds(journal, set(range(20)))
+    assert members(journal.lost.by_reason["corrupt"]) == set(range(20, 30))
+
+
+@pytest.mark.parametrize("kept", [0, 1, 47, 48, 95, 96, 100])
+def test_what_is_not_in_the_index_was_never_promised_and_is_set_aside(
+    tmp_path: Path, kept: int
+) -> None:
+    path = crashed(tmp_path / "j", (0, 9), (10, 19), (20, 29))
+    os.truncate(index_of(path), kept)
+    journal = reopened(path.parent) if kept >= 48 else None
+    if journal is None:
+        journal = Journal(path.parent, make_array())
+        OPENED.append(journal)
+    assert_holds(journal, set(range(10 * (kept // 48))))
+    assert path.with_suffix(".unread").exists()
+
+
+def test_an_index_that_is_missing_is_made_anew(tmp_path: Path) -> None:
+    filled(tmp_path, (0, 9), (10, 19)).close()
+    (path,) = segments(tmp_path)
+    before = index_of(path).read_bytes()
+    index_of(path).unlink()
+    assert_holds(reopened(tmp_path), set(range(20)))
+    assert index_of(path).read_bytes() == before
+
+
+@pytest.mark.parametrize("empty", [16, 400, 4096])
+def test_pages_that_a_power_cut_left_empty_are_no_frames(tmp_path: Path, empty: int) -> None:
+    """The length of a file may be on the disk before its bytes are: zeros that Arrow reads well."""
+    path = crashed(tmp_path / "j", (0, 9), (10, 19), (20, 29))
+    content = path.read_bytes()
+    path.write_bytes(content[:-empty] + bytes(empty))
+    journal = Journal(path.parent, make_array())
+    OPENED.append(journal)
+    kept = {16: 20, 400: 20, 4096: 0}[empty]
+    assert_holds(journal, set(range(kept)))
+
+
+def test_a_segment_that_is_gone_is_an_error_that_names_it(tmp_path: Path) -> None:
+    journal = filled(tmp_path, (0, 9))
+    (path,) = segments(tmp_path)
+    path.unlink()
+    with pytest.raises(StorageError, match=path.name):
+        list(journal.read(0, 9))

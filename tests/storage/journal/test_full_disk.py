@@ -1,0 +1,158 @@
+"""A journal whose disk is full, slow or failing."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+from devices.errors import StorageError
+from storage.journal import segment as segment_module
+from storage.wire import encode
+from tests.storage.faulty_disk import disk_with_room_for
+from tests.storage.journal.journals import (
+    HEADER,
+    LONG,
+    SCHEMA,
+    assert_holds,
+    begun,
+    filled,
+    members,
+    part,
+    reopened,
+    segments,
+)
+
+
+@pytest.mark.parametrize("short", [1, 500, 2000])
+def test_a_full_disk_holds_nothing_of_the_batch_and_goes_on_when_there_is_room(
+    tmp_path: Path, short: int
+) -> None:
+    journal = filled(tmp_path, (0, 9))
+    (path,) = segments(tmp_path)
+    needed = len(encode(part(10, 39), SCHEMA))
+    # In the segment that is written, then in the new ones that are tried.
+    for begin in (path.stat().st_size, HEADER, HEADER):
+        with pytest.raises(StorageError) as caught, disk_with_room_for(begin + needed - short):
+            journal.append(part(10, 39))
+        assert str(tmp_path) in str(caught.value)
+        assert_holds(journal, set(range(10)))
+    journal.append(part(10, 39))
+    journal.append(part(40, 49))
+    assert_holds(journal, set(range(50)))
+    journal.close()
+    assert_holds(reopened(tmp_path), set(range(50)))
+    for segment in segments(tmp_path):
+        assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows > 0
+
+
+@pytest.mark.parametrize("room", [0, 100, HEADER - 1, HEADER, HEADER + 500])
+def test_a_disk_that_is_full_from_the_beginning_leaves_nothing_that_is_in_the_way(
+    tmp_path: Path, room: int
+) -> None:
+    journal = begun(tmp_path)
+    for _ in range(2):
+        with pytest.raises(StorageError), disk_with_room_for(room):
+            journal.append(part(0, 59))
+        assert_holds(journal, set())
+    journal.append(part(0, 59))
+    assert_holds(journal, set(range(60)))
+    journal.close()
+    assert_holds(reopened(tmp_path), set(range(60)))
+
+
+def test_a_disk_that_neither_takes_nor_gives_back_leaves_all_whole_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A write that stops halfway and cannot be taken back: the next begins another segment."""
+    journal = filled(tmp_path, (0, 9))
+    whole = segment_module.write_all
+
+    def halfway(file: Any, data: bytes) -> None:
+        whole(file, data[: len(data) // 2])
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(segment_module, "write_all", halfway)
+        with pytest.raises(StorageError, match="No space left"):
+            journal.append(part(10, 19))
+    assert_holds(journal, set(range(10)))
+    journal.append(part(10, 19))
+    journal.append(part(20, 29))
+    assert_holds(journal, set(range(30)))
+    assert len(segments(tmp_path)) == 2
+    journal.close()
+    assert_holds(reopened(tmp_path), set(range(30)))
+
+
+@pytest.mark.parametrize("written", [0, 1, 2])
+def test_a_disk_that_fills_between_the_gaps_of_a_batch_holds_what_was_written_and_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    """A batch that fills three gaps is three writes."""
+    journal, held = filled(tmp_path, (5, 9), (15, 19)), {*range(5, 10), *range(15, 20)}
+    whole, writes = segment_module.write_all, 0
+
+    def full(file: Any, data: bytes) -> None:
+        nonlocal writes
+        writes += 1
+        if writes > 3 * written:  # of each gap a header, a batch and a record
+            raise OSError(28, "No space left on device")
+        whole(file, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(segment_module, "write_all", full)
+        with pytest.raises(StorageError):
+            journal.append(part(0, 29))
+    assert_holds(journal, held | set(range(10 * written)))
+    assert members(journal.append(part(0, 29))) == set(range(30)) - held - set(range(10 * written))
+    journal.close()
+    assert_holds(reopened(tmp_path), set(range(30)))
+
+
+def test_appending_never_waits_for_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[int] = []
+    real = os.fsync
+
+    def count(descriptor: int) -> None:
+        synced.append(descriptor)
+        real(descriptor)
+
+    journal = begun(tmp_path / "stream")
+    monkeypatch.setattr("os.fsync", count)
+    for first in range(0, 200, 20):
+        journal.append(LONG.rows(first, first + 20))
+    assert synced == []
+    assert len(segments(tmp_path / "stream")) == 10
+    journal.sync()
+    assert len(synced) == 3 * 9 + 2 + 1  # each segment and its index, closed but one; the folder
+    journal.sync()
+    assert len(synced) == 3 * 9 + 2 + 1
+
+
+def test_a_disk_that_does_not_sync_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(descriptor: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    journal = filled(tmp_path, (0, 9))
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", refuse)
+        with pytest.raises(StorageError, match="Input/output error"):
+            journal.sync()
+        with pytest.raises(StorageError, match="Input/output error"):
+            journal.close()
+    journal.append(part(10, 19))
+    assert_holds(journal, set(range(20)))
+
+
+def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StorageError):
+        begun(tmp_path / "file" / "journal")

@@ -1,0 +1,64 @@
+"""Session files to be read, changed and refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from devices.errors import FileFormatError
+from devices.frames import (
+    FrameBatch,
+)
+from storage.sessions.file import SessionReader, SessionWriter
+from tests.builders.arrays import PERIOD_NS, make_array
+from tests.builders.frames import make_frames
+
+
+def frames(rows: int, tiles: int = 2, *, seed: int = 0, period_ns: int = PERIOD_NS) -> FrameBatch:
+    rng = np.random.default_rng(seed)
+    shape = (rows, tiles)
+    return make_frames(
+        rows,
+        tiles,
+        period_ns=period_ns,
+        padc=rng.integers(250, 420, shape),
+        tadc=rng.integers(470, 490, shape),
+        sample_offset_us=rng.integers(-100, 3000, shape),
+        servo_counts=rng.integers(-5000, 5000, rows),
+        servo_age_us=rng.integers(0, 20000, rows),
+        status=rng.integers(0, 64, shape),
+        frame_status=rng.integers(0, 32, rows),
+        reference_force_n=rng.normal(0, 30, rows),
+    )
+
+
+def write(
+    path: Path, batch: FrameBatch, notes: dict[str, object] | None = None, **extra: np.ndarray
+) -> Path:
+    with SessionWriter(path, make_array(batch.tile_count), notes or {}) as writer:
+        writer.append(batch, extra)
+    return path
+
+
+def read(path: Path) -> FrameBatch:
+    with SessionReader(path) as session:
+        return session.frames()
+
+
+def rewritten(path: Path, table: pa.Table, **metadata: bytes | None) -> Path:
+    """The table as a Parquet file with these metadata changed; None takes an entry out."""
+    said = {f"foottile.{key}".encode(): value for key, value in metadata.items()}
+    merged = {**table.schema.metadata, **said}
+    kept = {key: value for key, value in merged.items() if value is not None}
+    pq.write_table(table.replace_schema_metadata(kept), path)
+    return path
+
+
+def refused(path: Path, match: str | None = None) -> None:
+    with pytest.raises(FileFormatError, match=match) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
