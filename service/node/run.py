@@ -111,10 +111,8 @@ class RunningNode:
             journal,
             name=options.record,
             calibration=options.calibration,
-            notes={
-                "scene": options.rig.scene.model_dump(mode="json"),
-                "emulated": options.rig.emulated,
-            },
+            scene_content=options.rig.scene.model_dump(mode="json"),
+            emulated=options.rig.emulated,
             report=report,
         )
         self._health = Health()
