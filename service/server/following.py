@@ -7,18 +7,16 @@ does every stream that it took meanwhile and brings home. Where a part ends is d
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime
 
-from devices.frames import ArrayInfo
 from service.server.nodes import Node
 from service.server_clock import utc_ns
+from service.sessions.begin import taken_up
 from service.sessions.ends import at_end, at_stop, broken_off, ended
 from service.sessions.streams import SessionStream
 from storage.clock.offset import ClockOffset
 from storage.intervals import NO_END, Intervals
-from storage.sessions.folder import Part, Session, new_session_id
+from storage.sessions.folder import Part, Session
 from storage.sessions.states import numbers_of
 
 _UNHEARD_S = 1.0
@@ -125,47 +123,23 @@ def _step(session: Session, node: Node) -> list[Session]:
     following = next(iter(_following(session, node)), None)
     if following is None:
         return []
+    begun = session.stopped_t_ns is None or _has_begun(session, node, following)
+    if begun is None:
+        return []
     closed, stream = at_end(session, streams, utc_ns()), streams[boot_id]
-    if session.stopped_t_ns is not None:
-        begun = _has_begun(session.stopped_t_ns, session, node, following)
-        if begun is None:
-            return []
-        if not begun:
-            wanted = numbers_of(closed.parts).get(boot_id, Intervals())
-            return [] if (stream.may_come - stream.held) & wanted else [closed]
+    if not begun:
+        wanted = numbers_of(closed.parts).get(boot_id, Intervals())
+        return [] if (stream.may_come - stream.held) & wanted else [closed]
     info = node.streams[following].info
     if stream.info is None or stream.info.has_same_tiles_as(info):
         part = Part(boot_id=following, seq_first=0)
         return [closed.model_copy(update={"parts": (*closed.parts, part)})]
-    update: dict[str, object] = {"problem": "the node came back with other tiles: recording ended"}
-    if closed.state == "recording":
-        begin_t_ns = _begin_t_ns(session, node, following)
-        update |= {"state": "pending", "stopped_t_ns": begin_t_ns}
-    return [closed.model_copy(update=update), _continued(session, node, info)]
-
-
-def _continued(session: Session, node: Node, info: ArrayInfo) -> Session:
-    """The session that takes up a recording whose node came back with other tiles."""
-    name, number = session.name, 2
-    if match := re.fullmatch(r"(.*) \((\d+)\)", name):
-        name, number = match[1], int(match[2]) + 1
+    begin_t_ns = _begin_t_ns(session, node, following)
+    scene_content = node.hello.scene if info.scene == node.info.scene else {}
     calibration = node.hello.calibration
-    return Session(
-        id=new_session_id(datetime.now(UTC)),
-        name=f"{name} ({number})",
-        node=session.node,
-        state=session.state,
-        started_t_ns=_begin_t_ns(session, node, info.boot_id),
-        stopped_t_ns=session.stopped_t_ns,
-        parts=(Part(boot_id=info.boot_id, seq_first=0),),
-        subject=session.subject,
-        notes=session.notes,
-        tags=session.tags,
-        scene=info.scene,
-        scene_content=node.hello.scene if info.scene == node.info.scene else {},
-        calibration=calibration.model_dump(mode="json") if calibration is not None else None,
-        continues=session.id,
-    )
+    return [
+        *taken_up(closed, info, begin_t_ns, scene_content=scene_content, calibration=calibration)
+    ]
 
 
 def _following(session: Session, node: Node) -> Iterable[str]:
@@ -174,15 +148,14 @@ def _following(session: Session, node: Node) -> Iterable[str]:
     if boot_id in order:
         return order[order.index(boot_id) + 1 :]
     # The node does not remember it: what began after its last frame came after it.
-    stream = node.streams.get(boot_id)
-    newest = stream.journal.t_ns_near(NO_END, newest=True) if stream and stream.journal else None
-    known = {part.boot_id for part in session.parts}
-    later = []
-    for name in order:
+    newest = streams_of(session, node)[boot_id].t_ns_near(NO_END, newest=True)
+
+    def is_later(name: str) -> bool:
         begin = node.streams[name].t_ns_first
-        if name == node.boot_id or (newest is not None and begin is not None and begin > newest):
-            later.append(name)
-    return tuple(name for name in later if name not in known)
+        return newest is not None and begin is not None and begin > newest
+
+    known = {part.boot_id for part in session.parts}
+    return [n for n in order if n not in known and (n == node.boot_id or is_later(n))]
 
 
 def _offset_ns(session: Session, node: Node | None, boot_id: str) -> int | None:
@@ -203,13 +176,14 @@ def _begin_t_ns(session: Session, node: Node, boot_id: str) -> int:
     return utc_ns() if begin_t_ns is None or offset_ns is None else begin_t_ns + offset_ns
 
 
-def _has_begun(stop_t_ns: int, session: Session, node: Node, boot_id: str) -> bool | None:
+def _has_begun(session: Session, node: Node, boot_id: str) -> bool | None:
     """Had a stream begun when the session was stopped? None: not known yet.
 
     The instant that an earlier stream's oldest frame has is its own word; of the present one only
     frames tell, or that it cannot be so old.
     """
     stream, rate_hz = node.streams[boot_id], node.streams[boot_id].info.nominal_rate_hz
+    stop_t_ns = session.stopped_t_ns or utc_ns()
     offset_ns = _offset_ns(session, node, boot_id)
     if boot_id != node.boot_id:
         known = offset_ns is not None and stream.t_ns_first is not None
