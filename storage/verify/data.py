@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from devices.errors import FileFormatError
 from storage.journal.segment import SUFFIX
-from storage.journal.segment_index import INDEX_SUFFIX
+from storage.journal.segment_format import INDEX_SUFFIX
 from storage.journal.stream_notes import NOTES_FILE
 from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME

@@ -11,7 +11,7 @@ from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
 from storage.intervals import Intervals
 from storage.journal.segment import SUFFIX, UNREAD_SUFFIX
-from storage.journal.segment_index import INDEX_SUFFIX, RECORD
+from storage.journal.segment_format import INDEX_SUFFIX, RECORD
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.sessions.claims import bytes_of
@@ -74,7 +74,7 @@ class StreamReport:
         last = self.held.last
         if self.notes is not None and self.notes.next_seq is not None:
             last = max(self.notes.next_seq - 1, -1 if last is None else last)
-        first = next(iter(self.held), (0, 0))[0]
+        first = self.held.first or 0
         if last is None or last < first:
             return Intervals()
         return self.held.missing(first, last) - self.lost.all
