@@ -1,8 +1,8 @@
 """Which dome for which load: the paper's Table I, Boyle's law, and what follows from them.
 
 The paper gives the range of one dome only, 25 to 35 N for 11 mm of Vytaflex 60 (III-A). For the
-others there is a scaling, marked as an estimate, and nothing else: nobody has published their
-curves. PAPER is Ruppert and Badri-Sproewitz 2020, [D] a derivation in hardware.md 9.
+others there is a scaling, marked as an estimate, and nothing else: their curves are not
+published. PAPER is Ruppert and Badri-Sproewitz 2020, [D] a derivation in hardware.md 9.
 """
 
 from __future__ import annotations
