@@ -55,11 +55,6 @@ class MuxRouter:
         """Muxes that did not let themselves be closed. They are taken to be without supply, which
         connects nothing; to read a tile of another mux, make sure of that."""
 
-    @property
-    def addresses(self) -> tuple[int, ...]:
-        """Addresses of the multiplexers, ascending."""
-        return tuple(self._muxes)
-
     def connect(self, masks: Mapping[int, int]) -> None:
         """Connect exactly the channels of `masks` (address to mask); all other muxes are closed.
 
