@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from service.server.nodes import Node
+from service.server.node import ServerNode
 from service.server_clock import utc_ns
 from service.sessions.begin import taken_up
 from service.sessions.ends import at_end, at_stop, broken_off, ended
@@ -24,7 +24,7 @@ _SLOWEST = 1.5
 """A stream is surely no more than so many times as old as its frames make it."""
 
 
-def streams_of(session: Session, node: Node | None) -> dict[str, SessionStream]:
+def streams_of(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
     """What is known of a session's streams, by boot_id."""
     found = {}
     for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
@@ -37,7 +37,7 @@ def streams_of(session: Session, node: Node | None) -> dict[str, SessionStream]:
     return found
 
 
-def first_part(node: Node, last_seq: int, last_t_ns: int, pre_roll_s: float) -> Part:
+def first_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_s: float) -> Part:
     """The part of a session that starts now, or earlier if a journal reaches back so far.
 
     What the node still has and is to send counts as if it were here.
@@ -56,7 +56,7 @@ def first_part(node: Node, last_seq: int, last_t_ns: int, pre_roll_s: float) -> 
     return Part(boot_id=node.boot_id, seq_first=seq_first)
 
 
-def stopped(session: Session, node: Node | None) -> Session:
+def stopped(session: Session, node: ServerNode | None) -> Session:
     """The session, stopped at this instant; its end is open until the stream has passed it."""
     update: dict[str, object] = {"stopped_t_ns": utc_ns(), "state": "pending", "problem": None}
     if node is not None and node.connected:
@@ -68,7 +68,7 @@ def stopped(session: Session, node: Node | None) -> Session:
     return ended(session, session.parts[-1], node.last_seq)
 
 
-def followed(session: Session, node: Node) -> list[Session]:
+def followed(session: Session, node: ServerNode) -> list[Session]:
     """The session as far as its node's streams are known to go by now.
 
     Returns:
@@ -83,13 +83,13 @@ def followed(session: Session, node: Node) -> list[Session]:
     return found
 
 
-def given_up(session: Session, node: Node | None) -> Session:
+def given_up(session: Session, node: ServerNode | None) -> Session:
     """The session without what has not come: an open end is closed at what is here."""
     closed = broken_off(session, streams_of(session, node), utc_ns())
     return closed.model_copy(update={"given_up": True})
 
 
-def parts_needed(session: Session, node: Node | None) -> Iterator[Part]:
+def parts_needed(session: Session, node: ServerNode | None) -> Iterator[Part]:
     """Parts of streams that a session, not sealed yet, needs in the journals."""
     yield from session.parts
     if session.parts[-1].seq_last is None and node is not None:
@@ -98,7 +98,7 @@ def parts_needed(session: Session, node: Node | None) -> Iterator[Part]:
             yield Part(boot_id=boot_id, seq_first=0)
 
 
-def clock_at_start(node: Node, part: Part) -> tuple[ClockOffset, ...]:
+def clock_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
     """Measurements of a node's clock from the beginning of a part on, and the last before it."""
     begin_t_ns = (
         journal.t_ns_near(part.seq_first, newest=False) if (journal := node.journal) else None
@@ -111,7 +111,7 @@ def clock_at_start(node: Node, part: Part) -> tuple[ClockOffset, ...]:
     return tuple(rows[before[-1] if before else 0 :])
 
 
-def _step(session: Session, node: Node) -> list[Session]:
+def _step(session: Session, node: ServerNode) -> list[Session]:
     """The session with its open part ended, and what follows; nothing if that is not known yet."""
     boot_id = session.parts[-1].boot_id
     streams = streams_of(session, node)
@@ -142,7 +142,7 @@ def _step(session: Session, node: Node) -> list[Session]:
     ]
 
 
-def _following(session: Session, node: Node) -> Iterable[str]:
+def _following(session: Session, node: ServerNode) -> Iterable[str]:
     """Streams that began after that of the session's open part, oldest first."""
     boot_id, order = session.parts[-1].boot_id, node.order
     if boot_id in order:
@@ -158,7 +158,7 @@ def _following(session: Session, node: Node) -> Iterable[str]:
     return [n for n in order if n not in known and (n == node.boot_id or is_later(n))]
 
 
-def _offset_ns(session: Session, node: Node | None, boot_id: str) -> int | None:
+def _offset_ns(session: Session, node: ServerNode | None, boot_id: str) -> int | None:
     """What to add to a stream's instants for the server's UTC; None if it was never measured."""
     stream = node.streams.get(boot_id) if node is not None else None
     if stream is not None and stream.clock is not None:
@@ -170,13 +170,13 @@ def _offset_ns(session: Session, node: Node | None, boot_id: str) -> int | None:
     return node.clock.server_minus_node_ns if node is not None and node.clock is not None else None
 
 
-def _begin_t_ns(session: Session, node: Node, boot_id: str) -> int:
+def _begin_t_ns(session: Session, node: ServerNode, boot_id: str) -> int:
     """When a stream began, server's UTC; now, if that is not known."""
     begin_t_ns, offset_ns = node.streams[boot_id].t_ns_first, _offset_ns(session, node, boot_id)
     return utc_ns() if begin_t_ns is None or offset_ns is None else begin_t_ns + offset_ns
 
 
-def _has_begun(session: Session, node: Node, boot_id: str) -> bool | None:
+def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
     """Had a stream begun when the session was stopped? None: not known yet.
 
     The instant that an earlier stream's oldest frame has is its own word; of the present one only

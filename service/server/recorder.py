@@ -24,7 +24,8 @@ from devices.errors import (
 )
 from service.link import ClockRow, StreamNumbers, Wanted
 from service.server import following
-from service.server.nodes import Node, Nodes
+from service.server.node import ServerNode
+from service.server.nodes import ServerNodes
 from service.server.trash import Trash
 from service.server_clock import utc_ns
 from service.sessions.begin import begun
@@ -62,10 +63,10 @@ class Recorder:
         self,
         folder: SessionFolder,
         trash: Trash,
-        nodes: Nodes,
+        nodes: ServerNodes,
         *,
         changed: Callable[[Session], None],
-        ask_again: Callable[[Node], None],
+        ask_again: Callable[[ServerNode], None],
     ) -> None:
         self.folder = folder
         self.trash = trash
@@ -254,7 +255,7 @@ class Recorder:
         self._changed(self._sessions[session_id])
         return self._sessions[session_id]
 
-    def follow(self, node: Node) -> None:
+    def follow(self, node: ServerNode) -> None:
         """The node has said which streams it took: its sessions go on in them.
 
         If its tiles are others now, a session of its own takes up a recording: a file describes
@@ -270,7 +271,7 @@ class Recorder:
                 except DamagedFramesError as error:
                     self._disown(session, error)
 
-    def note_clock(self, node: Node, row: ClockRow) -> None:
+    def note_clock(self, node: ServerNode, row: ClockRow) -> None:
         """Keep a new measurement of a node's clock, with its sessions too.
 
         It is in the stream's log; theirs are written down with the next change.

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from service.link import PROTOCOL, Hello
 from service.node.recording import NodeRecording
 from service.server import following
-from service.server.nodes import Node, Nodes
+from service.server.node import ServerNode
+from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
 from service.server.trash import Trash
 from service.sessions.recover import recover
@@ -229,9 +230,9 @@ def test_a_server_and_recovery_in_its_folder_come_to_the_same_session(
         assert (made.calibration is None) == (made.problem is not None)
 
 
-def server_on(data: Path, begun: Session) -> tuple[Recorder, Node]:
+def server_on(data: Path, begun: Session) -> tuple[Recorder, ServerNode]:
     """A server that was started on this folder, whose node has not connected since."""
-    nodes = Nodes(data)
+    nodes = ServerNodes(data)
     hello = Hello(
         protocol=PROTOCOL,
         array_info=make_array(boot_id=PRESENT),
