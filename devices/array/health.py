@@ -72,7 +72,7 @@ class TileHealth:
     # Presence
 
     def lose(self, now_ns: int) -> None:
-        """It does not answer, or gives what cannot be; it is looked for ever more rarely."""
+        """It does not answer, or gives what cannot be; it is looked for less and less often."""
         if self.present:
             self.doubt(now_ns)
         else:

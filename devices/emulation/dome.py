@@ -107,7 +107,7 @@ class Domes:
         return low + (position - index) * (high - low)
 
     def foresee(self, t_s: float) -> None:
-        """Have the pressures up to `t_s` ready, so that nobody who samples has to wait for them."""
+        """Have the pressures up to `t_s` ready, so that no sample has to wait for them."""
         if int(t_s / GRID_S) + 1 >= self._next:
             self._extend(int(t_s / GRID_S) + 1)
 

@@ -244,7 +244,7 @@ def _cop_masked(plan: EstimationPlan, foot: Foot) -> Bools:
 def _unseen(frames: FrameBatch, state: EstimationState) -> Bools:
     """Frames before which the foot was not seen for so long that it may have been anywhere.
 
-    A frame lost here and there is no reason to begin anew, or a link that loses every third would
+    A frame lost here and there is no reason to start over, or a link that loses every third would
     never see a contact last.
     """
     last_t_ns = frames.t_mono_ns[0] if state.last_seq is None else state.last_t_ns

@@ -13,7 +13,6 @@ import time
 import uuid
 from collections.abc import Callable
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 
 from devices.errors import (
@@ -25,16 +24,18 @@ from devices.errors import (
 )
 from service.link import ClockRow, StreamNumbers, Wanted
 from service.server import following
-from service.server.nodes import Node, Nodes
+from service.server.node import ServerNode
+from service.server.nodes import ServerNodes
 from service.server.trash import Trash
 from service.server_clock import utc_ns
+from service.sessions.begin import begun
 from service.sessions.ends import at_stop
 from service.sessions.sealing import seal
 from service.sessions.sources import Sources, sources_of
 from service.sessions.streams import SessionStream
 from storage.intervals import NO_END, Intervals, with_open_ends
 from storage.sessions.events import write_events
-from storage.sessions.folder import Event, Ledger, Session, SessionFolder, new_session_id
+from storage.sessions.folder import Event, Ledger, Session, SessionFolder
 from storage.sessions.ledger import ledger_of
 from storage.sessions.states import numbers_of, states_of
 
@@ -62,28 +63,25 @@ class Recorder:
         self,
         folder: SessionFolder,
         trash: Trash,
-        nodes: Nodes,
+        nodes: ServerNodes,
         *,
         changed: Callable[[Session], None],
-        ask_again: Callable[[Node], None],
+        ask_again: Callable[[ServerNode], None],
     ) -> None:
         self.folder = folder
         self.trash = trash
         self._nodes = nodes
         self._changed = changed
         self._ask_again = ask_again
-        self._sessions: dict[str, Session] = {}
         self._sealing: dict[str, asyncio.Task[None]] = {}
         self._again_after: dict[str, float] = {}
         self._not_sealed: dict[str, str] = {}
-        self._unreadable = trash.has_unreadable
-        """Is there a session of which nobody knows what it needs? Then nothing is given up."""
-        for session_id in folder.ids():
-            try:
-                self._sessions[session_id] = self._with_clock(folder.load(session_id))
-            except FootTileError as error:
-                log.warning("session %s is left out: %s", session_id, error)
-                self._unreadable = True
+        found, unreadable = folder.load_all()
+        for session_id, error in unreadable.items():
+            log.warning("session %s is left out: %s", session_id, error)
+        self._unreadable = bool(unreadable) or trash.has_unreadable
+        """Is it unknown what some session needs? Then nothing is given up."""
+        self._sessions = {session.id: self._with_clock(session) for session in found}
 
     def all(self) -> list[Session]:
         """All sessions, newest first."""
@@ -135,22 +133,16 @@ class Recorder:
                 f"node {node_name!r} is {behind_s:.1f} s behind: its link is too slow",
                 remedy="Record when it has caught up",
             )
-        calibration = node.live.calibration
         part = following.first_part(node, node.last_seq, node.last_t_ns, pre_roll_s)
-        now = datetime.now(UTC)
-        session = Session(
-            id=new_session_id(now),
-            name=name,
-            node=node_name,
-            state="recording",
-            started_t_ns=utc_ns(),
-            parts=(part,),
+        session = begun(
+            node.info,
+            name,
+            part,
+            scene_content=node.hello.scene,
+            calibration=node.live.calibration,
             subject=subject,
             notes=notes,
             tags=tags,
-            scene=node.info.scene,
-            scene_content=node.hello.scene,
-            calibration=calibration.model_dump(mode="json") if calibration is not None else None,
             missed_slots_at_start=node.present.missed_slots,
             clock=following.clock_at_start(node, part),
         )
@@ -263,7 +255,7 @@ class Recorder:
         self._changed(self._sessions[session_id])
         return self._sessions[session_id]
 
-    def follow(self, node: Node) -> None:
+    def follow(self, node: ServerNode) -> None:
         """The node has said which streams it took: its sessions go on in them.
 
         If its tiles are others now, a session of its own takes up a recording: a file describes
@@ -279,7 +271,7 @@ class Recorder:
                 except DamagedFramesError as error:
                     self._disown(session, error)
 
-    def note_clock(self, node: Node, row: ClockRow) -> None:
+    def note_clock(self, node: ServerNode, row: ClockRow) -> None:
         """Keep a new measurement of a node's clock, with its sessions too.
 
         It is in the stream's log; theirs are written down with the next change.

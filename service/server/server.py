@@ -13,7 +13,8 @@ from pathlib import Path
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
 from service.server.live import Hub
-from service.server.nodes import Node, Nodes
+from service.server.node import ServerNode
+from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
 from service.server.streams import ServerStream
 from service.server.trash import Trash, destroy
@@ -37,7 +38,7 @@ _SERVER_ID = re.compile(r"[0-9a-f]{32}")
 class Link:
     """One node's connection, as far as others may use it."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: ServerNode) -> None:
         self.node = node
         self.stream: ServerStream = node.present
         """Whose frames come."""
@@ -96,7 +97,7 @@ class Server:
             self.id = _id_of(data)
             """Name of this data folder: a node keeps what this server needs, whoever else asks."""
             self.hub = Hub()
-            self.nodes = Nodes(data)
+            self.nodes = ServerNodes(data)
             self.recorder = Recorder(
                 SessionFolder(data / "sessions"),
                 Trash(data / "trash"),
@@ -166,7 +167,7 @@ class Server:
         """Tell every screen that a session is in the trash."""
         self.hub.notice({"type": "deleted", "session_id": session_id})
 
-    def tell_node(self, node: Node) -> None:
+    def tell_node(self, node: ServerNode) -> None:
         """Tell every screen how a node is."""
         view = NodeView.of(node, self.recorder).model_dump(mode="json")
         self.hub.notice({"type": "node", "node": view})
@@ -177,7 +178,7 @@ class Server:
             if link.wanted is not None and self.recorder.wanted(link.node.name) != link.wanted:
                 link.news.set()
 
-    def _ask_again(self, node: Node) -> None:
+    def _ask_again(self, node: ServerNode) -> None:
         link = self.links.get(node.name)
         if link is not None:
             link.end(Close.RESTART, "frames are damaged here; send what the server lacks")
@@ -210,7 +211,7 @@ class Server:
             if session.state in ("recording", "pending", "sealing"):
                 self._tell_session(session)
 
-    async def _sync(self, node: Node) -> None:
+    async def _sync(self, node: ServerNode) -> None:
         """Have a node's journals on disk, then acknowledge what was in them before."""
         if node.storage_problem is not None:  # perhaps not even a journal could be begun
             await self._try_again(node)
@@ -218,7 +219,7 @@ class Server:
         streams = [stream for stream in node.streams.values() if stream.has_news]
         await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
 
-    async def _sync_stream(self, node: Node, stream: ServerStream) -> None:
+    async def _sync_stream(self, node: ServerNode, stream: ServerStream) -> None:
         unsynced, stream.unsynced = stream.unsynced, Intervals()
         owed, stream.owed = stream.owed, Intervals()
         try:
@@ -235,7 +236,7 @@ class Server:
         if link is not None and owed:
             link.acknowledge(stream.boot_id, owed)
 
-    async def _try_again(self, node: Node) -> None:
+    async def _try_again(self, node: ServerNode) -> None:
         """After a full disk: once it can be written again, have the node send what is missing."""
         try:
             await asyncio.to_thread(self.check_storage)

@@ -117,10 +117,10 @@ class Hopping(Ground):
             hopping.rise(place, self._angle)
         self._end_s = hopping.motion.t_s + _AIR_S
         self.recorded = hopping.recorded
-        self._time_s = np.array(self.recorded.t_s)
-        self._ankle_m = np.array(self.recorded.ankle_m)
-        self._stress_pa = np.array(self.recorded.stress_pa)
-        self._rest_n = np.array(self.recorded.rest_n)
+        self._time_s = np.array([step.t_s for step in self.recorded])
+        self._ankle_m = np.array([step.ankle_m for step in self.recorded])
+        self._stress_pa = np.array([step.stress_pa for step in self.recorded])
+        self._rest_n = np.array([step.rest_n for step in self.recorded])
 
     def _turn(self, begin_s: float, duration_s: float, to_rad: float) -> None:
         from_rad = self._angle(begin_s)

@@ -120,7 +120,7 @@ def strokes(*recordings: Indentation) -> Strokes:
     """Block averages of every slow stroke of a tile, in one file or several.
 
     Each file has its own baseline and its own zero of the reference. A file in which the tile is
-    only held or tapped has no stroke, and is none the worse for it beside others.
+    only held or tapped has no stroke, which is fine as long as another file has.
 
     Raises:
         CalibrationError: as for `unloaded`, or there is no slow stroke in any of them.

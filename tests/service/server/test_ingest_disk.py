@@ -11,7 +11,7 @@ import pytest
 
 import service.server
 import service.server.ingest
-import service.server.nodes
+import service.server.node
 import service.server.streams
 import storage.journal.segment
 from storage.intervals import Intervals
@@ -184,14 +184,14 @@ def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
     node.tiles += 1
     full = threading.Event()
     full.set()
-    keep = service.server.nodes.Node.keep
+    keep = service.server.node.ServerNode.keep
 
-    def refusing(kept: service.server.nodes.Node) -> None:
+    def refusing(kept: service.server.node.ServerNode) -> None:
         if full.is_set():
             raise StorageError("No space left on device")
         keep(kept)
 
-    monkeypatch.setattr(service.server.nodes.Node, "keep", refusing)
+    monkeypatch.setattr(service.server.node.ServerNode, "keep", refusing)
     node.connect()
     shown = running.node()
     assert len(shown["tiles"]) == node.tiles

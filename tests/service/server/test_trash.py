@@ -362,7 +362,7 @@ def test_what_killed_processes_left_half_written_is_removed_at_the_start(
 def test_frames_of_an_unsealed_session_are_never_pruned(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.server.nodes.RING_NS", 0)
+    monkeypatch.setattr("service.server.node.RING_NS", 0)
     pending(tared)
     node = running.server.nodes.get("bench")
     running.call(lambda: node.prune(running.server.recorder.needed("bench")))
