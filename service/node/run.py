@@ -23,9 +23,13 @@ from storage.journal.node_stream import NodeStream
 from storage.journal.wanted import ServerWants
 
 _LOOK_S = 0.02
+"""Between two looks whether the server has everything."""
 _DRAIN_S = 3.0
+"""A node that is stopped waits no longer for the server."""
 _AWAY_LOOKS = 50
+"""Without a link for a second it does not wait at all."""
 _TROUBLES_S = 0.5
+"""Between two looks at the disk's troubles."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -78,6 +79,23 @@ class StreamReport:
         if last is None or last < first:
             return Intervals()
         return self.held.missing(first, last) - self.lost.all
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has it (docs/formats.md)."""
+        lost = self.lost.by_reason.items()
+        return {
+            "node": self.node,
+            "boot_id": self.boot_id,
+            "segments": self.segments,
+            "frames": self.held.count,
+            "held": list(self.held),
+            "lost": {reason: numbers.count for reason, numbers in lost if numbers},
+            "missing": self.missing.count,
+            "unsynced": self.unsynced.count,
+            "next_seq": self.notes.next_seq if self.notes is not None else None,
+            "unsynced_tail_max": self.notes.unsynced_tail_max if self.notes is not None else 0,
+            "problems": self.problems,
+        }
 
 
 def verify_stream(folder: Path) -> StreamReport:

@@ -3,7 +3,7 @@
 A thread answers at `port` whatever opens it: `devices.chips.dynamixel.reader`, or ROBOTIS's own
 SDK. A pseudo-terminal has no wire, so the time on the wire and the return delay pass on the
 injected clock: with a `SystemClock` an answer takes as long as a servo's, with a `VirtualClock` it
-takes as long in virtual time, while whoever asked is blocked. What it answers is its firmware's
+takes as long in virtual time, while the reader is blocked. What it answers is its firmware's
 matter (`devices.emulation.chips.dynamixel_firmware`). Sources: hardware.md 5.1 and 5.2.
 """
 
@@ -77,7 +77,7 @@ class EmulatedServo:
         tty.setraw(self._slave)
         self.port = os.ttyname(self._slave)
         """What to open: the path of the pseudo-terminal."""
-        # A servo does not wait for a listener; what nobody reads is lost.
+        # A servo does not wait for a listener; what is not read is lost.
         os.set_blocking(self._line, False)
         self._wake, wake_writer = os.pipe()
         # A daemon only so that a forgotten `close` does not keep the interpreter from ending.

@@ -27,7 +27,7 @@ from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
 from storage.losses import Losses
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event, Part, Session, SessionFolder
-from storage.verify.data import as_dict, verdict_of, verify
+from storage.verify.data import verdict_of, verify
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
@@ -219,7 +219,7 @@ def test_several_parts_become_one_file(tmp_path: Path) -> None:
     session(tmp_path, parts=parts)
     assert outcomes(recover(tmp_path)) == ["sealed"]
     assert loaded(tmp_path).frames == 145
-    assert as_dict(verify(tmp_path))["problems"] == []
+    assert verify(tmp_path).as_dict()["problems"] == []
 
 
 def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) -> None:
@@ -387,9 +387,9 @@ def test_events_that_were_not_written_in_time_are_written_anew(tmp_path: Path) -
         update={"events": (*done.events, Event(id="e2", label="fall", t_ns=1))}
     )
     SessionFolder(tmp_path / "sessions").save(marked)
-    assert as_dict(verify(tmp_path))["problems"]
+    assert verify(tmp_path).as_dict()["problems"]
     assert recover(tmp_path).mended == [ID]
-    assert as_dict(verify(tmp_path))["problems"] == []
+    assert verify(tmp_path).as_dict()["problems"] == []
     assert recover(tmp_path).is_nothing
 
 

@@ -39,7 +39,7 @@ def test_a_servo_is_found_whatever_it_speaks(
 
 def test_nobody_is_found_where_nobody_answers() -> None:
     with FaultyServo(lambda _: 0, VirtualClock()) as servo, servo.silent():
-        assert probe(servo.port, VirtualClock(), timeout_s=0.001) == []
+        assert probe(servo.port, VirtualClock(), timeout_s=0.01) == []
 
 
 def test_a_damaged_answer_is_no_servo() -> None:
