@@ -14,7 +14,7 @@ from devices.errors import NoAcknowledgeError
 ADDRESSES = range(0x70, 0x78)
 CHANNELS = range(8)
 
-_REFUSALS_MAX = 2
+_REFUSALS_MAX = 2  # one refusal may be a disturbed bit
 
 
 class Tca9548a:

@@ -29,11 +29,11 @@ _AIR_S = 2.0
 """In the air after the last hop, and before the first again: long enough for a tare."""
 _STANCE_S = 0.25
 """About as long landing and push-off take; the segment turns that much longer than it stands."""
-_SWING_S = 0.12
-_FIRMNESS = 0.05
-_HEIGHT = 0.03
-_PITCH = 0.1
-_STEEPEST_RAD = 0.7
+_SWING_S = 0.12  # in which the segment turns back for the next touch-down
+_FIRMNESS = 0.05  # how much places differ, relative
+_HEIGHT = 0.03  # how much hops differ in height, relative
+_PITCH = 0.1  # how much they differ in pitch, relative
+_STEEPEST_RAD = 0.7  # a dome further round the foot would not press on the ground
 
 
 class Hopping(Ground):

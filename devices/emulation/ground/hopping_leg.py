@@ -26,13 +26,13 @@ _STANDING_DAMPING, _PUSHING_DAMPING = 0.4, 0.1
 """Of the leg's spring, relative to critical (assumed: geared servos hold it, or drive it)."""
 _STOP = 40.0
 """How many times stiffer than the spring the leg's end stop is; it is damped critically."""
-_FOLDED = 0.95
+_FOLDED = 0.95  # of its length: a spring that is pressed further has no more travel
 _PUSH_S = 0.10
 _RETRACT_S = 0.12
 _STROKE_MAX_M = 0.20
-_LEFT_WITHIN_S = 0.6
-_HEIGHT_TOLERANCE_M = 0.001
-_TRIES = 12
+_LEFT_WITHIN_S = 0.6  # a push-off that takes longer is stuck
+_HEIGHT_TOLERANCE_M = 0.001  # of the hop, good enough for a drawn height
+_TRIES = 12  # of the regula falsi
 
 Angle = Callable[[float], float]
 
