@@ -115,7 +115,7 @@ async def _start_node(
 async def _stop_recording(server: Server) -> None:
     for session in server.recorder.recording_on(NODE):
         server.recorder.stop(session.id)
-        sealed = await server.recorder.settled(session.id, _SEAL_S)
+        sealed = await server.settling.settled(session.id, _SEAL_S)
         remark(f"session {sealed.id} ({sealed.name}) is {sealed.state}")
 
 
