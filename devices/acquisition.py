@@ -34,8 +34,8 @@ BATCH_NS = 25_000_000
 STALLED_AFTER = 3
 """Without a rate of its own, a loop that takes so many periods more than usual has been stalled."""
 
-_BATCH_FRAMES_MAX = 64
-_AGE_MAX_US = 2**31 - 1
+_BATCH_FRAMES_MAX = 64  # more than any schedule takes in `BATCH_NS`; columns are made for so many
+_AGE_MAX_US = 2**31 - 1  # an int32 holds no more
 
 
 class ServoSource(Protocol):

@@ -47,8 +47,6 @@ _KPA_PER_PCOMP = (PRESSURE_MAX_KPA - PRESSURE_MIN_KPA) / COUNTS_MAX
 _SIGNED_WORDS = struct.Struct(">4h")
 _UNSIGNED_WORDS = struct.Struct(">2H")
 
-Counts = npt.NDArray[np.unsignedinteger]
-
 
 @dataclass(frozen=True)
 class Coefficients:

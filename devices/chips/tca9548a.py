@@ -14,7 +14,7 @@ from devices.errors import NoAcknowledgeError
 ADDRESSES = range(0x70, 0x78)
 CHANNELS = range(8)
 
-_REFUSALS_MAX = 2
+_REFUSALS_MAX = 2  # one refusal may be a disturbed bit
 
 
 class Tca9548a:
@@ -54,11 +54,6 @@ class MuxRouter:
         self.silent: set[int] = set()
         """Muxes that did not let themselves be closed. They are taken to be without supply, which
         connects nothing; to read a tile of another mux, make sure of that."""
-
-    @property
-    def addresses(self) -> tuple[int, ...]:
-        """Addresses of the multiplexers, ascending."""
-        return tuple(self._muxes)
 
     def connect(self, masks: Mapping[int, int]) -> None:
         """Connect exactly the channels of `masks` (address to mask); all other muxes are closed.

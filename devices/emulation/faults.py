@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from devices.scene.faults import BUS, RATE, FaultKind, FaultScene
 
-_BEFORE_NS = 2**62
+_BEFORE_NS = 2**62  # later than any instant of the clock
 
 
 class _Window(NamedTuple):

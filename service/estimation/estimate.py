@@ -31,7 +31,7 @@ from service.estimation.pending import Pending, PendingFrames
 from service.estimation.plan import SIGMAS, EstimationPlan
 from service.estimation.upper import Foot, UpperState, foot_of, grid_index, summed, tile_forces
 
-HULL_SIGMAS = 3.0
+HULL_SIGMAS = 3.0  # noise about the edge of the tiles is no reason to mask
 
 
 @dataclass(frozen=True)

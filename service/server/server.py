@@ -12,10 +12,12 @@ from pathlib import Path
 
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
+from service.server.book import SessionBook
 from service.server.live import Hub
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
+from service.server.settling import Settling
 from service.server.streams import ServerStream
 from service.server.trash import Trash, destroy
 from service.server.views import NodeView, SessionView
@@ -98,13 +100,11 @@ class Server:
             """Name of this data folder: a node keeps what this server needs, whoever else asks."""
             self.hub = Hub()
             self.nodes = ServerNodes(data)
-            self.recorder = Recorder(
-                SessionFolder(data / "sessions"),
-                Trash(data / "trash"),
-                self.nodes,
-                changed=self._tell_session,
-                ask_again=self._ask_again,
+            self.sessions = SessionBook(
+                SessionFolder(data / "sessions"), Trash(data / "trash"), self._tell_session
             )
+            self.settling = Settling(self.sessions, self.nodes, self._ask_again)
+            self.recorder = Recorder(self.sessions, self.nodes, self.settling)
         except FootTileError:
             self._lock.close()
             raise
@@ -118,7 +118,7 @@ class Server:
             now_s = time.monotonic()
             try:
                 await asyncio.gather(*(self._sync(node) for node in self.nodes))
-                self.recorder.settle()
+                self.settling.settle()
                 self._tell_wanted()
                 if now_s >= slow_s:
                     slow_s = now_s + _SLOW_TICK_S
@@ -136,7 +136,7 @@ class Server:
         """End the links and wait for what is being sealed."""
         for link in list(self.links.values()):
             link.end(Close.RESTART, "the server is going down; connect again")
-        await self.recorder.close()
+        await self.settling.close()
         for node in self.nodes:
             for stream in node.streams.values():
                 try:
@@ -160,7 +160,7 @@ class Server:
         Raises:
             StorageError: one of them cannot be deleted.
         """
-        doomed = self.recorder.trash.doom()
+        doomed = self.sessions.trash.doom()
         return len(doomed), await asyncio.to_thread(destroy, doomed)
 
     def tell_deleted(self, session_id: str) -> None:
@@ -207,7 +207,7 @@ class Server:
                 },
             }
         )
-        for session in self.recorder.all():
+        for session in self.sessions:
             if session.state in ("recording", "pending", "sealing"):
                 self._tell_session(session)
 

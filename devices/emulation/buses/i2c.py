@@ -22,10 +22,10 @@ from devices.clock import Clock
 from devices.emulation.buses.line import Line
 from devices.emulation.faults import Faults
 
-I2C_RDWR_IOCTL_MAX_MSGS = 42
-MESSAGE_BYTES_MAX = 8192
-_FLAG_READ = 0x0001
-_TIMEOUT_UNIT_NS = 10_000_000
+I2C_RDWR_IOCTL_MAX_MSGS = 42  # include/uapi/linux/i2c-dev.h
+MESSAGE_BYTES_MAX = 8192  # the kernel's limit of one message
+_FLAG_READ = 0x0001  # I2C_M_RD, include/uapi/linux/i2c.h
+_TIMEOUT_UNIT_NS = 10_000_000  # of the ioctl I2C_TIMEOUT
 _TIMEOUT_DEFAULT = 100  # the i2c core's second
 _NOT_ACKNOWLEDGED_BITS = 11  # START, address with direction and missing acknowledge, STOP
 

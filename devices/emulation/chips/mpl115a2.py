@@ -15,8 +15,8 @@ from devices.scene.emulation import ReadDuringConversion
 
 _CONVERT = 0x12
 _REGISTERS = 0x80
-_SAMPLE_QUARTER = 4
-_SLOW_NS = 2_900_000
+_SAMPLE_QUARTER = 4  # as the driver assumes (hardware.md 1.4)
+_SLOW_NS = 2_900_000  # slower than any healthy part, within the data sheet's 3 ms
 
 Sense = Callable[[int], tuple[int, int]]
 """Sample instant in ns -> the 10-bit words `padc`, `tadc` of a conversion that samples then."""

@@ -83,14 +83,6 @@ def volume_left(
     return float((p1_kpa / p2_kpa) ** (1.0 / exponent))
 
 
-def pressure_kpa(part_left: float, p1_kpa: float = SEAL_KPA, exponent: float = ISOTHERMAL) -> float:
-    """Pressure of a bubble of which V2/V1 is left.
-
-    Squeezed fast to what is 115 kPa slowly, it is at 121.6 kPa: beyond the chip's range.
-    """
-    return float(p1_kpa * part_left**-exponent)
-
-
 def fast_share(p1_kpa: float = SEAL_KPA, exponent: float = ADIABATIC) -> float:
     """Part of the slow full-scale change of volume that a fast load needs for full scale: 0.73.
 

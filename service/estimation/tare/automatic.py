@@ -34,7 +34,7 @@ SETTLE_NS = 100_000_000
 """The rubber recovers for so long after a contact, before a window may begin."""
 CONFIRM_NS = 900_000_000_000
 """Where nothing has moved the tare is renewed so seldom, long before it is called old."""
-MOVED_SIGMAS = 4.0
+MOVED_SIGMAS = 4.0  # of both tares: less may be chance
 MOVED_MIN_KPA = 0.02
 """Less than this is not worth an entry in the history."""
 

@@ -105,10 +105,6 @@ def test_a_mask_of_more_than_eight_bits_is_no_mask(protocol: Protocol, mask: int
 # All multiplexers
 
 
-def test_a_router_knows_each_mux_once(protocol: Protocol) -> None:
-    assert router(protocol, 0x72, 0x70, 0x72, 0x70).addresses == (0x70, 0x72)
-
-
 def test_the_first_selection_closes_every_other_mux_first(protocol: Protocol) -> None:
     # Nothing is known of them: whoever used the bus before may have left them open.
     muxes = router(protocol, 0x70, 0x71, 0x72)

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import service.api.routes.sessions
-import service.server.recorder
+import service.server.settling
 from service.sessions.sealing import seal
 from tests.builders.arrays import COUNT_KPA
 from tests.builders.frames import assert_same_bits
@@ -273,8 +273,8 @@ def test_a_session_is_sealed_again_when_the_disk_was_full(
             raise StorageError("No space left on device")
         return seal(*arguments)
 
-    monkeypatch.setattr(service.server.recorder, "seal", refusing)
-    monkeypatch.setattr(service.server.recorder, "_SEAL_AGAIN_S", 0.2)
+    monkeypatch.setattr(service.server.settling, "seal", refusing)
+    monkeypatch.setattr(service.server.settling, "_SEAL_AGAIN_S", 0.2)
     session = tared.record()
     tared.deliver(20)
     session.stop()

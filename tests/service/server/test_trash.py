@@ -12,7 +12,7 @@ import pytest
 
 import service.api.routes.sessions
 import service.server
-import service.server.recorder
+import service.server.settling
 from service.sessions.sealing import seal
 from storage.intervals import Intervals
 from storage.sessions.folder import DOOMED_PREFIX, SessionFolder
@@ -108,7 +108,7 @@ def test_a_session_that_is_being_sealed_is_not_deleted(
         assert may_seal.wait(20.0)
         return seal(*arguments)
 
-    monkeypatch.setattr(service.server.recorder, "seal", slow)
+    monkeypatch.setattr(service.server.settling, "seal", slow)
     try:
         session = tared.record()
         tared.deliver(20)
@@ -319,7 +319,7 @@ def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_th
     def refusing(*_: object) -> None:
         raise StorageError("No space left on device")
 
-    monkeypatch.setattr(service.server.recorder, "seal", refusing)
+    monkeypatch.setattr(service.server.settling, "seal", refusing)
     session = tared.record()
     tared.deliver(20)
     session.stop()
@@ -327,7 +327,7 @@ def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_th
         tared.send(10, now=True)
         until(lambda: "No space" in (session.now()["problem"] or ""))
     assert session.now()["state"] == state
-    monkeypatch.setattr(service.server.recorder, "seal", seal)
+    monkeypatch.setattr(service.server.settling, "seal", seal)
     running.restart()
     if state == "pending":
         tared.connect()

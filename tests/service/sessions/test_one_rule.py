@@ -16,9 +16,11 @@ from hypothesis import strategies as st
 from service.link import PROTOCOL, Hello
 from service.node.recording import NodeRecording
 from service.server import following
+from service.server.book import SessionBook
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
+from service.server.settling import Settling
 from service.server.trash import Trash
 from service.sessions.recover import recover
 from service.sessions.tares import TareHistory
@@ -246,11 +248,9 @@ def server_on(data: Path, begun: Session) -> tuple[Recorder, ServerNode]:
     node = nodes.greet(hello)
     node.keep()
     keep(data, begun)
-    recorder = Recorder(
-        SessionFolder(data / "sessions"),
-        Trash(data / "trash"),
-        nodes,
-        changed=lambda _: None,
-        ask_again=lambda _: None,
+    book = SessionBook(
+        SessionFolder(data / "sessions"), Trash(data / "trash"), changed=lambda _: None
     )
+    settling = Settling(book, nodes, ask_again=lambda _: None)
+    recorder = Recorder(book, nodes, settling)
     return recorder, node
