@@ -1,5 +1,4 @@
-"""The server: streams of nodes, live estimates, recording.
+"""The server: streams of nodes, live estimates, recording. It knows no hardware and no HTTP.
 
-A *server's stream* is what came of a node's stream; a *server's node* is what it said of itself.
-It knows no hardware and no HTTP: `service.api` asks it.
+A *server's node* is what a node said of itself, a *server's stream* what came of one of its streams.
 """

@@ -1,5 +1,5 @@
-"""A session from its streams: where it begins and ends, what it is made from, how it is sealed.
+"""What a session is made of, where it begins and ends, how it is sealed; no network.
 
-Rules that a server, a node alone and recovery after a crash share. They may read and write a data
-folder through `storage`; they know no network and no node or server.
+The rules that a server, a node alone and recovery after a crash share. They read and write a data
+folder through `storage`, and know of neither nodes nor servers.
 """
