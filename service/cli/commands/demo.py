@@ -43,7 +43,7 @@ def demo_command(
 ) -> None:
     """Run a server and an emulated node, and show where the live page is.
 
-    The scene goes on for ever; a recorded load is pressed over and over again. Ctrl-C stops what is
+    The scene never ends; a recorded load is pressed over and over again. Ctrl-C stops what is
     being recorded, seals it, and ends both.
     """
     import uvloop
