@@ -82,6 +82,7 @@ def test_a_part_that_stops_converting_becomes_stale() -> None:
         assert not any(has(TileStatus.STALE, during, other))
 
 
+@pytest.mark.slow
 def test_an_array_with_noise_is_not_called_stale() -> None:
     scene = make_scene(((0x70, 0),), emulation={"noise_kpa": 0.165}, array=TYPICAL)
     batch = foot(scene).run_for(20.0)

@@ -120,6 +120,7 @@ def what_it_is(done: Session) -> dict[str, Any]:
     return {"ledger": done.ledger, **done.model_dump(include=names)}
 
 
+@pytest.mark.slow
 @given(
     stream=streams(has_ended=True),
     first=SEQ,

@@ -368,6 +368,7 @@ def test_what_was_deleted_is_not_brought_back(tmp_path: Path) -> None:
 # --- what else a crash leaves ---------------------------------------------------------------------
 
 
+@pytest.mark.process
 def test_what_dead_processes_left_half_written_is_removed(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
@@ -452,6 +453,7 @@ class Killed(BaseException):
     """As good as SIGKILL for what is on the disk: nothing after it is done."""
 
 
+@pytest.mark.slow
 def test_killed_at_any_write_the_next_run_comes_to_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

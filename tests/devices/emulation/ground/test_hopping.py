@@ -213,6 +213,7 @@ def test_tiles_are_pressed_within_their_range(name: str) -> None:
         assert 4.0 < peak_n < 25.0
 
 
+@pytest.mark.slow
 @BOTH
 def test_the_same_seed_is_the_same_hop_to_the_bit_and_another_is_not(name: str) -> None:
     t_s = np.arange(0.0, 5.0, 0.001)
@@ -271,6 +272,7 @@ def test_a_flat_insole_does_not_hop() -> None:
         world_of(Scene.model_validate(facts))
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(
     st.fixed_dictionaries(

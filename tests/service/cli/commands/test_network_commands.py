@@ -20,6 +20,8 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
+pytestmark = pytest.mark.process
+
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 
 
