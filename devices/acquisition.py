@@ -184,18 +184,19 @@ class Acquisition:
                 servo_age_us = min(age_ns // 1000, _AGE_MAX_US)
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_status |= FrameStatus.SERVO_STALE
+        # Positional, and unpacked by the keeper: this runs for every frame.
         frame = FrameRow(
-            seq=self._next_seq,
-            t_mono_ns=t_mono_ns,
-            t_ns=t_mono_ns + self._anchor.offset_ns,
-            servo_counts=servo_counts,
-            servo_age_us=servo_age_us,
-            reference_force_n=scan.reference_n,
-            frame_status=frame_status,
-            padc=scan.padc,
-            tadc=scan.tadc,
-            sample_offset_us=[(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
-            status=scan.status,
+            self._next_seq,
+            t_mono_ns,
+            t_mono_ns + self._anchor.offset_ns,
+            servo_counts,
+            servo_age_us,
+            scan.reference_n,
+            frame_status,
+            scan.padc,
+            scan.tadc,
+            [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
+            scan.status,
         )
         for name, value in zip(FrameRow._fields, frame, strict=True):
             columns[name][row] = value

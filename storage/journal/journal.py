@@ -308,11 +308,11 @@ class Journal:
         self.held = union(segment.held for segment in self._segments)
 
     def _write(self, message: EncodedBatch) -> None:
-        segment = self._open.append(message).segment
-        if segment.held == message.numbers:  # its first batch
+        segment, numbers_ = self._open.append(message).segment, message.numbers
+        if segment.held == numbers_:  # its first batch
             self._segments.append(segment)
         self.held.add(message.seq_first, message.seq_last)
-        self.lost.found(message.numbers)
+        self.lost.found(numbers_)
 
     def _messages_of(
         self, found: list[tuple[tuple[int, int], Path, np.void]]
