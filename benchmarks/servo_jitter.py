@@ -33,9 +33,9 @@ from devices.acquisition import Acquisition
 from devices.chips.dynamixel.reader import open_servo
 from devices.chips.dynamixel.servo import ServoReader
 from devices.clock import SystemClock, UtcAnchor
-from devices.emulation.chips.dynamixel import EmulatedServo
 from devices.frames import FrameStatus
 from devices.realtime import sharpen_timers
+from tests.builders.servo import FaultyServo
 
 BAUDRATE = 1_000_000
 SERVO_HZ = 100.0
@@ -47,7 +47,7 @@ PIECES = (b"\xff\xff", b"\xff\xff\xfd\x00\x01", b"\xff\xff\x01\x04\x00", b"\x00\
 
 def be_a_servo(protocol: int, silent: bool, connection: Connection) -> None:
     with (
-        EmulatedServo(lambda t_ns: t_ns // 10**6, SystemClock(), protocol=protocol) as servo,
+        FaultyServo(lambda t_ns: t_ns // 10**6, SystemClock(), protocol=protocol) as servo,
         servo.silent() if silent else contextlib.nullcontext(),
     ):
         connection.send(servo.port)

@@ -1,7 +1,7 @@
-"""The paced loop: frames of an array, with the servo's position beside them, in batches.
+"""The paced loop: frames of an array, with the servo's position, in batches.
 
 Clock and sleep are injected; a batch is handed over every 25 ms or so. A slow consumer cannot
-be waited for here: whoever iterates must be quick, and what was missed is counted and flagged.
+be waited for here: it must be quick, and what was missed is counted and flagged.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ BATCH_NS = 25_000_000
 STALLED_AFTER = 3
 """Without a rate of its own, a loop that takes so many periods more than usual has been stalled."""
 
-_BATCH_FRAMES_MAX = 64
-_AGE_MAX_US = 2**31 - 1
+_BATCH_FRAMES_MAX = 64  # more than any schedule takes in `BATCH_NS`; columns are made for so many
+_AGE_MAX_US = 2**31 - 1  # an int32 holds no more
 
 
 class ServoSource(Protocol):
@@ -83,7 +83,7 @@ class Acquisition:
         rate_hz: frames a second; 0: as fast as the schedule allows.
         expected_hz: what rate that is, to tell when the loop was stalled; 0: do not tell.
         servo: its position goes with the frames.
-        is_new: the array was identified anew in a running node: the first frame says so.
+        is_new: the array was identified again in a running node: the first frame says so.
         keeper: keeps frames while their batch is being filled. Readings that are out of range are
             flagged when a batch is whole, see `RangeFlag`.
         lead_end_ns: frames before this instant are the lead of an emulated load; None: there is
@@ -184,18 +184,19 @@ class Acquisition:
                 servo_age_us = min(age_ns // 1000, _AGE_MAX_US)
             if reading is None or age_ns > self._servo.stale_after_ns:
                 frame_status |= FrameStatus.SERVO_STALE
+        # Positional, and unpacked by the keeper: this runs for every frame.
         frame = FrameRow(
-            seq=self._next_seq,
-            t_mono_ns=t_mono_ns,
-            t_ns=t_mono_ns + self._anchor.offset_ns,
-            servo_counts=servo_counts,
-            servo_age_us=servo_age_us,
-            reference_force_n=scan.reference_n,
-            frame_status=frame_status,
-            padc=scan.padc,
-            tadc=scan.tadc,
-            sample_offset_us=[(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
-            status=scan.status,
+            self._next_seq,
+            t_mono_ns,
+            t_mono_ns + self._anchor.offset_ns,
+            servo_counts,
+            servo_age_us,
+            scan.reference_n,
+            frame_status,
+            scan.padc,
+            scan.tadc,
+            [(sample_ns - t_mono_ns) // 1000 for sample_ns in samples_ns],
+            scan.status,
         )
         for name, value in zip(FrameRow._fields, frame, strict=True):
             columns[name][row] = value

@@ -1,6 +1,6 @@
 """Time is injected: one monotonic clock that never steps, and the one anchor that gives it a date.
 
-`SystemClock` is the node's. `VirtualClock` only moves when somebody moves it (the emulated bus by
+`SystemClock` is the node's. `VirtualClock` only moves when it is moved (by the emulated bus with
 its bit times, a sleeper by its wake-up), so that a whole session runs bit-exactly and faster than
 it would last.
 """
@@ -36,7 +36,7 @@ class SystemClock:
 
 
 class SpinningClock(SystemClock):
-    """The same clock, for whoever must not oversleep: it spins for the last part of a wait.
+    """The same clock, for a loop that must not oversleep: it spins for the last part of a wait.
 
     A sleep ends some 60 us late, more beside busy processes; measured by
     `benchmarks/acquisition_jitter.py`. The price is that much of a core in each wait, so it is for

@@ -6,7 +6,7 @@
      |    +-- MissingExtraError                this installation lacks a package for what is asked
      +-- LoadTraceError        (ValueError)    a load trace cannot be pressed on the tiles
      +-- I2cError              (OSError)
-     |    +-- NoAcknowledgeError               nobody answered at an address
+     |    +-- NoAcknowledgeError               no answer at an address
      |    +-- BusFaultError                    the bus itself failed: time-out, arbitration, reset
      |    +-- BusMisuseError                   the adapter cannot do what we asked: our bug
      |    +-- BusSetupError                    no such bus, no permission
@@ -144,7 +144,7 @@ class SpiSetupError(SpiError):
 
 
 class AdcSilentError(SpiError):
-    """The null bit before a conversion's result is not low: nobody drives the line."""
+    """The null bit before a conversion's result is not low: no converter drives the line."""
 
 
 class ServoError(FootTileError):

@@ -54,7 +54,7 @@ class FrameStatus(IntFlag):
     LEAD = 8
     """Taken before a load trace begins: the foot is unloaded."""
     NEW_ARRAY_INFO = 16
-    """The array was identified anew before this frame."""
+    """The array was identified again before this frame."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class ArrayInfo(_Fact):
     def has_same_tiles_as(self, other: ArrayInfo) -> bool:
         """Are these the same chips in the same places?
 
-        Conversion times are measured anew at each start and differ by some microseconds.
+        Conversion times are measured at each start and differ by some microseconds.
         """
 
         def places(info: ArrayInfo) -> list[TileInfo]:

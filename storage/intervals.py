@@ -47,6 +47,11 @@ class Intervals:
         return sum(last - first + 1 for first, last in self._intervals)
 
     @property
+    def first(self) -> int | None:
+        """Least number; None for an empty set."""
+        return self._intervals[0][0] if self._intervals else None
+
+    @property
     def last(self) -> int | None:
         """Greatest number; None for an empty set."""
         return self._intervals[-1][1] if self._intervals else None

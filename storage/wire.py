@@ -21,6 +21,7 @@ from storage.schema import from_record_batch, to_record_batch, wire_schema
 FRAMES_MAX = 4096
 """Frames in one message; a node sends some ten. More is not what a node sends."""
 _MESSAGE_FRAMES = 64
+"""As many as acquisition puts into a batch at most."""
 
 
 @dataclass(frozen=True)

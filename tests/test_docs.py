@@ -291,3 +291,11 @@ def test_every_decision_is_in_the_list_and_says_what_would_change_our_mind() -> 
         text = record.read_text("utf-8")
         for word in ("Context", "Decision", "Consequences", "What would change our mind"):
             assert f"\n**{word}.** " in text, record.name
+
+
+def test_every_path_in_the_picture_exists() -> None:
+    drawing = (ROOT / "docs" / "images" / "architecture.svg").read_text("utf-8")
+    paths = re.findall(r'class="mono"[^>]*>((?:devices|storage|service|web)[\w./]*)<', drawing)
+    assert len(paths) > 10
+    for path in paths:
+        assert (ROOT / path).exists(), path

@@ -54,7 +54,7 @@ class TileArray:
         timing: of bus and parts, for the length of a frame.
         temperature_every: temperature is read in every so many frames.
         broadcast_channels: how many channels may be open at once.
-        recovery: frees a stuck bus; None: nobody can.
+        recovery: frees a stuck bus; None: there is none.
         reference_n: gives the reference force in newtons; called once in a frame at the first
             tile's sample instant, while the bus waits.
 
@@ -100,7 +100,7 @@ class TileArray:
         self._temperature_every = temperature_every
         self._reference_n = reference_n
         self._frame_ns = round(frame_s(schedule, timing) * 1e9)
-        # Where a tile is started anew as soon as it was read, there is nothing to look at again.
+        # Where a tile is started again as soon as it was read, there is nothing to look at again.
         self._look_frames = 0
         if schedule != "pipelined" and len(tiles) > 1:
             look_ns = (timing.select_s + timing.read_s) * 1e9
@@ -170,7 +170,7 @@ class TileArray:
                 self._audit(scan)
         self._conclude(scan)
         if all(padc == NOT_READ for padc in scan.padc):
-            # Nobody answers, so nothing was waited for: do not run the faster for it.
+            # No tile answers, so nothing was waited for: do not run faster because of it.
             self._clock.sleep_until_ns(begin_ns + self._frame_ns)
         self._frames += 1
         return scan
@@ -178,7 +178,7 @@ class TileArray:
     # What schedules are made of
 
     def convert(self, scan: Scan, tiles: Sequence[int]) -> None:
-        """Start a conversion in all `tiles` at once; whoever is lost is left out."""
+        """Start a conversion in all `tiles` at once, except in those that are lost."""
         if len(tiles) == 1 and self._running[tiles[0]]:
             return  # of a slow part, which is not waited for and not to be disturbed
         if self._look_frames and self._frames % self._look_frames == self._look_frames - 1:
@@ -199,17 +199,17 @@ class TileArray:
             self._running[i] = i in called and self.health[i].present
 
     def _worth_calling(self, tiles: Sequence[int]) -> tuple[int, ...]:
-        """Those behind a mux of which anybody is present: a broadcast names muxes, not tiles."""
+        """Those behind a mux with a tile present: a broadcast names muxes, not tiles."""
         if all(self.health[i].present for i in tiles):
             return tuple(tiles)
         muxes = {self.tiles[i].mux for i in tiles if self.health[i].present}
         return tuple(i for i in tiles if self.tiles[i].mux in muxes)
 
     def close_ranks(self) -> None:
-        """Wait until all tiles can be read and started anew one right after the other.
+        """Wait until all tiles can be read and started again one right after the other.
 
-        A tile that was read late once, because another one was asked twice, would stay late for
-        ever: its samples would drift away from those of the others.
+        A tile that was read late once, because another one was asked twice, would stay late: its
+        samples would drift away from those of the others.
         """
         due_ns = 0
         for i in self.indices:
@@ -298,7 +298,7 @@ class TileArray:
             self._clock.sleep_until_ns(scan.reference_ns)
             scan.reference_n = self._reference_n()
         self._clock.sleep_until_ns(ready_ns)
-        self._busy_since_ns = self._clock.now_ns()  # who waits spends nothing
+        self._busy_since_ns = self._clock.now_ns()  # waiting spends nothing
 
     # Frame by frame
 
@@ -331,7 +331,7 @@ class TileArray:
             scan.note_bus_fault()
 
     def _look_again(self, scan: Scan, tiles: Sequence[int]) -> None:
-        """Before they are started anew: was what was read of one of them its final result?"""
+        """Before they are started again: was what was read of one of them its final result?"""
         tile = self._frames // self._look_frames % len(self.tiles)
         if tile not in tiles:
             return

@@ -14,14 +14,14 @@ from typing import get_args
 from devices.errors import SceneError
 from devices.scene.hardware import ScheduleName
 
-SELECT_BITS = 20
-CONVERT_BITS = 29
-_READ_BITS = 30
-_BYTE_BITS = 9
+SELECT_BITS = 20  # START, address, mask, STOP
+CONVERT_BITS = 29  # START, address, register, data, STOP
+_READ_BITS = 30  # START, address, register, repeated START, address, STOP
+_BYTE_BITS = 9  # eight and the acknowledge
 
 PREFERENCE: tuple[ScheduleName, ...] = ("simultaneous", "per_mux", "pipelined", "sequential")
 """Of schedules that are equally fast, the one with the least skew."""
-_AS_FAST = 0.995
+_AS_FAST = 0.995  # half a percent is no reason to prefer a schedule
 
 
 def read_bits(n_bytes: float) -> float:

@@ -12,7 +12,7 @@ from devices.errors import BusFaultError, BusSetupError
 from devices.recovery.recovery import BusRecovery
 
 _RECOVERY_NS = (10_000_000, 1_000_000_000)
-"""A stuck bus is helped at once, then ever more rarely."""
+"""A stuck bus is helped at once, then less and less often."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,14 @@ class BusWatch:
         self.recoveries = 0
         """How often a stuck bus was helped."""
         self.problem = ""
-        """Why it could not be helped the last time; empty if it could, or nobody can."""
+        """Why it could not be helped the last time; empty if it could, or there is no recovery."""
         self._router = router
         self._clock = clock
         self._recovery = recovery
         self._wait_ns, self._due_ns = _RECOVERY_NS[0], 0
 
     def look(self, scan: Scan) -> None:
-        """Nothing but zeros, or nobody at all: if it is the bus, the frame is given up."""
+        """Nothing but zeros, or no answer at all: if it is the bus, the frame is given up."""
         if not self._moves():
             scan.note_bus_fault(for_good=True)
 

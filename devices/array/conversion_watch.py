@@ -27,7 +27,7 @@ known to be slow is asked less often each time: whether it is quick again need n
 class ConversionWatch:
     """Waits of all tiles, and what keeps them true.
 
-    A reading that is taken too early is that of the conversion before. If the part is started anew
+    A reading that is taken too early is that of the conversion before. If the part is started again
     right after it, nothing ever finishes, and its words stand still, which is noticed. If it has
     time to finish until the next CONVERT, its words change from frame to frame like any other, one
     frame late, and betray nothing: so in some frames one tile is read again before that CONVERT,
@@ -87,7 +87,7 @@ class ConversionWatch:
         """Find out whether a part keeps its time, and wait for it accordingly from now on.
 
         As in the self-test there is one read for each CONVERT: to read a conversion that is not
-        finished may abort it. Its conversion has to be started anew afterwards.
+        finished may abort it. Its conversion has to be started again afterwards.
 
         Raises:
             I2cError: it does not answer.

@@ -25,12 +25,12 @@ STALE_EVIDENCE = 20
 readings one in nine is equal to its neighbour, so ten in a row come once in 10^9; with noise that
 is correlated over 10 ms once in 10^6."""
 
-_TRIAL_EVERY = 2048
+_TRIAL_EVERY = 2048  # every two seconds at 500 frames a second
 _TADC_MAX_NS = 500_000_000  # half of what `devices.temperature` holds one for
 _IMPOSSIBLE_TADC = (0, COUNTS_MAX)
-_FIRST_PROBE_NS = 2_000_000
-_PROBES_NS = 1_000_000_000
-_RECENT = 3
+_FIRST_PROBE_NS = 2_000_000  # a loose plug is back within a few milliseconds
+_PROBES_NS = 1_000_000_000  # what has been away for long is asked once a second
+_RECENT = 3  # the median of three is moved by no single outlier
 
 
 def is_impossible(padc: int, tadc: int) -> int:
@@ -72,7 +72,7 @@ class TileHealth:
     # Presence
 
     def lose(self, now_ns: int) -> None:
-        """It does not answer, or gives what cannot be; it is looked for ever more rarely."""
+        """It does not answer, or gives what cannot be; it is looked for less and less often."""
         if self.present:
             self.doubt(now_ns)
         else:

@@ -10,7 +10,7 @@ from devices.clock import Clock
 from devices.errors import BusFaultError
 from devices.frames import NOT_READ, TileStatus
 
-_BUS_FAULTS_MAX = 2
+_BUS_FAULTS_MAX = 2  # each may cost the adapter's time-out, 30 ms
 
 
 @dataclass

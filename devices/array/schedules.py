@@ -38,7 +38,7 @@ def simultaneous(array: TileArray, scan: Scan) -> None:
 
 
 def pipelined(array: TileArray, scan: Scan) -> None:
-    """Read what a tile has converted since the last frame, and start it anew at once.
+    """Read what a tile has converted since the last frame, and start it again at once.
 
     While one tile converts, the others are served, so that the wait costs nothing but for the
     first. Tiles are sampled one after another; every tile's own instant goes with its sample.

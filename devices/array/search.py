@@ -1,7 +1,7 @@
 """Looking for a tile that was lost: is it back, and is it itself?
 
-The protocol has no identity but the eight coefficients that are burnt into each part. Whoever comes
-back with others is another part, however well it answers.
+The protocol has no identity but the eight coefficients that are burnt into each part. A part
+that comes back with others is another one, however well it answers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from devices.frames import TileStatus
 
 
 class Search:
-    """Looks for the lost tiles of an array, each ever more rarely."""
+    """Looks for the lost tiles of an array, each less and less often."""
 
     def __init__(self, ports: TilePorts, clock: Clock, health: Sequence[TileHealth]) -> None:
         self._ports = ports

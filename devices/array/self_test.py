@@ -29,8 +29,8 @@ from devices.frames import TileInfo
 from devices.scene.hardware import TileScene
 
 _SETTLED_NS = 3_200_000  # the longest conversion and a little more
-_SHORTEST_NS = 800_000
-_RESOLUTION_NS = 8_000
+_SHORTEST_NS = 800_000  # half the typical time: no part is that fast
+_RESOLUTION_NS = 8_000  # half a percent of the typical time
 _NEVER_NS = 1 << 62
 _SAME_MAX = 8
 """So many readings without any change, and a conversion is taken to be unfinished. Of two healthy
@@ -43,8 +43,8 @@ _MARGIN = 1.004
 _ADDRESS_BITS = 29
 """START, address and register, repeated START and address: only then does a read take its data."""
 
-_SCL_READS = 100
-_SCL_BYTES = (2, 12)
+_SCL_READS = 100  # so that the median forgets what the machine did meanwhile
+_SCL_BYTES = (2, 12)  # far apart, within the part's registers
 
 
 def identify(bus: I2cBus, tiles: Sequence[TileScene]) -> tuple[TileInfo, ...]:

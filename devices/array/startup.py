@@ -86,7 +86,7 @@ def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
     """Make sure that the wires move at all: a slave may hang in a byte since the last run.
 
     Raises:
-        BusFaultError: SDA or SCL is stuck low, and nobody or nothing could free it.
+        BusFaultError: SDA or SCL is stuck low, and could not be freed.
     """
     router = MuxRouter(bus, [tile.mux for tile in scene.tile])
     fault: BusFaultError | None = None
@@ -94,7 +94,7 @@ def free_bus(bus: I2cBus, scene: Scene, recovery: BusRecovery | None) -> None:
     def moves() -> bool:
         nonlocal fault
         try:
-            # If nobody answers it moves: whose fault that is, identification says.
+            # If no mux answers it moves: identification says which tile is missing.
             if router.echoes() or router.refused is not None:
                 return True
             fault = BusFaultError(
@@ -130,7 +130,7 @@ def renew(
     Only the new parts are identified and measured, so that the others rest for a moment only.
 
     Raises:
-        TileSetupError, I2cError: a new part has gone again, or is none.
+        TileSetupError, I2cError: a new part is gone again, or is no MPL115A2.
     """
     replaced = before.array.replaced
     new = [tile for tile in scene.tile if tile.serial in replaced]

@@ -72,7 +72,7 @@ class I2cBus:
         """Run `messages` as one transaction; read messages are filled in place.
 
         Raises:
-            NoAcknowledgeError: nobody acknowledged an address or a byte.
+            NoAcknowledgeError: an address or a byte was not acknowledged.
             BusFaultError: time-out, lost arbitration, or an unspecified I/O error.
             BusMisuseError: the adapter cannot do this sequence (a bug in the driver).
             BusSetupError: the bus went away or may not be used.
@@ -147,7 +147,7 @@ def _classified(error: OSError, bus: str, messages: tuple[i2c_msg, ...]) -> I2cE
 def open_bus(name: str, emulated: I2cAdapter | None = None) -> I2cBus:
     """Open the bus `name`: a device such as `/dev/i2c-1`, or `"emulated"`.
 
-    An emulated adapter has to be handed in: the world behind it is made by whoever runs it.
+    An emulated adapter has to be handed in: the caller makes the world behind it.
 
     Raises:
         BusSetupError: the device is missing or may not be opened.

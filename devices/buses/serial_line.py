@@ -42,7 +42,7 @@ def open_line(port: str, baudrate: int, timeout_s: float) -> SerialPort:
     """Open a serial port for this program alone; a read waits `timeout_s` seconds at most.
 
     Raises:
-        ServoSetupError: there is no such port, it may not be used, or somebody else uses it.
+        ServoSetupError: there is no such port, it may not be used, or another program uses it.
     """
     try:
         line = serial.Serial(

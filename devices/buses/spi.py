@@ -37,7 +37,7 @@ class SpiDevice(Protocol):
 def open_spi(name: str, emulated: SpiDevice | None = None) -> SpiDevice:
     """Open the device `name`: a path such as `/dev/spidev0.0`, or `"emulated"`.
 
-    An emulated device has to be handed in: the world behind it is made by whoever runs it.
+    An emulated device has to be handed in: the caller makes the world behind it.
 
     Raises:
         SpiSetupError: the device is missing or may not be opened.

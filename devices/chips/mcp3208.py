@@ -14,9 +14,9 @@ COUNTS_MAX = 4095
 COUNTS_PER_VREF = 4096
 """Volts are counts * vref / 4096 (hardware.md 6)."""
 
-_START_SINGLE_ENDED = 0x06
-_NULL_BIT = 0x10
-_HIGH_BITS = 0x0F
+_START_SINGLE_ENDED = 0x06  # start bit, SGL/DIFF, and the place of D2
+_NULL_BIT = 0x10  # in the second byte, before B11
+_HIGH_BITS = 0x0F  # B11 to B8
 
 
 class Mcp3208:

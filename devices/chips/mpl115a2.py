@@ -47,8 +47,6 @@ _KPA_PER_PCOMP = (PRESSURE_MAX_KPA - PRESSURE_MIN_KPA) / COUNTS_MAX
 _SIGNED_WORDS = struct.Struct(">4h")
 _UNSIGNED_WORDS = struct.Struct(">2H")
 
-Counts = npt.NDArray[np.unsignedinteger]
-
 
 @dataclass(frozen=True)
 class Coefficients:
@@ -91,7 +89,7 @@ class Coefficients:
         """Why these cannot be a working part's coefficients; empty if they can.
 
         All known parts have a0 > 0, b1 < 0, b2 < 0, c12 > 0 (hardware.md 8). Eight zero bytes (SDA
-        stuck low) or eight ones (nobody there) fail here: they would give a constant 50 kPa.
+        stuck low) or eight ones (no part) fail here: they would give a constant 50 kPa.
         """
         for name, sign in (("a0", 1), ("b1", -1), ("b2", -1), ("c12", 1)):
             value = getattr(self, name)

@@ -14,7 +14,7 @@ from devices.errors import NoAcknowledgeError
 ADDRESSES = range(0x70, 0x78)
 CHANNELS = range(8)
 
-_REFUSALS_MAX = 2
+_REFUSALS_MAX = 2  # one refusal may be a disturbed bit
 
 
 class Tca9548a:
@@ -42,7 +42,7 @@ class MuxRouter:
 
     All tiles share one address, so a channel left open on another mux would answer too: reads would
     return the AND of two tiles, plausible and wrong. The state is cached, because a select costs
-    50 us; what is not known is written anew before anything else is connected.
+    50 us; what is not known is written again before anything else is connected.
     """
 
     def __init__(self, bus: I2cBus, addresses: Iterable[int]) -> None:
@@ -53,12 +53,7 @@ class MuxRouter:
         """The mux that did not acknowledge in the last `connect`; None if all did."""
         self.silent: set[int] = set()
         """Muxes that did not let themselves be closed. They are taken to be without supply, which
-        connects nothing; whoever reads a tile of another mux has to make sure of that."""
-
-    @property
-    def addresses(self) -> tuple[int, ...]:
-        """Addresses of the multiplexers, ascending."""
-        return tuple(self._muxes)
+        connects nothing; to read a tile of another mux, make sure of that."""
 
     def connect(self, masks: Mapping[int, int]) -> None:
         """Connect exactly the channels of `masks` (address to mask); all other muxes are closed.
@@ -67,7 +62,7 @@ class MuxRouter:
 
         Raises:
             I2cError: a mux did not answer. One that refuses to be closed twice in a row is
-                `silent` from then on, and in nobody's way.
+                `silent` from then on, and is skipped.
         """
         self.refused = None
         for address, mask in self._masks.items():
@@ -143,7 +138,7 @@ class MuxRouter:
             self._masks[address] = 0
 
     def _write(self, address: int, mask: int) -> None:
-        self._masks[address] = None  # until the STOP nobody knows
+        self._masks[address] = None  # not known until the STOP
         self.refused = address
         self._muxes[address].write_mask(mask)
         self.refused = None

@@ -25,15 +25,15 @@ from devices.scene.emulation import EmulationScene
 
 GRID_S = 0.0005
 """Between grid points pressure is taken as linear: in a tap of 20 ms that is off by 0.01 kPa."""
-_BLOCK = 2000
+_BLOCK = 2000  # a second of the grid, computed at once
 
 _KELVIN = 273.15
 _KAPPA = 0.4 / 1.4  # (gamma - 1) / gamma of air
 _MODES = np.arange(1, 9)
 _MODE_WEIGHTS = 6.0 / (np.pi * _MODES) ** 2  # of the mean temperature of a heated sphere
 _PLAY_WIDTHS_N = np.array([0.5, 1.0, 2.0, 4.0])
-_UNLOADED_N = 0.05
-_PICARD_LIMIT = 40
+_UNLOADED_N = 0.05  # a dome that bears less is not touched: the next touch is a new loading
+_PICARD_LIMIT = 40  # a bound; the iteration contracts by `_KAPPA`
 _PICARD_TOLERANCE_K = 1e-6  # 3e-7 kPa
 
 
@@ -107,7 +107,7 @@ class Domes:
         return low + (position - index) * (high - low)
 
     def foresee(self, t_s: float) -> None:
-        """Have the pressures up to `t_s` ready, so that nobody who samples has to wait for them."""
+        """Have the pressures up to `t_s` ready, so that no sample has to wait for them."""
         if int(t_s / GRID_S) + 1 >= self._next:
             self._extend(int(t_s / GRID_S) + 1)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from devices.scene.faults import BUS, RATE, FaultKind, FaultScene
 
-_BEFORE_NS = 2**62
+_BEFORE_NS = 2**62  # later than any instant of the clock
 
 
 class _Window(NamedTuple):
@@ -90,7 +90,7 @@ class Fault:
         return any(since_ns < window.begin_ns <= t_ns for window in self._windows_ns)
 
     def clear(self, t_ns: int) -> None:
-        """End what is there at `t_ns`: somebody mended it."""
+        """End what is there at `t_ns`: it was repaired."""
         self._windows_ns = tuple(
             w._replace(end_ns=min(w.end_ns, t_ns)) if w.begin_ns <= t_ns else w
             for w in self._windows_ns

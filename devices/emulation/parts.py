@@ -1,4 +1,4 @@
-"""What each emulated part is like, drawn once and for ever from its serial.
+"""What each emulated part is like, always the same for its serial.
 
 Two tiles of one serial are the same tile in every scene and session; `parts_seed` is another shelf
 of parts. Nothing here may be read by a driver or an estimator: they learn what crosses the bus, and

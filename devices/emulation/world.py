@@ -1,7 +1,7 @@
 """A whole emulated foot: chips behind multiplexers under domes on a ground, and its ground truth.
 
 A driver gets the world's adapter through `devices.buses.i2c.open_bus` and the pseudo-terminal of
-its servo, and nothing else. Truth is for whoever runs the scene, to judge an estimate by.
+its servo, and nothing else. Truth is there to judge an estimate by.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from devices.scene.file import Scene
 from devices.scene.grounds import MudGround
 from devices.scene.hardware import ServoScene
 
-_FORESIGHT_S = 0.4
+_FORESIGHT_S = 0.4  # a thread that is late by less delays no sample
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class World:
             )
             for index, serial in enumerate(serials)
         ]
-        """The chips. For who judges a driver; a driver has its bus."""
+        """The chips, to judge a driver by; a driver has its bus only."""
         muxes = [
             EmulatedTca9548a(
                 address,

@@ -41,7 +41,7 @@ class GpioLine:
         self._request.set_value(self._line, Value.INACTIVE if low else Value.ACTIVE)
 
     def high(self) -> bool:
-        """The level on the pin, whoever makes it."""
+        """The level on the pin, whatever drives it."""
         return bool(self._request.get_value(self._line))
 
 

@@ -1,4 +1,4 @@
-"""Freeing an I2C bus of which somebody holds SDA: nine clocks and a STOP, then the muxes' RESET.
+"""Freeing an I2C bus whose SDA a chip holds low: nine clocks and a STOP, then the muxes' RESET.
 
 Sources: UM10204 3.1.16, TCA9548A data sheet 6.7, hardware.md 2 and 8. A chip that lost count in
 the middle of a byte waits for clocks with its bit on the line. A Raspberry Pi's adapter sends none
@@ -28,7 +28,7 @@ class BusRecovery(Protocol):
     """What can be done about a bus that is stuck. Not while a transfer is under way."""
 
     def clock_out(self) -> bool:
-        """Clock whoever holds SDA through its byte, and send a STOP.
+        """Clock the chip that holds SDA through its byte, and send a STOP.
 
         Returns:
             True if SDA and SCL are high in the end, so that the bus can be used.
@@ -49,13 +49,13 @@ class BusRecovery(Protocol):
 
 
 class Line(Protocol):
-    """An open-drain wire: anybody may pull it low, nobody can pull it high."""
+    """An open-drain wire: every device may pull it low, none can pull it high."""
 
     def drive(self, *, low: bool) -> None:
         """Pull it low, or let go."""
 
     def high(self) -> bool:
-        """Is it high, that is, does nobody pull it low?"""
+        """Is it high, that is, does no device pull it low?"""
 
 
 class Lines(Protocol):
@@ -81,7 +81,7 @@ class GpioRecovery:
             self._wait(HALF_PERIOD_NS)
             for _ in range(CLOCKS):
                 if not scl.high():
-                    return False  # nobody stretches clocks here (hardware.md 3.2): it is stuck
+                    return False  # no chip here stretches clocks (hardware.md 3.2): it is stuck
                 if not sda.high():
                     self._drive(scl, low=True)
                     self._drive(scl, low=False)
@@ -103,7 +103,7 @@ class GpioRecovery:
         return True
 
     def _stop(self, scl: Line, sda: Line) -> bool:
-        """SDA rises while SCL is high; False if somebody holds one of them."""
+        """SDA rises while SCL is high; False if one of them is held."""
         self._drive(scl, low=True)
         self._drive(sda, low=True)
         self._drive(scl, low=False)

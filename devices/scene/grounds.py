@@ -16,7 +16,7 @@ class NoGround(Section):
 
 
 class PlateGround(Section):
-    """Somebody stands on a plate and sways."""
+    """Quiet standing on a plate, with sway."""
 
     kind: Literal["plate"]
     load_n: LoadN = 40.0

@@ -113,8 +113,8 @@ class ServoScene(Section):
 class ReferenceScene(Section):
     """`[reference]`: the force sensor of a calibration rig, read through an MCP3208 on SPI.
 
-    Force is (volts - zero_v) * n_per_v. Neither has a default: nobody knows them but whoever has
-    measured this sensor with this amplifier.
+    Force is (volts - zero_v) * n_per_v. Neither has a default: they are known only to those who
+    have measured this sensor with this amplifier.
     """
 
     port: str = EMULATED

@@ -37,7 +37,7 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
 
     Args:
         server: the state it serves.
-        hosts: names under which it is reached, beside addresses and localhost.
+        hosts: names under which it is reached, in addition to addresses and localhost.
         token: asked for on every change of state and on ingest; None: not asked for.
     """
     page = page_folder()

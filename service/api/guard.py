@@ -1,4 +1,4 @@
-"""Who may ask: Host and Origin are checked, and off loopback a token for every change of state.
+"""Who may ask: Host and Origin are checked, and except on loopback a token for every change.
 
 A web page of another site can make a browser send requests here; it cannot choose the Host header
 nor hide its Origin. On loopback that is what has to be kept out; on a network others are, too.
@@ -10,7 +10,7 @@ import hmac
 import ipaddress
 from collections.abc import Iterable
 from http import HTTPStatus
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -36,7 +36,7 @@ class Guard:
 
     Args:
         app: what is guarded.
-        hosts: names, beside addresses of this machine, under which it is reached.
+        hosts: names under which it is reached, in addition to addresses of this machine.
         token: asked for on every change of state and on ingest; None: only for loopback.
     """
 
@@ -62,13 +62,13 @@ class Guard:
     def _refusal(self, scope: Scope) -> tuple[HTTPStatus, str] | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        if len(headers.getlist("host")) != 1 or not self._is_ours(_hostname(f"//{host}")):
+        if len(headers.getlist("host")) != 1 or not self._is_ours(_parts(f"//{host}").hostname):
             what = f"Host {host[:80]!r} is not this server; name it with --allow-host"
             return HTTPStatus.FORBIDDEN, what
         websocket = scope["type"] == "websocket"
         changes = not websocket and scope["method"] not in SAFE_METHODS
         for origin in headers.getlist("origin") if websocket or changes else ():
-            if _netloc(origin) != host:
+            if _parts(origin).netloc != host:
                 what = f"Origin {origin[:80]!r} is another site than {host[:80]!r}"
                 return HTTPStatus.FORBIDDEN, what
         length = headers.get("content-length", "0")
@@ -90,7 +90,7 @@ class Guard:
         if name == "localhost" or name in self._hosts:
             return True
         try:
-            # An address is no name that somebody else's DNS could point here.
+            # A foreign DNS can point a name here, but not an address.
             ipaddress.ip_address(name)
         except ValueError:
             return False
@@ -132,18 +132,12 @@ def _hardened(send: Send) -> Send:
     return with_headers
 
 
-def _netloc(url: str) -> str | None:
+def _parts(url: str) -> SplitResult:
+    """A URL's parts; none of them of what is no URL."""
     try:
-        return urlsplit(url).netloc
+        return urlsplit(url)
     except ValueError:
-        return None
-
-
-def _hostname(url: str) -> str | None:
-    try:
-        return urlsplit(url).hostname
-    except ValueError:
-        return None
+        return urlsplit("")
 
 
 def is_loopback(host: str) -> bool:

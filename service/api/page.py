@@ -14,7 +14,7 @@ def page_folder() -> Path:
         FootTileError: the installation lacks it.
     """
     here = Path(__file__).resolve().parent
-    # A wheel carries it as service/web, a checkout has it beside service.
+    # A wheel carries it as service/web, a checkout has it next to service.
     for folder in (here.parent / "web", here.parents[1] / "web"):
         if (folder / "index.html").is_file():
             return folder

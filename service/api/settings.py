@@ -7,13 +7,13 @@ the TOML file named with --config, else from here.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from platformdirs import user_data_path
 from pydantic import Field, ValidationError
 from pydantic_settings import (
     BaseSettings,
-    PydanticBaseSettingsSource,
+    EnvSettingsSource,
     SettingsConfigDict,
     TomlConfigSettingsSource,
 )
@@ -36,7 +36,7 @@ class Settings(BaseSettings):
     """Asked for on every change of state; made and kept in the data folder if the host is not
     loopback and none is given."""
     allow_host: tuple[str, ...] = ()
-    """Names under which the server is reached, beside its addresses."""
+    """Names under which the server is reached, in addition to its addresses."""
 
 
 def load_settings(config: Path | None, **given: object) -> Settings:
@@ -48,31 +48,17 @@ def load_settings(config: Path | None, **given: object) -> Settings:
     if config is not None and not config.is_file():
         raise UsageError(f"no settings file {str(config)!r}")
 
-    class _FromFile(Settings):
-        @classmethod
-        def settings_customise_sources(
-            cls,
-            settings_cls: type[BaseSettings],
-            init_settings: PydanticBaseSettingsSource,
-            env_settings: PydanticBaseSettingsSource,
-            dotenv_settings: PydanticBaseSettingsSource,
-            file_secret_settings: PydanticBaseSettingsSource,
-        ) -> tuple[PydanticBaseSettingsSource, ...]:
-            return (
-                init_settings,
-                env_settings,
-                TomlConfigSettingsSource(settings_cls, toml_file=config),
-            )
-
-    chosen: dict[str, Any] = {name: v for name, v in given.items() if v is not None}
+    where = "" if config is None else str(config)
+    chosen = {name: value for name, value in given.items() if value is not None}
     try:
-        return Settings.model_construct(**_FromFile(**chosen).model_dump())
+        from_file = TomlConfigSettingsSource(Settings, toml_file=config)()
+        return Settings(**{**from_file, **EnvSettingsSource(Settings)(), **chosen})
     except ValidationError as error:
         complaint = error.errors()[0]
         name = ".".join(str(part) for part in complaint["loc"])
         raise UsageError(
             f"setting {name!r}: {complaint['msg']}",
-            where=str(config) if config is not None else "",
+            where=where,
         ) from error
     except ValueError as error:  # not TOML
-        raise UsageError(f"settings are not readable: {error}", where=str(config)) from error
+        raise UsageError(f"settings are not readable: {error}", where=where) from error

@@ -18,7 +18,7 @@ INTERVAL_95 = 1.96
 
 
 def calibration_tables(calibration: Calibration) -> list[Table]:
-    """Quality of every tile's curve, where it ends, and what is known of it beside its curve."""
+    """Quality of every tile's curve, where it ends, and what else is known of it."""
     return [_curves(calibration), _ranges(calibration), _effects(calibration)]
 
 
@@ -145,7 +145,7 @@ def loop_half_width_n(effects: Effects) -> Parameter | None:
 
 
 def calibration_json(calibration: Calibration) -> dict[str, object]:
-    """The contract's shape of a calibration's quality, with what came later beside it."""
+    """A calibration's quality for programs."""
     return {
         "id": calibration.id,
         "name": calibration.name,

@@ -22,13 +22,13 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JS
 
 class _Output(Console):
     def on_broken_pipe(self) -> None:
-        # Whoever reads has seen enough, as with `| head -1`: that is no failure.
+        # The reader has seen enough, as with `| head -1`: that is no failure.
         self.quiet = True
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0)
 
 
-# Data goes to stdout; progress and remarks to stderr, progress only if somebody watches.
+# Data goes to stdout; progress and remarks to stderr, progress only on a terminal.
 stdout = _Output()
 stderr = Console(stderr=True)
 

@@ -39,5 +39,5 @@ class _Kept(FunctionCache):
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # likewise
         except (OSError, EOFError, pickle.UnpicklingError):
             with contextlib.suppress(OSError):
-                self.flush()  # type: ignore[no-untyped-call]  # it is written anew
+                self.flush()  # type: ignore[no-untyped-call]  # it is written again
             return None

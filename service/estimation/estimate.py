@@ -31,7 +31,7 @@ from service.estimation.pending import Pending, PendingFrames
 from service.estimation.plan import SIGMAS, EstimationPlan
 from service.estimation.upper import Foot, UpperState, foot_of, grid_index, summed, tile_forces
 
-HULL_SIGMAS = 3.0
+HULL_SIGMAS = 3.0  # noise about the edge of the tiles is no reason to mask
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def _cop_masked(plan: EstimationPlan, foot: Foot) -> Bools:
 def _unseen(frames: FrameBatch, state: EstimationState) -> Bools:
     """Frames before which the foot was not seen for so long that it may have been anywhere.
 
-    A frame lost here and there is no reason to begin anew, or a link that loses every third would
+    A frame lost here and there is no reason to start over, or a link that loses every third would
     never see a contact last.
     """
     last_t_ns = frames.t_mono_ns[0] if state.last_seq is None else state.last_t_ns

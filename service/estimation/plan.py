@@ -21,16 +21,16 @@ from service.estimation.foot.geometry import grid_indices, hull
 from service.estimation.ladder import MODELS, Ladder, make_ladder
 from service.estimation.tare.tare import Tare
 
-CONTACT_ON_SIGMA = 5.0
-CONTACT_OFF_SIGMA = 3.0
-CONTACT_MIN_NS = 10_000_000
+CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
+CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter
+CONTACT_MIN_NS = 10_000_000  # a shorter change is an outlier or a bounce
 SIGMAS = 5.0
 """COP needs a GRF of so many sigma: below, the first-order variance of a ratio is not valid. And a
 pressure so many sigma below the calibrated range is no noise."""
-COP_SIGMA_MAX_M = 0.003
+COP_SIGMA_MAX_M = 0.003  # a quarter of a dome: worse says nothing of where the load is
 TARE_OLD_NS = 1_800_000_000_000
 """Half an hour: at the 0.3 kPa/K of a sealed bubble a degree in that time is half a newton."""
-LAG_MAX_MS = 60_000.0
+LAG_MAX_MS = 60_000.0  # so long are frames kept in memory
 GAP = 1.5
 """A frame this many nominal periods after the one before comes after a gap."""
 

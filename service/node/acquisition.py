@@ -28,6 +28,7 @@ _WAITING_MAX = 4096
 """Batches that may wait for a parent that does not read, 100 s; then frames are lost and counted
 as a gap in `seq`."""
 _END_S = 5.0
+"""What is told to end gets so long before it is killed."""
 _LOOK_EVERY_NS = 500_000_000
 """Of the stream's own time: so often is the array asked how it is."""
 

@@ -24,6 +24,7 @@ from service.node.clock_probes import ClockProbes
 from service.node.sending import Greeted, Sending
 
 STATUS_EVERY_S = 1.0
+"""It is for people to read."""
 
 
 class Connection:

@@ -16,8 +16,11 @@ from devices.errors import UsageError
 from service.link import INGEST_PATH
 
 EVERY_S = 0.5
+"""So soon at most does a link that has returned carry an attempt."""
 GIVE_UP_S = 5.0
+"""After that the address is looked up again."""
 _UNSENT_BYTES = 16 << 10
+"""Some messages of frames."""
 
 
 def ingest_url(server: str) -> str:

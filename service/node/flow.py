@@ -13,9 +13,13 @@ from collections import deque
 QUEUE_S = 0.4
 """How long what is under way may take: the newest frame waits so long at most."""
 LEAST_BYTES = 32 << 10
+"""Half a second or so of four tiles: with less, a link with a long delay would stand idle."""
 MOST_BYTES = 8 << 20
+"""More than any link needs in `QUEUE_S`; bounds memory."""
 _PACE_OVER_S = 1.0
+"""The pace is that of the last second: links change."""
 _PIECES = 8
+"""So many questions are under way in a full window."""
 
 
 class Flow:

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 
 from devices.errors import FootTileError, StorageError
 from service.estimation.calibration import Calibration
 from service.server_clock import utc_ns
+from service.sessions.begin import begun, numbered, taken_up
 from service.sessions.ends import at_end, broken_off
 from service.sessions.streams import SessionStream
 from storage.durable import remove_stale_temporaries
 from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
-from storage.sessions.folder import Part, Session, SessionFolder, new_session_id
+from storage.sessions.folder import Part, Session, SessionFolder
 from storage.sessions.ledger import ledger_of
 from storage.sessions.states import numbers_of, states_of
 
@@ -35,7 +35,8 @@ class NodeRecording:
         journal: where the frames are.
         name: of the session to record; None: none, but what was left behind is sealed.
         calibration: to estimate with.
-        notes: for the sealed file.
+        scene_content: of its scene file.
+        emulated: is its array?
         report: told what happens.
     """
 
@@ -47,50 +48,56 @@ class NodeRecording:
         *,
         name: str | None,
         calibration: Calibration | None,
-        notes: Mapping[str, object],
+        scene_content: Mapping[str, object],
+        emulated: bool,
         report: Callable[[str], None],
     ) -> None:
         self._folder = SessionFolder(root / "sessions")
-        self._node = node
         self._journal = journal
         self._name = name
         self._calibration = calibration
-        self._notes = notes
+        self._scene_content = scene_content
+        self._emulated = emulated
         self._report = report
         self._session: Session | None = None
         self._sealing = threading.Lock()
         """Held while what was left is sealed: a node may be stopped meanwhile."""
-        self._unreadable = False
-        """Is there a session of which nobody knows what it needs? Then everything is kept."""
-        self._left_over = self._unfinished()
+        found, self._unreadable = self._folder.load_all()
+        """Sessions that cannot be read: what they need is not known, so everything is kept."""
+        for session_id, error in self._unreadable.items():
+            report(f"session {session_id} is left out: {error}")
+        self._left_over = [s for s in found if s.state != "sealed" and s.node == node]
         self._need()
 
     def goes_on_in(self, stream: NodeStream) -> None:
         """A stream has begun: it belongs to the session from its first frame on."""
         if self._name is None:
             return
-        part = Part(boot_id=stream.boot_id, seq_first=0)
-        session = self._session
+        session, part = self._session, Part(boot_id=stream.boot_id, seq_first=0)
+        if session is None and (session := self._broken_off()) is not None:
+            self._left_over.remove(session)
+            self._report(f"session {session.id} ({session.name}) goes on")
+        scene, calibration = self._scene_content, self._calibration
         if session is None:
-            session = next((s for s in self._left_over if s.name == self._name), None)
-            if session is not None:
-                self._left_over.remove(session)
-                self._report(f"session {session.id} ({session.name}) goes on")
-        if session is not None and self._has_other_tiles(session, stream):
-            self._report(f"other tiles: session {session.id} ends, and another one begins")
-            self._left_over.append(session)
-            session = None
-        if session is None:
-            session = self._new(part, stream)
+            session = begun(
+                stream.info, self._name, part, scene_content=scene, calibration=calibration
+            )
         else:
-            session = at_end(session, self._described(session))
-            session = session.model_copy(update={"parts": (*session.parts, part)})
+            streams = self._described(session)
+            before = streams[session.parts[-1].boot_id].info
+            session = at_end(session, streams)
+            if before is None or before.has_same_tiles_as(stream.info):
+                session = session.model_copy(update={"parts": (*session.parts, part)})
+            else:
+                ended, session = taken_up(
+                    session, stream.info, utc_ns(), scene_content=scene, calibration=calibration
+                )
+                self._report(f"other tiles: session {ended.id} ends, and another one begins")
+                self._left_over.append(ended)
+                self._note(ended)
         self._session = session
         self._need()
-        try:
-            self._folder.save(session)
-        except StorageError as error:  # its frames are kept all the same, if any can be
-            self._report(f"session {session.id} cannot be noted: {error}")
+        self._note(session)
 
     def stop(self) -> tuple[str | None, bool]:
         """Seal the session; its id, None if there is none, and whether it is lossy.
@@ -122,19 +129,19 @@ class NodeRecording:
                 self._left_over.remove(session)
                 self._need()
 
-    def _new(self, part: Part, stream: NodeStream) -> Session:
-        calibration = self._calibration
-        return Session(
-            id=new_session_id(datetime.now(UTC)),
-            name=self._name or "",
-            node=self._node,
-            state="recording",
-            started_t_ns=utc_ns(),
-            parts=(part,),
-            scene=stream.info.scene,
-            scene_content=dict(_object(self._notes.get("scene"))),
-            calibration=calibration.model_dump(mode="json") if calibration is not None else None,
-        )
+    def _broken_off(self) -> Session | None:
+        """The newest session that this recording left behind, but those that others took up."""
+        for session in self._left_over:
+            is_its_own = self._name in (session.name, numbered(session.name)[0])
+            if is_its_own and session.state != "pending":
+                return session
+        return None
+
+    def _note(self, session: Session) -> None:
+        try:
+            self._folder.save(session)
+        except StorageError as error:  # its frames are kept all the same, if any can be
+            self._report(f"session {session.id} cannot be noted: {error}")
 
     def _seal(self, session: Session) -> Session:
         # Here, because a real node need not wait for scipy before its first frame.
@@ -146,8 +153,7 @@ class NodeRecording:
         self._folder.save(session)
         folder = self._folder.path(session.id)
         remove_stale_temporaries(folder)
-        emulated = self._notes.get("emulated")
-        sources = sources_of(session, streams, tares=None, emulated=bool(emulated))
+        sources = sources_of(session, streams, tares=None, emulated=self._emulated)
         ledger = ledger_of(session.parts, states_of(session, streams), finished=True)
         sealed = seal(sources, folder, ledger)
         self._folder.save(sealed)
@@ -158,10 +164,6 @@ class NodeRecording:
         known = {stream.boot_id: _described(stream) for stream in self._journal.streams}
         return {p.boot_id: known.get(p.boot_id, SessionStream()) for p in session.parts}
 
-    def _has_other_tiles(self, session: Session, stream: NodeStream) -> bool:
-        before = self._described(session)[session.parts[-1].boot_id].info
-        return before is not None and not before.has_same_tiles_as(stream.info)
-
     def _need(self) -> None:
         """Have the journal keep what is not sealed yet."""
         sessions = (*self._left_over, *((self._session,) if self._session else ()))
@@ -169,19 +171,6 @@ class NodeRecording:
         if self._unreadable:
             needed = {stream.boot_id: Intervals([(0, NO_END)]) for stream in self._journal.streams}
         self._journal.wanted.say_local(needed)
-
-    def _unfinished(self) -> list[Session]:
-        found = []
-        for session_id in self._folder.ids():
-            try:
-                session = self._folder.load(session_id)
-            except FootTileError as error:
-                self._report(f"session {session_id} is left out: {error}")
-                self._unreadable = True
-                continue
-            if session.state != "sealed" and session.node == self._node:
-                found.append(session)
-        return found
 
 
 def _described(stream: NodeStream) -> SessionStream:
@@ -198,7 +187,3 @@ def _described(stream: NodeStream) -> SessionStream:
         info=stream.info,
         journal=stream.journal,
     )
-
-
-def _object(value: object) -> Mapping[str, object]:
-    return value if isinstance(value, Mapping) else {}

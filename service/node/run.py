@@ -11,8 +11,9 @@ from typing import Any
 
 from devices.errors import FootTileError
 from service.estimation.calibration import Calibration
-from service.link import PROTOCOL, EarlierStream, Hello, Status, Wanted
+from service.link import Status, Wanted
 from service.node.acquisition import AcquisitionProcess, Batch, Failed, Health, Message, Started
+from service.node.introduction import hello_of
 from service.node.publisher import Publisher
 from service.node.recording import NodeRecording
 from service.node.sending import Source
@@ -22,10 +23,13 @@ from storage.journal.node_stream import NodeStream
 from storage.journal.wanted import ServerWants
 
 _LOOK_S = 0.02
+"""Between two looks whether the server has everything."""
 _DRAIN_S = 3.0
+"""A node that is stopped waits no longer for the server."""
 _AWAY_LOOKS = 50
+"""Without a link for a second it does not wait at all."""
 _TROUBLES_S = 0.5
-_EARLIER_MAX = 64
+"""Between two looks at the disk's troubles."""
 
 
 @dataclass(frozen=True)
@@ -111,10 +115,8 @@ class RunningNode:
             journal,
             name=options.record,
             calibration=options.calibration,
-            notes={
-                "scene": options.rig.scene.model_dump(mode="json"),
-                "emulated": options.rig.emulated,
-            },
+            scene_content=options.rig.scene.model_dump(mode="json"),
+            emulated=options.rig.emulated,
             report=report,
         )
         self._health = Health()
@@ -205,7 +207,7 @@ class RunningNode:
             Source(
                 present=self._present_stream,
                 streams=lambda: {stream.boot_id: stream for stream in self._journal.streams},
-                hello=self._hello,
+                hello=lambda: hello_of(self._options, self._journal, self._present_stream()),
                 status=self._status,
                 wanted=self._want,
                 damaged=self._journal.damaged,
@@ -220,29 +222,6 @@ class RunningNode:
         if self._present is None:
             raise RuntimeError("no stream has begun")
         return self._present
-
-    def _hello(self) -> Hello:
-        options, present = self._options, self._present_stream()
-        next_seq = present.next_seq  # before what is held, which may go on meanwhile
-        others = [stream for stream in self._journal.streams if stream is not present]
-        # As many as fit into a message, those that a session waits for first.
-        waited_for = [stream for stream in others if self._journal.undelivered(stream)]
-        rest = [stream for stream in others if stream not in waited_for]
-        chosen = (*waited_for[:_EARLIER_MAX], *rest[-_EARLIER_MAX:])[:_EARLIER_MAX]
-        earlier = [stream for stream in others if stream in chosen]
-        return Hello(
-            protocol=PROTOCOL,
-            array_info=present.info,
-            held=tuple(present.held),
-            next_seq=next_seq,
-            lost=present.lost.as_pairs(),
-            scene=options.rig.scene.model_dump(mode="json"),
-            emulated=options.rig.emulated,
-            calibration=options.calibration,
-            calibration_problem=options.calibration_problem,
-            earlier=tuple(_earlier(stream) for stream in earlier),
-            has_more=len(earlier) < len(others),
-        )
 
     def _status(self, backlog_frames: int) -> Status:
         return Status(
@@ -308,22 +287,6 @@ class RunningNode:
             recorded=recorded,
             is_lossy=is_lossy,
         )
-
-
-def _earlier(stream: NodeStream) -> EarlierStream:
-    held = stream.held
-    first = next(iter(held))[0] if held else 0
-    journal = stream.journal
-    t_ns_first = journal.t_ns_near(first, newest=False) if journal is not None else None
-    return EarlierStream(
-        array_info=stream.info,
-        held=tuple(held),
-        next_seq=stream.next_seq,
-        lost=stream.lost.as_pairs(),
-        unsynced_tail_max=stream.notes.unsynced_tail_max,
-        missed_slots=stream.missed_slots,
-        t_ns_first=t_ns_first or 0,
-    )
 
 
 async def _started(

@@ -24,12 +24,15 @@ from storage.journal.node_stream import NodeStream
 from storage.wire import EncodedBatch
 
 _ASK_EVERY_S = 0.5
+"""Asked even if nothing is sent, so that silence means something."""
 _NO_ANSWER_S = 4.0
 """A link on which nothing comes back for so long is half open."""
 _LIVE_BEHIND_S = 0.5
 """Frames that wait longer to be sent are overtaken by newer ones."""
 _CHUNK_FRAMES = 512
+"""A second or so of the past is read at once; then newer frames have their turn."""
 _READ_AGAIN_S = 0.2
+"""After what was to be read was deleted meanwhile."""
 
 
 @dataclass(frozen=True)

@@ -106,9 +106,9 @@ def read_recordings(paths: Sequence[Path]) -> dict[str, list[Pressed]]:
                 others.append(pressed)
     # Tiles that were only soaked have nothing to be fitted to.
     bench = {
-        serial: all_of
-        for serial, all_of in sorted(found.items())
-        if pressed_in([one.indentation for one in all_of])
+        serial: recordings
+        for serial, recordings in sorted(found.items())
+        if pressed_in([pressed.indentation for pressed in recordings])
     }
     if not bench:
         raise CalibrationError(
@@ -119,17 +119,24 @@ def read_recordings(paths: Sequence[Path]) -> dict[str, list[Pressed]]:
     return bench
 
 
-def _refuse_contradiction(one: Pressed, other: Pressed) -> None:
-    serial, files = one.indentation.serial, f"{one.indentation.where} and {other.indentation.where}"
-    if one.chip != other.chip:
+def _refuse_contradiction(first: Pressed, second: Pressed) -> None:
+    serial, files = (
+        first.indentation.serial,
+        f"{first.indentation.where} and {second.indentation.where}",
+    )
+    if first.chip != second.chip:
         raise CalibrationError(
-            f"tile {serial} has another chip in each of two recordings: coefficients {one.chip} "
-            f"and {other.chip}",
+            f"tile {serial} has another chip in each of two recordings: coefficients {first.chip} "
+            f"and {second.chip}",
             where=files,
             remedy="Give the replaced part a serial of its own, and calibrate each by itself",
         )
     # A repeat that counts twice would look like agreement.
-    if one.boot_id == other.boot_id and one.seq[0] <= other.seq[1] and other.seq[0] <= one.seq[1]:
+    if (
+        first.boot_id == second.boot_id
+        and first.seq[0] <= second.seq[1]
+        and second.seq[0] <= first.seq[1]
+    ):
         raise CalibrationError(
             f"tile {serial}: the same frames are given twice",
             where=files,

@@ -1,8 +1,8 @@
 """Where a calibration comes from by its name: a preset, a file, or the emulated bench.
 
 The bench presses each tile alone, as a user would on the mill, and fits what was recorded. A serial
-is for ever the same tile, so its result is kept in the user's cache; it is found again by serial,
-parts seed and version, and would come out the same if it were made anew.
+always means the same tile, so its result is kept in the user's cache; it is found again by serial,
+parts seed and version, and would be the same if it were made again.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class Diagnosis:
     """What was found, and what it means.
 
     Attributes:
-        tiles: every tile of the scene, and every one beside it.
+        tiles: every tile of the scene, and every other one.
         scl_hz: bus clock as measured; None without a tile to measure it with.
         asked_scl_hz: what it should be.
         transaction_s: what a transaction costs beyond its bits.

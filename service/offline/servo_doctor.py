@@ -1,4 +1,4 @@
-"""Who is on a servo's serial line, and whether it is the one that a scene means."""
+"""Which servos are on a serial line, and whether the one that a scene means is among them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from devices.scene.hardware import ServoScene
 
 @dataclass(frozen=True)
 class ServoDiagnosis:
-    """Who is on a serial line.
+    """Which servos are on a serial line.
 
     Attributes:
         found: every servo that answered.
@@ -33,7 +33,7 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
     Args:
         port: its serial port.
         clock: a real one.
-        wanted: what the scene says of it; None: whoever has id 1.
+        wanted: what the scene says of it; None: the one with id 1.
 
     Raises:
         ServoSetupError: the port cannot be opened.
@@ -49,8 +49,8 @@ def diagnose_servo(port: str, clock: Clock, wanted: ServoScene | None) -> ServoD
     wrong = []
     if not found:
         wrong.append(
-            f"Nobody answers as id {servo_id}. Check power, cable and id; an MX leaves the factory "
-            "with id 1 at 57600 baud."
+            f"No servo answers as id {servo_id}. Check power, cable and id; an MX leaves the "
+            "factory with id 1 at 57600 baud."
         )
     elif wanted is not None and not any(_is_wanted(servo, wanted) for servo in found):
         wrong.append(

@@ -135,7 +135,7 @@ class Simulation:
         """Frames with what the emulation adds: truth if asked for, the mill's notes."""
         mill = self._world.mill
         batches = self.acquisition.run(lambda: self._clock.now_ns() >= self._end_ns)
-        # Nobody watches, so frames may gather: batching does not change a bit of the result.
+        # Nothing is shown live, so frames may gather: batching does not change a bit of the result.
         while gathered := list(islice(batches, _GATHER)):
             batch = FrameBatch.concatenate(gathered)
             extra: dict[str, npt.NDArray[Any]] = {}

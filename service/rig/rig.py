@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from devices.emulation.world import World
 
 _TRIAL_FRAMES = 100
+"""From so many frames the bus's rate is taken: a fifth of a second."""
 _RENEW_AGAIN_NS = 2_000_000_000
+"""Between attempts to identify a part that is being plugged."""
 
 # Threads of an emulated world must not make the bus wait for Python's lock longer than a bit or so.
 _SWITCH_S = 0.0002

@@ -7,18 +7,16 @@ does every stream that it took meanwhile and brings home. Where a part ends is d
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime
 
-from devices.frames import ArrayInfo
-from service.server.nodes import Node
+from service.server.node import ServerNode
 from service.server_clock import utc_ns
+from service.sessions.begin import taken_up
 from service.sessions.ends import at_end, at_stop, broken_off, ended
 from service.sessions.streams import SessionStream
 from storage.clock.offset import ClockOffset
 from storage.intervals import NO_END, Intervals
-from storage.sessions.folder import Part, Session, new_session_id
+from storage.sessions.folder import Part, Session
 from storage.sessions.states import numbers_of
 
 _UNHEARD_S = 1.0
@@ -26,7 +24,7 @@ _SLOWEST = 1.5
 """A stream is surely no more than so many times as old as its frames make it."""
 
 
-def streams_of(session: Session, node: Node | None) -> dict[str, SessionStream]:
+def streams_of(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
     """What is known of a session's streams, by boot_id."""
     found = {}
     for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
@@ -39,7 +37,7 @@ def streams_of(session: Session, node: Node | None) -> dict[str, SessionStream]:
     return found
 
 
-def first_part(node: Node, last_seq: int, last_t_ns: int, pre_roll_s: float) -> Part:
+def first_part(node: ServerNode, last_seq: int, last_t_ns: int, pre_roll_s: float) -> Part:
     """The part of a session that starts now, or earlier if a journal reaches back so far.
 
     What the node still has and is to send counts as if it were here.
@@ -58,7 +56,7 @@ def first_part(node: Node, last_seq: int, last_t_ns: int, pre_roll_s: float) -> 
     return Part(boot_id=node.boot_id, seq_first=seq_first)
 
 
-def stopped(session: Session, node: Node | None) -> Session:
+def stopped(session: Session, node: ServerNode | None) -> Session:
     """The session, stopped at this instant; its end is open until the stream has passed it."""
     update: dict[str, object] = {"stopped_t_ns": utc_ns(), "state": "pending", "problem": None}
     if node is not None and node.connected:
@@ -70,7 +68,7 @@ def stopped(session: Session, node: Node | None) -> Session:
     return ended(session, session.parts[-1], node.last_seq)
 
 
-def followed(session: Session, node: Node) -> list[Session]:
+def followed(session: Session, node: ServerNode) -> list[Session]:
     """The session as far as its node's streams are known to go by now.
 
     Returns:
@@ -85,13 +83,13 @@ def followed(session: Session, node: Node) -> list[Session]:
     return found
 
 
-def given_up(session: Session, node: Node | None) -> Session:
+def given_up(session: Session, node: ServerNode | None) -> Session:
     """The session without what has not come: an open end is closed at what is here."""
     closed = broken_off(session, streams_of(session, node), utc_ns())
     return closed.model_copy(update={"given_up": True})
 
 
-def parts_needed(session: Session, node: Node | None) -> Iterator[Part]:
+def parts_needed(session: Session, node: ServerNode | None) -> Iterator[Part]:
     """Parts of streams that a session, not sealed yet, needs in the journals."""
     yield from session.parts
     if session.parts[-1].seq_last is None and node is not None:
@@ -100,7 +98,7 @@ def parts_needed(session: Session, node: Node | None) -> Iterator[Part]:
             yield Part(boot_id=boot_id, seq_first=0)
 
 
-def clock_at_start(node: Node, part: Part) -> tuple[ClockOffset, ...]:
+def clock_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
     """Measurements of a node's clock from the beginning of a part on, and the last before it."""
     begin_t_ns = (
         journal.t_ns_near(part.seq_first, newest=False) if (journal := node.journal) else None
@@ -113,7 +111,7 @@ def clock_at_start(node: Node, part: Part) -> tuple[ClockOffset, ...]:
     return tuple(rows[before[-1] if before else 0 :])
 
 
-def _step(session: Session, node: Node) -> list[Session]:
+def _step(session: Session, node: ServerNode) -> list[Session]:
     """The session with its open part ended, and what follows; nothing if that is not known yet."""
     boot_id = session.parts[-1].boot_id
     streams = streams_of(session, node)
@@ -125,67 +123,42 @@ def _step(session: Session, node: Node) -> list[Session]:
     following = next(iter(_following(session, node)), None)
     if following is None:
         return []
+    begun = session.stopped_t_ns is None or _has_begun(session, node, following)
+    if begun is None:
+        return []
     closed, stream = at_end(session, streams, utc_ns()), streams[boot_id]
-    if session.stopped_t_ns is not None:
-        begun = _has_begun(session.stopped_t_ns, session, node, following)
-        if begun is None:
-            return []
-        if not begun:
-            wanted = numbers_of(closed.parts).get(boot_id, Intervals())
-            return [] if (stream.may_come - stream.held) & wanted else [closed]
+    if not begun:
+        wanted = numbers_of(closed.parts).get(boot_id, Intervals())
+        return [] if (stream.may_come - stream.held) & wanted else [closed]
     info = node.streams[following].info
     if stream.info is None or stream.info.has_same_tiles_as(info):
         part = Part(boot_id=following, seq_first=0)
         return [closed.model_copy(update={"parts": (*closed.parts, part)})]
-    update: dict[str, object] = {"problem": "the node came back with other tiles: recording ended"}
-    if closed.state == "recording":
-        begin_t_ns = _begin_t_ns(session, node, following)
-        update |= {"state": "pending", "stopped_t_ns": begin_t_ns}
-    return [closed.model_copy(update=update), _continued(session, node, info)]
-
-
-def _continued(session: Session, node: Node, info: ArrayInfo) -> Session:
-    """The session that takes up a recording whose node came back with other tiles."""
-    name, number = session.name, 2
-    if match := re.fullmatch(r"(.*) \((\d+)\)", name):
-        name, number = match[1], int(match[2]) + 1
+    begin_t_ns = _begin_t_ns(session, node, following)
+    scene_content = node.hello.scene if info.scene == node.info.scene else {}
     calibration = node.hello.calibration
-    return Session(
-        id=new_session_id(datetime.now(UTC)),
-        name=f"{name} ({number})",
-        node=session.node,
-        state=session.state,
-        started_t_ns=_begin_t_ns(session, node, info.boot_id),
-        stopped_t_ns=session.stopped_t_ns,
-        parts=(Part(boot_id=info.boot_id, seq_first=0),),
-        subject=session.subject,
-        notes=session.notes,
-        tags=session.tags,
-        scene=info.scene,
-        scene_content=node.hello.scene if info.scene == node.info.scene else {},
-        calibration=calibration.model_dump(mode="json") if calibration is not None else None,
-        continues=session.id,
-    )
+    return [
+        *taken_up(closed, info, begin_t_ns, scene_content=scene_content, calibration=calibration)
+    ]
 
 
-def _following(session: Session, node: Node) -> Iterable[str]:
+def _following(session: Session, node: ServerNode) -> Iterable[str]:
     """Streams that began after that of the session's open part, oldest first."""
     boot_id, order = session.parts[-1].boot_id, node.order
     if boot_id in order:
         return order[order.index(boot_id) + 1 :]
     # The node does not remember it: what began after its last frame came after it.
-    stream = node.streams.get(boot_id)
-    newest = stream.journal.t_ns_near(NO_END, newest=True) if stream and stream.journal else None
-    known = {part.boot_id for part in session.parts}
-    later = []
-    for name in order:
+    newest = streams_of(session, node)[boot_id].t_ns_near(NO_END, newest=True)
+
+    def is_later(name: str) -> bool:
         begin = node.streams[name].t_ns_first
-        if name == node.boot_id or (newest is not None and begin is not None and begin > newest):
-            later.append(name)
-    return tuple(name for name in later if name not in known)
+        return newest is not None and begin is not None and begin > newest
+
+    known = {part.boot_id for part in session.parts}
+    return [n for n in order if n not in known and (n == node.boot_id or is_later(n))]
 
 
-def _offset_ns(session: Session, node: Node | None, boot_id: str) -> int | None:
+def _offset_ns(session: Session, node: ServerNode | None, boot_id: str) -> int | None:
     """What to add to a stream's instants for the server's UTC; None if it was never measured."""
     stream = node.streams.get(boot_id) if node is not None else None
     if stream is not None and stream.clock is not None:
@@ -197,19 +170,20 @@ def _offset_ns(session: Session, node: Node | None, boot_id: str) -> int | None:
     return node.clock.server_minus_node_ns if node is not None and node.clock is not None else None
 
 
-def _begin_t_ns(session: Session, node: Node, boot_id: str) -> int:
+def _begin_t_ns(session: Session, node: ServerNode, boot_id: str) -> int:
     """When a stream began, server's UTC; now, if that is not known."""
     begin_t_ns, offset_ns = node.streams[boot_id].t_ns_first, _offset_ns(session, node, boot_id)
     return utc_ns() if begin_t_ns is None or offset_ns is None else begin_t_ns + offset_ns
 
 
-def _has_begun(stop_t_ns: int, session: Session, node: Node, boot_id: str) -> bool | None:
+def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
     """Had a stream begun when the session was stopped? None: not known yet.
 
     The instant that an earlier stream's oldest frame has is its own word; of the present one only
     frames tell, or that it cannot be so old.
     """
     stream, rate_hz = node.streams[boot_id], node.streams[boot_id].info.nominal_rate_hz
+    stop_t_ns = session.stopped_t_ns or utc_ns()
     offset_ns = _offset_ns(session, node, boot_id)
     if boot_id != node.boot_id:
         known = offset_ns is not None and stream.t_ns_first is not None

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from devices.arrays import Floats
 from devices.frames import FrameBatch
 from service.estimation.foot.contact import UNKNOWN
-from service.server.nodes import Estimated, Node
+from service.server.node import Estimated, ServerNode
 from storage.intervals import Intervals
 
 SUMMARY_NS = 1_000_000_000
@@ -95,7 +95,7 @@ class Subscriber:
         self._notices.append(message)
         self.news.set()
 
-    def add(self, node: Node, piece: Piece) -> None:
+    def add(self, node: ServerNode, piece: Piece) -> None:
         """More frames of a node."""
         key = node.name
         if self._only not in (None, key):
@@ -207,7 +207,7 @@ class Hub:
             for subscriber in self._subscribers:
                 subscriber.notice(text)
 
-    def publish(self, node: Node, due: list[Estimated]) -> None:
+    def publish(self, node: ServerNode, due: list[Estimated]) -> None:
         """Frames of a node with their estimates."""
         for frames, columns in due:
             node.shown_t_ns = int(frames.t_ns[-1])

@@ -12,9 +12,12 @@ from pathlib import Path
 
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
+from service.server.book import SessionBook
 from service.server.live import Hub
-from service.server.nodes import Node, Nodes
+from service.server.node import ServerNode
+from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
+from service.server.settling import Settling
 from service.server.streams import ServerStream
 from service.server.trash import Trash, destroy
 from service.server.views import NodeView, SessionView
@@ -37,7 +40,7 @@ _SERVER_ID = re.compile(r"[0-9a-f]{32}")
 class Link:
     """One node's connection, as far as others may use it."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: ServerNode) -> None:
         self.node = node
         self.stream: ServerStream = node.present
         """Whose frames come."""
@@ -96,14 +99,12 @@ class Server:
             self.id = _id_of(data)
             """Name of this data folder: a node keeps what this server needs, whoever else asks."""
             self.hub = Hub()
-            self.nodes = Nodes(data)
-            self.recorder = Recorder(
-                SessionFolder(data / "sessions"),
-                Trash(data / "trash"),
-                self.nodes,
-                changed=self._tell_session,
-                ask_again=self._ask_again,
+            self.nodes = ServerNodes(data)
+            self.sessions = SessionBook(
+                SessionFolder(data / "sessions"), Trash(data / "trash"), self._tell_session
             )
+            self.settling = Settling(self.sessions, self.nodes, self._ask_again)
+            self.recorder = Recorder(self.sessions, self.nodes, self.settling)
         except FootTileError:
             self._lock.close()
             raise
@@ -117,7 +118,7 @@ class Server:
             now_s = time.monotonic()
             try:
                 await asyncio.gather(*(self._sync(node) for node in self.nodes))
-                self.recorder.settle()
+                self.settling.settle()
                 self._tell_wanted()
                 if now_s >= slow_s:
                     slow_s = now_s + _SLOW_TICK_S
@@ -135,7 +136,7 @@ class Server:
         """End the links and wait for what is being sealed."""
         for link in list(self.links.values()):
             link.end(Close.RESTART, "the server is going down; connect again")
-        await self.recorder.close()
+        await self.settling.close()
         for node in self.nodes:
             for stream in node.streams.values():
                 try:
@@ -159,14 +160,14 @@ class Server:
         Raises:
             StorageError: one of them cannot be deleted.
         """
-        doomed = self.recorder.trash.doom()
+        doomed = self.sessions.trash.doom()
         return len(doomed), await asyncio.to_thread(destroy, doomed)
 
     def tell_deleted(self, session_id: str) -> None:
         """Tell every screen that a session is in the trash."""
         self.hub.notice({"type": "deleted", "session_id": session_id})
 
-    def tell_node(self, node: Node) -> None:
+    def tell_node(self, node: ServerNode) -> None:
         """Tell every screen how a node is."""
         view = NodeView.of(node, self.recorder).model_dump(mode="json")
         self.hub.notice({"type": "node", "node": view})
@@ -177,7 +178,7 @@ class Server:
             if link.wanted is not None and self.recorder.wanted(link.node.name) != link.wanted:
                 link.news.set()
 
-    def _ask_again(self, node: Node) -> None:
+    def _ask_again(self, node: ServerNode) -> None:
         link = self.links.get(node.name)
         if link is not None:
             link.end(Close.RESTART, "frames are damaged here; send what the server lacks")
@@ -206,11 +207,11 @@ class Server:
                 },
             }
         )
-        for session in self.recorder.all():
+        for session in self.sessions:
             if session.state in ("recording", "pending", "sealing"):
                 self._tell_session(session)
 
-    async def _sync(self, node: Node) -> None:
+    async def _sync(self, node: ServerNode) -> None:
         """Have a node's journals on disk, then acknowledge what was in them before."""
         if node.storage_problem is not None:  # perhaps not even a journal could be begun
             await self._try_again(node)
@@ -218,7 +219,7 @@ class Server:
         streams = [stream for stream in node.streams.values() if stream.has_news]
         await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
 
-    async def _sync_stream(self, node: Node, stream: ServerStream) -> None:
+    async def _sync_stream(self, node: ServerNode, stream: ServerStream) -> None:
         unsynced, stream.unsynced = stream.unsynced, Intervals()
         owed, stream.owed = stream.owed, Intervals()
         try:
@@ -235,7 +236,7 @@ class Server:
         if link is not None and owed:
             link.acknowledge(stream.boot_id, owed)
 
-    async def _try_again(self, node: Node) -> None:
+    async def _try_again(self, node: ServerNode) -> None:
         """After a full disk: once it can be written again, have the node send what is missing."""
         try:
             await asyncio.to_thread(self.check_storage)

@@ -6,7 +6,7 @@ import logging
 import shutil
 from pathlib import Path
 
-from devices.errors import FootTileError, UnknownError
+from devices.errors import UnknownError
 from storage.durable import storage_errors
 from storage.sessions.folder import DOOMED_PREFIX, Session, SessionFolder
 
@@ -22,17 +22,14 @@ class Trash:
 
     def __init__(self, folder: Path) -> None:
         self.folder = SessionFolder(folder)
-        self._sessions: dict[str, Session] = {}
-        self.has_unreadable = False
-        """Is there one that cannot be read?"""
         for doomed in folder.glob(DOOMED_PREFIX + "*"):
             shutil.rmtree(doomed, ignore_errors=True)
-        for session_id in self.folder.ids():
-            try:
-                self._sessions[session_id] = self.folder.load(session_id)
-            except FootTileError as error:
-                log.warning("session %s in the trash is left out: %s", session_id, error)
-                self.has_unreadable = True
+        found, unreadable = self.folder.load_all()
+        for session_id, error in unreadable.items():
+            log.warning("session %s in the trash is left out: %s", session_id, error)
+        self.has_unreadable = bool(unreadable)
+        """Is there one that cannot be read?"""
+        self._sessions = {session.id: session for session in found}
 
     def __contains__(self, session_id: str) -> bool:
         return session_id in self._sessions

@@ -13,7 +13,7 @@ from devices.frames import ServoInfo
 from service.estimation.calibration import Calibration
 from service.estimation.tare.drift import expected_shift_kpa, trend, warmer_k
 from service.estimation.tare.tare import Source
-from service.server.nodes import Node
+from service.server.node import ServerNode
 from service.server.recorder import Recorder
 from service.server.tare_keeper import AutoTare
 from service.sessions.tares import RecordedTare
@@ -115,7 +115,7 @@ class DriftView(View):
     grf_n_since_tare: float | None = Field(description="What that makes of the GRF.")
 
     @classmethod
-    def of(cls, node: Node) -> DriftView:
+    def of(cls, node: ServerNode) -> DriftView:
         """Of a node as it is now."""
         live, tiles = node.live, len(node.info.tiles)
         line = trend(node.tares.valid(node.info), tiles=tiles)
@@ -199,7 +199,7 @@ class NodeView(View):
     recording: list[str] = Field(description="Ids of sessions that are being recorded.")
 
     @classmethod
-    def of(cls, node: Node, recorder: Recorder) -> NodeView:
+    def of(cls, node: ServerNode, recorder: Recorder) -> NodeView:
         """Of a node as it is now."""
         info, live = node.info, node.live
         calibration = live.calibration
@@ -318,7 +318,7 @@ class Problem(BaseModel):
     instance: str
 
 
-def _tiles(node: Node) -> list[TileView]:
+def _tiles(node: ServerNode) -> list[TileView]:
     calibration, full_scale_n = node.live.calibration, node.live.full_scale_n
     full_scales = [None] * len(node.info.tiles) if full_scale_n is None else _known(full_scale_n)
     placed = {"serial", "mux", "channel", "x_m", "y_m", "z_m", "reference"}

@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from devices.errors import FootTileError
+from service.sessions.begin import begun
 from service.sessions.ends import at_stop, broken_off, open_tail
 from service.sessions.recover_streams import OpenedStream, hello_of, open_streams
 from service.sessions.sealing import seal
@@ -115,13 +116,11 @@ def recover(
     for path in sorted(_set_aside(data) - set_aside):
         name = f"{path.parent.parent.name}/{path.parent.name}"
         recovery.cut[name] = recovery.cut.get(name, 0) + path.stat().st_size
-    known = []
-    for session_id in sorted(sessions.ids()):
-        try:
-            known.append(sessions.load(session_id))
-        except FootTileError as error:
-            if any(sessions.path(session_id).iterdir()):
-                recovery.problems.append(str(error))
+    known, unreadable = sessions.load_all()
+    known.sort(key=lambda session: session.id)
+    for session_id, error in sorted(unreadable.items()):
+        if any(sessions.path(session_id).iterdir()):
+            recovery.problems.append(str(error))
     for session in known:
         if session.state == "sealed":
             if _mend_events(session, sessions.path(session.id)):
@@ -201,12 +200,8 @@ def _of_no_session(
     data: Path, known: list[Session], streams: Streams, now: Callable[[], datetime]
 ) -> list[Session]:
     """Sessions of the frames that belong to none, one for every run of a stream."""
-    trash = SessionFolder(data / "trash")
-    for session_id in trash.ids():
-        try:
-            known = [*known, trash.load(session_id)]
-        except FootTileError:  # whoever deleted it does not want it back
-            continue
+    # What was deleted is not wanted back, and what of it cannot be read says nothing of its frames.
+    known = [*known, *SessionFolder(data / "trash").load_all()[0]]
     found = []
     for (node, boot_id), stream in streams.items():
         parts = (part for session in known if session.node == node for part in session.parts)
@@ -219,18 +214,19 @@ def _of_no_session(
             if not held:
                 continue
             first, last = held[0][0], held[-1][1]
-            session = Session(
+            session = begun(
+                journal.info,
+                f"recovered {node} {boot_id}",
+                Part(boot_id=boot_id, seq_first=first, seq_last=last),
+                scene_content=hello.get("scene") or {},
+                calibration=None,
                 id=new_session_id(now()),
-                name=f"recovered {node} {boot_id}",
                 node=node,
                 state="sealing",
                 started_t_ns=journal.t_ns_near(first, newest=False) or 0,
                 stopped_t_ns=journal.t_ns_near(last, newest=True),
-                parts=(Part(boot_id=boot_id, seq_first=first, seq_last=last),),
-                scene=journal.info.scene,
-                scene_content=hello.get("scene") or {},
-                calibration=hello.get("calibration"),
             )
+            session = session.model_copy(update={"calibration": hello.get("calibration")})
             if last == journal.held.last and (tail := open_tail(stream.for_session(session))):
                 session = session.model_copy(update={"unsynced_tail_max": {boot_id: tail}})
             found.append(session)

@@ -36,6 +36,7 @@ FAST = 500e-6
 _READING_NS = 1.0
 """Both clocks are read in whole ns."""
 _FIRST_LOOK_ROWS = 64
+"""Looked at first, then twice as many: a clock that steps often costs no square of its rows."""
 _STEADY_ROWS_MIN = 4
 """A step between two rows or three looks like a steady rate."""
 

@@ -71,9 +71,15 @@ class InFlight:
 
     def put(self, frame: FrameRow) -> None:
         """Keep one frame, as it was taken."""
-        *scalars, padc, tadc, sample_offset_us, status = frame
-        row = self._row.pack(*scalars, *padc, *tadc, *sample_offset_us, *status)
-        at = self._begin + (frame.seq % ROWS) * self._size
+        seq, t_mono_ns, t_ns, counts, age_us, force_n, flags, padc, tadc, offset_us, status = frame
+        row = self._row.pack(
+            *(seq, t_mono_ns, t_ns, counts, age_us, force_n, flags),
+            *padc,
+            *tadc,
+            *offset_us,
+            *status,
+        )
+        at = self._begin + (seq % ROWS) * self._size
         self._map[at : at + self._size] = row + zlib.crc32(row).to_bytes(4, "little")
 
     def close(self) -> None:

@@ -22,8 +22,7 @@ from storage.durable import make_folder, storage_errors
 from storage.intervals import NO_END, Intervals, union
 from storage.journal.open_segments import OpenSegments
 from storage.journal.segment import SUFFIX, Segment, recover
-from storage.journal.segment_bytes import payload_of, read_header
-from storage.journal.segment_index import RECORD, numbers
+from storage.journal.segment_format import RECORD, numbers, payload_of, read_header
 from storage.journal.stream_notes import StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.schema import array_info, wire_schema
@@ -206,10 +205,7 @@ class Journal:
 
         By whole batches; None if there is no such frame.
         """
-        if newest:
-            near = self.held.within(0, seq).last
-        else:
-            near = next(iter(self.held.within(seq, NO_END)), (None,))[0]
+        near = self.held.within(0, seq).last if newest else self.held.within(seq, NO_END).first
         if near is None:
             return None
         for segment in self._segments:
@@ -312,11 +308,11 @@ class Journal:
         self.held = union(segment.held for segment in self._segments)
 
     def _write(self, message: EncodedBatch) -> None:
-        segment = self._open.append(message).segment
-        if segment.held == message.numbers:  # its first batch
+        segment, numbers_ = self._open.append(message).segment, message.numbers
+        if segment.held == numbers_:  # its first batch
             self._segments.append(segment)
         self.held.add(message.seq_first, message.seq_last)
-        self.lost.found(message.numbers)
+        self.lost.found(numbers_)
 
     def _messages_of(
         self, found: list[tuple[tuple[int, int], Path, np.void]]

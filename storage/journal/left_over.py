@@ -42,8 +42,7 @@ def recover_stream(folder: Path) -> NodeStream | None:
     if frames is not None:
         held, first = stream.stored, int(frames.seq[0])
         # What is older than everything that is held was evicted, not lost in flight.
-        oldest = next(iter(held), (0, 0))[0]
-        for a, b in held.missing(max(first, oldest), int(frames.seq[-1])):
+        for a, b in held.missing(max(first, held.first or 0), int(frames.seq[-1])):
             # If there is a gap before them, more waited for the disk than was in flight.
             for batch in messages_of(frames.rows(a - first, b + 1 - first), stream.info):
                 stream.put(batch, gap=DISK_SLOW)

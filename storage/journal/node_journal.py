@@ -35,10 +35,15 @@ log = logging.getLogger("foottile.journal")
 WAITING_BYTES = 32 << 20
 """What may wait in memory for the disk: some minutes."""
 SYNC_S = 0.2
+"""Less than half of `PROMISE_S`: what just missed one sync is on the disk with the next."""
 _TIDY_S = 2.0
+"""What is dropped is minutes old: so often is soon enough."""
 _AGAIN_S = 1.0
+"""Between attempts at a disk that takes nothing."""
 _CLOSE_S = 10.0
+"""A node that is stopped waits no longer for its disk."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What a full disk, a quota and a limit of file sizes say: making room helps."""
 
 
 class NodeJournal:

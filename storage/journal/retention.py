@@ -17,7 +17,9 @@ from storage.journal.wanted import Wanted
 BUDGET_BYTES = 4 << 30
 """A day and a half of four tiles at full rate."""
 _WEIGH_S = 1.0
+"""Between two looks at what all segments take."""
 _NEVER_NS = 2**62
+"""Later than every frame."""
 
 
 class Retention:

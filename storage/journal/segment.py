@@ -20,8 +20,7 @@ import pyarrow as pa
 from devices.errors import StorageError
 from storage.durable import write_whole
 from storage.intervals import Intervals
-from storage.journal.segment_bytes import messages_from, payload_of, read_header
-from storage.journal.segment_index import (
+from storage.journal.segment_format import (
     INDEX_SUFFIX,
     RECORD,
     Records,
@@ -30,7 +29,10 @@ from storage.journal.segment_index import (
     end_of,
     is_closed,
     is_whole,
+    messages_from,
     numbers,
+    payload_of,
+    read_header,
     read_index,
     record_of,
 )

@@ -16,6 +16,7 @@ NOTES_FILE = "stream.json"
 PROMISE_S = 0.5
 """No frame of a node is longer unsynced, as long as its disk is not slower."""
 _BATCH_S = 0.033
+"""The longest batch of a node."""
 
 
 def unsynced_tail_max(rate_hz: float, waited_s: float = 0.0) -> int:

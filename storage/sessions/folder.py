@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from devices.errors import FileFormatError, UnknownError
+from devices.errors import FileFormatError, FootTileError, UnknownError
 from storage.checked_json import with_check, without_check
 from storage.clock.offset import ClockOffset
 from storage.durable import make_folder, storage_errors, sync_folder, write_whole
@@ -188,6 +188,16 @@ class SessionFolder:
             raise UnknownError(f"no session {session_id!r}") from error
         except (OSError, ValidationError) as error:
             raise FileFormatError(f"not a session: {error}", where=str(path)) from error
+
+    def load_all(self) -> tuple[list[Session], dict[str, FootTileError]]:
+        """All sessions, newest first, and by its id why one cannot be read."""
+        found, unreadable = [], {}
+        for session_id in self.ids():
+            try:
+                found.append(self.load(session_id))
+            except FootTileError as error:
+                unreadable[session_id] = error
+        return found, unreadable
 
     def move(self, session_id: str, to: SessionFolder) -> None:
         """Have a session's folder among those of `to`: it is in one place or the other, never both.

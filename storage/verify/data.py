@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from devices.errors import FileFormatError
 from storage.journal.segment import SUFFIX
-from storage.journal.segment_index import INDEX_SUFFIX
+from storage.journal.segment_format import INDEX_SUFFIX
 from storage.journal.stream_notes import NOTES_FILE
 from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME
@@ -38,6 +38,20 @@ class FolderReport:
     sessions: list[SessionReport] = field(default_factory=list)
     streams: list[StreamReport] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has it (docs/formats.md)."""
+        sessions, streams = self.sessions, self.streams
+        everything = [
+            *self.problems,
+            *(f"session {s.id or s.path.name}: {said}" for s in sessions for said in s.problems),
+            *(f"journal {j.node}/{j.boot_id}: {said}" for j in streams for said in j.problems),
+        ]
+        return {
+            "sessions": [session.as_dict() for session in sessions],
+            "journals": [stream.as_dict() for stream in streams],
+            "problems": everything,
+        }
 
 
 Report = FolderReport | SessionReport | StreamReport | SegmentReport
@@ -122,53 +136,6 @@ def verdict_of(report: Report) -> Verdict:
     if report.ledger.lossy:
         return "lossy"
     return "complete" if report.ledger.complete else "pending"
-
-
-def as_dict(report: Report) -> dict[str, Any]:
-    """A report as JSON has it (docs/formats.md)."""
-    if isinstance(report, SessionReport):
-        return report.as_dict()
-    if isinstance(report, FolderReport):
-        sessions, streams = report.sessions, report.streams
-        everything = [
-            *report.problems,
-            *(f"session {s.id or s.path.name}: {said}" for s in sessions for said in s.problems),
-            *(f"journal {j.node}/{j.boot_id}: {said}" for j in streams for said in j.problems),
-        ]
-        return {
-            "sessions": [session.as_dict() for session in sessions],
-            "journals": [_stream_as_dict(stream) for stream in streams],
-            "problems": everything,
-        }
-    if isinstance(report, StreamReport):
-        return _stream_as_dict(report)
-    return {
-        "node": report.info.node if report.info is not None else None,
-        "boot_id": report.info.boot_id if report.info is not None else None,
-        "frames": report.held.count,
-        "held": list(report.held),
-        "damaged": list(report.damaged),
-        "unsynced": report.unsynced.count,
-        "closed": report.is_closed,
-        "problems": report.problems,
-    }
-
-
-def _stream_as_dict(report: StreamReport) -> dict[str, Any]:
-    notes = report.notes
-    return {
-        "node": report.node,
-        "boot_id": report.boot_id,
-        "segments": report.segments,
-        "frames": report.held.count,
-        "held": list(report.held),
-        "lost": {reason: lost.count for reason, lost in report.lost.by_reason.items() if lost},
-        "missing": report.missing.count,
-        "unsynced": report.unsynced.count,
-        "next_seq": notes.next_seq if notes is not None else None,
-        "unsynced_tail_max": notes.unsynced_tail_max if notes is not None else 0,
-        "problems": report.problems,
-    }
 
 
 def _session_folders(place: Path) -> list[Path]:

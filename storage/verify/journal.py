@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
 from storage.intervals import Intervals
 from storage.journal.segment import SUFFIX, UNREAD_SUFFIX
-from storage.journal.segment_index import INDEX_SUFFIX, RECORD
+from storage.journal.segment_format import INDEX_SUFFIX, RECORD
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.sessions.claims import bytes_of
@@ -74,10 +75,27 @@ class StreamReport:
         last = self.held.last
         if self.notes is not None and self.notes.next_seq is not None:
             last = max(self.notes.next_seq - 1, -1 if last is None else last)
-        first = next(iter(self.held), (0, 0))[0]
+        first = self.held.first or 0
         if last is None or last < first:
             return Intervals()
         return self.held.missing(first, last) - self.lost.all
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has it (docs/formats.md)."""
+        lost = self.lost.by_reason.items()
+        return {
+            "node": self.node,
+            "boot_id": self.boot_id,
+            "segments": self.segments,
+            "frames": self.held.count,
+            "held": list(self.held),
+            "lost": {reason: numbers.count for reason, numbers in lost if numbers},
+            "missing": self.missing.count,
+            "unsynced": self.unsynced.count,
+            "next_seq": self.notes.next_seq if self.notes is not None else None,
+            "unsynced_tail_max": self.notes.unsynced_tail_max if self.notes is not None else 0,
+            "problems": self.problems,
+        }
 
 
 def verify_stream(folder: Path) -> StreamReport:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,8 +18,7 @@ import pyarrow as pa
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
 from storage.intervals import Intervals
-from storage.journal.segment_bytes import messages_from, payload_of, read_header
-from storage.journal.segment_index import (
+from storage.journal.segment_format import (
     INDEX_SUFFIX,
     RECORD,
     Records,
@@ -26,7 +26,10 @@ from storage.journal.segment_index import (
     end_of,
     is_closed,
     is_whole,
+    messages_from,
     numbers,
+    payload_of,
+    read_header,
     read_index,
 )
 from storage.schema import array_info, wire_schema
@@ -59,6 +62,19 @@ class SegmentReport:
     index: Records = field(default_factory=lambda: np.zeros(0, RECORD))
     problems: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has it (docs/formats.md)."""
+        return {
+            "node": self.info.node if self.info is not None else None,
+            "boot_id": self.info.boot_id if self.info is not None else None,
+            "frames": self.held.count,
+            "held": list(self.held),
+            "damaged": list(self.damaged),
+            "unsynced": self.unsynced.count,
+            "closed": self.is_closed,
+            "problems": self.problems,
+        }
 
 
 def verify_segment(path: Path) -> SegmentReport:

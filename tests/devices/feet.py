@@ -17,9 +17,7 @@ from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.world import World
-from devices.frames import (
-    FrameBatch,
-)
+from devices.frames import FrameBatch
 from devices.scene.file import Scene
 from devices.scene.hardware import ScheduleName, TileScene
 from tests.builders.arrays import DATA_SHEET_CHIP

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from typing import get_args
+from typing import Any, get_args
 
 from smbus2 import i2c_msg
 
@@ -180,9 +180,23 @@ def array_on(
 def settled(wires: Wires, schedule: ScheduleName = "simultaneous", **options: object) -> TileArray:
     """The same, after the frames in which every reading is read twice."""
     array = array_on(wires, schedule, **options)  # type: ignore[arg-type]  # as there
-    for _ in range(SETTLED + 1):
-        array.scan()
+    scanned(array, SETTLED + 1)
     return array
+
+
+def settled_on(
+    plugs: Plugs, schedule: ScheduleName = "simultaneous", **how: Any
+) -> tuple[Wires, TileArray]:
+    """Tiles on these plugs, and an array of them that has its history."""
+    wires = Wires(plugs, **how)
+    return wires, settled(wires, schedule)
+
+
+def scanned(array: TileArray, frames: int) -> Scan:
+    """The last of so many frames."""
+    for _ in range(frames - 1):
+        array.scan()
+    return array.scan()
 
 
 def timed_scan(array: TileArray, wires: Wires) -> tuple[Scan, int]:

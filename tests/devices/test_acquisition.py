@@ -9,12 +9,7 @@ from devices.acquisition import Acquisition
 from devices.array.array import TileArray
 from devices.array.budget import BusTiming
 from devices.buses.i2c import I2cBus
-from devices.frames import (
-    NO_SERVO_AGE,
-    NO_SERVO_COUNTS,
-    FrameBatch,
-    FrameStatus,
-)
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, FrameBatch, FrameStatus
 from devices.scene.file import Scene
 from devices.scene.hardware import ScheduleName
 from tests.builders.scenes import make_scene
@@ -101,6 +96,7 @@ def test_a_paced_stream_keeps_its_rate_exactly(rate_hz: float) -> None:
     assert one.stream.missed_slots == 0
 
 
+@pytest.mark.slow
 def test_the_audit_of_a_second_costs_a_hundredth_of_it_at_most() -> None:
     one = foot(make_scene(array=TYPICAL, emulation={"noise_kpa": 0.165}), rate_hz=370.0)
     batch = one.run_for(10.0)
@@ -111,6 +107,7 @@ def test_the_audit_of_a_second_costs_a_hundredth_of_it_at_most() -> None:
     assert slower.stream.missed_slots == 0, "it fits into the pause between two frames"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [396.0, 400.0, 1000.0, 5000.0])
 def test_a_rate_that_the_bus_does_not_give_shows_as_missed_slots(rate_hz: float) -> None:
     one = foot(make_scene(array=TYPICAL, emulation=LIVELY), rate_hz=rate_hz)

@@ -13,23 +13,10 @@ from smbus2 import i2c_msg
 from devices.buses.i2c import I2cAdapter
 from devices.clock import VirtualClock
 from devices.errors import BusMisuseError, BusSetupError
-from devices.frames import (
-    NOT_READ,
-    FrameBatch,
-    FrameStatus,
-    TileStatus,
-)
+from devices.frames import NOT_READ, FrameBatch, FrameStatus, TileStatus
 from devices.scene.file import Scene
 from tests.builders.scenes import make_scene
-from tests.devices.feet import (
-    FRAME_NS,
-    LIVELY,
-    TYPICAL,
-    Foot,
-    at_its_own_pace,
-    foot,
-    reading,
-)
+from tests.devices.feet import FRAME_NS, LIVELY, TYPICAL, Foot, at_its_own_pace, foot, reading
 
 
 def has(bits: int, batch: FrameBatch, tile: int) -> list[bool]:
@@ -95,6 +82,7 @@ def test_a_part_that_stops_converting_becomes_stale() -> None:
         assert not any(has(TileStatus.STALE, during, other))
 
 
+@pytest.mark.slow
 def test_an_array_with_noise_is_not_called_stale() -> None:
     scene = make_scene(((0x70, 0),), emulation={"noise_kpa": 0.165}, array=TYPICAL)
     batch = foot(scene).run_for(20.0)

@@ -56,6 +56,7 @@ def test_the_clock_is_set_unless_the_kernel_says_otherwise(
     assert realtime.clock_is_set() is is_set
 
 
+@pytest.mark.process
 def test_a_process_ends_with_its_parent_even_if_that_is_killed() -> None:
     child = (
         "import sys, time; from devices.realtime import end_with_parent; end_with_parent(); "

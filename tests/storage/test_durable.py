@@ -194,6 +194,7 @@ def first_line(process: subprocess.Popen[str]) -> Path:
     return Path(process.stdout.readline().strip())
 
 
+@pytest.mark.process
 def test_what_a_dead_process_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
     with temporary_of_another(tmp_path / "frames.parquet") as process:
         stale = first_line(process)
@@ -209,6 +210,7 @@ def test_what_a_dead_process_left_is_removed_and_nothing_else(tmp_path: Path) ->
     assert remove_stale_temporaries(tmp_path) == []
 
 
+@pytest.mark.process
 def test_what_a_living_process_is_writing_stays(tmp_path: Path) -> None:
     with temporary_of_another(
         tmp_path / "frames.parquet", "; import sys, time; sys.stdout.flush(); time.sleep(60)"

@@ -31,7 +31,7 @@ class Packet:
     """One packet off the wire, unstuffed.
 
     Whether it asks or answers is written in it in 2.0 only. In 1.0 the byte of the `instruction` is
-    the error byte of an answer, and whoever listens has to know which of the two it is.
+    the error byte of an answer, and the listener has to know which of the two it is.
     """
 
     servo_id: int

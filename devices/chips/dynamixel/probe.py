@@ -1,4 +1,4 @@
-"""Who is on a serial line whose protocol and baud rate nobody remembers."""
+"""Finds servos on a serial line whose protocol and baud rate are not known."""
 
 from __future__ import annotations
 

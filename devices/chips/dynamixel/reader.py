@@ -1,4 +1,4 @@
-"""Dynamixel MX servos over Protocol 1.0 or 2.0, read only: who is there, where its shaft stands.
+"""Dynamixel MX servos over Protocol 1.0 or 2.0, read only: identity and position.
 
 Sources: e-manual of the MX series and hardware.md 5. A servo can neither be moved nor set up from
 here, so that no mistake in a measurement can move a robot.
@@ -73,7 +73,7 @@ class Dynamixel:
         protocol: int = 2,
     ) -> None:
         self.remarks: tuple[str, ...] = ()
-        """What is wrong with this servo that frames can do without; for whoever opened it."""
+        """What is wrong with this servo, but does not stop the frames."""
         self._port = port
         self._clock = clock
         self._id = servo_id
@@ -232,7 +232,7 @@ def open_servo(
     longest return delay (0.5 ms) and an FTDI's default latency timer (16 ms).
 
     Raises:
-        ServoSetupError: there is no such port, it may not be used, or somebody else uses it; or
+        ServoSetupError: there is no such port, it may not be used, or another program uses it; or
             another model or firmware answers than `model` and `protocol`.
     """
     line = open_line(port, baudrate, timeout_s)

@@ -104,7 +104,7 @@ class ServoReader(_PacedServo):
         due_ns = self._clock.now_ns()
         while not self._stop.is_set():
             try:
-                # Replaced as a whole, newest first: whoever looks sees the old or the new ones.
+                # Replaced as a whole, newest first: a reader sees the old or the new ones.
                 self._recent = (self._servo.read_position(), *self._recent[: _RECENT - 1])
             except ServoError:
                 self.failures += 1

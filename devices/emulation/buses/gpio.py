@@ -27,7 +27,7 @@ class EmulatedWire:
         self._low = low
 
     def high(self) -> bool:
-        """Does nobody pull it low?"""
+        """Does no device pull it low?"""
         return not self._low and not self._held(self._clock.now_ns())
 
 
@@ -59,7 +59,7 @@ class EmulatedReset:
             self._adapter.reset_muxes()
 
     def high(self) -> bool:
-        """Nobody else pulls it."""
+        """Nothing else pulls it."""
         return True
 
 

@@ -2,8 +2,8 @@
 
 The adapter takes the very `i2c_msg` objects that `smbus2.SMBus.i2c_rdwr` takes, raises bare
 `OSError` with the Raspberry Pi's errno, and refuses what the Pi's bcm2835 adapter refuses
-(hardware.md 3.2). The wires are open-drain: an acknowledge is low if *anybody* pulls it low, a data
-bit is low if *anybody* pulls it low. Time on the bus is counted in SCL periods as bus_budget.py
+(hardware.md 3.2). The wires are open-drain: an acknowledge or a data bit is low if
+*any* device pulls it low. Time on the bus is counted in SCL periods as bus_budget.py
 does: START, repeated START and STOP one each, nine per byte.
 """
 
@@ -22,10 +22,10 @@ from devices.clock import Clock
 from devices.emulation.buses.line import Line
 from devices.emulation.faults import Faults
 
-I2C_RDWR_IOCTL_MAX_MSGS = 42
-MESSAGE_BYTES_MAX = 8192
-_FLAG_READ = 0x0001
-_TIMEOUT_UNIT_NS = 10_000_000
+I2C_RDWR_IOCTL_MAX_MSGS = 42  # include/uapi/linux/i2c-dev.h
+MESSAGE_BYTES_MAX = 8192  # the kernel's limit of one message
+_FLAG_READ = 0x0001  # I2C_M_RD, include/uapi/linux/i2c.h
+_TIMEOUT_UNIT_NS = 10_000_000  # of the ioctl I2C_TIMEOUT
 _TIMEOUT_DEFAULT = 100  # the i2c core's second
 _NOT_ACKNOWLEDGED_BITS = 11  # START, address with direction and missing acknowledge, STOP
 
@@ -61,13 +61,13 @@ class MuxDevice(I2cDevice, Protocol):
         """Devices on the channels that are in force now."""
 
     def suffer(self, t_ns: int) -> None:
-        """Let happen what has befallen it since it was last asked."""
+        """Apply what has happened to it since it was last asked."""
 
     def reset(self) -> None:
         """Its RESET line was low."""
 
 
-_NOBODY: Sequence[I2cDevice] = ()
+_NO_DEVICE: Sequence[I2cDevice] = ()
 
 
 class EmulatedI2cAdapter:
@@ -120,12 +120,12 @@ class EmulatedI2cAdapter:
                 address, length = message.addr, message.len
                 reading = bool(message.flags & _FLAG_READ)
                 t_ns = begin_ns + round(bits * self._ns_per_bit)
-                listeners = self._wire.get(address, _NOBODY)
+                listeners = self._wire.get(address, _NO_DEVICE)
                 if disturbed is not None:
                     listeners = self._called(address, reading, t_ns, disturbed)
                 if len(listeners) == 1:
                     if not listeners[0].start(reading, t_ns):
-                        listeners = _NOBODY
+                        listeners = _NO_DEVICE
                 else:
                     listeners = [device for device in listeners if device.start(reading, t_ns)]
                 addressed += listeners
@@ -154,11 +154,11 @@ class EmulatedI2cAdapter:
     def _called(
         self, address: int, reading: bool, t_ns: int, disturbed: Line
     ) -> Sequence[I2cDevice]:
-        """Who hears a disturbed address byte as his own."""
+        """Devices that take a disturbed address byte for their own."""
         heard = disturbed.disturbed(address << 1 | reading, t_ns)
         if heard & 1 != reading:
-            return _NOBODY  # one side reads where the other does: nobody gets on with it
-        return self._wire.get(heard >> 1, _NOBODY)
+            return _NO_DEVICE  # both sides would read, or both write
+        return self._wire.get(heard >> 1, _NO_DEVICE)
 
     def _is_stuck(self, messages: Sequence[i2c_msg], begin_ns: int) -> bool:
         """Go through a transaction on wires that do not move; True if that looks like success."""
@@ -233,7 +233,7 @@ def _read(
 ) -> None:
     if len(listeners) == 1:
         values = listeners[0].read(message.len)
-    else:  # open drain: a bit is low if anybody pulls it low
+    else:  # open drain: a bit is low if any device pulls it low
         given = [device.read(message.len) for device in listeners]
         values = bytes(map(partial(reduce, and_), zip(*given, strict=True)))
     if disturbed is not None:

@@ -1,8 +1,8 @@
 """The two wires of the bus when something is wrong with them.
 
 `sda_low`: a slave holds SDA: every bit reads as 0, so every acknowledge is there, every byte reads
-00, and nobody hears anything (hardware.md 3.2). It hangs in the middle of a byte and lets go after
-the clocks that are left of it. `sda_high`: SDA is open and reads as 1: nobody acknowledges.
+00, and no device hears anything (hardware.md 3.2). It hangs in the middle of a byte and lets go
+after the clocks that are left of it. `sda_high`: SDA is open and reads as 1: no answer.
 `scl_low`: nothing moves, the adapter gives up after its time-out. `adapter_timeout`: the same once,
 by chance. `nack_storm` and `bit_errors`: single acknowledges and bits are lost by chance, on every
 byte with the fault's rate; there is no checksum in this protocol.

@@ -3,7 +3,7 @@
 A thread answers at `port` whatever opens it: `devices.chips.dynamixel.reader`, or ROBOTIS's own
 SDK. A pseudo-terminal has no wire, so the time on the wire and the return delay pass on the
 injected clock: with a `SystemClock` an answer takes as long as a servo's, with a `VirtualClock` it
-takes as long in virtual time, while whoever asked is blocked. What it answers is its firmware's
+takes as long in virtual time, while the reader is blocked. What it answers is its firmware's
 matter (`devices.emulation.chips.dynamixel_firmware`). Sources: hardware.md 5.1 and 5.2.
 """
 
@@ -16,9 +16,8 @@ import select
 import termios
 import threading
 import tty
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Self
+from collections.abc import Callable
+from typing import Self
 
 from devices.chips.dynamixel.packets import Packet, PacketDecoder, wire_time_ns
 from devices.clock import Clock
@@ -34,13 +33,6 @@ _SPEEDS = {
     3_000_000: termios.B3000000,
     4_000_000: termios.B4000000,
 }
-
-
-@dataclass(frozen=True)
-class _Faults:
-    silent: bool = False
-    garbage: bytes = b""
-    corrupt_crc: bool = False
 
 
 class EmulatedServo:
@@ -76,7 +68,6 @@ class EmulatedServo:
             status_return_level=status_return_level,
         )
         self._speed = _SPEEDS[baudrate]
-        self._faults = _Faults()
         self._resources = contextlib.ExitStack()
         self._power_up()
 
@@ -86,7 +77,7 @@ class EmulatedServo:
         tty.setraw(self._slave)
         self.port = os.ttyname(self._slave)
         """What to open: the path of the pseudo-terminal."""
-        # A servo does not wait for a listener; what nobody reads is lost.
+        # A servo does not wait for a listener; what is not read is lost.
         os.set_blocking(self._line, False)
         self._wake, wake_writer = os.pipe()
         # A daemon only so that a forgotten `close` does not keep the interpreter from ending.
@@ -108,41 +99,6 @@ class EmulatedServo:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # Faults. Each lasts as long as its context and may be set from any thread.
-
-    def silent(self) -> contextlib.AbstractContextManager[None]:
-        """Answer nothing, as without power or with the plug pulled; but its state survives."""
-        return self._with(silent=True)
-
-    def garbage_before_reply(self, garbage: bytes) -> contextlib.AbstractContextManager[None]:
-        """Send `garbage` before every answer. Unrealistic: it is always the same."""
-        return self._with(garbage=garbage)
-
-    def corrupt_crc(self) -> contextlib.AbstractContextManager[None]:
-        """Invert the last byte of every answer, which is of its CRC or checksum.
-
-        Unrealistic: a bad line hits any bit, now and then.
-        """
-        return self._with(corrupt_crc=True)
-
-    @contextlib.contextmanager
-    def alert(self) -> Iterator[None]:
-        """Report an input voltage error. Unrealistic at its end: silicon keeps it until reboot."""
-        self._firmware.complain(of_voltage=True)
-        try:
-            yield
-        finally:
-            self._firmware.complain(of_voltage=False)
-
-    @contextlib.contextmanager
-    def _with(self, **changes: Any) -> Iterator[None]:
-        before = self._faults
-        self._faults = replace(before, **changes)
-        try:
-            yield
-        finally:
-            self._faults = before
-
     # The servo's thread.
 
     def _serve(self) -> None:
@@ -158,17 +114,17 @@ class EmulatedServo:
             if termios.tcgetattr(self._slave)[5] != self._speed:
                 continue
             for packet in decoder.feed(data):
-                if self._firmware.is_answered(packet) and not self._faults.silent:
+                if self._firmware.is_answered(packet):
                     self._answer(packet, received_ns)
 
     def _answer(self, packet: Packet, received_ns: int) -> None:
         request_end_ns = received_ns + wire_time_ns(len(packet.wire), self._baudrate)
         begin_ns = request_end_ns + self._firmware.return_delay_ns
         self._clock.sleep_until_ns(begin_ns)
-        answer = self._firmware.answer(packet, begin_ns)
-        if self._faults.corrupt_crc:
-            answer = answer[:-1] + bytes([answer[-1] ^ 0xFF])
-        reply = self._faults.garbage + answer
+        reply = self._reply(packet, begin_ns)
         self._clock.sleep_until_ns(begin_ns + wire_time_ns(len(reply), self._baudrate))
         with contextlib.suppress(BlockingIOError):
             os.write(self._line, reply)
+
+    def _reply(self, packet: Packet, t_ns: int) -> bytes:
+        return self._firmware.answer(packet, t_ns)

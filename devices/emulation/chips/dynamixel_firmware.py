@@ -29,7 +29,6 @@ MULTI_TURN_COUNTS = 28_672
 
 _ANSWERED_FROM: dict[int, int] = {Instruction.PING: 0, Instruction.READ: 1}
 _INSTRUCTION_ERROR, _CRC_ERROR, _DATA_RANGE_ERROR, _DATA_LENGTH_ERROR = 2, 3, 4, 5
-_INPUT_VOLTAGE_ERROR = 1
 _HARDWARE_ERROR = 70  # address, of the 2.0 table only
 
 
@@ -84,6 +83,8 @@ class EmulatedFirmware(ABC):
             )
         firmware = FIRMWARES[self.version]
         self.protocol = firmware.protocol
+        self.alerts = Error(0)
+        """What it complains of in every answer, in 1.0; in 2.0 that is in its table."""
         self._position = position
         self._position_address = firmware.position_address
         layout = self._layout
@@ -116,10 +117,6 @@ class EmulatedFirmware(ABC):
     def answer(self, packet: Packet, t_ns: int) -> bytes:
         """The status packet to `packet`, executed at `t_ns`."""
 
-    @abstractmethod
-    def complain(self, of_voltage: bool) -> None:
-        """Begin or end to report an input voltage error."""
-
     def _is_called_by(self, packet: Packet) -> bool:
         """Is this servo one of those that a broadcast names?"""
         return False
@@ -151,14 +148,10 @@ class _Firmware1(EmulatedFirmware):
         2_000_000: 0,
         3_000_000: 252,
     }
-    _alerts = Error(0)
 
     def answer(self, packet: Packet, t_ns: int) -> bytes:
         error, data = self._execute(packet, t_ns)
-        return self.protocol.pack(self._id, self._alerts | error, data)
-
-    def complain(self, of_voltage: bool) -> None:
-        self._alerts = Error.VOLTAGE if of_voltage else Error(0)
+        return self.protocol.pack(self._id, self.alerts | error, data)
 
     def _execute(self, packet: Packet, t_ns: int) -> tuple[Error, bytes]:
         if not packet.intact:
@@ -205,9 +198,6 @@ class _Firmware2(EmulatedFirmware):
         error, data = self._execute(packet, t_ns)
         alert = ALERT if self.table[_HARDWARE_ERROR] else 0
         return self.protocol.pack(self._id, Instruction.STATUS, bytes([alert | error]) + data)
-
-    def complain(self, of_voltage: bool) -> None:
-        self.table[_HARDWARE_ERROR] = _INPUT_VOLTAGE_ERROR if of_voltage else 0
 
     def _is_called_by(self, packet: Packet) -> bool:
         return packet.instruction == Instruction.SYNC_READ and self._id in packet.parameters[4:]

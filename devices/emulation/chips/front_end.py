@@ -19,13 +19,13 @@ from devices.scene.emulation import EmulationScene
 
 _KPA_PER_PCOMP = (PRESSURE_MAX_KPA - PRESSURE_MIN_KPA) / 1023
 _TADC_PER_KELVIN = -5.35
-_TADC_NOISE = 0.5
+_TADC_NOISE = 0.5  # in counts
 
 _MEASURED_NOISE_KPA = 0.165
 _OUTLIER_RATE = 0.012
-_OUTLIER_KPA = (0.5, 1.2)
-_OUTLIERS_LOW = 0.85
-_DRAWN_AT_ONCE = 1024
+_OUTLIER_KPA = (0.5, 1.2)  # their size, at the noise that was measured
+_OUTLIERS_LOW = 0.85  # most are low (hardware.md 1.3)
+_DRAWN_AT_ONCE = 1024  # a call of numpy for each reading would be dear
 _FAR_OVER_RANGE_KPA = 45.0
 
 

@@ -15,15 +15,15 @@ from devices.scene.emulation import ReadDuringConversion
 
 _CONVERT = 0x12
 _REGISTERS = 0x80
-_SAMPLE_QUARTER = 4
-_SLOW_NS = 2_900_000
+_SAMPLE_QUARTER = 4  # as the driver assumes (hardware.md 1.4)
+_SLOW_NS = 2_900_000  # slower than any healthy part, within the data sheet's 3 ms
 
 Sense = Callable[[int], tuple[int, int]]
 """Sample instant in ns -> the 10-bit words `padc`, `tadc` of a conversion that samples then."""
 
 OnConversion = Callable[[int, tuple[int, int], tuple[int, int, int, int]], None]
 """Told of every conversion: the instant of its CONVERT's STOP, its words, and the coefficients of
-the part that made it. Only for who judges a driver; no driver has it."""
+the part that made it. Only to judge a driver by; no driver has it."""
 
 
 @dataclass
@@ -34,7 +34,7 @@ class PartFaults:
     `unplugged`: it has no supply; plugged in again its registers are zero. `replaced`: the same,
     and what is plugged in again is another part. `stale`: a conversion never ends. `slow`: it takes
     2.9 ms, still within the data sheet. `all_ones`: it is lost between address and data, so that
-    nobody drives the line.
+    the line floats high.
     """
 
     no_answer: Fault = field(default_factory=Fault)
@@ -67,7 +67,7 @@ class EmulatedMpl115a2:
     """One part: sixteen bytes of registers, a command, and a conversion that takes its time.
 
     Registers are zero after power-up and keep the previous result until a conversion ends, a
-    conversion being started by the STOP of a CONVERT. A CONVERT during a conversion starts it anew.
+    conversion being started by the STOP of a CONVERT. A CONVERT during a conversion restarts it.
     """
 
     address = 0x60
@@ -111,7 +111,7 @@ class EmulatedMpl115a2:
         return True
 
     def _lives(self, t_ns: int) -> bool:
-        """Does it acknowledge? What befell it since it was last called is made up for first."""
+        """Does it acknowledge? What happened to it since it was last called is applied first."""
         since_ns, self._seen_ns = self._seen_ns, t_ns
         faults = self._faults
         if faults.replaced.possible and faults.replaced.struck(since_ns, t_ns):

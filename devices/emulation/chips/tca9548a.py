@@ -35,7 +35,7 @@ class EmulatedTca9548a:
         """Channels in force."""
 
     def suffer(self, t_ns: int) -> None:
-        """Let happen what has befallen it since it was last asked."""
+        """Apply what has happened to it since it was last asked."""
         since_ns, self._seen_ns = self._seen_ns, t_ns
         if self._brown_out.struck(since_ns, t_ns) or self._mux_reset.set_in(since_ns, t_ns):
             self.reset()

@@ -29,11 +29,11 @@ _AIR_S = 2.0
 """In the air after the last hop, and before the first again: long enough for a tare."""
 _STANCE_S = 0.25
 """About as long landing and push-off take; the segment turns that much longer than it stands."""
-_SWING_S = 0.12
-_FIRMNESS = 0.05
-_HEIGHT = 0.03
-_PITCH = 0.1
-_STEEPEST_RAD = 0.7
+_SWING_S = 0.12  # in which the segment turns back for the next touch-down
+_FIRMNESS = 0.05  # how much places differ, relative
+_HEIGHT = 0.03  # how much hops differ in height, relative
+_PITCH = 0.1  # how much they differ in pitch, relative
+_STEEPEST_RAD = 0.7  # a dome further round the foot would not press on the ground
 
 
 class Hopping(Ground):
@@ -117,10 +117,10 @@ class Hopping(Ground):
             hopping.rise(place, self._angle)
         self._end_s = hopping.motion.t_s + _AIR_S
         self.recorded = hopping.recorded
-        self._time_s = np.array(self.recorded.t_s)
-        self._ankle_m = np.array(self.recorded.ankle_m)
-        self._stress_pa = np.array(self.recorded.stress_pa)
-        self._rest_n = np.array(self.recorded.rest_n)
+        self._time_s = np.array([step.t_s for step in self.recorded])
+        self._ankle_m = np.array([step.ankle_m for step in self.recorded])
+        self._stress_pa = np.array([step.stress_pa for step in self.recorded])
+        self._rest_n = np.array([step.rest_n for step in self.recorded])
 
     def _turn(self, begin_s: float, duration_s: float, to_rad: float) -> None:
         from_rad = self._angle(begin_s)

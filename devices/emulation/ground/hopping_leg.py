@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from devices.emulation.ground.soft_ground import GRAVITY_M_S2, SoftGround
 from devices.errors import SceneError
@@ -25,13 +26,13 @@ _STANDING_DAMPING, _PUSHING_DAMPING = 0.4, 0.1
 """Of the leg's spring, relative to critical (assumed: geared servos hold it, or drive it)."""
 _STOP = 40.0
 """How many times stiffer than the spring the leg's end stop is; it is damped critically."""
-_FOLDED = 0.95
+_FOLDED = 0.95  # of its length: a spring that is pressed further has no more travel
 _PUSH_S = 0.10
 _RETRACT_S = 0.12
 _STROKE_MAX_M = 0.20
-_LEFT_WITHIN_S = 0.6
-_HEIGHT_TOLERANCE_M = 0.001
-_TRIES = 12
+_LEFT_WITHIN_S = 0.6  # a push-off that takes longer is stuck
+_HEIGHT_TOLERANCE_M = 0.001  # of the hop, good enough for a drawn height
+_TRIES = 12  # of the regula falsi
 
 Angle = Callable[[float], float]
 
@@ -111,9 +112,8 @@ class Motion:
         return Motion(**(vars(self) | {"set_m": list(self.set_m)}))
 
 
-@dataclass
-class Recorded:
-    """What happened, one entry a step.
+class Step(NamedTuple):
+    """What happened in one step.
 
     Attributes:
         t_s: time.
@@ -125,13 +125,13 @@ class Recorded:
         rest_n: vertical force of the ground that presses no strip.
     """
 
-    t_s: list[float] = field(default_factory=list)
-    ankle_m: list[float] = field(default_factory=list)
-    body_m: list[float] = field(default_factory=list)
-    ankle_m_s: list[float] = field(default_factory=list)
-    body_m_s: list[float] = field(default_factory=list)
-    stress_pa: list[list[float]] = field(default_factory=list)
-    rest_n: list[float] = field(default_factory=list)
+    t_s: float
+    ankle_m: float
+    body_m: float
+    ankle_m_s: float
+    body_m_s: float
+    stress_pa: list[float]
+    rest_n: float
 
 
 class HoppingLeg:
@@ -147,7 +147,7 @@ class HoppingLeg:
         self.leg = leg
         ankle_m = drop_m + leg.sole_m
         self.motion = Motion(t_s, ankle_m, ankle_m + LEG_M, set_m=[0.0] * len(leg.strips))
-        self.recorded = Recorded()
+        self.recorded: list[Step] = []
         self._strips = [(p.x_m, p.z_m, p.area_m2, p.area_m2 / p.radius_m) for p in leg.strips]
         self._sole_m2 = sum(p.area_m2 for p in leg.strips)
         self._reach_m = max(p.radius_m for p in leg.strips)
@@ -235,7 +235,7 @@ class HoppingLeg:
             self._step(self.motion, ground, angle, self.recorded)
 
     def _push(
-        self, ground: SoftGround, angle: Angle, stroke_m: float, record: Recorded | None
+        self, ground: SoftGround, angle: Angle, stroke_m: float, record: list[Step] | None
     ) -> None:
         motion = self.motion
         begin_s = motion.t_s
@@ -251,7 +251,7 @@ class HoppingLeg:
         motion.stroke_m = max(motion.stroke_m - _STROKE_MAX_M * STEP_S / _RETRACT_S, 0.0)
 
     def _step(
-        self, motion: Motion, ground: SoftGround, angle: Angle, record: Recorded | None
+        self, motion: Motion, ground: SoftGround, angle: Angle, record: list[Step] | None
     ) -> None:
         """One step: forces of the present, then speeds, then places (semi-implicit Euler)."""
         known_s, angle_rad = self._angle
@@ -262,13 +262,9 @@ class HoppingLeg:
         turn_rad = (ahead_rad - angle_rad) / STEP_S
         stress_pa, press_n, rest_n = self._ground_n(motion, ground, angle_rad, turn_rad)
         if record is not None:
-            record.t_s.append(motion.t_s)
-            record.ankle_m.append(motion.ankle_m)
-            record.body_m.append(motion.body_m)
-            record.ankle_m_s.append(motion.ankle_m_s)
-            record.body_m_s.append(motion.body_m_s)
-            record.stress_pa.append(stress_pa)
-            record.rest_n.append(rest_n)
+            m = motion
+            step = Step(m.t_s, m.ankle_m, m.body_m, m.ankle_m_s, m.body_m_s, stress_pa, rest_n)
+            record.append(step)
         leg = self.leg
         leg_n = self._leg_n(motion)
         motion.ankle_m_s += ((press_n + rest_n - leg_n) / leg.foot_kg - GRAVITY_M_S2) * STEP_S

@@ -24,7 +24,7 @@ def problems(**meanings: str) -> dict[int | str, dict[str, Any]]:
 
 
 def present(path: Path) -> Path:
-    """A file of a sealed session, which somebody may have taken away.
+    """A file of a sealed session, which may have been taken away.
 
     Raises:
         UnknownError: it is not there.

@@ -45,13 +45,13 @@ async def clock(
 
     `format=parquet` is `clock.parquet`, the measurements themselves, as they lie beside the frames.
     """
-    session = server.recorder.get(session_id)
+    session = server.sessions.get(session_id)
     if format == "parquet":
-        return _table(session, server.recorder.folder.path(session_id) / CLOCK_NAME)
+        return _table(session, server.sessions.folder.path(session_id) / CLOCK_NAME)
     if session.sha256 is None:
         table = server.recorder.sources(session_id).clock_table()
         return await run_in_threadpool(table.summary)
-    return await run_in_threadpool(_sealed, server.recorder.folder.path(session_id) / FRAMES_NAME)
+    return await run_in_threadpool(_sealed, server.sessions.folder.path(session_id) / FRAMES_NAME)
 
 
 def _table(session: Session, path: Path) -> FileResponse:

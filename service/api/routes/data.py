@@ -115,7 +115,7 @@ async def data(
     session is recorded it is what there is so far. `Foottile-Complete` says whether frames are
     missing.
     """
-    session = server.recorder.get(session_id)
+    session = server.sessions.get(session_id)
     ledger = server.recorder.ledger(session_id)
     complete = "lossy" if ledger.lossy else str(ledger.complete).lower()
     headers = {"Foottile-Complete": complete}
@@ -134,7 +134,7 @@ async def data(
 def _stored(
     session: Session, sha256: str, request: Request, server: Server, headers: dict[str, str]
 ) -> Response:
-    path = present(server.recorder.folder.path(session.id) / FRAMES_NAME)
+    path = present(server.sessions.folder.path(session.id) / FRAMES_NAME)
     headers |= {
         "ETag": f'"{sha256}"',
         "Cache-Control": f"private, max-age={_YEAR_S}, immutable",
@@ -204,7 +204,7 @@ async def _made(
 
 
 def _clocks_hash(session: Session, server: Server) -> str:
-    path = server.recorder.folder.path(session.id) / CLOCK_NAME
+    path = server.sessions.folder.path(session.id) / CLOCK_NAME
     if session.sha256 is not None and path.is_file():
         return sha256_of(path)
     return hashlib.sha256(repr(session.clock).encode()).hexdigest()
@@ -215,7 +215,7 @@ def _chunks(session: Session, query: DataQuery, server: Server) -> Iterator[byte
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
         return export(SessionFrames(sources), sources.info, {}, query.format, query.slice, clock)
-    return _chunks_of_file(server.recorder.folder.path(session.id) / FRAMES_NAME, query)
+    return _chunks_of_file(server.sessions.folder.path(session.id) / FRAMES_NAME, query)
 
 
 def _chunks_of_file(path: Path, query: DataQuery) -> Iterator[bytes]:

@@ -90,7 +90,7 @@ def _hello(server: Server, node: str | None) -> dict[str, object]:
         ],
         "recording": [
             SessionView.of(session, recorder).model_dump(mode="json")
-            for session in recorder.all()
+            for session in server.sessions.all()
             if session.state == "recording" and node in (None, session.node)
         ],
     }

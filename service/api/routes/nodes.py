@@ -89,7 +89,7 @@ async def list_tares(node: str, server: ServerState) -> TaresPage:
 async def undo_tare(node: str, tare_id: str, server: ServerState) -> None:
     """The tare before it is in force again; it stays in the history, marked.
 
-    If it was an automatic one, no other is taken until somebody tares by hand.
+    If it was an automatic one, no other is taken until one is taken by hand.
     """
     the_node = server.nodes.get(node)
     the_node.tare_keeper.undo(tare_id)

@@ -107,7 +107,7 @@ async def stop(session_id: str, server: ServerState) -> SessionView:
     session = server.recorder.stop(session_id)
     server.tell_node(server.nodes.get(session.node))
     if server.nodes.get(session.node).connected:
-        session = await server.recorder.settled(session_id, SETTLE_S)
+        session = await server.settling.settled(session_id, SETTLE_S)
     return SessionView.of(session, server.recorder)
 
 
@@ -123,7 +123,7 @@ async def seal(session_id: str, server: ServerState) -> SessionView:
     It is sealed as lossy: frames that were still to come are lost, reason `given_up`.
     """
     server.recorder.give_up(session_id)
-    session = await server.recorder.settled(session_id, SETTLE_S)
+    session = await server.settling.settled(session_id, SETTLE_S)
     return SessionView.of(session, server.recorder)
 
 
@@ -137,7 +137,7 @@ async def list_sessions(
     ] = None,
 ) -> Page[SessionView]:
     """A page of sessions."""
-    found = [s for s in server.recorder.all() if q is None or _mentions(s, q.casefold())]
+    found = [s for s in server.sessions.all() if q is None or _mentions(s, q.casefold())]
     if cursor is not None:
         key = _key_of(cursor)
         found = [session for session in found if (session.started_t_ns, session.id) < key]
@@ -152,7 +152,7 @@ async def list_sessions(
 @router.get("/{session_id}", operation_id="getSession", summary="A session", responses=_UNKNOWN)
 async def get_session(session_id: str, server: ServerState) -> SessionView:
     """As it is now."""
-    return SessionView.of(server.recorder.get(session_id), server.recorder)
+    return SessionView.of(server.sessions.get(session_id), server.recorder)
 
 
 @router.patch(
@@ -164,7 +164,7 @@ async def get_session(session_id: str, server: ServerState) -> SessionView:
 async def change(session_id: str, body: ChangeSession, server: ServerState) -> SessionView:
     """Change name, subject, notes or tags; the sealed data does not change."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
-    return SessionView.of(server.recorder.change(session_id, **changes), server.recorder)
+    return SessionView.of(server.sessions.change(session_id, **changes), server.recorder)
 
 
 @router.delete(
@@ -189,14 +189,14 @@ async def delete(session_id: str, server: ServerState) -> None:
 )
 async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventView:
     """Note that something happened, now or at an instant."""
-    event = server.recorder.mark(session_id, body.label, body.t_ns, body.id)
+    event = server.sessions.mark(session_id, body.label, body.t_ns, body.id)
     return EventView(**event.model_dump())
 
 
 @router.get("/{session_id}/events", operation_id="listEvents", summary="Events", responses=_UNKNOWN)
 async def events(session_id: str, server: ServerState) -> Page[EventView]:
     """In order of time."""
-    marked = sorted(server.recorder.get(session_id).events, key=lambda event: event.t_ns)
+    marked = sorted(server.sessions.get(session_id).events, key=lambda event: event.t_ns)
     return Page(items=[EventView(**event.model_dump()) for event in marked])
 
 

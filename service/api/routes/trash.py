@@ -21,8 +21,8 @@ class Emptied(View):
 @router.get("", operation_id="listTrash", summary="Deleted sessions, newest first")
 async def list_trash(server: ServerState) -> Page[SessionView]:
     """Each can be had back."""
-    recorder = server.recorder
-    return Page(items=[SessionView.of(session, recorder) for session in recorder.trash.all()])
+    deleted = server.sessions.trash.all()
+    return Page(items=[SessionView.of(session, server.recorder) for session in deleted])
 
 
 @router.post(

@@ -43,7 +43,7 @@ def demo_command(
 ) -> None:
     """Run a server and an emulated node, and show where the live page is.
 
-    The scene goes on for ever; a recorded load is pressed over and over again. Ctrl-C stops what is
+    The scene never ends; a recorded load is pressed over and over again. Ctrl-C stops what is
     being recorded, seals it, and ends both.
     """
     import uvloop
@@ -115,7 +115,7 @@ async def _start_node(
 async def _stop_recording(server: Server) -> None:
     for session in server.recorder.recording_on(NODE):
         server.recorder.stop(session.id)
-        sealed = await server.recorder.settled(session.id, _SEAL_S)
+        sealed = await server.settling.settled(session.id, _SEAL_S)
         remark(f"session {sealed.id} ({sealed.name}) is {sealed.state}")
 
 

@@ -47,7 +47,7 @@ def estimate_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Estimate a recorded session anew and write it with the estimates.
+    """Estimate a recorded session again and write it with the new estimates.
 
     The tare comes from --tare-s, else from frames flagged as lead, else from the first interval
     that can be recognised as unloaded. Exit codes: 0 good, 1 failed, 2 wrong usage.
@@ -55,7 +55,7 @@ def estimate_command(
     from service.cli.report import findings_json, tell_findings
     from service.offline.estimate import estimate_session
 
-    # The session itself may be written anew: it is replaced whole, and nothing raw is lost.
+    # The session itself may be the output: it is replaced whole, and nothing raw is lost.
     path = output_path(out, *(Path(name) for name in (calibration, scene) if name is not None))
     with progress(f"estimating {session}"):
         result = estimate_session(

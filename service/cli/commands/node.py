@@ -1,4 +1,4 @@
-"""`foottile node`: acquisition beside the robot."""
+"""`foottile node`: acquisition on the robot."""
 
 from __future__ import annotations
 

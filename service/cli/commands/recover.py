@@ -83,7 +83,7 @@ def _tell(recovery: Recovery) -> None:
     if recovery.removed:
         say(f"{len(recovery.removed)} half-written files were removed")
     for session_id in recovery.mended:
-        say(f"session {session_id}: events.parquet was written anew")
+        say(f"session {session_id}: events.parquet was written again")
     for found in recovery.sessions:
         say(f"session {found.session.id} ({found.session.name}): {_outcome(found)}")
         if found.problem:

@@ -40,17 +40,17 @@ def verify_command(
 ) -> None:
     """Prove sessions and journals from their files alone: checksums, hashes, order and ledger.
 
-    Nothing is written, and a server may run beside it. Exit codes: 0 everything is whole and
+    Nothing is written, and a server may run meanwhile. Exit codes: 0 everything is whole and
     complete, 1 something is damaged, 2 wrong usage, 3 whole, but lossy or not yet sealed.
     """
-    from storage.verify.data import as_dict, verdict_of, verify
+    from storage.verify.data import verdict_of, verify
 
     path = _path_of(target, data)
     with progress(f"reading {path}"):
         report = verify(path, data=data)
     verdict = verdict_of(report)
     if as_json:
-        print_json(as_dict(report))
+        print_json(report.as_dict())
     else:
         _tell(report)
         say(_SENTENCE[verdict])

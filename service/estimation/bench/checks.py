@@ -22,10 +22,10 @@ from service.estimation.bench.indentation import (
     unloaded,
 )
 
-LOADED_N = 1.0
+LOADED_N = 1.0  # less is as good as no load on a tile of 30 N
 LOADED_KPA = 3.0
 """A fifth of what the chip has above a seal at 100 kPa, and 24 counts: less bears no cubic."""
-REPEATS_MIN = 2
+REPEATS_MIN = 2  # one has to be predicted from the others
 R2_MIN = 0.9
 """The paper has 0.9999 for the mean of four; four loadings with its scatter of 0.03 have 0.97 to
 0.997 on the emulated bench."""
@@ -40,8 +40,8 @@ _FLAT_PART = 0.01
 """What stands still changes by less than this part of its range ..."""
 _MOVING_PART = 0.15
 """... while the other one changes by more than this part of its own."""
-_FLAT_NOISE = 0.6
-_RAIL_READINGS = 5
+_FLAT_NOISE = 0.6  # of the noise of a reading: block means scatter by less
+_RAIL_READINGS = 5  # fewer may be missing by chance
 
 
 def refuse_unloaded(blocks: Strokes, where: str) -> None:

@@ -1,8 +1,8 @@
 """Which dome for which load: the paper's Table I, Boyle's law, and what follows from them.
 
 The paper gives the range of one dome only, 25 to 35 N for 11 mm of Vytaflex 60 (III-A). For the
-others there is a scaling, marked as an estimate, and nothing else: nobody has published their
-curves. PAPER is Ruppert and Badri-Sproewitz 2020, [D] a derivation in hardware.md 9.
+others there is a scaling, marked as an estimate, and nothing else: their curves are not
+published. PAPER is Ruppert and Badri-Sproewitz 2020, [D] a derivation in hardware.md 9.
 """
 
 from __future__ import annotations
@@ -81,14 +81,6 @@ def volume_left(
     loads reach full scale earlier: k = 1.4 leaves 0.9050.
     """
     return float((p1_kpa / p2_kpa) ** (1.0 / exponent))
-
-
-def pressure_kpa(part_left: float, p1_kpa: float = SEAL_KPA, exponent: float = ISOTHERMAL) -> float:
-    """Pressure of a bubble of which V2/V1 is left.
-
-    Squeezed fast to what is 115 kPa slowly, it is at 121.6 kPa: beyond the chip's range.
-    """
-    return float(p1_kpa * part_left**-exponent)
 
 
 def fast_share(p1_kpa: float = SEAL_KPA, exponent: float = ADIABATIC) -> float:

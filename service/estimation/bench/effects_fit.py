@@ -28,14 +28,13 @@ def fit_effects(recordings: Sequence[Indentation], tile: TileCalibration) -> Eff
     """
     points, baseline_kpa = loadings(recordings)
     noise_kpa = float(np.mean([unloaded(each).noise_kpa for each in pressed_in(recordings)]))
-    warm = _best([fit_soak(soak(recording, noise_kpa)) for recording in recordings])
+    soaked = _best([fit_soak(soak(recording, noise_kpa)) for recording in recordings])
     effects = identify(
         points,
         scale_kpa=tile.range_kpa[1],
         baseline_kpa=baseline_kpa,
         first_curve=curve_over_range(tile.coefficients),
-        temperature=warm if isinstance(warm, TemperatureEffect) else None,
-        why_no_temperature="" if isinstance(warm, TemperatureEffect) else warm,
+        soaked=soaked,
     )
     rubber = effects.rubber
     if rubber is None:

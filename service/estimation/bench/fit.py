@@ -39,8 +39,8 @@ from service.estimation.bench.indentation import (
 from service.estimation.bench_facts import BandPoint, BenchFacts
 from service.estimation.calibration import LOOP_OPENS_N, TileCalibration, is_monotonic, loop_share
 
-BAND_STEPS = 10
-MEAN_STEPS = 30
+BAND_STEPS = 10  # of the band in the file
+MEAN_STEPS = 30  # of the mean curve, fine enough for a cubic
 
 
 class _Cubic:

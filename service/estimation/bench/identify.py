@@ -37,8 +37,7 @@ def identify(
     scale_kpa: float,
     baseline_kpa: float,
     first_curve: Floats,
-    temperature: TemperatureEffect | None,
-    why_no_temperature: str,
+    soaked: TemperatureEffect | str,
 ) -> Effects:
     """What of gas, rubber and hysteresis the recording determines.
 
@@ -47,13 +46,14 @@ def identify(
         scale_kpa: end of the calibrated range.
         baseline_kpa: absolute pressure unloaded.
         first_curve: c1, c2, c3 of the static curve over gauge / `scale_kpa`, to begin with.
-        temperature: from the soak; its wall's give is used.
-        why_no_temperature: the reason if there is none.
+        soaked: from the soak, whose wall's give is used; or why it tells nothing.
     """
     refused: dict[EffectName, str] = {}
-    if temperature is None:
-        refused["temperature"] = why_no_temperature
-        refused["ambient"] = why_no_temperature
+    temperature = None
+    if isinstance(soaked, str):
+        refused["temperature"] = refused["ambient"] = soaked
+    else:
+        temperature = soaked
     wall_per_kpa = Effects(temperature=temperature).wall_per_kpa
     static = DomeModel(first_curve, scale_kpa, baseline_kpa, wall_per_kpa)
     problem = OutputErrorProblem(points, static)

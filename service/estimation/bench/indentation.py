@@ -17,10 +17,10 @@ from devices.arrays import Arrays, Bools, Floats, Ints, Times
 from devices.errors import CalibrationError
 from service.estimation.bench.soak import Soak
 
-BLOCKS_PER_STROKE = 60
-BASELINE_NS = 1_000_000_000
-BASELINE_READINGS_MIN = 10
-REST_NS = 500_000_000
+BLOCKS_PER_STROKE = 60  # many for a cubic, and each averages many readings
+BASELINE_NS = 1_000_000_000  # before the first press
+BASELINE_READINGS_MIN = 10  # fewer do not tell the noise
+REST_NS = 500_000_000  # the end of a rest, when the rubber has recovered most
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def strokes(*recordings: Indentation) -> Strokes:
     """Block averages of every slow stroke of a tile, in one file or several.
 
     Each file has its own baseline and its own zero of the reference. A file in which the tile is
-    only held or tapped has no stroke, and is none the worse for it beside others.
+    only held or tapped has no stroke, which is fine as long as another file has.
 
     Raises:
         CalibrationError: as for `unloaded`, or there is no slow stroke in any of them.

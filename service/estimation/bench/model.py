@@ -18,8 +18,8 @@ from service.estimation.models.gas import warmed
 from service.estimation.models.hysteresis import WIDTHS_N, played
 from service.estimation.models.rubber import crept_parts
 
-_NEWTON_STEPS = 30
-_GAS_STEPS = 6
+_NEWTON_STEPS = 30  # a bound; it ends when a step is below 1e-10
+_GAS_STEPS = 6  # of a fixed point that contracts by (gamma - 1) / gamma
 _FLATTEST = 0.05
 """Of the curve's slope at zero: where a trial cubic turns over it is taken to go on like that."""
 

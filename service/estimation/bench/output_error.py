@@ -19,13 +19,13 @@ from service.estimation.bench.press import Presses
 from service.estimation.effects import EffectName
 from service.estimation.models.hysteresis import WIDTHS_N
 
-TERMS = 2
+TERMS = 2  # of the creep: one fast, one slow
 _SCATTER = (0.003, 0.03)
 """Least scatter of loadings that is believed, and the paper's, to begin with."""
-_ROUNDS = 2
-_EVALUATIONS = 60
-_NO_LIMIT = 1e3
-_BINS = 15
+_ROUNDS = 2  # the second one knows how much loadings scatter
+_EVALUATIONS = 60  # of the residuals in a round, at most
+_NO_LIMIT = 1e3  # newtons: no coefficient of a curve of 30 N comes near
+_BINS = 15  # parts of the range that systematic errors are averaged over
 _OPENS_N = 0.1
 """What is pressed with less is at rest."""
 

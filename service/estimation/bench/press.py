@@ -15,7 +15,7 @@ from devices.arrays import Arrays, Bools, Floats, Ints
 from service.estimation.bench.indentation import Indentation, Unloaded
 from service.estimation.models.outliers import spikes
 
-BLOCK = 10
+BLOCK = 10  # readings: 20 ms of a stroke that lasts seconds
 _NOISE_MIN_KPA = 0.03
 """Rounding to a count alone leaves this much."""
 _APART_S = 600.0

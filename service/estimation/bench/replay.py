@@ -17,8 +17,8 @@ from service.estimation.bench.model import DomeModel
 from service.estimation.calibration import TileCalibration
 from service.estimation.effects import values
 
-_BEFORE_S = 0.02
-_AFTER_S = 0.1
+_BEFORE_S = 0.02  # enough to see where it came from
+_AFTER_S = 0.1  # in which the gas cools, and beyond which a hold is a hold
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from service.estimation.bench.confidence import fit_covariance
 from service.estimation.effects import Parameter, TemperatureEffect
 
 STEP_MIN_K = 1.0
-_LAG_S = (0.3, 30.0)
-_BIN_S = 0.1
-_SIGMA_MAX = 0.1
+_LAG_S = (0.3, 30.0)  # shortest and longest lag that is looked for
+_BIN_S = 0.1  # shorter than the shortest lag, and long enough to average noise
+_SIGMA_MAX = 0.1  # relative: a baseline per kelvin that is known worse is not used
 _KELVIN = 273.15
 _T_SIGMA = 5.0 / 298.0
 """The chip's thermometer is not calibrated: it may be off by 5 K (hardware.md 1.3)."""

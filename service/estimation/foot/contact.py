@@ -54,7 +54,7 @@ def seeming(
     """Per frame whether the foot seems loaded (0 or 1), and since when it has seemed so.
 
     Frames without a force change nothing; at a frame that is `broken` from the one before (a gap)
-    a run begins anew.
+    a new run begins.
     """
     with np.errstate(invalid="ignore"):
         decided = np.where(grf_n >= rule.on_n, 1, np.where(grf_n <= rule.off_n, 0, -1))

@@ -11,7 +11,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.frames import ServoInfo
 
-_SAME_PLACE_M = 1e-6
+_SAME_PLACE_M = 1e-6  # tiles that differ by less stand in one line
 
 
 def hull(positions_m: Floats) -> tuple[Floats, Floats]:

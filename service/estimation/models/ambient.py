@@ -15,7 +15,7 @@ import numpy as np
 from devices.arrays import Floats, Times
 from service.estimation.compiled import compiled
 
-SMOOTHING_S = 0.03
+SMOOTHING_S = 0.03  # long against noise, short against a foot that sinks in
 HELD_S = 0.2
 """A foot sinks or is lifted in that time: what was read before says nothing of where it is."""
 

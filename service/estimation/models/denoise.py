@@ -15,7 +15,7 @@ import numpy as np
 from devices.arrays import Floats, Times
 from service.estimation.compiled import compiled
 
-PAST_NS = 250_000_000
+PAST_NS = 250_000_000  # how far the longest window reaches back
 REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
 """How far the windows reach to either side, in samples."""
 AGREE = 1.0

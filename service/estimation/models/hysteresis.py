@@ -22,7 +22,7 @@ from service.estimation.compiled import compiled
 WIDTHS_N = np.array([0.6, 1.5, 4.0])
 """Half widths of the plays; their parts are what is fitted."""
 OPENS = 0.4
-_ITERATIONS = 100
+_ITERATIONS = 100  # a bound; see `_inverted`
 _CLOSE = 1e-14
 """Relative; a step so small changes nothing any more."""
 

@@ -13,7 +13,7 @@ from devices.arrays import Bools, Floats
 
 FAR = 3.0
 """In units of the noise that a reading has about the mean of two; one healthy reading in 600."""
-_ABOUT_MEAN = np.sqrt(1.5)
+_ABOUT_MEAN = np.sqrt(1.5)  # of a reading's own noise and that of a mean of two
 
 
 def spikes(kpa: Floats, noise_kpa: Floats) -> Bools:

@@ -2,7 +2,7 @@
 
 A load that builds up slowly looks like a dome that warms up slowly. What tells them apart is the
 chip's own temperature, and what bounds the mistake is how far a baseline may be moved without it:
-by `NEAR_KPA` at once, `APART_NS` apart, and by `FAR_KPA` in all since somebody tared by hand.
+by `NEAR_KPA` at once, `APART_NS` apart, and by `FAR_KPA` in all since the last tare by hand.
 However slowly a load comes, no more of it is tared away than that: half a newton on a tile.
 """
 
@@ -34,7 +34,7 @@ SETTLE_NS = 100_000_000
 """The rubber recovers for so long after a contact, before a window may begin."""
 CONFIRM_NS = 900_000_000_000
 """Where nothing has moved the tare is renewed so seldom, long before it is called old."""
-MOVED_SIGMAS = 4.0
+MOVED_SIGMAS = 4.0  # of both tares: less may be chance
 MOVED_MIN_KPA = 0.02
 """Less than this is not worth an entry in the history."""
 
@@ -70,7 +70,7 @@ def look_in_flight(
     Args:
         seen: the last `LOOK_BACK_NS` of the stream, in order.
         present: the tare in force.
-        anchor: the last one that was not automatic; None if there is none any more.
+        anchor: the last one that was not automatic; None if there is none.
         free_since_t_ns: since when there has been no contact, nor any doubt about it.
         bears: (tiles,), False for bare tiles, which follow the weather and no load; None: all do.
     """
@@ -112,7 +112,7 @@ def first_in_flight(seen: TareFrames) -> Look:
     """A first tare that nobody asked for, if it can be no mistake.
 
     The foot has to have been loaded in these seconds and to be off the ground at their end, every
-    tile near its baseline on the bench: a foot that merely stands light is quiet and near as well.
+    tile near its baseline on the bench: a foot that stands light is quiet and near as well.
     """
     if not seen.has_bench or not len(seen.frames):
         return NOTHING

@@ -15,8 +15,8 @@ from devices.frames import NOT_READ, FrameBatch
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import FRAMES_MIN, NEAR_BASELINE_KPA, TareFrames, lowest
 
-LOOK_BACK_NS = 10_000_000_000
-WINDOW_NS = 250_000_000
+LOOK_BACK_NS = 10_000_000_000  # a foot that walks is in the air within that time
+WINDOW_NS = 250_000_000  # fits into the flight of a hop, and holds enough readings
 WARMING_COUNTS = 4.0
 """0.75 K: the gas may be that far from its chip, a quarter of a kilopascal or half a newton."""
 WINDOW_MAX_NS = 1_000_000_000

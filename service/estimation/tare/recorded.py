@@ -18,7 +18,7 @@ from service.estimation.tare.unloaded import NEAR_BASELINE_KPA, TareFrames, lowe
 
 RECOGNISE_WITHIN_NS = 60_000_000_000
 """An unloaded interval is looked for in the first minute of a recording."""
-WINDOW_NS = 500_000_000
+WINDOW_NS = 500_000_000  # longer than in flight: a recording begins at rest
 
 
 def take_tare(

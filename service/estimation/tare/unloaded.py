@@ -19,7 +19,7 @@ from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Source, Tare
 
-FRAMES_MIN = 20
+FRAMES_MIN = 20  # fewer do not tell noise from drift
 NEAR_BASELINE_KPA = 1.5
 """How far an unloaded bubble may be from its baseline on the bench: 5 K, by p0 / T0."""
 LOADED_KPA = 3.0

@@ -149,5 +149,5 @@ def run_draw(task: Task) -> Drawn:
 
 
 def reason(error: Exception) -> str:
-    """Why something failed; an error that nobody meant to raise is named by its type."""
+    """Why something failed; an unexpected error is named by its type."""
     return str(error) if isinstance(error, FootTileError) else f"{type(error).__name__}: {error}"

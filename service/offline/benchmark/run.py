@@ -54,7 +54,7 @@ class BenchOptions:
     repeatability: float | None = None
     """Of the emulated domes, instead of the scenes'."""
     correlated_ms: float | None = None
-    """Of the emulated noise, likewise."""
+    """Correlation time of the emulated noise, instead of the scenes'."""
 
     def emulated(self, scene: Scene) -> Scene:
         """The scene with the emulation that is asked for."""
@@ -126,12 +126,12 @@ def run_bench(options: BenchOptions, tell: Callable[[str], None]) -> Bench:
         ladder = rungs(scene.models, offered=_offered(scene))
         if options.whole_only:
             ladder = tuple(rung for rung in ladder if rung.is_default)
-        tasks = [Task(scene, options.seconds, draw, ladder) for draw in range(options.draws)]
+        tasks = [Task(scene, options.seconds, seed, ladder) for seed in range(options.draws)]
         draws: list[Drawn] = []
-        for one in drawn(tasks, options.jobs):
-            draws.append(one)
+        for draw in drawn(tasks, options.jobs):
+            draws.append(draw)
             tell(f"{scene.name}: {len(draws)} of {options.draws} draws")
-        draws.sort(key=lambda one: one.draw)
+        draws.sort(key=lambda draw: draw.draw)
         scenes.append(_figures(scene, ladder, draws, options, tell))
     made = datetime.now(UTC).isoformat(timespec="seconds")
     return Bench(options, made, SOFTWARE, machine(), tuple(scenes))
@@ -151,8 +151,8 @@ def _figures(
     options: BenchOptions,
     tell: Callable[[str], None],
 ) -> SceneFigures:
-    failures = [failure for one in draws for failure in one.failures]
-    good = [one for one in draws if one.accuracy]
+    failures = [failure for draw in draws for failure in draw.failures]
+    good = [draw for draw in draws if draw.accuracy]
     if not good:
         raise FootTileError(
             f"none of {len(draws)} draws gave a figure: {failures[0].what}: {failures[0].why}",
@@ -169,7 +169,7 @@ def _figures(
         absent_models=absent(scene.models),
         assumed_scale=_is_assumed(recording),
         draws=len(good),
-        frames=Spread.of([float(one.frames) for one in good]),
+        frames=Spread.of([float(draw.frames) for draw in good]),
         rungs=ladder,
         measured=measured_of(ladder, good, times_ns),
         failures=(*failures, *not_timed),

@@ -20,6 +20,7 @@ from tests.devices.rigs import (
     Wires,
     array_on,
     settled,
+    settled_on,
     timed_scan,
 )
 
@@ -64,8 +65,7 @@ def test_all_tiles_of_a_simultaneous_frame_convert_at_one_instant() -> None:
 
 
 def test_each_tile_of_a_sequential_frame_has_an_instant_of_its_own() -> None:
-    wires = Wires(FOUR)
-    array = settled(wires, "sequential")
+    wires, array = settled_on(FOUR, "sequential")
     first_ns = wires.clock.now_ns() + (SELECT + CONVERT) * BIT_NS
     step_ns = (SELECT + CONVERT + READ) * BIT_NS + TYPICAL_NS
     assert step_ns == 1_887_500
@@ -215,8 +215,7 @@ def test_a_tile_that_comes_back_brings_its_temperature() -> None:
 def test_after_something_else_used_the_bus_nothing_is_read_that_was_started_before(
     schedule: ScheduleName,
 ) -> None:
-    wires = Wires(TWO_MUXES)
-    array = settled(wires, schedule)
+    wires, array = settled_on(TWO_MUXES, schedule)
     wires.bus.transfer(i2c_msg.write(0x73, [0xFF]))
     wires.clock.sleep_until_ns(wires.clock.now_ns() + 1_000_000_000)
     resumed_ns = wires.clock.now_ns()
@@ -230,8 +229,7 @@ def test_after_something_else_used_the_bus_nothing_is_read_that_was_started_befo
 
 
 def test_what_went_wrong_is_counted_from_the_begin_of_a_stream_and_on_when_it_goes_on() -> None:
-    wires = Wires(FOUR)
-    array = settled(wires)
+    wires, array = settled_on(FOUR)
     with wires.fault("no_answer", "T03"):
         array.scan()
     counted = dict(array.health[2].counts)

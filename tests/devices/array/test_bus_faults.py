@@ -11,7 +11,7 @@ from smbus2 import i2c_msg
 from devices.errors import BusMisuseError, BusSetupError
 from devices.frames import NOT_READ, TileStatus
 from devices.scene.hardware import ScheduleName
-from tests.devices.array.wiring import every_schedule, failing, frames, to_tiles
+from tests.devices.array.wiring import every_schedule, failing, to_tiles
 from tests.devices.rigs import (
     FOUR,
     ONE,
@@ -20,15 +20,15 @@ from tests.devices.rigs import (
     Plugs,
     Wires,
     array_on,
-    settled,
+    scanned,
+    settled_on,
 )
 
 
 @pytest.mark.parametrize("number", [5, 110, 11, 16])
 @every_schedule
 def test_a_fault_of_the_bus_is_told_from_a_silent_tile(schedule: ScheduleName, number: int) -> None:
-    wires = Wires(FOUR)
-    array = settled(wires, schedule)
+    wires, array = settled_on(FOUR, schedule)
     wires.on_transaction = failing(number, lambda _, __: True)
     for _ in range(3):
         scan = array.scan()
@@ -37,8 +37,7 @@ def test_a_fault_of_the_bus_is_told_from_a_silent_tile(schedule: ScheduleName, n
         assert all(status & TileStatus.NO_ANSWER for status in scan.status)
     assert "stuck" in array.troubles()[""]
     wires.on_transaction = lambda _, __: None
-    for _ in range(3):
-        scan = array.scan()
+    scan = scanned(array, 3)
     assert not scan.bus_fault
     assert scan.status == [0] * 4
     assert array.troubles() == {}
@@ -46,8 +45,7 @@ def test_a_fault_of_the_bus_is_told_from_a_silent_tile(schedule: ScheduleName, n
 
 def test_a_stuck_bus_is_asked_for_once_a_frame_and_no_more() -> None:
     # Each transfer may cost the adapter's 30 ms.
-    wires = Wires(FOUR)
-    array = settled(wires)
+    wires, array = settled_on(FOUR)
     wires.on_transaction = failing(110, lambda _, __: True)
     wires.log.clear()
     array.scan()
@@ -59,8 +57,7 @@ def test_a_stuck_bus_is_asked_for_once_a_frame_and_no_more() -> None:
 
 
 def test_a_fault_of_the_bus_shows_although_the_second_attempt_succeeded() -> None:
-    wires = Wires(FOUR)
-    array = settled(wires)
+    wires, array = settled_on(FOUR)
     last = array.scan().padc
     wires.log.clear()
     wires.on_transaction = failing(11, lambda count, _: count == 4)  # the first tile's read
@@ -88,14 +85,13 @@ def test_a_bug_of_ours_and_a_bus_that_is_gone_are_raised_and_not_flagged(
 @every_schedule
 def test_a_bus_that_is_gone_is_raised_wherever_it_is_noticed(schedule: ScheduleName) -> None:
     for after in range(60):
-        wires = Wires(FOUR)
-        array = settled(wires, schedule)
+        wires, array = settled_on(FOUR, schedule)
         with wires.fault("no_answer", "T02"):  # one tile is looked for, too
             array.scan()
         wires.log.clear()
         wires.on_transaction = failing(19, partial(later_than, after))
         with pytest.raises(BusSetupError):
-            frames(array, 20)
+            scanned(array, 20)
 
 
 @every_schedule
@@ -103,15 +99,13 @@ def test_a_bus_that_is_gone_is_raised_wherever_it_is_noticed(schedule: ScheduleN
 def test_a_bus_on_which_nobody_answers_is_a_fault_of_the_bus_from_the_first_frame_on(
     schedule: ScheduleName, plugs: Plugs
 ) -> None:
-    wires = Wires(plugs)
-    array = settled(wires, schedule)
+    wires, array = settled_on(plugs, schedule)
     with wires.fault("sda_high"):
         for _ in range(10):
             scan = array.scan()
             assert scan.bus_fault
             assert all(status & TileStatus.NO_ANSWER for status in scan.status)
-    for _ in range(SETTLED + 2):
-        scan = array.scan()
+    scan = scanned(array, SETTLED + 2)
     assert scan.status == [0] * len(plugs)
 
 
@@ -121,15 +115,13 @@ def test_a_bus_that_acknowledges_everything_and_reads_as_zeros_is_stuck(
     schedule: ScheduleName, plugs: Plugs
 ) -> None:
     # hardware.md 8: 0/0 on several tiles, 50.00 kPa with all-zero coefficients
-    wires = Wires(plugs)
-    array = settled(wires, schedule)
+    wires, array = settled_on(plugs, schedule)
     with wires.fault("sda_low"):
         for _ in range(10):
             scan = array.scan()
             assert scan.bus_fault
             assert all(status & TileStatus.UNUSABLE for status in scan.status)
-    for _ in range(SETTLED + 2):
-        scan = array.scan()
+    scan = scanned(array, SETTLED + 2)
     assert scan.status == [0] * len(plugs)
     assert not scan.bus_fault
 
@@ -139,8 +131,7 @@ def test_a_bus_that_acknowledges_everything_and_reads_as_zeros_is_stuck(
 def test_the_tiles_of_the_other_mux_go_on_while_one_is_without_supply(
     schedule: ScheduleName, broken: int
 ) -> None:
-    wires = Wires(TWO_MUXES)
-    array = settled(wires, schedule)
+    wires, array = settled_on(TWO_MUXES, schedule)
     others = array.by_mux[1 if broken == 0x70 else 0]
     with wires.fault("brown_out", f"0x{broken:02x}"):
         scans = [array.scan() for _ in range(100)]
@@ -153,8 +144,7 @@ def test_the_tiles_of_the_other_mux_go_on_while_one_is_without_supply(
         for i in others:
             assert after.status[i] == 0
             assert after.padc[i] == before.padc[i] + 1
-    for _ in range(200):
-        scan = array.scan()
+    scan = scanned(array, 200)
     assert scan.status == [0] * 4
 
 
@@ -180,10 +170,10 @@ def test_a_stuck_bus_is_said_and_what_kept_it_from_being_helped() -> None:
     plain, helped = array_on(wires), array_on(wires, recovery=NoLines())
     for array in (plain, helped):
         with wires.fault("sda_low"):
-            frames(array, 3)
+            scanned(array, 3)
             assert list(array.troubles()) == [""]
             text = array.troubles()[""]
-        frames(array, 200)
+        scanned(array, 200)
         assert array.troubles() == {}
         assert text.startswith("the bus is stuck or cut")
         assert ("GPIO lines cannot be used" in text) == (array is helped)

@@ -28,6 +28,8 @@ from devices.scene.hardware import ScheduleName
 from tests.builders.witness import Verdict, Witness
 from tests.devices.rigs import FOUR, SCHEDULES, TWO_MUXES, Plugs
 
+pytestmark = pytest.mark.slow
+
 BEGIN_S, LENGTH_S, RECOVERED_S, RUN_S = 0.7, 0.4, 1.2, 2.6
 END_S = BEGIN_S + LENGTH_S
 BAD = 1

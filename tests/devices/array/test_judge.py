@@ -9,7 +9,7 @@ import pytest
 from devices.array.array import TileArray
 from devices.frames import TileStatus
 from tests.builders.arrays import FORUM_CHIP
-from tests.devices.rigs import FOUR, LOOK_FRAMES, Wires, settled
+from tests.devices.rigs import FOUR, LOOK_FRAMES, Wires, settled_on
 
 Tamper = Callable[[int, list[int]], None]
 
@@ -47,8 +47,7 @@ def reads_of(wires: Wires, tile: int) -> int:
 
 @pytest.fixture
 def foot() -> tuple[Wires, TileArray]:
-    wires = Wires(FOUR)
-    array = settled(wires)
+    wires, array = settled_on(FOUR)
     quiet_frame(array)
     wires.log.clear()
     return wires, array
@@ -125,8 +124,7 @@ def test_a_true_jump_is_believed_at_once_if_it_comes_twice(foot: tuple[Wires, Ti
 
 
 def test_a_jump_that_is_another_tiles_word_is_noticed_by_its_coefficients() -> None:
-    wires = Wires(FOUR, words={3: FORUM_CHIP})
-    array = settled(wires)
+    wires, array = settled_on(FOUR, words={3: FORUM_CHIP})
     quiet_frame(array)
     array.scan()
     # Channel 2 is wired to the fourth tile from now on.

@@ -30,7 +30,9 @@ from tests.devices.rigs import (
     Wires,
     array_on,
     full,
+    scanned,
     settled,
+    settled_on,
     timed_scan,
 )
 
@@ -97,8 +99,7 @@ def steady_ns(schedule: ScheduleName, plugs: Plugs, scl_hz: int, every: int = 1)
     """Length of a frame in the steady state, in which nothing is audited nor read twice."""
     wires = Wires(plugs, scl_hz)
     array = settled(wires, schedule, temperature_every=every)
-    for _ in range(2):
-        array.scan()
+    scanned(array, 2)
     (common, count), *_ = Counter(timed_scan(array, wires)[1] for _ in range(9)).most_common(1)
     assert count >= 4
     return common
@@ -187,11 +188,9 @@ def test_the_published_rates_are_reached(schedule: ScheduleName, tiles: int, hz:
 def test_drawn_parts_take_no_longer_than_the_slowest_of_them_would(
     schedule: ScheduleName, plugs: Plugs, tc_ns: list[int]
 ) -> None:
-    wires = Wires(plugs, tc_ns=tc_ns[: len(plugs)])
-    array = settled(wires, schedule)
+    wires, array = settled_on(plugs, schedule, tc_ns=tc_ns[: len(plugs)])
     begin_ns = wires.clock.now_ns()
-    for _ in range(5):
-        array.scan()
+    scanned(array, 5)
     slowest = frame_ns(schedule, plugs, 2_500) + (
         sum(tc_ns[: len(plugs)]) - len(plugs) * TYPICAL_NS
         if schedule == "sequential"
@@ -209,16 +208,14 @@ C = "60<1200"
 
 @every_schedule
 def test_a_single_tile_needs_no_select_after_the_first(schedule: ScheduleName) -> None:
-    wires = Wires(ONE)
-    array = settled(wires, schedule)
+    wires, array = settled_on(ONE, schedule)
     wires.log.clear()
     array.scan()
     assert sorted(wires.log) == [R, C]
 
 
 def log_of_a_frame(schedule: ScheduleName, plugs: Plugs) -> list[str]:
-    wires = Wires(plugs)
-    array = settled(wires, schedule)
+    wires, array = settled_on(plugs, schedule)
     wires.log.clear()
     array.scan()
     first = list(wires.log)
@@ -326,8 +323,7 @@ def test_never_is_more_than_one_mux_open_outside_a_broadcast(
 
     wires.on_transaction, wires.after_transaction = before, after
     array = array_on(wires, schedule)
-    for _ in range(4):
-        array.scan()
+    scanned(array, 4)
     assert reads >= 3 * len(plugs)
 
 
@@ -341,8 +337,7 @@ def test_a_broadcast_reaches_the_tiles_of_the_scene_and_no_other_channel() -> No
 
     wires.on_transaction = before
     array = array_on(wires, "simultaneous")
-    for _ in range(3):
-        array.scan()
+    scanned(array, 3)
     assert masks == [{0x70: 0b100001, 0x73: 0b11}] * 3
 
 
@@ -389,8 +384,8 @@ def test_no_read_begins_before_its_parts_conversion_is_finished(
 def test_no_conversion_is_lost_or_torn_whatever_an_early_read_would_do(
     schedule: ScheduleName, mode: ReadDuringConversion
 ) -> None:
-    wires = Wires(TWO_MUXES, mode=mode, tc_ns=[1_412_345, 1_999_999, 1_600_001, 1_723_456])
-    array = settled(wires, schedule)
+    tc_ns = [1_412_345, 1_999_999, 1_600_001, 1_723_456]
+    _, array = settled_on(TWO_MUXES, schedule, mode=mode, tc_ns=tc_ns)
     last = array.scan().padc
     for _ in range(100):
         scan = array.scan()

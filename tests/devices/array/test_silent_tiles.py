@@ -25,15 +25,15 @@ from tests.devices.rigs import (
     TWO_MUXES,
     Wires,
     full,
-    settled,
+    scanned,
+    settled_on,
     timed_scan,
 )
 
 
 @every_schedule
 def test_a_tile_that_falls_silent_leaves_the_others_their_values(schedule: ScheduleName) -> None:
-    wires = Wires(TWO_MUXES)
-    array = settled(wires, schedule)
+    wires, array = settled_on(TWO_MUXES, schedule)
     last = array.scan().padc
     with wires.fault("no_answer", "T02"):
         for _ in range(20):
@@ -50,8 +50,7 @@ def test_a_tile_that_falls_silent_leaves_the_others_their_values(schedule: Sched
 
 @pytest.mark.parametrize("schedule", ["simultaneous", "pipelined", "per_mux"])
 def test_a_silent_tile_is_told_by_one_flag(schedule: ScheduleName) -> None:
-    wires = Wires(TWO_MUXES)
-    array = settled(wires, schedule)
+    wires, array = settled_on(TWO_MUXES, schedule)
     with wires.fault("no_answer", "T02"):
         for _ in range(20):
             assert array.scan().status == [0, TileStatus.NO_ANSWER, 0, 0]
@@ -60,8 +59,7 @@ def test_a_silent_tile_is_told_by_one_flag(schedule: ScheduleName) -> None:
 def test_a_silent_tile_is_asked_twice_in_its_first_frame_and_ever_more_rarely_from_then_on() -> (
     None
 ):
-    wires = Wires(FOUR)
-    array = settled(wires)
+    wires, array = settled_on(FOUR)
     without_ns = WHOLE_NS - (SELECT + READ) * BIT_NS
     asked_ns = (SELECT + NOT_ACKNOWLEDGED) * BIT_NS
     looked_ms = []
@@ -86,11 +84,9 @@ def test_a_silent_tile_is_asked_twice_in_its_first_frame_and_ever_more_rarely_fr
 
 @every_schedule
 def test_a_tile_that_is_back_is_looked_at_before_it_is_believed(schedule: ScheduleName) -> None:
-    wires = Wires(TWO_MUXES)
-    array = settled(wires, schedule)
+    wires, array = settled_on(TWO_MUXES, schedule)
     with wires.fault("unplugged", "T02"):
-        for _ in range(3):
-            array.scan()
+        scanned(array, 3)
     wires.log.clear()
     frames = 0
     while array.scan().status[1]:
@@ -105,8 +101,7 @@ def test_a_tile_that_is_back_is_looked_at_before_it_is_believed(schedule: Schedu
 def test_a_tile_that_was_powered_up_anew_is_not_read_before_it_has_converted(
     schedule: ScheduleName,
 ) -> None:
-    wires = Wires(TWO_MUXES)
-    array = settled(wires, schedule)
+    wires, array = settled_on(TWO_MUXES, schedule)
     with wires.fault("unplugged", "T02"):
         array.scan()
         array.scan()
@@ -118,8 +113,7 @@ def test_a_tile_that_was_powered_up_anew_is_not_read_before_it_has_converted(
 
 @every_schedule
 def test_another_part_in_the_place_of_a_tile_is_never_believed(schedule: ScheduleName) -> None:
-    wires = Wires(TWO_MUXES)
-    array = settled(wires, schedule)
+    wires, array = settled_on(TWO_MUXES, schedule)
     with wires.fault("no_answer", "T02"):
         array.scan()
     plug_another(wires, 1)
@@ -146,8 +140,7 @@ def plug_another(wires: Wires, tile: int) -> None:
 def test_another_part_is_not_believed_even_if_only_one_convert_was_missed(
     schedule: ScheduleName,
 ) -> None:
-    wires = Wires(TWO_MUXES)
-    array = settled(wires, schedule)
+    wires, array = settled_on(TWO_MUXES, schedule)
     silent = False
 
     def swap(_: int, messages: tuple[i2c_msg, ...]) -> None:
@@ -161,8 +154,7 @@ def test_another_part_is_not_believed_even_if_only_one_convert_was_missed(
                 raise OSError(121, "nobody there")
 
     wires.on_transaction = swap
-    for _ in range(3):
-        array.scan()
+    scanned(array, 3)
     assert silent
     wires.on_transaction = lambda _, __: None
     plug_another(wires, 1)
@@ -175,24 +167,21 @@ def test_another_part_is_not_believed_even_if_only_one_convert_was_missed(
 def test_one_missing_acknowledge_is_mended_within_the_frame_and_flagged(
     schedule: ScheduleName,
 ) -> None:
-    wires = Wires(FOUR)
-    array = settled(wires, schedule)
+    wires, array = settled_on(FOUR, schedule)
     for _ in range(5):  # whatever the turn of the tile is
         mended(wires, array, 2)
 
 
 @every_schedule
 def test_so_it_is_if_the_tile_was_waited_for(schedule: ScheduleName) -> None:
-    wires = Wires(FOUR)
-    array = settled(wires, schedule)
+    wires, array = settled_on(FOUR, schedule)
     for _ in range(5):
         mended(wires, array, 0)
 
 
 @every_schedule
 def test_so_it_is_in_an_array_of_one(schedule: ScheduleName) -> None:
-    wires = Wires(ONE)
-    array = settled(wires, schedule)
+    wires, array = settled_on(ONE, schedule)
     before = [array.scan().padc[0] for _ in range(3)]
     wires.log.clear()
     failed: list[bool] = []
@@ -231,8 +220,7 @@ def mended(wires: Wires, array: TileArray, tile: int) -> None:
 
 
 def test_a_broadcast_that_nobody_acknowledged_is_tried_once_more() -> None:
-    wires = Wires(FOUR)
-    array = settled(wires)
+    wires, array = settled_on(FOUR)
     last = array.scan().padc
     wires.log.clear()
     wires.on_transaction = failing(121, lambda count, _: count == 2)
@@ -246,8 +234,7 @@ def test_a_broadcast_that_nobody_acknowledged_is_tried_once_more() -> None:
 def test_a_mux_that_was_reset_behind_our_back_costs_no_sample_of_a_tile_read_later(
     schedule: ScheduleName,
 ) -> None:
-    wires = Wires(FOUR)
-    array = settled(wires, schedule)
+    wires, array = settled_on(FOUR, schedule)
     reads = 0
 
     def reset(_: int, messages: tuple[i2c_msg, ...]) -> None:
@@ -266,8 +253,7 @@ def test_a_mux_that_was_reset_behind_our_back_costs_no_sample_of_a_tile_read_lat
 
 @every_schedule
 def test_a_foot_without_any_tile_left_is_still_a_frame(schedule: ScheduleName) -> None:
-    wires = Wires(FOUR)
-    array = settled(wires, schedule)
+    wires, array = settled_on(FOUR, schedule)
     wires.on_transaction = failing(121, to_tiles)
     for _ in range(20):
         begin_ns = wires.clock.now_ns()
@@ -278,14 +264,12 @@ def test_a_foot_without_any_tile_left_is_still_a_frame(schedule: ScheduleName) -
         assert took_ns >= 1_000_000, "nothing to do is no reason to hurry"
         assert begin_ns - took_ns <= scan.convert_stop_ns[0] <= wires.clock.now_ns()
     wires.on_transaction = lambda _, __: None
-    for _ in range(200):
-        scan = array.scan()
+    scan = scanned(array, 200)
     assert scan.status == [0] * 4
 
 
 def test_one_disturbed_select_does_not_make_a_tile_another_part() -> None:
-    wires = Wires(FOUR, words={3: FORUM_CHIP})
-    array = settled(wires)
+    wires, array = settled_on(FOUR, words={3: FORUM_CHIP})
     with wires.fault("no_answer", "T02"):
         array.scan()
     disturbed: list[bool] = []
@@ -296,8 +280,7 @@ def test_one_disturbed_select_does_not_make_a_tile_another_part() -> None:
             wires.adapter.i2c_rdwr(i2c_msg.write(0x70, [0b1000]))  # a bit or two turned over
 
     wires.after_transaction = disturb
-    for _ in range(100):
-        scan = array.scan()
+    scan = scanned(array, 100)
     assert disturbed
     assert array.replaced == ()
     assert scan.status == [0] * 4
@@ -305,8 +288,7 @@ def test_one_disturbed_select_does_not_make_a_tile_another_part() -> None:
 
 @every_schedule
 def test_one_disturbed_select_passes_on_no_word_of_another_tile(schedule: ScheduleName) -> None:
-    wires = Wires(FOUR, words={3: FORUM_CHIP})
-    array = settled(wires, schedule)
+    wires, array = settled_on(FOUR, schedule, words={3: FORUM_CHIP})
     last = array.scan().padc
     disturbed: list[bool] = []
 
@@ -330,8 +312,7 @@ def test_one_disturbed_select_passes_on_no_word_of_another_tile(schedule: Schedu
 
 def test_one_bad_plug_does_not_slow_the_others_down() -> None:
     # Every transfer of one tile fails at every second attempt: it is never quite lost.
-    wires = Wires(FOUR)
-    array = settled(wires)
+    wires, array = settled_on(FOUR)
     bad = 0
 
     def first(_: int, messages: tuple[i2c_msg, ...]) -> bool:
@@ -357,8 +338,7 @@ def test_one_bad_plug_does_not_slow_the_others_down() -> None:
 
 def test_second_attempts_share_a_budget_so_that_a_storm_does_not_halve_the_rate() -> None:
     plugs = full(8)
-    wires = Wires(plugs)
-    array = settled(wires)
+    wires, array = settled_on(plugs)
     whole_ns = timed_scan(array, wires)[1]
     count = 0
 
@@ -373,11 +353,9 @@ def test_second_attempts_share_a_budget_so_that_a_storm_does_not_halve_the_rate(
 
 
 def test_a_tile_that_was_lost_costs_nothing_but_its_first_frame_of_attention() -> None:
-    wires = Wires(FOUR)
-    array = settled(wires)
+    wires, array = settled_on(FOUR)
     with wires.fault("no_answer", "T03"):
-        for _ in range(3):
-            array.scan()
+        scanned(array, 3)
         wires.log.clear()
         array.scan()
     assert wires.log == [
@@ -388,8 +366,7 @@ def test_a_tile_that_was_lost_costs_nothing_but_its_first_frame_of_attention() -
 
 
 def test_finding_a_tile_again_costs_one_reading_of_its_coefficients() -> None:
-    wires = Wires(FOUR)
-    array = settled(wires)
+    wires, array = settled_on(FOUR)
     with wires.fault("no_answer", "T03"):
         array.scan()
     _, took_ns = timed_scan(array, wires)
@@ -401,13 +378,11 @@ def test_finding_a_tile_again_costs_one_reading_of_its_coefficients() -> None:
 
 @every_schedule
 def test_a_single_tile_that_comes_and_goes_is_found_again(schedule: ScheduleName) -> None:
-    wires = Wires(ONE)
-    array = settled(wires, schedule)
+    wires, array = settled_on(ONE, schedule)
     with wires.fault("unplugged", "T01"):
         for _ in range(50):
             scan = array.scan()
             assert scan.status[0] & TileStatus.NO_ANSWER
             assert scan.padc == [NOT_READ]
-    for _ in range(SETTLED + 100):
-        scan = array.scan()
+    scan = scanned(array, SETTLED + 100)
     assert scan.status == [0]

@@ -7,14 +7,7 @@ from collections.abc import Callable
 import pytest
 from smbus2 import i2c_msg
 
-from devices.array.array import TileArray
-from tests.devices.rigs import (
-    CONVERT,
-    READ,
-    SCHEDULES,
-    SELECT,
-    TYPICAL_NS,
-)
+from tests.devices.rigs import CONVERT, READ, SCHEDULES, SELECT, TYPICAL_NS
 
 BIT_NS = 2_500
 WHOLE_NS = (4 * SELECT + CONVERT + 4 * READ) * BIT_NS + TYPICAL_NS  # simultaneous, four tiles
@@ -34,8 +27,3 @@ def failing(
 
 def to_tiles(_: int, messages: tuple[i2c_msg, ...]) -> bool:
     return bool(messages[0].addr == 0x60)
-
-
-def frames(array: TileArray, count: int) -> None:
-    for _ in range(count):
-        array.scan()

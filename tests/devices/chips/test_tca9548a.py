@@ -58,6 +58,11 @@ class Protocol:
         yield
         assert not self.left, "these were expected and did not come"
 
+    def connects(self, muxes: MuxRouter, address: int, channel: int, *steps: str) -> None:
+        """To connect one channel takes exactly these transactions."""
+        with self.exchanged(*steps):
+            muxes.connect_only(address, channel)
+
 
 @pytest.fixture
 def protocol() -> Protocol:
@@ -100,35 +105,24 @@ def test_a_mask_of_more_than_eight_bits_is_no_mask(protocol: Protocol, mask: int
 # All multiplexers
 
 
-def test_a_router_knows_each_mux_once(protocol: Protocol) -> None:
-    assert router(protocol, 0x72, 0x70, 0x72, 0x70).addresses == (0x70, 0x72)
-
-
 def test_the_first_selection_closes_every_other_mux_first(protocol: Protocol) -> None:
     # Nothing is known of them: whoever used the bus before may have left them open.
     muxes = router(protocol, 0x70, 0x71, 0x72)
-    with protocol.exchanged("70<00", "72<00", "71<08"):
-        muxes.connect_only(0x71, 3)
+    protocol.connects(muxes, 0x71, 3, "70<00", "72<00", "71<08")
 
 
 def test_what_is_open_is_not_written_again(protocol: Protocol) -> None:
     muxes = router(protocol)
-    with protocol.exchanged("71<00", "70<01"):
-        muxes.connect_only(0x70, 0)
-    with protocol.exchanged():
-        muxes.connect_only(0x70, 0)
-    with protocol.exchanged("70<02"):
-        muxes.connect_only(0x70, 1)
+    protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
+    protocol.connects(muxes, 0x70, 0)
+    protocol.connects(muxes, 0x70, 1, "70<02")
 
 
 def test_the_mux_that_is_left_is_closed_before_another_one_opens(protocol: Protocol) -> None:
     muxes = router(protocol)
-    with protocol.exchanged("71<00", "70<80"):
-        muxes.connect_only(0x70, 7)
-    with protocol.exchanged("70<00", "71<01"):
-        muxes.connect_only(0x71, 0)
-    with protocol.exchanged("71<00", "70<80"):
-        muxes.connect_only(0x70, 7)
+    protocol.connects(muxes, 0x70, 7, "71<00", "70<80")
+    protocol.connects(muxes, 0x71, 0, "70<00", "71<01")
+    protocol.connects(muxes, 0x70, 7, "71<00", "70<80")
 
 
 def test_a_broadcast_opens_all_that_is_asked_for_and_is_closed_again(protocol: Protocol) -> None:
@@ -137,8 +131,7 @@ def test_a_broadcast_opens_all_that_is_asked_for_and_is_closed_again(protocol: P
         muxes.connect({0x70: 0x0F, 0x71: 0xF0})
     with protocol.exchanged():
         muxes.connect({0x70: 0x0F, 0x71: 0xF0})
-    with protocol.exchanged("71<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
 
 
 def test_a_mask_of_zero_closes_a_mux_once(protocol: Protocol) -> None:
@@ -153,11 +146,9 @@ def test_a_mask_of_zero_closes_a_mux_once(protocol: Protocol) -> None:
 
 def test_a_forgotten_routing_is_written_afresh(protocol: Protocol) -> None:
     muxes = router(protocol)
-    with protocol.exchanged("71<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
     muxes.forget()
-    with protocol.exchanged("71<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
 
 
 @pytest.mark.parametrize(
@@ -168,60 +159,49 @@ def test_what_a_mux_connects_after_a_failed_write_is_not_taken_as_known(
     protocol: Protocol, number: int, kind: type[I2cError]
 ) -> None:
     muxes = router(protocol, 0x70, 0x71, 0x72)
-    with protocol.exchanged("71<00", "72<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "72<00", "70<01")
     with protocol.exchanged(f"70<02 {number}"), pytest.raises(kind):
         muxes.connect_only(0x70, 1)
     # It may have heard it or not; the others were not spoken to.
-    with protocol.exchanged("70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "70<01")
     muxes.forget()  # what a user of the bus does after a fault of the bus itself
-    with protocol.exchanged("71<00", "72<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "72<00", "70<01")
 
 
 def test_one_mux_alone_can_be_forgotten(protocol: Protocol) -> None:
     muxes = router(protocol, 0x70, 0x71, 0x72)
-    with protocol.exchanged("71<00", "72<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "72<00", "70<01")
     muxes.forget(0x72)
-    with protocol.exchanged("72<00"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "72<00")
 
 
 def test_a_mux_that_does_not_close_keeps_the_others_shut(protocol: Protocol) -> None:
     muxes = router(protocol)
-    with protocol.exchanged("71<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
     with protocol.exchanged(f"70<00 {NACK}"), pytest.raises(NoAcknowledgeError):
         muxes.connect_only(0x71, 0)
-    with protocol.exchanged("70<00", "71<01"):
-        muxes.connect_only(0x71, 0)
+    protocol.connects(muxes, 0x71, 0, "70<00", "71<01")
 
 
 def test_a_mux_that_refuses_to_be_closed_twice_in_a_row_is_silent_and_in_nobodys_way(
     protocol: Protocol,
 ) -> None:
     muxes = router(protocol)
-    with protocol.exchanged("71<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
     with protocol.exchanged(f"70<00 {NACK}"), pytest.raises(NoAcknowledgeError):
         muxes.connect_only(0x71, 0)
     assert muxes.silent == set()
-    with protocol.exchanged(f"70<00 {NACK}", "71<01"):
-        muxes.connect_only(0x71, 0)
+    protocol.connects(muxes, 0x71, 0, f"70<00 {NACK}", "71<01")
     assert muxes.silent == {0x70}
     with protocol.exchanged("71<02"):  # nor is it asked any more
         muxes.connect_only(0x71, 1)
-    with protocol.exchanged("71<00", "70<04"):
-        muxes.connect_only(0x70, 2)
+    protocol.connects(muxes, 0x70, 2, "71<00", "70<04")
     assert muxes.silent == set(), "it has answered"
 
 
 def test_a_mux_that_fails_with_the_bus_is_not_silent(protocol: Protocol) -> None:
     muxes = router(protocol)
-    with protocol.exchanged("71<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "70<01")
     for _ in range(3):
         with protocol.exchanged(f"70<00 {TIMEOUT}"), pytest.raises(BusFaultError):
             muxes.connect_only(0x71, 0)
@@ -233,8 +213,7 @@ def test_a_mux_that_fails_with_the_bus_is_not_silent(protocol: Protocol) -> None
 
 def test_an_audit_reads_back_every_mux_of_which_something_is_known(protocol: Protocol) -> None:
     muxes = router(protocol, 0x70, 0x71, 0x72)
-    with protocol.exchanged("71<00", "72<00", "70<04"):
-        muxes.connect_only(0x70, 2)
+    protocol.connects(muxes, 0x70, 2, "71<00", "72<00", "70<04")
     with protocol.exchanged("70>04", "71>00", "72>00"):
         assert muxes.audit()
     muxes.forget(0x71)
@@ -244,32 +223,26 @@ def test_an_audit_reads_back_every_mux_of_which_something_is_known(protocol: Pro
 
 def test_a_mux_that_was_reset_behind_our_back_is_found_by_an_audit(protocol: Protocol) -> None:
     muxes = router(protocol)
-    with protocol.exchanged("71<00", "70<04"):
-        muxes.connect_only(0x70, 2)
+    protocol.connects(muxes, 0x70, 2, "71<00", "70<04")
     with protocol.exchanged("70>00", "71>00"):
         assert not muxes.audit()
-    with protocol.exchanged("70<04"):
-        muxes.connect_only(0x70, 2)
+    protocol.connects(muxes, 0x70, 2, "70<04")
 
 
 def test_a_mux_that_somebody_opened_is_found_by_an_audit(protocol: Protocol) -> None:
     muxes = router(protocol)
-    with protocol.exchanged("71<00", "70<04"):
-        muxes.connect_only(0x70, 2)
+    protocol.connects(muxes, 0x70, 2, "71<00", "70<04")
     with protocol.exchanged("70>04", "71>01"):
         assert not muxes.audit()
-    with protocol.exchanged("71<00"):
-        muxes.connect_only(0x70, 2)
+    protocol.connects(muxes, 0x70, 2, "71<00")
 
 
 def test_a_mux_that_does_not_answer_an_audit_is_not_taken_as_known(protocol: Protocol) -> None:
     muxes = router(protocol)
-    with protocol.exchanged("71<00", "70<04"):
-        muxes.connect_only(0x70, 2)
+    protocol.connects(muxes, 0x70, 2, "71<00", "70<04")
     with protocol.exchanged(f"70>04 {NACK}", "71>00"):
         assert not muxes.audit()
-    with protocol.exchanged("70<04"):
-        muxes.connect_only(0x70, 2)
+    protocol.connects(muxes, 0x70, 2, "70<04")
     with protocol.exchanged(f"70>04 {TIMEOUT}"), pytest.raises(BusFaultError):
         muxes.audit()
 
@@ -279,8 +252,7 @@ def test_one_mux_that_keeps_what_is_written_proves_that_the_wires_move(protocol:
     with protocol.exchanged(f"70<01 {NACK}", "71<01", "71>01"):
         assert muxes.echoes()
     # It was only a trial: nothing is taken as known afterwards.
-    with protocol.exchanged("71<00", "72<00", "70<01"):
-        muxes.connect_only(0x70, 0)
+    protocol.connects(muxes, 0x70, 0, "71<00", "72<00", "70<01")
 
 
 def test_a_bus_on_which_everything_reads_as_zero_does_not_move(protocol: Protocol) -> None:

@@ -363,6 +363,7 @@ def test_the_mills_notes_name_tile_and_phase() -> None:
     assert notes["phase"].tolist() == ["rest", "rest", "load", "unload", "soak"]
 
 
+@pytest.mark.slow
 def test_the_soak_is_warmer_at_its_end() -> None:
     keys = {"kind": "indentation", "stroke_s": 0.1, "repeats": 2, "soak_k": 4.0}
     scene = make_scene(ONE, ground=keys)

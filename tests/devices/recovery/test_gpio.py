@@ -17,6 +17,8 @@ from devices.recovery.gpio import GpioLines
 from devices.recovery.recovery import GpioRecovery, open_recovery
 from devices.scene.hardware import RecoveryScene
 
+pytestmark = pytest.mark.process
+
 gpiod = pytest.importorskip("gpiod")
 ACTIVE, INACTIVE = gpiod.line.Value.ACTIVE, gpiod.line.Value.INACTIVE
 

@@ -156,7 +156,7 @@ def many(running: Running, node: FakeNode) -> list[str]:
         for i in range(23)
     ]
     for session in sessions:
-        running.call(partial(running.server.recorder._keep, session))
+        running.call(partial(running.server.sessions.keep, session))
     sessions.sort(key=lambda s: (s.started_t_ns, s.id), reverse=True)
     return [session.id for session in sessions]
 

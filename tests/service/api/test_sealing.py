@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import service.api.routes.sessions
-import service.server.recorder
+import service.server.settling
 from devices.errors import StorageError
 from service.sessions.sealing import seal
 from tests.builders.arrays import COUNT_KPA
@@ -264,8 +264,8 @@ def test_a_session_is_sealed_again_when_the_disk_was_full(
     tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refusing = failing_once(seal, StorageError, "No space left on device")
-    monkeypatch.setattr(service.server.recorder, "seal", refusing)
-    monkeypatch.setattr(service.server.recorder, "_SEAL_AGAIN_S", 0.2)
+    monkeypatch.setattr(service.server.settling, "seal", refusing)
+    monkeypatch.setattr(service.server.settling, "_SEAL_AGAIN_S", 0.2)
     session = tared.record()
     tared.deliver(20)
     session.stop()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from service.cli.main import main
+from service.version import SOFTWARE
 from tests.service.cli.outcome import Outcome, Run
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -37,6 +40,18 @@ def run(
         return Outcome(code, out, err)
 
     return run_foottile
+
+
+@pytest.fixture
+def bench(run: Run, bench_cache: Path) -> bytes:
+    """A recording of tiles T01 and T02 under the mill, which takes seconds: made once."""
+    kept = bench_cache / f"{SOFTWARE}-T01,T02.parquet"
+    if not kept.exists():
+        made = f"{os.getpid()}.parquet"
+        pressed = ("--tiles", "T01,T02", "--out", made)
+        assert run("simulate", "--scene", "indentation", *pressed).code == 0
+        shutil.move(made, kept)
+    return kept.read_bytes()
 
 
 @pytest.fixture

@@ -19,6 +19,11 @@ class Outcome:
 Run = Callable[..., Outcome]
 
 
-def scene_text(name: str) -> str:
-    """The file of a built-in scene."""
-    return (resources.files("devices.scene") / "builtin" / f"{name}.toml").read_text("utf-8")
+def scene_text(name: str, tiles: int | None = None) -> str:
+    """The file of a built-in scene, if asked for with its first tiles only."""
+    text = (resources.files("devices.scene") / "builtin" / f"{name}.toml").read_text("utf-8")
+    if tiles is None:
+        return text
+    head, *each = text.split("[[tile]]")
+    _, begin, rest = each[-1].partition("\n[")
+    return "[[tile]]".join([head, *each[:tiles]]) + begin + rest

@@ -44,6 +44,7 @@ def changed(value: object) -> object:
     return 1.0 if value is None else f"{value}x"
 
 
+@pytest.mark.slow
 @given(
     c=st.tuples(numbers, st.floats(0.1, 100), st.floats(0, 100), st.floats(0, 100)),
     offset_n=numbers,

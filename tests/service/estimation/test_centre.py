@@ -8,10 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from devices.frames import (
-    NO_SERVO_COUNTS,
-    FrameStatus,
-)
+from devices.frames import NO_SERVO_COUNTS, FrameStatus
 from service.estimation.calibration import paper_eq2_shape
 from service.estimation.estimates import Estimates, EstimateStatus
 from tests.builders.arrays import COUNT_KPA, array_at, make_servo

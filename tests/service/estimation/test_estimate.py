@@ -16,11 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
-from devices.frames import (
-    NO_SERVO_COUNTS,
-    NOT_READ,
-    FrameBatch,
-)
+from devices.frames import NO_SERVO_COUNTS, NOT_READ, FrameBatch
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import EstimateStatus
 from service.estimation.lower import ApparentForces

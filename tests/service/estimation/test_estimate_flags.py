@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from devices.frames import (
-    TileStatus,
-)
+from devices.frames import TileStatus
 from service.estimation.estimates import EstimateStatus
 from service.estimation.models.temperature import Temperature
 from tests.builders.arrays import COUNT_KPA, array_at

@@ -18,6 +18,8 @@ from service.offline.calibrate import calibrate_recordings, read_recordings
 from service.offline.calibrations import with_tiles
 from service.offline.simulate import SimulateOptions, simulate
 
+pytestmark = pytest.mark.slow
+
 Bench = tuple[Calibration, dict[str, list[Indentation]]]
 
 

@@ -14,6 +14,7 @@ from service.rig.emulated import EmulatedFoot
 from service.rig.rig import Rig, RigOptions
 
 
+@pytest.mark.slow
 def test_a_machine_that_is_busy_during_the_trial_frames_does_not_use_up_the_lead(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -17,7 +17,6 @@ from websockets.exceptions import ConnectionClosed
 
 import service.server
 import service.server.ingest
-import service.server.nodes
 import service.server.streams
 from devices.frames import FrameBatch
 from storage.intervals import Intervals

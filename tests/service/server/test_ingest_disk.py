@@ -9,7 +9,7 @@ import pytest
 
 import service.server
 import service.server.ingest
-import service.server.nodes
+import service.server.node
 import service.server.streams
 import storage.journal.segment
 from devices.errors import StorageError
@@ -163,7 +163,7 @@ def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
     node.reboot()
     node.tiles += 1
     with monkeypatch.context() as patch:
-        patch.setattr(service.server.nodes.Node, "keep", refusing(*STORAGE_FULL))
+        patch.setattr(service.server.node.ServerNode, "keep", refusing(*STORAGE_FULL))
         node.connect()
     shown = running.node()
     assert len(shown["tiles"]) == node.tiles

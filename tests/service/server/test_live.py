@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from devices.frames import FrameBatch
 from service.estimation.foot.contact import UNKNOWN
 from service.server.live import SUMMARY_NS, Encoder, Hub, Piece, Subscriber, min_of, sum_up
-from service.server.nodes import Node
+from service.server.node import ServerNode
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 
@@ -26,7 +26,7 @@ RANGE_KPA = np.array([15.0, 15.0])
 Columns = dict[str, np.ndarray]
 
 
-def fake_node(name: str = "bench", boot_id: str = "0" * 32) -> Node:
+def fake_node(name: str = "bench", boot_id: str = "0" * 32) -> ServerNode:
     node = SimpleNamespace(
         name=name,
         boot_id=boot_id,
@@ -34,7 +34,7 @@ def fake_node(name: str = "bench", boot_id: str = "0" * 32) -> Node:
         live=SimpleNamespace(range_kpa=RANGE_KPA),
         shown_t_ns=None,
     )
-    return cast(Node, node)
+    return cast(ServerNode, node)
 
 
 def frames(first: int, rows: int, *, period_ns: int = PERIOD_NS) -> FrameBatch:

@@ -17,7 +17,7 @@ from devices.frames import (
     FrameBatch,
 )
 from service.link import PROTOCOL, EarlierStream, Hello
-from service.server.nodes import Node
+from service.server.node import ServerNode
 from storage.intervals import NO_END, Intervals
 from storage.schema import wire_schema
 from storage.wire import encode
@@ -43,13 +43,13 @@ class Told:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.info = {boot: make_array(boot_id=boot) for boot in (OLD, NEW)}
-        self.node: Node
+        self.node: ServerNode
         self.restart()
 
     def restart(self) -> None:
         if hasattr(self, "node"):
             self.close()
-        self.node = Node(self.folder / "node", self.folder / "journal", self.hello())
+        self.node = ServerNode(self.folder / "node", self.folder / "journal", self.hello())
 
     def hello(self, **changes: Any) -> Hello:
         content: dict[str, Any] = {
@@ -206,7 +206,7 @@ def test_frames_from_before_the_server_knew_the_node_are_not_lost(told: Told) ->
 def test_what_was_deleted_because_nobody_needs_it_is_not_lost_even_after_a_restart(
     told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.server.nodes.RING_NS", 20 * PERIOD_NS)
+    monkeypatch.setattr("service.server.node.RING_NS", 20 * PERIOD_NS)
     monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 10 * PERIOD_NS)
     told.connect()
     for n in range(0, 100, 5):

@@ -13,7 +13,7 @@ import pytest
 from devices.errors import StorageError, TareError
 from devices.frames import FrameBatch, FrameStatus, TileStatus
 from service.link import PROTOCOL, Hello
-from service.server.nodes import Node
+from service.server.node import ServerNode
 from storage.intervals import Intervals
 from storage.schema import wire_schema
 from storage.wire import encode
@@ -45,14 +45,14 @@ class Foot:
             calibration=make_calibration(*info.serials),
             calibration_problem=None,
         )
-        self.node: Node
+        self.node: ServerNode
         self.restart()
 
     def restart(self) -> None:
         """The server goes down and comes up again, and the node connects."""
         if hasattr(self, "node"):
             self.close()
-        self.node = Node(self._folder / "node", self._folder / "journal", self.hello)
+        self.node = ServerNode(self._folder / "node", self._folder / "journal", self.hello)
         self.node.attach(self.hello, UTC_NS)
         self.node.connected = True
 

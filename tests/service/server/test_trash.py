@@ -12,7 +12,7 @@ import pytest
 
 import service.api.routes.sessions
 import service.server
-import service.server.recorder
+import service.server.settling
 from devices.errors import StorageError
 from service.sessions.sealing import seal
 from storage.intervals import Intervals
@@ -110,7 +110,7 @@ def test_a_session_that_is_being_sealed_is_not_deleted(
         assert may_seal.wait(20.0)
         return seal(*arguments)
 
-    monkeypatch.setattr(service.server.recorder, "seal", slow)
+    monkeypatch.setattr(service.server.settling, "seal", slow)
     try:
         session = tared.record()
         tared.deliver(20)
@@ -311,7 +311,7 @@ def test_frames_that_are_found_damaged_and_nobody_has_are_lost_and_said_to_be(
 def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_the_next(
     running: Running, tared: FakeNode, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(service.server.recorder, "seal", refusing(StorageError, "No space left"))
+    monkeypatch.setattr(service.server.settling, "seal", refusing(StorageError, "No space left"))
     session = tared.record()
     tared.deliver(20)
     session.stop()
@@ -319,7 +319,7 @@ def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_th
         tared.send(10, now=True)
         until(lambda: "No space" in (session.now()["problem"] or ""))
     assert session.now()["state"] == state
-    monkeypatch.setattr(service.server.recorder, "seal", seal)
+    monkeypatch.setattr(service.server.settling, "seal", seal)
     running.restart()
     if state == "pending":
         tared.connect()
@@ -354,7 +354,7 @@ def test_what_killed_processes_left_half_written_is_removed_at_the_start(
 def test_frames_of_an_unsealed_session_are_never_pruned(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.server.nodes.RING_NS", 0)
+    monkeypatch.setattr("service.server.node.RING_NS", 0)
     pending(tared)
     node = running.server.nodes.get("bench")
     running.call(lambda: node.prune(running.server.recorder.needed("bench")))

@@ -27,7 +27,7 @@ from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
 from storage.losses import Losses
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event, Part, Session, SessionFolder
-from storage.verify.data import as_dict, verdict_of, verify
+from storage.verify.data import verdict_of, verify
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
@@ -220,7 +220,7 @@ def test_several_parts_become_one_file(tmp_path: Path) -> None:
     session(tmp_path, parts=parts)
     assert outcomes(recover(tmp_path)) == ["sealed"]
     assert loaded(tmp_path).frames == 145
-    assert as_dict(verify(tmp_path))["problems"] == []
+    assert verify(tmp_path).as_dict()["problems"] == []
 
 
 def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) -> None:
@@ -369,6 +369,7 @@ def test_what_was_deleted_is_not_brought_back(tmp_path: Path) -> None:
 # --- what else a crash leaves ---------------------------------------------------------------------
 
 
+@pytest.mark.process
 def test_what_dead_processes_left_half_written_is_removed(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
@@ -388,9 +389,9 @@ def test_events_that_were_not_written_in_time_are_written_anew(tmp_path: Path) -
         update={"events": (*done.events, Event(id="e2", label="fall", t_ns=1))}
     )
     SessionFolder(tmp_path / "sessions").save(marked)
-    assert as_dict(verify(tmp_path))["problems"]
+    assert verify(tmp_path).as_dict()["problems"]
     assert recover(tmp_path).mended == [ID]
-    assert as_dict(verify(tmp_path))["problems"] == []
+    assert verify(tmp_path).as_dict()["problems"] == []
     assert recover(tmp_path).is_nothing
 
 
@@ -449,6 +450,7 @@ class Killed(BaseException):
     """As good as SIGKILL for what is on the disk: nothing after it is done."""
 
 
+@pytest.mark.slow
 def test_killed_at_any_write_the_next_run_comes_to_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,6 +33,7 @@ from tests.storage.journal.journals import (
 )
 
 
+@pytest.mark.slow
 def test_a_cut_anywhere_keeps_every_whole_message_before_it(tmp_path: Path) -> None:
     whole = tmp_path / "whole"
     filled(whole, (0, 9), (10, 10), (11, 12)).close()

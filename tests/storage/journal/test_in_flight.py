@@ -98,6 +98,7 @@ def test_what_is_no_such_file_is_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.process
 def test_a_killed_process_has_left_every_frame_that_it_had_taken(tmp_path: Path) -> None:
     code = """
 import json, sys

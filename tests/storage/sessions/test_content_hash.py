@@ -79,6 +79,7 @@ def content(path: Path) -> dict[str, Any]:
         return reader.content
 
 
+@pytest.mark.process
 def test_the_lines_in_the_documents_make_the_same_hashes(tmp_path: Path) -> None:
     section = FORMATS.read_text("utf-8").split("### Hashes")[1]
     code = section.split("```python")[1].split("```")[0]

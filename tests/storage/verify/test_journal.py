@@ -16,7 +16,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.segment import SegmentWriter
-from storage.journal.segment_index import INDEX_SUFFIX, RECORD
+from storage.journal.segment_format import INDEX_SUFFIX, RECORD
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.schema import wire_schema
 from storage.verify.journal import verify_stream

@@ -25,7 +25,7 @@ from storage.losses import Losses
 from storage.sessions.folder import Event, Part, Session, SessionFolder
 from storage.sessions.ledger import ledger_of
 from storage.sessions.states import StreamState
-from storage.verify.data import as_dict, verdict_of, verify
+from storage.verify.data import verdict_of, verify
 from storage.verify.file import verify_file
 from storage.verify.session import SessionReport, verify_session
 from tests.builders.arrays import UTC_NS, make_array
@@ -186,7 +186,7 @@ def test_a_lone_file_says_what_it_cannot_prove(tmp_path: Path) -> None:
     path = sealed(tmp_path) / "frames.parquet"
     report = verify(path)
     assert isinstance(report, SessionReport)
-    assert as_dict(report)["id"] == ID
+    assert report.as_dict()["id"] == ID
     assert verdict_of(report) == "lossy"
     assert "session.json" in " ".join(report.unproven)
 
@@ -225,7 +225,7 @@ def test_a_session_in_another_one_s_folder_is_seen(tmp_path: Path) -> None:
     folder = sealed(tmp_path)
     folder.rename(folder.with_name(OTHER_ID))
     report = verify(tmp_path)
-    assert any("lies in the folder of" in said for said in as_dict(report)["problems"])
+    assert any("lies in the folder of" in said for said in report.as_dict()["problems"])
 
 
 @settings(max_examples=120, deadline=None)
@@ -406,7 +406,7 @@ def test_a_data_folder_is_all_of_its_sessions_and_journals(tmp_path: Path) -> No
     (tmp_path / "sessions" / "20200101T000000Z-00000c").mkdir()  # begun, and killed
     report = verify(tmp_path)
     assert verdict_of(report) == "lossy"
-    content = as_dict(report)
+    content = report.as_dict()
     assert set(content) == {"sessions", "journals", "problems"}
     assert [one["id"] for one in content["sessions"]] == [ID, OTHER_ID]
     assert [one["frames"] for one in content["journals"]] == [56, 20]
@@ -419,9 +419,9 @@ def test_whatever_is_named_is_found(tmp_path: Path) -> None:
     folder = sealed(tmp_path)
     stream = tmp_path / "journal" / "bench" / BOOTS[0]
     for path in (folder, folder / "session.json", stream, stream / "stream.json", tmp_path):
-        assert as_dict(verify(path))["problems"] == []
+        assert verify(path).as_dict()["problems"] == []
     for path in stream.glob("0*"):
-        assert as_dict(verify(path))["closed"] is True
+        assert verify(path).as_dict()["closed"] is True
     (tmp_path / "empty").mkdir()
     for path in (tmp_path / "none", tmp_path / "empty"):
         with pytest.raises(FileFormatError):

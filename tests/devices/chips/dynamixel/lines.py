@@ -9,7 +9,7 @@ import pytest
 
 from devices.chips.dynamixel.reader import Dynamixel, open_servo
 from devices.clock import VirtualClock
-from devices.emulation.chips.dynamixel import EmulatedServo
+from tests.builders.servo import FaultyServo
 
 # In real time. No test waits for the ample one; where a time-out is to happen, it is short.
 AMPLE_S = 5.0
@@ -23,9 +23,9 @@ def emulated(
     timeout_s: float = AMPLE_S,
     asked_id: int = 1,
     protocol: int = 2,
-) -> Iterator[tuple[EmulatedServo, Dynamixel, VirtualClock]]:
+) -> Iterator[tuple[FaultyServo, Dynamixel, VirtualClock]]:
     clock = VirtualClock(t_ns=1_000_000_000)
-    with EmulatedServo(position, clock, baudrate=baudrate, protocol=protocol) as servo:
+    with FaultyServo(position, clock, baudrate=baudrate, protocol=protocol) as servo:
         driver = open_servo(
             servo.port,
             baudrate=baudrate,

@@ -6,9 +6,9 @@ import pytest
 
 from devices.chips.dynamixel.probe import FoundServo, probe
 from devices.clock import VirtualClock
-from devices.emulation.chips.dynamixel import EmulatedServo
 from devices.emulation.chips.dynamixel_firmware import FIRMWARE_VERSION
 from devices.errors import ServoSetupError
+from tests.builders.servo import FaultyServo
 
 # In real time; ample for an emulated servo even where the machine is busy.
 TIMEOUT_S = 0.1
@@ -24,7 +24,7 @@ def test_a_servo_is_found_whatever_it_speaks(
     protocol: int, model: str, number: int, baudrate: int
 ) -> None:
     clock = VirtualClock()
-    with EmulatedServo(
+    with FaultyServo(
         lambda _: 0, clock, servo_id=3, model=model, protocol=protocol, baudrate=baudrate
     ) as servo:
         found = probe(
@@ -38,12 +38,12 @@ def test_a_servo_is_found_whatever_it_speaks(
 
 
 def test_nobody_is_found_where_nobody_answers() -> None:
-    with EmulatedServo(lambda _: 0, VirtualClock()) as servo, servo.silent():
-        assert probe(servo.port, VirtualClock(), timeout_s=0.001) == []
+    with FaultyServo(lambda _: 0, VirtualClock()) as servo, servo.silent():
+        assert probe(servo.port, VirtualClock(), timeout_s=0.01) == []
 
 
 def test_a_damaged_answer_is_no_servo() -> None:
-    with EmulatedServo(lambda _: 0, VirtualClock()) as servo, servo.corrupt_crc():
+    with FaultyServo(lambda _: 0, VirtualClock()) as servo, servo.corrupt_crc():
         assert probe(servo.port, VirtualClock(), baudrates=(1_000_000,), timeout_s=0.02) == []
 
 

@@ -14,13 +14,8 @@ from devices.chips.dynamixel.protocol1 import PROTOCOL_1, Error
 from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 from devices.chips.dynamixel.reader import Dynamixel, ServoIdentity, open_servo
 from devices.clock import VirtualClock
-from devices.emulation.chips.dynamixel import EmulatedServo
-from devices.errors import (
-    ServoPacketError,
-    ServoSetupError,
-    ServoStatusError,
-    ServoTimeoutError,
-)
+from devices.errors import ServoPacketError, ServoSetupError, ServoStatusError, ServoTimeoutError
+from tests.builders.servo import FaultyServo
 from tests.devices.chips.dynamixel.lines import SHORT_S, both_protocols, emulated
 
 # hardware.md 5.1, from the e-manual
@@ -286,7 +281,7 @@ def test_what_is_no_serial_port_or_no_baud_rate_is_a_setup_error(
     port: str | None, baudrate: int
 ) -> None:
     with (
-        EmulatedServo(lambda _: 0, VirtualClock()) as servo,
+        FaultyServo(lambda _: 0, VirtualClock()) as servo,
         pytest.raises(ServoSetupError, match="cannot be opened"),
     ):
         open_servo(port or servo.port, baudrate=baudrate, clock=VirtualClock())
@@ -312,7 +307,7 @@ def test_a_plug_that_is_pulled_is_a_setup_error() -> None:
 @both_protocols
 def test_the_servo_of_the_scene_is_opened_without_a_remark(model: str, protocol: int) -> None:
     clock = VirtualClock()
-    with EmulatedServo(lambda _: 7, clock, model=model, protocol=protocol) as servo:
+    with FaultyServo(lambda _: 7, clock, model=model, protocol=protocol) as servo:
         driver = open_servo(
             servo.port, baudrate=1_000_000, clock=clock, model=model, protocol=protocol
         )
@@ -324,7 +319,7 @@ def test_the_servo_of_the_scene_is_opened_without_a_remark(model: str, protocol:
 @both_protocols
 def test_another_model_is_refused_and_the_key_to_set_is_named(protocol: int) -> None:
     with (
-        EmulatedServo(lambda _: 0, VirtualClock(), model="MX-28", protocol=protocol) as servo,
+        FaultyServo(lambda _: 0, VirtualClock(), model="MX-28", protocol=protocol) as servo,
         pytest.raises(ServoSetupError, match=r'expected an MX-64 .* Set model = "MX-28"'),
     ):
         open_servo(servo.port, baudrate=1_000_000, clock=VirtualClock(), protocol=protocol)
@@ -348,7 +343,7 @@ def test_a_servo_of_another_kind_is_refused_by_its_number() -> None:
 @pytest.mark.parametrize("asked", [1, 2])
 def test_a_servo_of_the_other_protocol_is_silent_which_is_a_remark(asked: int) -> None:
     clock = VirtualClock()
-    with EmulatedServo(lambda _: 0, clock, protocol=3 - asked) as servo:
+    with FaultyServo(lambda _: 0, clock, protocol=3 - asked) as servo:
         driver = open_servo(
             servo.port, baudrate=1_000_000, clock=clock, timeout_s=SHORT_S, protocol=asked
         )
@@ -361,7 +356,7 @@ def test_a_servo_of_the_other_protocol_is_silent_which_is_a_remark(asked: int) -
 @both_protocols
 def test_a_servo_that_is_silent_at_first_is_opened_and_read_once_it_answers(protocol: int) -> None:
     clock = VirtualClock()
-    with EmulatedServo(lambda _: -4097, clock, protocol=protocol) as servo:
+    with FaultyServo(lambda _: -4097, clock, protocol=protocol) as servo:
         with servo.silent():
             driver = open_servo(
                 servo.port, baudrate=1_000_000, clock=clock, timeout_s=0.5, protocol=protocol
@@ -379,7 +374,7 @@ def test_a_slow_adapter_is_a_remark(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_port_whose_servo_is_refused_is_free_again() -> None:
-    with EmulatedServo(lambda _: 0, VirtualClock(), model="MX-28") as servo:
+    with FaultyServo(lambda _: 0, VirtualClock(), model="MX-28") as servo:
         for model, refused in (("MX-64", True), ("MX-28", False)):
             with contextlib.ExitStack() as stack:
                 if refused:

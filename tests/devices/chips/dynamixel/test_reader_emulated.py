@@ -10,11 +10,8 @@ from hypothesis import strategies as st
 
 from devices.chips.dynamixel.reader import open_servo
 from devices.clock import SystemClock, VirtualClock
-from devices.emulation.chips.dynamixel import EmulatedServo
-from devices.errors import (
-    ServoPacketError,
-    ServoTimeoutError,
-)
+from devices.errors import ServoPacketError, ServoTimeoutError
+from tests.builders.servo import FaultyServo
 from tests.devices.chips.dynamixel.lines import AMPLE_S, SHORT_S, both_protocols, emulated
 
 # The driver against an emulated servo
@@ -85,7 +82,7 @@ def test_the_time_stamp_is_midway_between_request_and_answer(
 
 def test_on_a_system_clock_an_answer_takes_the_time_of_the_wire() -> None:
     clock = SystemClock()
-    with EmulatedServo(lambda _: 7, clock, baudrate=57_600) as servo:
+    with FaultyServo(lambda _: 7, clock, baudrate=57_600) as servo:
         driver = open_servo(servo.port, baudrate=57_600, clock=clock, timeout_s=AMPLE_S)
         with contextlib.closing(driver):
             t_ns = clock.now_ns()
@@ -137,7 +134,7 @@ def test_a_servo_of_another_id_is_silent() -> None:
 
 def test_a_servo_at_another_baud_rate_is_silent() -> None:
     clock = VirtualClock()
-    with EmulatedServo(lambda _: 0, clock, baudrate=57_600) as servo:
+    with FaultyServo(lambda _: 0, clock, baudrate=57_600) as servo:
         driver = open_servo(servo.port, baudrate=1_000_000, clock=clock, timeout_s=SHORT_S)
         with contextlib.closing(driver), pytest.raises(ServoTimeoutError, match="baud rate"):
             driver.identify()

@@ -17,8 +17,8 @@ from devices.chips.dynamixel.packets import Instruction, PacketDecoder
 from devices.chips.dynamixel.protocol1 import PROTOCOL_1, Error
 from devices.chips.dynamixel.protocol2 import PROTOCOL_2
 from devices.clock import SystemClock, VirtualClock
-from devices.emulation.chips.dynamixel import EmulatedServo
 from devices.errors import UsageError
+from tests.builders.servo import FaultyServo
 
 PING = Instruction.PING
 PING_1 = bytes.fromhex("FFFFFD00 01 0300 01 194E")
@@ -29,7 +29,7 @@ PONG = bytes.fromhex("37 01 2A")  # model number 311, firmware 42
 class Line:
     """Raw bytes to and from a servo; whoever waits in vain fails after five seconds."""
 
-    def __init__(self, servo: EmulatedServo, baudrate: int = 1_000_000) -> None:
+    def __init__(self, servo: FaultyServo, baudrate: int = 1_000_000) -> None:
         self.port = serial.Serial(servo.port, baudrate, timeout=5, write_timeout=5)
 
     def ask(self, request: bytes) -> tuple[int, int, bytes]:
@@ -46,20 +46,20 @@ class Line:
 
 
 @contextlib.contextmanager
-def line_to(servo: EmulatedServo, baudrate: int = 1_000_000) -> Iterator[Line]:
+def line_to(servo: FaultyServo, baudrate: int = 1_000_000) -> Iterator[Line]:
     line = Line(servo, baudrate)
     with contextlib.closing(line.port):
         yield line
 
 
 @pytest.fixture
-def servo() -> Iterator[EmulatedServo]:
-    with EmulatedServo(lambda _: -5, VirtualClock()) as servo:
+def servo() -> Iterator[FaultyServo]:
+    with FaultyServo(lambda _: -5, VirtualClock()) as servo:
         yield servo
 
 
 @pytest.fixture
-def line(servo: EmulatedServo) -> Iterator[Line]:
+def line(servo: FaultyServo) -> Iterator[Line]:
     with line_to(servo) as line:
         yield line
 
@@ -75,7 +75,7 @@ def test_a_ping_returns_model_and_firmware(line: Line) -> None:
 
 def test_the_control_table_says_how_the_servo_is_set_up() -> None:
     with (
-        EmulatedServo(
+        FaultyServo(
             lambda _: 0,
             VirtualClock(),
             servo_id=7,
@@ -95,7 +95,7 @@ def test_the_control_table_says_how_the_servo_is_set_up() -> None:
 
 def test_the_position_is_read_afresh_at_the_end_of_the_return_delay() -> None:
     clock = VirtualClock(1_000)
-    with EmulatedServo(lambda t_ns: t_ns, clock) as servo, line_to(servo) as line:
+    with FaultyServo(lambda t_ns: t_ns, clock) as servo, line_to(servo) as line:
         _, _, data = line.ask(PROTOCOL_2.read_request(1, 132, 4))
         assert struct.unpack("<i", data) == (1_000 + 140_000 + 500_000,)
         assert clock.now_ns() == 1_000 + 140_000 + 500_000 + 150_000
@@ -168,7 +168,7 @@ def test_what_it_cannot_do_is_answered_with_an_error_number(
 
 
 def test_an_alert_shows_in_the_error_byte_and_in_the_hardware_error_status(
-    servo: EmulatedServo, line: Line
+    servo: FaultyServo, line: Line
 ) -> None:
     with servo.alert():
         assert line.ask(PROTOCOL_2.read_request(1, 70, 1)) == (1, 0x80, b"\x01")
@@ -190,7 +190,7 @@ def test_the_status_return_level_says_what_is_answered(
     level: int, request_: bytes, from_level: int, answer: tuple[int, int, bytes]
 ) -> None:
     with (
-        EmulatedServo(lambda _: -5, VirtualClock(), status_return_level=level) as servo,
+        FaultyServo(lambda _: -5, VirtualClock(), status_return_level=level) as servo,
         line_to(servo) as line,
     ):
         first = line.ask(request_ + PING_1)
@@ -199,7 +199,7 @@ def test_the_status_return_level_says_what_is_answered(
 
 def test_a_rate_that_no_servo_has_is_refused() -> None:
     with pytest.raises(UsageError, match="no emulated servo runs at 123456 baud"):
-        EmulatedServo(lambda _: 0, VirtualClock(), baudrate=123_456)
+        FaultyServo(lambda _: 0, VirtualClock(), baudrate=123_456)
 
 
 def test_closing_leaves_neither_thread_nor_descriptor() -> None:
@@ -208,21 +208,21 @@ def test_closing_leaves_neither_thread_nor_descriptor() -> None:
 
     descriptors, threads = open_descriptors(), threading.active_count()
     for _ in range(3):
-        with EmulatedServo(lambda _: 0, VirtualClock()) as servo, line_to(servo) as line:
+        with FaultyServo(lambda _: 0, VirtualClock()) as servo, line_to(servo) as line:
             assert line.ask(PING_1) == (1, 0, PONG)
         servo.close()
     assert open_descriptors() == descriptors
     assert threading.active_count() == threads
 
 
-def test_nobody_need_listen_for_the_servo_to_close(servo: EmulatedServo, line: Line) -> None:
+def test_nobody_need_listen_for_the_servo_to_close(servo: FaultyServo, line: Line) -> None:
     with servo.garbage_before_reply(bytes(1_000_000)):
         line.port.write(PING_1)
         assert line.port.read(1) == b"\x00"
         servo.close()
 
 
-def test_a_reader_may_come_again(servo: EmulatedServo) -> None:
+def test_a_reader_may_come_again(servo: FaultyServo) -> None:
     for _ in range(3):
         with line_to(servo) as line:
             assert line.ask(PING_1) == (1, 0, PONG)
@@ -232,7 +232,7 @@ def test_a_reader_may_come_again(servo: EmulatedServo) -> None:
 
 
 @contextlib.contextmanager
-def sdk_port_to(servo: EmulatedServo) -> Iterator[sdk.PortHandler]:
+def sdk_port_to(servo: FaultyServo) -> Iterator[sdk.PortHandler]:
     with servo:
         port = sdk.PortHandler(servo.port)
         assert port.setBaudRate(1_000_000)
@@ -249,7 +249,7 @@ def patient_sdk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def sdk_port() -> Iterator[sdk.PortHandler]:
-    with sdk_port_to(EmulatedServo(lambda _: -5, SystemClock())) as port:
+    with sdk_port_to(FaultyServo(lambda _: -5, SystemClock())) as port:
         yield port
 
 
@@ -281,7 +281,7 @@ def test_the_makers_sdk_understands_its_errors(sdk_port: sdk.PortHandler) -> Non
 class Line1:
     """Raw bytes to and from a servo of Protocol 1.0, on a virtual clock."""
 
-    def __init__(self, servo: EmulatedServo) -> None:
+    def __init__(self, servo: FaultyServo) -> None:
         self.port = serial.Serial(servo.port, 1_000_000, timeout=5, write_timeout=5)
 
     def ask(self, request: bytes) -> tuple[int, int, bytes]:
@@ -297,9 +297,9 @@ class Line1:
 
 
 @contextlib.contextmanager
-def line_1(counts: int = -5, **options: Any) -> Iterator[tuple[Line1, EmulatedServo, VirtualClock]]:
+def line_1(counts: int = -5, **options: Any) -> Iterator[tuple[Line1, FaultyServo, VirtualClock]]:
     clock = VirtualClock(1_000)
-    with EmulatedServo(lambda _: counts, clock, protocol=1, **options) as servo:
+    with FaultyServo(lambda _: counts, clock, protocol=1, **options) as servo:
         line = Line1(servo)
         with contextlib.closing(line.port):
             yield line, servo, clock
@@ -407,12 +407,12 @@ def test_the_status_return_level_says_what_an_old_servo_answers(
 
 def test_a_rate_that_no_old_servo_has_is_refused() -> None:
     with pytest.raises(UsageError, match="at 4000000 baud in protocol 1"):
-        EmulatedServo(lambda _: 0, VirtualClock(), protocol=1, baudrate=4_000_000)
+        FaultyServo(lambda _: 0, VirtualClock(), protocol=1, baudrate=4_000_000)
 
 
 def test_the_makers_sdk_finds_and_reads_an_old_servo() -> None:
     packets = sdk.PacketHandler(1.0)
-    with sdk_port_to(EmulatedServo(lambda _: -4097, SystemClock(), protocol=1)) as port:
+    with sdk_port_to(FaultyServo(lambda _: -4097, SystemClock(), protocol=1)) as port:
         assert packets.ping(port, 1) == (310, sdk.COMM_SUCCESS, 0)
         value, result, error = packets.read2ByteTxRx(port, 1, 36)
         assert (result, error) == (sdk.COMM_SUCCESS, 0)
@@ -421,7 +421,7 @@ def test_the_makers_sdk_finds_and_reads_an_old_servo() -> None:
 
 def test_the_makers_sdk_understands_the_errors_of_an_old_servo() -> None:
     packets = sdk.PacketHandler(1.0)
-    servo = EmulatedServo(lambda _: 7, SystemClock(), protocol=1)
+    servo = FaultyServo(lambda _: 7, SystemClock(), protocol=1)
     with sdk_port_to(servo) as port:
         result, error = packets.write1ByteTxRx(port, 1, 24, 1)
         assert result == sdk.COMM_SUCCESS

@@ -87,10 +87,10 @@ def test_each_hop_reaches_about_10_cm_again(name: str) -> None:
 @BOTH
 def test_the_grounds_impulse_between_two_tops_is_weight_times_time(name: str) -> None:
     world, ground = hopping(name)
-    recorded = ground.recorded
-    body, ankle = np.array(recorded.body_m_s), np.array(recorded.ankle_m_s)
+    body = np.array([step.body_m_s for step in ground.recorded])
+    ankle = np.array([step.ankle_m_s for step in ground.recorded])
     momentum = 0.909 * (0.87 * body + 0.13 * ankle)
-    times = np.array(recorded.t_s)
+    times = np.array([step.t_s for step in ground.recorded])
     tops = [times[0]]
     for begin, end in zip(ground.leave_s, [*ground.touch_s[1:], times[-1]], strict=True):
         flight = (times > begin) & (times <= end)
@@ -213,6 +213,7 @@ def test_tiles_are_pressed_within_their_range(name: str) -> None:
         assert 4.0 < peak_n < 25.0
 
 
+@pytest.mark.slow
 @BOTH
 def test_the_same_seed_is_the_same_hop_to_the_bit_and_another_is_not(name: str) -> None:
     t_s = np.arange(0.0, 5.0, 0.001)
@@ -271,6 +272,7 @@ def test_a_flat_insole_does_not_hop() -> None:
         world_of(Scene.model_validate(facts))
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(
     st.fixed_dictionaries(

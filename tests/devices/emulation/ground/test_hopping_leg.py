@@ -35,7 +35,7 @@ def dropped(ground: SoftGround, *, stand_s: float = 2.0, leg: Leg = LEG) -> Hopp
 
 
 def column(hopping: HoppingLeg, name: str) -> Floats:
-    return np.array(getattr(hopping.recorded, name))
+    return np.array([getattr(step, name) for step in hopping.recorded])
 
 
 def ground_n(hopping: HoppingLeg) -> Floats:

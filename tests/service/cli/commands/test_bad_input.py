@@ -188,6 +188,7 @@ def test_calibrate_refuses_a_session_that_is_no_indentation(
     assert left(tmp_path, "s.parquet") == []
 
 
+@pytest.mark.slow
 def test_calibrate_refuses_an_indentation_that_never_loads_the_tile(
     run: Run, tmp_path: Path
 ) -> None:
@@ -202,6 +203,7 @@ def test_calibrate_refuses_an_indentation_that_never_loads_the_tile(
     assert left(tmp_path, "scene.toml", "bench.parquet") == []
 
 
+@pytest.mark.slow
 def test_calibrate_refuses_one_tile_from_two_files(run: Run, tmp_path: Path, bench: bytes) -> None:
     for name in ("a.parquet", "b.parquet"):
         (tmp_path / name).write_bytes(bench)
@@ -229,6 +231,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(
     assert left(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_tare_under_load_is_refused(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "standing", "--seconds", 4, "--out", "s.parquet")
     outcome = run("estimate", "s.parquet", "--tare-s", "2,3", "--out", "e.parquet")
@@ -270,6 +273,7 @@ def test_a_wrong_list_of_tiles_is_refused(run: Run, tmp_path: Path, tiles: str) 
     assert left(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_reference_with_brackets_is_printed_as_it_is(
     run: Run, tmp_path: Path, bench: bytes
 ) -> None:
@@ -280,6 +284,7 @@ def test_a_reference_with_brackets_is_printed_as_it_is(
     assert reference in outcome.out
 
 
+@pytest.mark.slow
 def test_a_calibration_of_another_part_with_the_same_serial_is_refused(
     run: Run, tmp_path: Path, bench: bytes
 ) -> None:

@@ -15,6 +15,8 @@ from service.offline.benchmark import draws
 from service.offline.calibrations import find_calibration
 from tests.service.cli.outcome import Run, scene_text
 
+pytestmark = pytest.mark.slow
+
 QUICK = ("--quick", "--frames", 2000, "--seconds", 2, "--jobs", 1)
 
 

@@ -12,6 +12,8 @@ import pytest
 
 from tests.service.cli.outcome import Run, scene_text
 
+pytestmark = pytest.mark.slow
+
 
 def test_calibrate_merges_files_and_its_tables_fit_a_narrow_terminal(
     run: Run, monkeypatch: pytest.MonkeyPatch
@@ -40,8 +42,8 @@ def test_calibrate_merges_files_and_its_tables_fit_a_narrow_terminal(
     assert not Path("other.json").exists()
 
 
-def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run) -> None:
-    run("simulate", "--scene", "indentation", "--tiles", "T01,T02", "--out", "bench.parquet")
+def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, bench: bytes) -> None:
+    Path("bench.parquet").write_bytes(bench)
     table = pq.read_table("bench.parquet")
     force = table["reference_force_n"].to_numpy().copy()
     second = np.array([name == "T02" for name in table["pressed_tile"].to_pylist()])

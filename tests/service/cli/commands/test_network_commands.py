@@ -20,6 +20,8 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
+pytestmark = pytest.mark.process
+
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 
 
@@ -175,7 +177,7 @@ def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path
     within = t_ns[(since_s >= 0.2) & (since_s < 0.9)]
     assert len(within) > 20
     assert tables["csv"]["t_ns"].to_pylist() == within.tolist()
-    assert tables["arrow"].schema.field("force_n_0").metadata == {b"unit": b"N"}
+    assert (tables["arrow"].schema.field("force_n_0").metadata or {})[b"unit"] == b"N"
 
 
 @pytest.mark.real_time

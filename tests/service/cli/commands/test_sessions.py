@@ -14,6 +14,8 @@ from service.offline.simulate import START_NS
 from storage.schema import ESTIMATES, FRAMES, TRUTH
 from tests.service.cli.outcome import Run, scene_text
 
+pytestmark = pytest.mark.slow
+
 QUIET = """
 [emulation]
 noise_kpa = 0.0
@@ -48,7 +50,8 @@ def test_the_same_command_gives_the_same_bytes(run: Run, tmp_path: Path) -> None
 def test_a_fresh_bench_and_a_kept_one_give_the_same_bytes(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arguments = ("simulate", "--scene", "standing", "--seconds", 2, "--out")
+    (tmp_path / "one.toml").write_text(scene_text("standing", tiles=1))
+    arguments = ("simulate", "--scene", "one.toml", "--seconds", 2, "--out")
     assert run(*arguments, "kept.parquet").code == 0
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "empty"))
     assert run(*arguments, "fresh.parquet").code == 0
@@ -91,23 +94,15 @@ def test_no_estimates_leaves_raw_frames_only(run: Run, tmp_path: Path) -> None:
 
 def test_bench_to_session_to_estimate_closes_on_a_quiet_dome(run: Run, tmp_path: Path) -> None:
     bench = scene_text("indentation").split("[emulation]")[0] + QUIET
+    bench = bench.replace('"indentation"\n[', '"indentation"\nrepeats = 2\nstroke_s = 1.5\n[')
     (tmp_path / "bench.toml").write_text(bench)
     assert run("simulate", "--scene", "bench.toml", "--out", "bench.parquet").code == 0
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--json")
     assert outcome.code == 0, outcome.err
     assert min(tile["r2"] for tile in json.loads(outcome.out)["tiles"]) > 0.9999
     (tmp_path / "foot.toml").write_text(scene_text("standing") + QUIET)
-    run(
-        "simulate",
-        "--scene",
-        "foot.toml",
-        "--seconds",
-        5,
-        "--truth",
-        "--no-estimates",
-        "--out",
-        "s.parquet",
-    )
+    options = ("--seconds", 5, "--truth", "--no-estimates", "--out", "s.parquet")
+    run("simulate", "--scene", "foot.toml", *options)
     outcome = run(
         "estimate", "s.parquet", "--out", "e.parquet", "--calibration", "cal.json", "--json"
     )
@@ -230,8 +225,8 @@ def test_json_is_on_stdout_alone(run: Run) -> None:
     assert json.loads(outcome.out)["frames"] > 700
 
 
-def test_calibrate_prints_the_contract_and_draws(run: Run, tmp_path: Path) -> None:
-    run("simulate", "--scene", "indentation", "--tiles", "T01,T02", "--out", "bench.parquet")
+def test_calibrate_prints_the_contract_and_draws(run: Run, tmp_path: Path, bench: bytes) -> None:
+    (tmp_path / "bench.parquet").write_bytes(bench)
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--plot", "cal.png", "--json")
     assert outcome.code == 0, outcome.err
     printed = json.loads(outcome.out)

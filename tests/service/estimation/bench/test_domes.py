@@ -15,7 +15,6 @@ from service.estimation.bench.domes import (
     external_share,
     fast_share,
     give_per_kpa,
-    pressure_kpa,
     range_of,
     ranges,
     volume_left,
@@ -33,18 +32,6 @@ def test_a_fast_load_is_at_full_scale_earlier() -> None:
 
 def test_a_polytropic_load_lies_between_slow_and_fast() -> None:
     assert volume_left() < volume_left(exponent=1.2) < volume_left(exponent=ADIABATIC)
-
-
-def test_a_fast_squeeze_to_the_slow_volume_overshoots_the_chip() -> None:
-    fast_kpa = pressure_kpa(volume_left(), exponent=ADIABATIC)
-    assert fast_kpa == pytest.approx(121.6, abs=0.05)
-    assert (fast_kpa - 100.0) / 15.0 == pytest.approx(1.44, abs=0.005)
-
-
-@pytest.mark.parametrize("exponent", [1.0, 1.2, 1.4])
-def test_pressure_and_volume_are_each_others_inverse(exponent: float) -> None:
-    part = volume_left(95.0, 110.0, exponent)
-    assert pressure_kpa(part, 95.0, exponent) == pytest.approx(110.0, rel=1e-12)
 
 
 def test_the_wall_gives_way_as_a_thick_sphere() -> None:

@@ -24,6 +24,8 @@ from service.estimation.effects import WALL_PER_KPA, EffectName, Effects
 from service.estimation.models.hysteresis import WIDTHS_N
 from tests.builders.calibrations import make_calibration
 
+pytestmark = pytest.mark.slow
+
 STEP_S = 0.00184
 FULL_N, SCALE_KPA, BASE_KPA = 30.0, 16.0, 100.3
 CURVE = np.array([22.0, 5.0, 5.0])

@@ -149,6 +149,7 @@ def loop(readings: Readings, lag_ns: int) -> list[float]:
     return result
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(data=st.data(), lag_ms=st.sampled_from([0, 3, 10, 100]))
 def test_any_readings_give_what_a_loop_over_the_frames_gives(

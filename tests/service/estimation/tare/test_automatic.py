@@ -186,6 +186,7 @@ def test_what_the_temperature_does_not_explain_is_doubted_and_left(bench: Bench)
     assert NEAR_KPA < 3 * COUNT_KPA
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("newtons_per_minute", [0.02, 0.1, 0.5, 1.0, 3.0, 10.0])
 def test_of_a_load_that_builds_up_slowly_hardly_anything_is_tared_away(
     bench: Bench, newtons_per_minute: float

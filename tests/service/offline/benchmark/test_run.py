@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
+
 from devices.scene.file import load_scene
 from service.offline.benchmark.draws import Task, run_draw
 from service.offline.benchmark.run import drawn
 from service.offline.benchmark.rungs import rungs
 
 
+@pytest.mark.process
 def test_draws_in_processes_of_their_own_give_the_same() -> None:
     scene = load_scene("rolling").model_copy(
         update={"calibration": "paper-eq2-shape", "models": ("unwrap", "static")}

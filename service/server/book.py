@@ -1,0 +1,117 @@
+"""The sessions of a server: what is known of each, kept on disk, and what people say of them."""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from collections.abc import Callable, Iterator
+
+from devices.errors import UnknownError
+from service.server.trash import Trash
+from service.server_clock import utc_ns
+from storage.sessions.events import write_events
+from storage.sessions.folder import Event, Session, SessionFolder
+
+log = logging.getLogger("foottile.recorder")
+
+
+class SessionBook:
+    """All sessions of a server.
+
+    Args:
+        folder: where they are kept.
+        trash: where those are that were deleted.
+        changed: told of every session that changed.
+    """
+
+    def __init__(
+        self, folder: SessionFolder, trash: Trash, changed: Callable[[Session], None]
+    ) -> None:
+        self.folder = folder
+        self.trash = trash
+        self.changed = changed
+        found, unreadable = folder.load_all()
+        for session_id, error in unreadable.items():
+            log.warning("session %s is left out: %s", session_id, error)
+        self.has_unreadable = bool(unreadable) or trash.has_unreadable
+        """Is there one that cannot be read? What it needs is not known."""
+        self._sessions = {session.id: session for session in found}
+
+    def __iter__(self) -> Iterator[Session]:
+        return iter(list(self._sessions.values()))
+
+    def of_node(self, node: str) -> list[Session]:
+        """Sessions of a node that are not sealed yet and not in the trash."""
+        return [s for s in self._sessions.values() if s.node == node and s.state != "sealed"]
+
+    def all(self) -> list[Session]:
+        """All sessions, newest first."""
+        return sorted(self._sessions.values(), key=lambda s: (s.started_t_ns, s.id), reverse=True)
+
+    def get(self, session_id: str) -> Session:
+        """One session, with the counts of the moment.
+
+        Raises:
+            UnknownError: there is none of this id.
+        """
+        self.folder.path(session_id)
+        if session_id not in self._sessions:
+            remedy = "It is in the trash: restore it first" if session_id in self.trash else ""
+            raise UnknownError(f"no session {session_id!r}", remedy=remedy)
+        return self._sessions[session_id]
+
+    def keep(self, session: Session) -> Session:
+        """Have a session, new or changed, on the disk, and tell of it.
+
+        Raises:
+            StorageError: it cannot be written down; what is known here is as it was.
+        """
+        self.folder.save(session)
+        self.note(session)
+        self.changed(session)
+        return session
+
+    def note(self, session: Session) -> None:
+        """Know a session so; it is written down with its next change."""
+        self._sessions[session.id] = session
+
+    def change(self, session_id: str, **changes: object) -> Session:
+        """Change what people say of a session: name, subject, notes, tags.
+
+        Raises:
+            UnknownError: no such session.
+            StorageError: it cannot be written down.
+        """
+        return self.keep(self.get(session_id).model_copy(update=changes))
+
+    def mark(
+        self, session_id: str, label: str, t_ns: int | None, event_id: str | None = None
+    ) -> Event:
+        """Note an event, now or at `t_ns` of the server's UTC; once, if it comes with an id.
+
+        Raises:
+            UnknownError: no such session.
+            StorageError: it cannot be written down.
+        """
+        session = self.get(session_id)
+        for known in session.events:
+            if known.id == event_id:
+                return known
+        event = Event(
+            id=event_id or uuid.uuid4().hex[:12],
+            label=label,
+            t_ns=utc_ns() if t_ns is None else t_ns,
+        )
+        session = self.keep(session.model_copy(update={"events": (*session.events, event)}))
+        if session.state == "sealed":
+            write_events(session, self.folder.path(session_id))
+        return event
+
+    def take_out(self, session: Session) -> None:
+        """Move a session to the trash.
+
+        Raises:
+            StorageError: it cannot be moved.
+        """
+        self.trash.take(session, self.folder)
+        del self._sessions[session.id]

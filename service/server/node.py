@@ -1,0 +1,322 @@
+"""One node as a server knows it: its streams, estimates, tares and clock.
+
+What has to outlive the server is on disk: the journals, the node's last hello and its tares.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+
+from devices.errors import (
+    FileFormatError,
+    StateError,
+    StorageError,
+)
+from devices.frames import ArrayInfo, FrameBatch
+from service.link import Hello, StreamNumbers
+from service.server.live_estimates import LiveEstimates
+from service.server.streams import ServerStream
+from service.server.tare_keeper import TareKeeper
+from service.sessions.pipeline import Columns
+from service.sessions.tares import RecordedTare, TareHistory
+from storage.clock.offset import ClockOffset
+from storage.durable import make_folder, storage_errors, write_whole
+from storage.intervals import NO_END, Intervals, with_open_ends
+from storage.journal.journal import RING_NS, Journal
+from storage.losses import NODE_RESTARTED
+from storage.wire import decode
+
+log = logging.getLogger("foottile.nodes")
+
+_RATE_OVER_NS = 1_000_000_000
+BOOT_ID = re.compile(r"[0-9a-f]{32}")
+
+Estimated = tuple[FrameBatch, Columns]
+
+
+class ServerNode:
+    """One node, connected or remembered.
+
+    Args:
+        folder: what is kept of it beside its journals.
+        journals: folder of its journals, one for each of its streams.
+        hello: what it said last.
+    """
+
+    def __init__(self, folder: Path, journals: Path, hello: Hello) -> None:
+        self.name = hello.array_info.node
+        self.hello = hello
+        self.connected = False
+        self.tares = TareHistory(folder / "tares.json")
+        self.streams: dict[str, ServerStream] = {}
+        """By boot_id: those that are kept here, and those that it said it has."""
+        self.has_spoken = False
+        """Has it said hello since the server was started?"""
+        self.greeted_t_ns: int | None = None
+        """When it said so last, server's UTC."""
+        self.storage_problem: str | None = None
+        self.troubles: tuple[str, ...] = ()
+        """What is wrong with its array or its disk, as it said last."""
+        self.fault_counts: dict[str, dict[str, int]] = {}
+        """How often what went wrong in its stream, by serial and reason, as it said last."""
+        self.last_seq: int | None = None
+        self.last_t_ns: int | None = None
+        self.last_seen_t_ns: int | None = None
+        self.shown_t_ns: int | None = None
+        """Instant of the newest frame on the screens, in the node's UTC."""
+        self._folder = folder
+        self._journals_folder = journals
+        self._pace: deque[tuple[int, int]] = deque()
+        for path in sorted(journals.glob("*")):
+            if BOOT_ID.fullmatch(path.name):
+                try:
+                    self.streams[path.name] = ServerStream.open(path)
+                except FileFormatError as error:
+                    log.warning("a journal is left out: %s", error)
+        self.present = self._stream_of(self.info)
+        """The stream that it takes now."""
+        self.live, self.tare_keeper = self._estimates()
+
+    @property
+    def info(self) -> ArrayInfo:
+        """Description of the present stream's array."""
+        return self.hello.array_info
+
+    @property
+    def boot_id(self) -> str:
+        """Name of the present stream."""
+        return self.info.boot_id
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Its streams by boot_id, oldest first, as it said last; the present one is the last."""
+        return (*(each.array_info.boot_id for each in self.hello.earlier), self.boot_id)
+
+    @property
+    def journals(self) -> dict[str, Journal]:
+        """Journals by boot_id, of streams of which frames have come."""
+        return {name: s.journal for name, s in self.streams.items() if s.journal is not None}
+
+    @property
+    def journal(self) -> Journal | None:
+        """Journal of the present stream; None before its first frame."""
+        return self.present.journal
+
+    @property
+    def clock(self) -> ClockOffset | None:
+        """How its clock differs in the present stream; None before it was measured."""
+        return self.present.clock
+
+    @property
+    def missing(self) -> Intervals:
+        """What of the present stream should be here and is not: lost, or still to come."""
+        newest = -1 if self.last_seq is None else self.last_seq
+        if self.has_spoken:
+            newest = max(newest, self.hello.next_seq - 1)
+        return self.present.missing(newest)
+
+    @property
+    def backlog_frames(self) -> int:
+        """How many of them the node still has."""
+        return (self.missing & self.present.may_come).count
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """How many of them it has not, by reason."""
+        gone = self.missing - self.present.may_come
+        named = {why: lost.count for why, lost in self.present.lost.within(gone).items()}
+        if unnamed := gone.count - sum(named.values()):
+            named[NODE_RESTARTED] = named.get(NODE_RESTARTED, 0) + unnamed
+        return named
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Frames a second over the last second, by the node's clock."""
+        if len(self._pace) < 2:  # a rate needs two instants
+            return None
+        (first_ns, first_seq), (last_ns, last_seq) = self._pace[0], self._pace[-1]
+        return (
+            (last_seq - first_seq) / ((last_ns - first_ns) * 1e-9) if last_ns > first_ns else None
+        )
+
+    def attach(self, hello: Hello, now_t_ns: int) -> None:
+        """The node has connected, and said which frames it has.
+
+        Args:
+            hello: in which every stream has the array that it had before.
+            now_t_ns: the server's UTC.
+        """
+        if hello.array_info.boot_id != self.boot_id or self.last_seq is None:
+            self.last_seq = self.last_t_ns = None
+            self.troubles, self.fault_counts = (), {}
+            self._pace.clear()
+        known = (self.hello.array_info, self.hello.calibration)
+        self.hello = hello
+        self.has_spoken, self.greeted_t_ns = True, now_t_ns
+        for stream in self.streams.values():
+            stream.owed = Intervals()
+            if stream.boot_id not in self.order and not hello.has_more:
+                stream.is_gone()
+        for earlier in hello.earlier:
+            self._stream_of(earlier.array_info).has_ended(earlier)
+        self.present = self._stream_of(hello.array_info)
+        self.present.is_present(hello)
+        # What is here but was never acknowledged, because the link broke before: acknowledge it.
+        for name in self.order:
+            stream = self.streams[name]
+            stream.owed = stream.held & stream.may_come
+        if known != (hello.array_info, hello.calibration):
+            self.live, self.tare_keeper = self._estimates()
+        try:
+            self.keep()
+        except StorageError as error:  # the picture goes on; what is sent is not acknowledged
+            self.storage_problem = str(error)
+
+    def lacks(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
+        """What it is asked for: first what sessions need, then the rest of the present stream.
+
+        Args:
+            needed: numbers by stream.
+        """
+        found = []
+        for name in self.order:
+            stream, present = self.streams[name], name == self.boot_id
+            wanted = needed.get(name, Intervals())
+            asked = stream.lacks(wanted, all_of_it=present)
+            first = (asked & wanted).within(0, self.hello.next_seq - 1 if present else NO_END)
+            numbers = _joined([*first, *asked - first])
+            if numbers:
+                found.append(StreamNumbers(boot_id=name, numbers=with_open_ends(numbers)))
+        return tuple(found)
+
+    def detach(self) -> None:
+        """The node has gone; what it sent stays."""
+        self.connected = False
+        self._pace.clear()
+
+    def take(
+        self, stream: ServerStream, payload: bytes, now_t_ns: int
+    ) -> tuple[int, int, list[Estimated]]:
+        """One message of frames: kept, and estimated if it is news.
+
+        Args:
+            stream: whose frames they are.
+            payload: the message.
+            now_t_ns: the server's UTC.
+
+        Returns:
+            First and last number of the message, and the frames whose estimates are now due.
+
+        Raises:
+            FileFormatError: it is not a message of this stream's frames.
+        """
+        frames = decode(payload, stream.schema)
+        if (frames.t_ns - frames.t_mono_ns != stream.info.utc_offset_ns).any():
+            raise FileFormatError(
+                f"frames {frames.seq[0]} to {frames.seq[-1]} are not t_mono_ns plus the offset",
+                expected=f"t_ns - t_mono_ns = {stream.info.utc_offset_ns}, as announced in hello",
+            )
+        try:
+            stream.take(frames, payload, now_t_ns)
+        except StorageError as error:  # the live picture goes on; nothing is acknowledged
+            self.storage_problem = str(error)
+        first, last = int(frames.seq[0]), int(frames.seq[-1])
+        self.last_seen_t_ns = now_t_ns
+        if stream is not self.present:
+            return first, last, []
+        if self.last_seq is not None and last <= self.last_seq:
+            self._look_for_tare()  # sent again for the journal; the picture is further on
+            return first, last, []
+        if self.last_seq is not None:
+            frames = frames.rows(max(0, self.last_seq + 1 - first), len(frames))
+        self.last_seq, self.last_t_ns = last, int(frames.t_ns[-1])
+        self._pace.append((int(frames.t_mono_ns[-1]), last))
+        while self._pace[-1][0] - self._pace[0][0] > _RATE_OVER_NS and len(self._pace) > 2:
+            self._pace.popleft()
+        due = list(self.live.feed(frames))
+        self._look_for_tare()
+        return first, last, due
+
+    def take_tare(self, reason: str = "") -> RecordedTare:
+        """Tare from an unloaded interval of the last seconds, and put it in force.
+
+        Raises:
+            TareError: the foot was loaded, or there is nothing to tare.
+            StateError: the node is away.
+            StorageError: it cannot be kept.
+        """
+        if not self.connected:
+            raise StateError(
+                f"node {self.name!r} is away", remedy="Tare when it is connected again"
+            )
+        return self.tare_keeper.by_hand(reason)
+
+    def server_t_ns(self, t_ns: int) -> int:
+        """An instant of the node's UTC in the server's; the same while no offset is measured."""
+        return t_ns + (self.clock.server_minus_node_ns if self.clock is not None else 0)
+
+    def node_t_ns(self, t_ns: int) -> int:
+        """An instant of the server's UTC in the node's."""
+        return t_ns - (self.clock.server_minus_node_ns if self.clock is not None else 0)
+
+    def prune(self, keep: Mapping[str, Intervals]) -> None:
+        """Delete what is older than the ring and not in `keep`, by stream.
+
+        Raises:
+            StorageError: a file cannot be deleted.
+        """
+        for name, stream in list(self.streams.items()):
+            kept = keep.get(name, Intervals())
+            if stream is self.present:
+                if self.last_t_ns is not None:
+                    stream.prune(self.last_t_ns - RING_NS, kept)
+            elif not kept:
+                stream.delete()
+                if name not in self.order:
+                    del self.streams[name]
+
+    def keep(self) -> None:
+        """Write down what the node said, for after a restart.
+
+        Raises:
+            StorageError: the disk is full or not writable.
+        """
+        with storage_errors(self._folder):
+            make_folder(self._folder)
+        write_whole(self._folder / "hello.json", self.hello.model_dump_json().encode())
+
+    def _stream_of(self, info: ArrayInfo) -> ServerStream:
+        if info.boot_id not in self.streams:
+            self.streams[info.boot_id] = ServerStream(self._journals_folder / info.boot_id, info)
+        return self.streams[info.boot_id]
+
+    def _look_for_tare(self) -> None:
+        if self.storage_problem is not None:  # it could not be kept
+            return
+        try:
+            to_come = next(iter(self.present.may_come), (0, 0))[0]
+            self.tare_keeper.look(self.journal, to_come)
+        except StorageError as error:  # not in force then; tried again once it can be kept
+            self.storage_problem = str(error)
+
+    def _estimates(self) -> tuple[LiveEstimates, TareKeeper]:
+        in_force = self.tares.in_force(self.info)
+        tare = in_force.tare if in_force is not None else None
+        live = LiveEstimates(self.info, self.hello.calibration, tare)
+        automatic = self.hello.scene.get("auto_tare", True) is not False
+        return live, TareKeeper(self.info, live, self.tares, automatic=automatic)
+
+
+def _joined(numbers: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The same in the same order, neighbours that follow each other as one."""
+    joined: list[tuple[int, int]] = []
+    for first, last in numbers:
+        if joined and joined[-1][1] + 1 == first:
+            joined[-1] = (joined[-1][0], last)
+        else:
+            joined.append((first, last))
+    return joined

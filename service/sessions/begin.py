@@ -1,0 +1,91 @@
+"""How a session begins: by hand, or because an array became another one while it was recorded."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from devices.frames import ArrayInfo
+from service.estimation.calibration import Calibration
+from service.server_clock import utc_ns
+from storage.sessions.folder import Part, Session, new_session_id
+
+
+def begun(
+    info: ArrayInfo,
+    name: str,
+    part: Part,
+    *,
+    scene_content: Mapping[str, Any],
+    calibration: Calibration | None,
+    **content: Any,
+) -> Session:
+    """A session that begins now.
+
+    Args:
+        info: array of its first part.
+        name: as people call it.
+        part: its first part.
+        scene_content: of the node's scene file.
+        calibration: in use when it begins.
+        content: more fields of a session, or others.
+    """
+    facts: dict[str, Any] = {
+        "id": new_session_id(datetime.now(UTC)),
+        "name": name,
+        "node": info.node,
+        "state": "recording",
+        "started_t_ns": utc_ns(),
+        "parts": (part,),
+        "scene": info.scene,
+        "scene_content": dict(scene_content),
+        "calibration": calibration.model_dump(mode="json") if calibration is not None else None,
+    }
+    return Session(**facts | content)
+
+
+def taken_up(
+    session: Session,
+    info: ArrayInfo,
+    begin_t_ns: int,
+    *,
+    scene_content: Mapping[str, Any],
+    calibration: Calibration | None,
+) -> tuple[Session, Session]:
+    """A session whose node came back with other tiles, and the one that takes it up.
+
+    A file describes one array, so the recording goes on in a session of its own.
+
+    Args:
+        session: with an end of its last part.
+        info: the array that the node has now.
+        begin_t_ns: when its stream began, by the clock that sessions are stopped by.
+        scene_content: of the node's scene file.
+        calibration: of the tiles that it has now.
+    """
+    problem = "the node came back with other tiles: recording ended"
+    update: dict[str, object] = {"problem": problem}
+    if session.state == "recording":
+        update |= {"state": "pending", "stopped_t_ns": begin_t_ns}
+    name, number = numbered(session.name)
+    further = begun(
+        info,
+        f"{name} ({number + 1})",
+        Part(boot_id=info.boot_id, seq_first=0),
+        scene_content=scene_content,
+        calibration=calibration,
+        state=session.state,
+        started_t_ns=begin_t_ns,
+        stopped_t_ns=session.stopped_t_ns,
+        continues=session.id,
+        **{field: getattr(session, field) for field in ("subject", "notes", "tags")},
+    )
+    return session.model_copy(update=update), further
+
+
+def numbered(name: str) -> tuple[str, int]:
+    """The name that a recording was given, and which of its sessions this is: `mud (2)` is two."""
+    match = re.fullmatch(r"(.*) \((\d+)\)", name)
+    return (match[1], int(match[2])) if match else (name, 1)
