@@ -156,33 +156,21 @@ def calibration_json(calibration: Calibration) -> dict[str, object]:
     }
 
 
-_FIELDS = (
-    "serial",
-    "r2",
-    "rmse_n",
-    "cv_rmse_n",
-    "hysteresis_n",
-    "range_kpa",
-    "monotonic",
-    "coefficients",
-    "absolute_scale",
-    "repeats",
-    "covariance",
-    "baseline_kpa",
-    "noise_kpa",
-)
+_OF_A_TILE = {
+    *("serial", "r2", "rmse_n", "cv_rmse_n", "hysteresis_n", "range_kpa", "monotonic"),
+    *("coefficients", "absolute_scale", "repeats", "covariance", "baseline_kpa", "noise_kpa"),
+    "bench",
+}
 
 
 def _tile_json(tile: TileCalibration) -> dict[str, object]:
-    content = tile.model_dump(mode="json")
     effects = tile.effects
     gas, rubber, warm = effects.gas, effects.rubber, effects.temperature
     gamma, tau = (gas.gamma, gas.tau_s) if gas else (None, None)
     kpa_per_k, lag = (warm.kpa_per_k, warm.lag_s) if warm else (None, None)
     return {
-        **{name: content[name] for name in _FIELDS},
+        **tile.model_dump(mode="json", include=_OF_A_TILE),
         "student_t_95": student_t_95(tile.repeats) if tile.repeats > 1 else None,
-        "bench": content["bench"],
         "effects": {
             "gamma": _parameter(gamma),
             "gas_tau_ms": _parameter(tau, 1e3),

@@ -50,7 +50,7 @@ class ServerNodes:
                 raise FileFormatError(
                     f"not a node's description: {error}",
                     where=str(path),
-                    remedy="Move it away; it is written anew when the node connects",
+                    remedy="Move it away; it is written again when the node connects",
                 ) from error
             self._nodes[hello.array_info.node] = self._make(hello)
 

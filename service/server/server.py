@@ -54,9 +54,7 @@ class Link:
 
     def acknowledge(self, boot_id: str, numbers: Intervals) -> None:
         """Tell the node that these frames are on the disk."""
-        waiting = self._acks.setdefault(boot_id, Intervals())
-        for interval in numbers:
-            waiting.add(*interval)
+        self._acks[boot_id] = self._acks.get(boot_id, Intervals()) | numbers
         self.news.set()
 
     def acks(self) -> dict[str, Intervals]:
@@ -97,7 +95,7 @@ class Server:
             remove_stale_temporaries(data)
             self.check_storage()
             self.id = _id_of(data)
-            """Name of this data folder: a node keeps what this server needs, whoever else asks."""
+            """Name of this data folder: a node keeps what this server needs apart from others."""
             self.hub = Hub()
             self.nodes = ServerNodes(data)
             self.sessions = SessionBook(
@@ -227,9 +225,7 @@ class Server:
         except StorageError as error:
             node.storage_problem = str(error)
             # The kernel may forget what it could not write: the node has to send it again.
-            for interval in unsynced:
-                stream.unsynced.add(*interval)
-            stream.disown(stream.unsynced)
+            stream.disown(stream.unsynced | unsynced)
             stream.unsynced, stream.owed = Intervals(), Intervals()
             return
         link = self.links.get(node.name)

@@ -1,7 +1,7 @@
 """One stream of a node as the server keeps it: its journal, and what the node has said of it.
 
 What the node said is in `stream.json` beside the journal, so that a server that was restarted still
-knows why frames are missing and where a stream ended. It is written by whoever calls `sync`.
+knows why frames are missing and where a stream ended. `sync` writes it.
 """
 
 from __future__ import annotations
@@ -284,8 +284,7 @@ class ServerStream:
             StorageError: a file cannot be deleted.
         """
         if self.journal is not None:
-            for interval in self.journal.prune(before_t_ns, keep):
-                self._forgotten.add(*interval)
+            self._forgotten = self._forgotten | self.journal.prune(before_t_ns, keep)
 
     def close(self) -> None:
         """Sync everything, and close the journal.

@@ -1,4 +1,4 @@
-"""Sessions that were deleted and can still be had back, until somebody empties the trash."""
+"""Sessions that were deleted and can still be had back, until the trash is emptied."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Where the parts of a session end: rules on what is known of its streams, nothing kept here.
 
-A session ends with the last frame that was taken before it was stopped, by the clock of whoever
-stopped it. A stream that ended before that ends its part. Where frames are missing, the end is
+A session ends with the last frame that was taken before it was stopped, by the clock that it
+was stopped by. A stream that ended before that ends its part. Where frames are missing, the end is
 placed by the rate; where a node has not said how its stream ended, the frames that it may have
 taken unheard are bounded.
 """

@@ -108,7 +108,7 @@ class EstimateStream:
             rest, rest_of = frames, extra
             if not len(rest):
                 continue
-            if int(rest.t_mono_ns[0]) < last_t_mono_ns:  # the node was switched on anew
+            if int(rest.t_mono_ns[0]) < last_t_mono_ns:  # the node was switched on again
                 yield from run.finish()
             last_t_mono_ns = int(rest.t_mono_ns[-1])
             while changes and int(rest.t_ns[-1]) > changes[0].t_ns:

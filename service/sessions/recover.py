@@ -2,8 +2,8 @@
 
 A session is sealed if all its frames are here or can never come; what is missing then is lost, for
 a reason. On a server's folder a node may still bring frames: such a session waits, unless it is
-given up. Every sealed file is read again and proven before it counts as recovered. Who is killed
-here begins anew: what was written is whole, and the second run comes to the same.
+given up. Every sealed file is read again and proven before it counts as recovered. It can be
+killed at any time: what was written is whole, and a second run comes to the same.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Recovery:
         sessions: that were not sealed before.
         removed: half-written files of dead processes.
         cut: journals of which something was cut off, and how many bytes; set aside, not deleted.
-        mended: sessions whose `events.parquet` was written anew.
+        mended: sessions whose `events.parquet` was written again.
         problems: what could not be recovered, beside sessions.
     """
 
@@ -239,7 +239,7 @@ def _set_aside(data: Path) -> set[Path]:
 
 
 def _mend_events(session: Session, folder: Path) -> bool:
-    """Write `events.parquet` anew if it is not what `session.json` says: that is written first."""
+    """Write `events.parquet` again if it is not what `session.json` says: that is written first."""
     wanted = [event.model_dump() for event in session.events]
     try:
         with pq.ParquetFile(folder / EVENTS_NAME) as file:

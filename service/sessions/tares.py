@@ -2,7 +2,7 @@
 
 Automatic tares (source "flight") come unasked, so they have rules of their own: of many the older
 ones are thinned out, never one that was taken by hand; and when one is undone, no other follows
-until somebody tares by hand, for whoever undoes it does not trust them now.
+until one is taken by hand: an undone tare says that automatic ones are not trusted now.
 """
 
 from __future__ import annotations
@@ -200,5 +200,5 @@ def _read(path: Path) -> list[RecordedTare]:
         raise FileFormatError(
             f"the node's tares are not readable: {error}",
             where=str(path),
-            remedy="Move the file away; the node has to be tared anew then",
+            remedy="Move the file away; the node has to be tared again then",
         ) from error

@@ -4,7 +4,7 @@ Two, because they answer two questions. The *content hash* is of what the file s
 row groups and encodings: of every column's numbers, of the array's description and of the notes.
 The *file hash* is of every byte of the file with its own digits taken as zeros; no flipped bit
 escapes it, in a footer's statistics as little as in a page. Both are in the footer (docs/formats.md
-has the few lines that make them anew).
+has the few lines that compute them).
 """
 
 from __future__ import annotations
@@ -62,12 +62,7 @@ class ContentDigest:
         return {
             "frames": sum(part.frames for part in parts),
             "parts": [
-                {
-                    "part": part.part,
-                    "seq_first": part.seq_first,
-                    "seq_last": part.seq_last,
-                    "frames": part.frames,
-                }
+                {name: getattr(part, name) for name in ("part", "seq_first", "seq_last", "frames")}
                 for part in parts
             ],
             "columns": self.columns,

@@ -86,7 +86,7 @@ class SessionWriter:
         while begin < len(frames):
             t_mono_ns = int(frames.t_mono_ns[begin])
             if self._group_end_ns is not None and t_mono_ns < self._group_end_ns - ROW_GROUP_NS:
-                self._write_group()  # the node was switched on anew: another part begins
+                self._write_group()  # the node was switched on again: another part begins
             fresh = self._group_end_ns is None
             if self._group_end_ns is None:
                 self._group_end_ns = int(frames.t_mono_ns[begin]) + ROW_GROUP_NS

@@ -132,7 +132,7 @@ class FrameOrder:
 def in_order(
     pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]], *, where: str
 ) -> Iterator[tuple[FrameBatch, Mapping[str, Array]]]:
-    """The same frames, for whoever relies on their order.
+    """The same frames, for readers that rely on their order.
 
     Raises:
         FileFormatError: the first frame out of order is reached.

@@ -305,7 +305,7 @@ def assert_damaged(path: Path) -> None:
     with pytest.raises(FileFormatError, match="not readable") as caught:
         TareHistory(path)
     assert caught.value.where == str(path)
-    assert "tared anew" in caught.value.remedy
+    assert "tared again" in caught.value.remedy
 
 
 def test_a_file_that_is_cut_off_anywhere_is_damaged(tmp_path: Path) -> None:
