@@ -278,6 +278,12 @@ class FakeNode:
         for begin in range(0, len(batch), 10):
             self.socket.send(self.payload(batch.rows(begin, begin + 10)))
 
+    def come_back(self) -> list[Earlier]:
+        """Connect, mention every earlier stream, and send what the server lacks of them."""
+        self.connect(earlier=tuple(earlier.said() for earlier in self.before))
+        self.send_lacking()
+        return self.before
+
     def send_lacking(self) -> None:
         """Send what the server asked for of streams before this one."""
         for earlier in self.before:

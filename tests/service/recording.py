@@ -86,3 +86,9 @@ class Recording:
 def parts_of(session: dict[str, Any]) -> list[tuple[str, int, int | None]]:
     """Stream, first and last number of every part."""
     return [(part["boot_id"], part["seq_first"], part["seq_last"]) for part in session["parts"]]
+
+
+def whole_parts_of(session: dict[str, Any]) -> list[tuple[str, int, int | None]]:
+    """The parts of a session of which nothing may be lacking."""
+    assert session["complete"] is True
+    return parts_of(session)

@@ -2,12 +2,47 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any, NoReturn
 
 import pytest
+
+NO_SPACE = (OSError, errno.ENOSPC, "No space left on device")
+IO_ERROR = (OSError, errno.EIO, "Input/output error")
+
+
+def refusing(kind: type[Exception], *facts: object, **more: object) -> Callable[..., NoReturn]:
+    """A function that does nothing but fail with this error, each time with a new one."""
+
+    def refuse(*_: object, **__: object) -> NoReturn:
+        raise kind(*facts, **more)
+
+    return refuse
+
+
+def failing_if(
+    fails: Callable[..., bool], function: Callable[..., Any], kind: type[Exception], *facts: object
+) -> Callable[..., Any]:
+    """The function, which fails with this error when `fails` says so of its arguments."""
+
+    def call(*arguments: Any) -> Any:
+        if fails(*arguments):
+            raise kind(*facts)
+        return function(*arguments)
+
+    return call
+
+
+def failing_once(
+    function: Callable[..., Any], kind: type[Exception], *facts: object
+) -> Callable[..., Any]:
+    """The function, which fails with this error when it is called for the first time."""
+    answers = iter([True])
+    return failing_if(lambda *_: next(answers, False), function, kind, *facts)
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from storage.durable import (
     temporary_of,
     write_whole,
 )
-from tests.storage.faulty_disk import disk_with_room_for
+from tests.storage.faulty_disk import IO_ERROR, disk_with_room_for, refusing
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -91,11 +91,8 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(
 def test_a_disk_that_does_not_sync_leaves_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(descriptor: int) -> None:
-        raise OSError(5, "Input/output error")
-
     write_whole(tmp_path / "file", b"old")
-    monkeypatch.setattr(os, "fsync", refuse)
+    monkeypatch.setattr(os, "fsync", refusing(*IO_ERROR))
     with pytest.raises(StorageError, match="Input/output error"):
         write_whole(tmp_path / "file", b"new")
     assert files_in(tmp_path) == {"file": b"old"}

@@ -12,12 +12,14 @@ from typing import Any
 import httpx
 import pytest
 
+from devices.errors import StorageError
 from service.api.app import make_app
 from service.api.guard import BODY_BYTES_MAX
 from service.server.server import Server
 from storage.sessions.folder import Part, Session, new_session_id
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
+from tests.storage.faulty_disk import refusing
 from tests.waiting import until
 
 UNKNOWN_ID = "20200101T000000Z-000000"
@@ -120,10 +122,7 @@ def test_a_body_in_chunks_that_is_too_long_is_a_problem(running: Running) -> Non
 def test_a_mistake_of_the_server_is_a_problem_without_its_inside(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken() -> None:
-        raise ZeroDivisionError("secret")
-
-    monkeypatch.setattr(running.server, "check_storage", broken)
+    monkeypatch.setattr(running.server, "check_storage", refusing(ZeroDivisionError, "secret"))
     answer = running.http.get("/ready")
     assert_problem(answer, 500, "/api/v1/ready")
     assert "secret" not in answer.text
@@ -132,11 +131,7 @@ def test_a_mistake_of_the_server_is_a_problem_without_its_inside(
 def test_a_full_disk_is_a_problem_that_says_so(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from devices.errors import StorageError
-
-    def full() -> None:
-        raise StorageError("No space left on device", remedy="Free space")
-
+    full = refusing(StorageError, "No space left on device", remedy="Free space")
     monkeypatch.setattr(running.server, "check_storage", full)
     assert_problem(running.http.get("/ready"), 507, "/api/v1/ready")
 

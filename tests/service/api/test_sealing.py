@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
-from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,11 +11,13 @@ import pytest
 
 import service.api.routes.sessions
 import service.server.settling
+from devices.errors import StorageError
 from service.sessions.sealing import seal
 from tests.builders.arrays import COUNT_KPA
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running
+from tests.storage.faulty_disk import failing_once
 from tests.waiting import until
 
 
@@ -263,16 +263,7 @@ def test_what_people_write_comes_back_as_it_is(
 def test_a_session_is_sealed_again_when_the_disk_was_full(
     tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from devices.errors import StorageError
-
-    tried = threading.Event()
-
-    def refusing(*arguments: Any) -> Any:
-        if not tried.is_set():
-            tried.set()
-            raise StorageError("No space left on device")
-        return seal(*arguments)
-
+    refusing = failing_once(seal, StorageError, "No space left on device")
     monkeypatch.setattr(service.server.settling, "seal", refusing)
     monkeypatch.setattr(service.server.settling, "_SEAL_AGAIN_S", 0.2)
     session = tared.record()

@@ -9,6 +9,7 @@ import pytest
 
 from service.node import dial as dial_module
 from service.node.dial import dial
+from tests.waiting import in_a_loop
 
 
 def listening() -> socket.socket:
@@ -39,44 +40,40 @@ def test_a_name_that_is_none_is_an_error() -> None:
         asyncio.run(dial("ws://no-such-host.invalid:1"))
 
 
-def test_a_link_that_returns_is_noticed_by_a_fresh_attempt_beside_those_that_wait(
+@in_a_loop
+async def test_a_link_that_returns_is_noticed_by_a_fresh_attempt_beside_those_that_wait(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The kernel repeats its first packet after 1, 3, 7 s only."""
     monkeypatch.setattr(dial_module, "EVERY_S", 0.02)
     begun: list[int] = []
 
-    async def scenario() -> None:
-        loop = asyncio.get_running_loop()
-        real = loop.sock_connect
+    loop = asyncio.get_running_loop()
+    real = loop.sock_connect
 
-        async def connect(sock: socket.socket, address: tuple[str, int]) -> None:
-            begun.append(len(begun))
-            if begun[-1] < 3:
-                await asyncio.sleep(60.0)
-            await real(sock, address)
+    async def connect(sock: socket.socket, address: tuple[str, int]) -> None:
+        begun.append(len(begun))
+        if begun[-1] < 3:
+            await asyncio.sleep(60.0)
+        await real(sock, address)
 
-        monkeypatch.setattr(loop, "sock_connect", connect)
-        with listening() as server:
-            (await dial(f"ws://127.0.0.1:{server.getsockname()[1]}")).close()
-        assert asyncio.all_tasks() == {asyncio.current_task()}
-
-    asyncio.run(scenario())
+    monkeypatch.setattr(loop, "sock_connect", connect)
+    with listening() as server:
+        (await dial(f"ws://127.0.0.1:{server.getsockname()[1]}")).close()
+    assert asyncio.all_tasks() == {asyncio.current_task()}
     assert len(begun) == 4
 
 
-def test_nobody_who_answers_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_a_loop
+async def test_nobody_who_answers_is_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dial_module, "EVERY_S", 0.01)
     monkeypatch.setattr(dial_module, "GIVE_UP_S", 0.05)
 
-    async def scenario() -> None:
-        loop = asyncio.get_running_loop()
+    loop = asyncio.get_running_loop()
 
-        async def connect(sock: socket.socket, address: tuple[str, int]) -> None:
-            await asyncio.sleep(60.0)
+    async def connect(sock: socket.socket, address: tuple[str, int]) -> None:
+        await asyncio.sleep(60.0)
 
-        monkeypatch.setattr(loop, "sock_connect", connect)
-        with pytest.raises(TimeoutError, match="no answer"):
-            await dial("ws://127.0.0.1:9")
-
-    asyncio.run(scenario())
+    monkeypatch.setattr(loop, "sock_connect", connect)
+    with pytest.raises(TimeoutError, match="no answer"):
+        await dial("ws://127.0.0.1:9")

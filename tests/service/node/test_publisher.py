@@ -11,139 +11,119 @@ import service.server
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.node.publishing import Publishing, assert_all_arrived
 from tests.service.running import Running, ServeWith
+from tests.waiting import in_a_loop
 
 
-def test_everything_is_acknowledged_and_the_backlog_empties(
+@in_a_loop
+async def test_everything_is_acknowledged_and_the_backlog_empties(
     running: Running, node: FakeNode
 ) -> None:
-    async def scenario() -> list[str]:
-        async with Publishing(node, running.url) as publishing:
-            publishing.take(100)
-            await publishing.emptied()
-            for _ in range(5):
-                publishing.take(30)
-                await asyncio.sleep(0)
-            await publishing.emptied()
-            await asyncio.to_thread(running.http.get, "/health")
-            return publishing.reports
-
-    reports = asyncio.run(scenario())
-    assert len(reports) == 1
-    assert reports[0].startswith("connected to ws://127.0.0.1")
+    async with Publishing(node, running.url) as publishing:
+        publishing.take(100)
+        await publishing.emptied()
+        for _ in range(5):
+            publishing.take(30)
+            await asyncio.sleep(0)
+        await publishing.emptied()
+        await asyncio.to_thread(running.http.get, "/health")
+    assert len(publishing.reports) == 1
+    assert publishing.reports[0].startswith("connected to ws://127.0.0.1")
     assert_all_arrived(running, node)
     clock = running.node()["clock"]
     assert abs(clock["server_minus_node_ns"]) < 1e9
     assert 0 < clock["uncertainty_ns"] < 1e9
 
 
-def test_nothing_is_lost_when_the_server_is_away_for_a_while(
+@in_a_loop
+async def test_nothing_is_lost_when_the_server_is_away_for_a_while(
     running: Running, node: FakeNode
 ) -> None:
-    async def scenario() -> list[str]:
-        async with Publishing(node, running.url) as publishing:
-            for _ in range(3):
-                publishing.take(100)
-                # Not waited for: it may stop anywhere in it.
-                await asyncio.to_thread(running.stop)
-                publishing.take(100)
-                await asyncio.to_thread(running.start)
-            publishing.take(50)
-            await publishing.until(
-                lambda: (
-                    running.server.nodes.get("bench").last_seq == node.seq - 1
-                    if list(running.server.nodes)
-                    else False
-                )
+    async with Publishing(node, running.url) as publishing:
+        for _ in range(3):
+            publishing.take(100)
+            # Not waited for: it may stop anywhere in it.
+            await asyncio.to_thread(running.stop)
+            publishing.take(100)
+            await asyncio.to_thread(running.start)
+        publishing.take(50)
+        await publishing.until(
+            lambda: (
+                running.server.nodes.get("bench").last_seq == node.seq - 1
+                if list(running.server.nodes)
+                else False
             )
-            await publishing.emptied()
-            return publishing.reports
-
-    reports = asyncio.run(scenario())
-    assert reports[-1].startswith("connected to")
+        )
+        await publishing.emptied()
+    assert publishing.reports[-1].startswith("connected to")
     assert_all_arrived(running, node)
 
 
-def test_what_the_server_held_and_had_not_acknowledged_is_not_kept_for_ever(
+@in_a_loop
+async def test_what_the_server_held_and_had_not_acknowledged_is_not_kept_for_ever(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def scenario() -> None:
-        async with Publishing(node, running.url) as publishing:
-            publishing.take(50)
-            await publishing.emptied()
-            monkeypatch.setattr(service.server.server, "TICK_S", 0.5)
-            publishing.take(10)
-            await publishing.emptied()  # the next tick is half a second away
-            publishing.take(10)
-            bench = running.server.nodes.get("bench")
-            await publishing.until(lambda: bench.last_seq == 69)
-            await asyncio.to_thread(running.restart)
-            publishing.take(10)
-            await publishing.emptied()
-
-    asyncio.run(scenario())
+    async with Publishing(node, running.url) as publishing:
+        publishing.take(50)
+        await publishing.emptied()
+        monkeypatch.setattr(service.server.server, "TICK_S", 0.5)
+        publishing.take(10)
+        await publishing.emptied()  # the next tick is half a second away
+        publishing.take(10)
+        bench = running.server.nodes.get("bench")
+        await publishing.until(lambda: bench.last_seq == 69)
+        await asyncio.to_thread(running.restart)
+        publishing.take(10)
+        await publishing.emptied()
 
 
-def test_a_server_that_comes_later_is_found(running: Running, node: FakeNode) -> None:
+@in_a_loop
+async def test_a_server_that_comes_later_is_found(running: Running, node: FakeNode) -> None:
     running.stop()
-
-    async def scenario() -> list[str]:
-        async with Publishing(node, running.url) as publishing:
-            publishing.take(50)
-            await publishing.until(lambda: publishing.reports)
-            await asyncio.sleep(0.5)  # several attempts
-            said = list(publishing.reports)
-            await asyncio.to_thread(running.start)
-            await publishing.emptied()
-            return said
-
-    [reason] = asyncio.run(scenario())  # said once
+    async with Publishing(node, running.url) as publishing:
+        publishing.take(50)
+        await publishing.until(lambda: publishing.reports)
+        await asyncio.sleep(0.5)  # several attempts
+        said = list(publishing.reports)
+        await asyncio.to_thread(running.start)
+        await publishing.emptied()
+    [reason] = said  # said once
     assert reason.startswith("not connected to ws://127.0.0.1")
     assert "trying again" in reason
     assert_all_arrived(running, node)
 
 
-def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
+@in_a_loop
+async def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
     serve_with: ServeWith, node_of: NodeOf
 ) -> None:
     running = serve_with(token="right")  # noqa: S106  # of this test
     node = node_of(running)
-
-    async def scenario() -> list[str]:
-        async with Publishing(node, running.url, token="wrong") as publishing:  # noqa: S106  # of this test
-            await publishing.until(lambda: publishing.reports)
-            await asyncio.sleep(0.5)  # several attempts
-            return publishing.reports
-
-    [reason] = asyncio.run(scenario())
+    async with Publishing(node, running.url, token="wrong") as publishing:  # noqa: S106  # of this test
+        await publishing.until(lambda: publishing.reports)
+        await asyncio.sleep(0.5)  # several attempts
+    [reason] = publishing.reports
     assert "FOOTTILE_TOKEN" in reason
     assert running.http.get("/nodes").json()["items"] == []
 
 
-def test_a_right_token_is_taken(serve_with: ServeWith, node_of: NodeOf) -> None:
+@in_a_loop
+async def test_a_right_token_is_taken(serve_with: ServeWith, node_of: NodeOf) -> None:
     running = serve_with(token="right")  # noqa: S106  # of this test
     node = node_of(running)
-
-    async def scenario() -> None:
-        async with Publishing(node, running.url, token="right") as publishing:  # noqa: S106  # of this test
-            publishing.take(20)
-            await publishing.emptied()
-
-    asyncio.run(scenario())
+    async with Publishing(node, running.url, token="right") as publishing:  # noqa: S106  # of this test
+        publishing.take(20)
+        await publishing.emptied()
     assert_all_arrived(running, node)
 
 
-def test_a_name_that_is_taken_is_reported(
+@in_a_loop
+async def test_a_name_that_is_taken_is_reported(
     running: Running, node: FakeNode, node_of: NodeOf
 ) -> None:
     node.connect()
     other = node_of(running)
-
-    async def scenario() -> list[str]:
-        async with Publishing(other, running.url) as publishing:
-            await publishing.until(lambda: publishing.reports)
-            await asyncio.sleep(0.3)
-            return publishing.reports
-
-    reports = asyncio.run(scenario())
-    assert len(reports) == 1, reports
-    assert "--name" in reports[0]
+    async with Publishing(other, running.url) as publishing:
+        await publishing.until(lambda: publishing.reports)
+        await asyncio.sleep(0.3)
+    assert len(publishing.reports) == 1, publishing.reports
+    assert "--name" in publishing.reports[0]

@@ -38,8 +38,10 @@ from storage.journal.stream_notes import StreamNotes
 from storage.journal.wanted import Wanted as NodeWanted
 from storage.schema import wire_schema
 from storage.wire import decode
+from tests.faults.proxy import Proxy
 from tests.service.fake_node import FakeNode
 from tests.service.node.publishing import Publishing, batches
+from tests.waiting import in_a_loop
 
 
 class Script:
@@ -108,18 +110,16 @@ async def played() -> AsyncIterator[Script]:
         yield script
 
 
-def test_the_newest_frames_come_first_and_the_past_behind_them(node: FakeNode) -> None:
-    async def scenario() -> tuple[list[tuple[str, int, int]], list[int]]:
-        async with played() as script:
-            publishing = Publishing(node, script.url)
-            publishing.take(1000)
-            async with publishing:
-                await publishing.until(lambda: script.came)
-                publishing.take(10)
-                await publishing.emptied()
-                return script.came, publishing.behind
-
-    came, behind = asyncio.run(scenario())
+@in_a_loop
+async def test_the_newest_frames_come_first_and_the_past_behind_them(node: FakeNode) -> None:
+    async with played() as script:
+        publishing = Publishing(node, script.url)
+        publishing.take(1000)
+        async with publishing:
+            await publishing.until(lambda: script.came)
+            publishing.take(10)
+            await publishing.emptied()
+    came, behind = script.came, publishing.behind
     first = [first for _, first, _ in came]
     assert sorted(first) == list(range(0, 1010, 10))
     # Not behind the thousand that were there before: ahead of most of them.
@@ -129,30 +129,26 @@ def test_the_newest_frames_come_first_and_the_past_behind_them(node: FakeNode) -
     assert behind[0] > 0
 
 
-def test_earlier_streams_are_named_before_their_frames(node: FakeNode) -> None:
-    async def scenario() -> list[tuple[str, int, int]]:
-        async with played() as script:
-            old = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
-            for batch in batches(node, 50):
-                old.put(batch, 0)
-            old_id = node.boot_id
-            node.reboot()
-            publishing = Publishing(node, script.url, earlier=[old])
-            publishing.take(20)
-            script.lacks = (
-                StreamNumbers(boot_id=old_id, numbers=((15, 34),)),
-                StreamNumbers(boot_id=node.boot_id, numbers=((0, None),)),
-            )
-            async with publishing:
-                publishing.take(10)
-                await publishing.emptied()
-                await publishing.until(lambda: len(script.came) == 6)
-                assert old.acked == Intervals([(10, 39)])
-                return [
-                    (("new", "old")[b == old_id], first, last) for b, first, last in script.came
-                ]
-
-    came = asyncio.run(scenario())
+@in_a_loop
+async def test_earlier_streams_are_named_before_their_frames(node: FakeNode) -> None:
+    async with played() as script:
+        old = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
+        for batch in batches(node, 50):
+            old.put(batch, 0)
+        old_id = node.boot_id
+        node.reboot()
+        publishing = Publishing(node, script.url, earlier=[old])
+        publishing.take(20)
+        script.lacks = (
+            StreamNumbers(boot_id=old_id, numbers=((15, 34),)),
+            StreamNumbers(boot_id=node.boot_id, numbers=((0, None),)),
+        )
+        async with publishing:
+            publishing.take(10)
+            await publishing.emptied()
+            await publishing.until(lambda: len(script.came) == 6)
+            assert old.acked == Intervals([(10, 39)])
+    came = [(("new", "old")[b == old_id], first, last) for b, first, last in script.came]
     assert [c for c in came if c[0] == "old"] == [
         ("old", 10, 19),
         ("old", 20, 29),
@@ -165,152 +161,84 @@ def test_earlier_streams_are_named_before_their_frames(node: FakeNode) -> None:
     ]
 
 
-def test_what_a_server_wants_is_told_with_the_streams_it_had_heard_of(node: FakeNode) -> None:
-    async def scenario() -> Publishing:
-        async with played() as script:
-            wanted = Wanted(
-                streams=(StreamNumbers(boot_id=node.boot_id, numbers=((5, None),)),), recording=True
-            )
-            script.wanted = wanted
-            async with Publishing(node, script.url) as publishing:
-                await publishing.until(lambda: publishing.wanted)
-                assert script.connection is not None
-                nothing = Wanted(streams=(), recording=False)
-                await script.connection.send(say(nothing))
-                await publishing.until(lambda: len(publishing.wanted) == 2)
-            assert publishing.wanted[0] == ("played", wanted, (node.boot_id,))
-            assert publishing.wanted[1] == ("played", nothing, (node.boot_id,))
-            return publishing
-
-    asyncio.run(scenario())
+@in_a_loop
+async def test_what_a_server_wants_is_told_with_the_streams_it_had_heard_of(node: FakeNode) -> None:
+    async with played() as script:
+        wanted = Wanted(
+            streams=(StreamNumbers(boot_id=node.boot_id, numbers=((5, None),)),), recording=True
+        )
+        script.wanted = wanted
+        async with Publishing(node, script.url) as publishing:
+            await publishing.until(lambda: publishing.wanted)
+            assert script.connection is not None
+            nothing = Wanted(streams=(), recording=False)
+            await script.connection.send(say(nothing))
+            await publishing.until(lambda: len(publishing.wanted) == 2)
+        assert publishing.wanted[0] == ("played", wanted, (node.boot_id,))
+        assert publishing.wanted[1] == ("played", nothing, (node.boot_id,))
 
 
-def test_losses_are_said_whenever_they_change(node: FakeNode) -> None:
-    async def scenario() -> list[Lost]:
-        async with played() as script, Publishing(node, script.url) as publishing:
-            await publishing.until(lambda: script.said)
-            publishing.stream.lose(Intervals([(3, 9)]), "disk_full", NodeWanted(Path("nowhere")))
-            await publishing.until(lambda: any(isinstance(m, Lost) for m in script.said))
-            await asyncio.sleep(0.1)
-            return [message for message in script.said if isinstance(message, Lost)]
-
-    [lost] = asyncio.run(scenario())
+@in_a_loop
+async def test_losses_are_said_whenever_they_change(node: FakeNode) -> None:
+    async with played() as script, Publishing(node, script.url) as publishing:
+        await publishing.until(lambda: script.said)
+        publishing.stream.lose(Intervals([(3, 9)]), "disk_full", NodeWanted(Path("nowhere")))
+        await publishing.until(lambda: any(isinstance(m, Lost) for m in script.said))
+        await asyncio.sleep(0.1)
+    [lost] = [message for message in script.said if isinstance(message, Lost)]
     assert lost == Lost(boot_id=node.boot_id, lost={"disk_full": ((3, 9),)})
 
 
-def test_a_new_stream_is_announced_by_a_new_hello(node: FakeNode) -> None:
-    async def scenario() -> list[Hello]:
-        async with played() as script, Publishing(node, script.url) as publishing:
-            publishing.take(20)
-            await publishing.emptied()
-            before = publishing.stream
-            node.reboot()
-            publishing.earlier = (before,)
-            publishing.stream = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
-            publishing.publisher.renew()
-            publishing.take(10)
-            await publishing.emptied()
-            return script.hellos
-
-    first, second = asyncio.run(scenario())
+@in_a_loop
+async def test_a_new_stream_is_announced_by_a_new_hello(node: FakeNode) -> None:
+    async with played() as script, Publishing(node, script.url) as publishing:
+        publishing.take(20)
+        await publishing.emptied()
+        before = publishing.stream
+        node.reboot()
+        publishing.earlier = (before,)
+        publishing.stream = NodeStream(Path("nowhere"), StreamNotes(array_info=node.info), None)
+        publishing.publisher.renew()
+        publishing.take(10)
+        await publishing.emptied()
+    first, second = script.hellos
     assert [s.array_info.boot_id for s in second.earlier] == [first.array_info.boot_id]
 
 
-def test_a_link_that_is_half_open_is_noticed_and_dialled_again(
+@in_a_loop
+async def test_a_link_that_is_half_open_is_noticed_and_dialled_again(
     node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server that reads nothing, and closes nothing: its machine has gone."""
     monkeypatch.setattr(service.node.sending, "_NO_ANSWER_S", 0.3)
     monkeypatch.setattr(service.node.sending, "_ASK_EVERY_S", 0.05)
-
-    async def scenario() -> list[str]:
-        async with played() as script:
-            proxy = _Proxy(script.port)
-            port = await proxy.start()
-            async with Publishing(node, f"http://127.0.0.1:{port}") as publishing:
+    async with played() as script:
+        with Proxy(script.port) as proxy:
+            async with Publishing(node, f"http://127.0.0.1:{proxy.port}") as publishing:
                 publishing.take(20)
                 await publishing.emptied()
-                proxy.passes.clear()
+                proxy.black_hole()
                 publishing.take(20)
                 await publishing.until(lambda: len(publishing.reports) > 1)
-                proxy.passes.set()
+                proxy.mend()
                 await publishing.emptied()
-                reports = publishing.reports
-            await proxy.stop()
-            return reports
-
-    reports = asyncio.run(scenario())
-    assert "has not answered" in reports[1]
-    assert reports[-1].startswith("connected to")
+    assert "has not answered" in publishing.reports[1]
+    assert publishing.reports[-1].startswith("connected to")
 
 
-class _Proxy:
-    """Passes bytes on, unless it is told to keep them."""
-
-    def __init__(self, port: int) -> None:
-        self._port = port
-        self.passes = asyncio.Event()
-        self.passes.set()
-        self._server: asyncio.Server | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
-
-    async def start(self) -> int:
-        self._server = await asyncio.start_server(self._pass, "127.0.0.1", 0)
-        return int(self._server.sockets[0].getsockname()[1])
-
-    async def stop(self) -> None:
-        assert self._server is not None
-        self._server.close()
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self._server.wait_closed()
-
-    async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._tasks.add(task)
-        far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._port)
-
-        async def one_way(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
-            while data := await source.read(4096):
-                await self.passes.wait()
-                sink.write(data)
-                await sink.drain()
-
-        try:
-            await asyncio.wait(
-                [
-                    asyncio.create_task(one_way(reader, far_writer)),
-                    asyncio.create_task(one_way(far_reader, writer)),
-                ],
-                return_when=asyncio.FIRST_COMPLETED,
-            )
-        finally:
-            for each in asyncio.all_tasks():
-                if each.get_coro().__qualname__.endswith("one_way"):  # type: ignore[union-attr]
-                    each.cancel()
-            writer.close()
-            far_writer.close()
-            self._tasks.discard(task)
-
-
-def test_on_a_slow_link_the_newest_overtake_what_waits(node: FakeNode) -> None:
+@in_a_loop
+async def test_on_a_slow_link_the_newest_overtake_what_waits(node: FakeNode) -> None:
     """Half a second of frames may wait; what waits longer follows behind."""
-
-    async def scenario() -> list[int]:
-        async with played() as script:
-            script.reads.clear()
-            async with Publishing(node, script.url) as publishing:
-                await publishing.until(lambda: script.hellos)
-                for _ in range(60):
-                    publishing.take(50)
-                    await asyncio.sleep(0.01)
-                script.reads.set()
-                await publishing.emptied()
-                return [first for _, first, _ in script.came]
-
-    first = asyncio.run(scenario())
+    async with played() as script:
+        script.reads.clear()
+        async with Publishing(node, script.url) as publishing:
+            await publishing.until(lambda: script.hellos)
+            for _ in range(60):
+                publishing.take(50)
+                await asyncio.sleep(0.01)
+            script.reads.set()
+            await publishing.emptied()
+    first = [first for _, first, _ in script.came]
     assert sorted(first) == list(range(0, 3000, 10))
     assert first != sorted(first)
     newest = first.index(2990)
@@ -341,14 +269,14 @@ def another_server(no_threads_left: None) -> Iterator[str]:
         thread.join(5.0)
 
 
-def test_a_server_that_is_not_ours_is_reported_once(another_server: str, node: FakeNode) -> None:
-    async def scenario() -> list[str]:
-        async with Publishing(node, another_server) as publishing:
-            await publishing.until(lambda: publishing.reports)
-            await asyncio.sleep(0.5)
-            return publishing.reports
-
-    [reason] = asyncio.run(scenario())
+@in_a_loop
+async def test_a_server_that_is_not_ours_is_reported_once(
+    another_server: str, node: FakeNode
+) -> None:
+    async with Publishing(node, another_server) as publishing:
+        await publishing.until(lambda: publishing.reports)
+        await asyncio.sleep(0.5)
+    [reason] = publishing.reports
     assert "not connected" in reason
     assert "200" in reason
 
@@ -385,7 +313,8 @@ def test_what_is_no_address_is_refused(server: str) -> None:
         ingest_url(server)
 
 
-def test_a_redirect_is_no_end(node: FakeNode) -> None:
+@in_a_loop
+async def test_a_redirect_is_no_end(node: FakeNode) -> None:
     asked: list[int] = []
 
     async def redirect(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -397,13 +326,10 @@ def test_a_redirect_is_no_end(node: FakeNode) -> None:
         await writer.wait_closed()
         asked.append(1)
 
-    async def scenario() -> list[str]:
-        portal = await asyncio.start_server(redirect, "127.0.0.1", 0)
-        port = portal.sockets[0].getsockname()[1]
-        async with Publishing(node, f"http://127.0.0.1:{port}") as publishing:
-            await publishing.until(lambda: len(asked) > 1)
-        portal.close()
-        await portal.wait_closed()
-        return publishing.reports
-
-    assert "trying again" in asyncio.run(scenario())[0]
+    portal = await asyncio.start_server(redirect, "127.0.0.1", 0)
+    port = portal.sockets[0].getsockname()[1]
+    async with Publishing(node, f"http://127.0.0.1:{port}") as publishing:
+        await publishing.until(lambda: len(asked) > 1)
+    portal.close()
+    await portal.wait_closed()
+    assert "trying again" in publishing.reports[0]

@@ -12,9 +12,18 @@ import pytest
 from devices.frames import FrameBatch
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode
-from tests.service.recording import parts_of
+from tests.service.recording import Recording, parts_of, whole_parts_of
 from tests.service.running import Running
 from tests.waiting import until
+
+
+@pytest.fixture
+def session(tared: FakeNode) -> Recording:
+    """A session of fifty frames, 70 to 119, whose node has left then."""
+    session = tared.record()
+    tared.deliver(50)
+    tared.leave()
+    return session
 
 
 def reboot_now(node: FakeNode) -> None:
@@ -24,11 +33,8 @@ def reboot_now(node: FakeNode) -> None:
 
 
 def test_streams_that_were_taken_while_the_link_was_down_are_parts_and_nothing_is_lost(
-    running: Running, tared: FakeNode
+    running: Running, tared: FakeNode, session: Recording
 ) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    tared.leave()
     tared.frames(30)
     tared.reboot()
     tared.frames(40)
@@ -41,8 +47,7 @@ def test_streams_that_were_taken_while_the_link_was_down_are_parts_and_nothing_i
     assert session.ledger()["parts"][0]["pending"] == 30
     tared.send_lacking()
     sealed = tared.finish(session)
-    assert sealed["complete"] is True
-    assert parts_of(sealed) == [
+    assert whole_parts_of(sealed) == [
         (first.boot_id, 70, 149),
         (second.boot_id, 0, 39),
         (tared.boot_id, 0, 19),
@@ -77,17 +82,13 @@ def test_it_goes_on_so_although_the_server_is_restarted_between_any_two_steps(
     tared.connect(earlier=(first.said(held=()),))
     tared.taken_in() if tared.seq > 10 else None
     sealed = tared.finish(session)
-    assert sealed["complete"] is True
-    assert parts_of(sealed) == [(first.boot_id, 70, 149), (tared.boot_id, 0, 9)]
+    assert whole_parts_of(sealed) == [(first.boot_id, 70, 149), (tared.boot_id, 0, 9)]
 
 
 @pytest.mark.parametrize(("said", "open_tail"), [(250, 200), (30, 0), (50, 0)])
 def test_a_tail_that_a_power_cut_left_open_is_shorter_by_what_the_server_has_of_it(
-    tared: FakeNode, said: int, open_tail: int
+    tared: FakeNode, session: Recording, said: int, open_tail: int
 ) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    tared.leave()
     tared.reboot()
     [first] = tared.before
     # The last fifty frames are here, and were lost there when the power failed.
@@ -100,10 +101,7 @@ def test_a_tail_that_a_power_cut_left_open_is_shorter_by_what_the_server_has_of_
     assert sealed["tail_frames_max"] == open_tail
 
 
-def test_what_an_earlier_stream_lost_is_named(tared: FakeNode) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    tared.leave()
+def test_what_an_earlier_stream_lost_is_named(tared: FakeNode, session: Recording) -> None:
     tared.frames(30)
     tared.reboot()
     [first] = tared.before
@@ -119,11 +117,8 @@ def test_what_an_earlier_stream_lost_is_named(tared: FakeNode) -> None:
 
 
 def test_a_stop_while_the_node_was_away_falls_into_the_stream_that_was_taken_then(
-    tared: FakeNode,
+    tared: FakeNode, session: Recording
 ) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    tared.leave()
     tared.frames(30)
     tared.reboot()
     tared.frames(40)  # long ago, as all before
@@ -131,35 +126,27 @@ def test_a_stop_while_the_node_was_away_falls_into_the_stream_that_was_taken_the
     tared.frames(25, now=True)
     reboot_now(tared)
     tared.frames(10)
-    first, second = tared.before
-    tared.connect(earlier=(first.said(), second.said()))
-    tared.send_lacking()
+    first, second = tared.come_back()
     sealed = session.sealed()
-    assert sealed["complete"] is True
-    assert parts_of(sealed) == [(first.boot_id, 70, 149), (second.boot_id, 0, 39)]
+    assert whole_parts_of(sealed) == [(first.boot_id, 70, 149), (second.boot_id, 0, 39)]
 
 
-def test_a_stop_between_two_streams_ends_with_the_first_one(tared: FakeNode) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    tared.leave()
+def test_a_stop_between_two_streams_ends_with_the_first_one(
+    tared: FakeNode, session: Recording
+) -> None:
     tared.frames(30)
     session.stop()
     reboot_now(tared)
     tared.frames(10)
     reboot_now(tared)
-    first, second = tared.before
-    tared.connect(earlier=(first.said(), second.said()))
-    tared.send_lacking()
+    first, _ = tared.come_back()
     sealed = session.sealed()
-    assert sealed["complete"] is True
-    assert parts_of(sealed) == [(first.boot_id, 70, 149)]
+    assert whole_parts_of(sealed) == [(first.boot_id, 70, 149)]
 
 
-def test_a_stop_that_falls_into_the_present_stream_makes_it_a_part(tared: FakeNode) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    tared.leave()
+def test_a_stop_that_falls_into_the_present_stream_makes_it_a_part(
+    tared: FakeNode, session: Recording
+) -> None:
     tared.reboot()
     tared.frames(40)
     session.stop()
@@ -171,14 +158,12 @@ def test_a_stop_that_falls_into_the_present_stream_makes_it_a_part(tared: FakeNo
     assert session.now()["state"] == "pending"
     tared.send_again(tared.sent[0])
     sealed = session.sealed()
-    assert sealed["complete"] is True
-    assert parts_of(sealed) == [(first.boot_id, 70, 119), (tared.boot_id, 0, 39)]
+    assert whole_parts_of(sealed) == [(first.boot_id, 70, 119), (tared.boot_id, 0, 39)]
 
 
-def test_a_stop_in_the_middle_of_what_has_not_come_yet_waits_for_it(tared: FakeNode) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    tared.leave()
+def test_a_stop_in_the_middle_of_what_has_not_come_yet_waits_for_it(
+    tared: FakeNode, session: Recording
+) -> None:
     tared.frames(30)
     session.stop()
     tared.frames(30, now=True)
@@ -191,8 +176,7 @@ def test_a_stop_in_the_middle_of_what_has_not_come_yet_waits_for_it(tared: FakeN
     tared.send_again(tared.sent[-3])
     tared.send_again(tared.sent[-2])
     sealed = session.sealed()
-    assert sealed["complete"] is True
-    assert parts_of(sealed) == [(tared.boot_id, 70, 149)]
+    assert whole_parts_of(sealed) == [(tared.boot_id, 70, 149)]
 
 
 def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tared: FakeNode) -> None:
@@ -224,9 +208,7 @@ def test_other_tiles_begin_a_session_of_their_own_also_in_an_earlier_stream(
     tared.tiles = 3
     tared.frames(40)
     tared.reboot()
-    first, second = tared.before
-    tared.connect(earlier=(first.said(), second.said()))
-    tared.send_lacking()
+    first, second = tared.come_back()
     tared.deliver(20)
     sealed = session.sealed()
     assert parts_of(sealed) == [(first.boot_id, 70, 119)]
@@ -306,11 +288,8 @@ def test_the_node_is_told_what_sessions_need_whenever_that_changes(tared: FakeNo
 
 
 def test_while_it_is_not_known_which_stream_a_stop_fell_into_none_of_them_may_be_forgotten(
-    tared: FakeNode,
+    tared: FakeNode, session: Recording
 ) -> None:
-    session = tared.record()
-    tared.deliver(50)
-    tared.leave()
     tared.frames(30)
     tared.reboot()
     tared.frames(40)
@@ -334,8 +313,7 @@ def test_a_pre_roll_reaches_into_what_the_node_has_yet_to_send(tared: FakeNode) 
     tared.send_again(backlog)
     tared.deliver(30)
     sealed = tared.finish(session)
-    assert sealed["complete"] is True
-    assert parts_of(sealed) == [(tared.boot_id, first, 519)]
+    assert whole_parts_of(sealed) == [(tared.boot_id, first, 519)]
 
 
 def test_events_are_kept_by_their_instant_also_while_the_node_is_away_and_after_the_stop(

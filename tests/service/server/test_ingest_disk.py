@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import threading
-from typing import Any
 
 import pytest
 
@@ -14,12 +12,23 @@ import service.server.ingest
 import service.server.node
 import service.server.streams
 import storage.journal.segment
+from devices.errors import StorageError
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running, closed
+from tests.storage.faulty_disk import (
+    IO_ERROR,
+    NO_SPACE,
+    before_each_sync_of_frames,
+    failing_if,
+    failing_once,
+    refusing,
+)
 from tests.waiting import until
+
+STORAGE_FULL = (StorageError, "No space left on device")
 
 
 def gated_sync(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
@@ -72,23 +81,11 @@ def test_frames_that_come_during_a_sync_wait_for_the_next_one(
 def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_all = storage.journal.segment.write_all
-    check_storage = running.server.check_storage
     full = threading.Event()
-
-    def refusing(file: Any, data: bytes) -> None:
-        if full.is_set():
-            raise OSError(28, "No space left on device")
-        write_all(file, data)
-
-    def check() -> None:
-        if full.is_set():
-            from devices.errors import StorageError
-
-            raise StorageError("No space left on device")
-        check_storage()
-
-    monkeypatch.setattr(storage.journal.segment, "write_all", refusing)
+    segment, is_full = storage.journal.segment, lambda *_: full.is_set()
+    writes = failing_if(is_full, segment.write_all, *NO_SPACE)
+    check = failing_if(is_full, running.server.check_storage, *STORAGE_FULL)
+    monkeypatch.setattr(segment, "write_all", writes)
     monkeypatch.setattr(running.server, "check_storage", check)
     node.connect()
     node.tared()
@@ -127,15 +124,11 @@ def test_one_message_that_a_full_disk_did_not_take_is_asked_for_again(
     lost = node.frames(10)
     refused = node.payload(lost)
 
-    def refusing(file: Any, data: bytes) -> None:
-        if data == refused:
-            raise OSError(28, "No space left on device")
-        write_all(file, data)
-
+    refusing_it = failing_if(lambda file, data: data == refused, write_all, *NO_SPACE)
     monkeypatch.setattr(service.server.server, "TICK_S", 0.5)
     node.send(10)
     node.acknowledged(29, first=20)  # the next tick is half a second away
-    monkeypatch.setattr(storage.journal.segment, "write_all", refusing)
+    monkeypatch.setattr(storage.journal.segment, "write_all", refusing_it)
     node.send_again(lost)
     node.send(10)
     until(lambda: running.node()["last_seq"] == 39)
@@ -147,20 +140,9 @@ def test_one_message_that_a_full_disk_did_not_take_is_asked_for_again(
 def test_a_disk_that_refuses_to_sync_acknowledges_nothing(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from devices.errors import StorageError
-
-    sync = Journal.sync
-    broken = threading.Event()
-
-    def refusing(journal: Journal) -> None:
-        if broken.is_set():
-            broken.clear()
-            raise StorageError("Input/output error")
-        sync(journal)
-
-    monkeypatch.setattr(Journal, "sync", refusing)
     node.connect()
-    broken.set()
+    broken = failing_once(Journal.sync, StorageError, "Input/output error")
+    monkeypatch.setattr(Journal, "sync", broken)
     node.send(20)
     assert closed(node.socket)[0] == 1012
     assert not node.acked
@@ -175,30 +157,19 @@ def test_a_disk_that_refuses_to_sync_acknowledges_nothing(
 def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from devices.errors import StorageError
-
     node.connect()
     node.deliver(10)
     node.leave()
     node.reboot()
     node.tiles += 1
-    full = threading.Event()
-    full.set()
-    keep = service.server.node.ServerNode.keep
-
-    def refusing(kept: service.server.node.ServerNode) -> None:
-        if full.is_set():
-            raise StorageError("No space left on device")
-        keep(kept)
-
-    monkeypatch.setattr(service.server.node.ServerNode, "keep", refusing)
-    node.connect()
+    with monkeypatch.context() as patch:
+        patch.setattr(service.server.node.ServerNode, "keep", refusing(*STORAGE_FULL))
+        node.connect()
     shown = running.node()
     assert len(shown["tiles"]) == node.tiles
     calibration = node.hello().calibration
     assert calibration is not None
     assert shown["calibration"]["id"] == calibration.id
-    full.clear()
 
 
 def test_what_could_not_be_synced_is_sent_again(
@@ -206,17 +177,7 @@ def test_what_could_not_be_synced_is_sent_again(
 ) -> None:
     node.connect()
     node.deliver(10)
-    broken = threading.Event()
-    broken.set()
-    fsync = os.fsync
-
-    def failing(descriptor: int) -> None:
-        if broken.is_set() and "arrows" in os.readlink(f"/proc/self/fd/{descriptor}"):
-            broken.clear()
-            raise OSError(5, "Input/output error")
-        fsync(descriptor)
-
-    monkeypatch.setattr(os, "fsync", failing)
+    before_each_sync_of_frames(monkeypatch, failing_once(lambda: None, *IO_ERROR))
     lost = node.send(10)
     assert closed(node.socket)[0] == 1012
     assert node.connect() == [(10, None)]
@@ -229,11 +190,7 @@ def test_what_could_not_be_synced_is_sent_again(
 def test_a_disk_that_was_full_from_the_first_frame_on_is_tried_again(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from devices.errors import StorageError
-
-    def refuse(*_: object) -> None:
-        raise StorageError("No space left on device")
-
+    refuse = refusing(*STORAGE_FULL)
     monkeypatch.setattr(service.server.streams, "Journal", refuse)  # not even a folder
     monkeypatch.setattr(running.server, "check_storage", refuse)
     node.connect()

@@ -20,6 +20,7 @@ from storage.wire import encode
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
+from tests.storage.faulty_disk import NO_SPACE, refusing
 
 PERIOD_NS = 10_000_000  # 100 Hz
 BATCH = 25
@@ -219,13 +220,10 @@ def test_without_a_lead_that_could_be_used_the_tare_of_before_stays_and_that_is_
 def test_a_lead_whose_tare_cannot_be_kept_is_a_storage_problem_and_tried_again(
     foot_of: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
     foot = foot_of()
     foot.live(1.0, lead=True)
     with monkeypatch.context() as patch:
-        patch.setattr("storage.durable.os.fsync", full)
+        patch.setattr("storage.durable.os.fsync", refusing(*NO_SPACE))
         foot.live(1.0)
         assert "No space left" in foot.node.storage_problem
         assert foot.history == []
@@ -340,11 +338,8 @@ def test_an_automatic_tare_that_is_undone_does_not_come_back_until_somebody_tare
 def test_an_automatic_tare_that_cannot_be_kept_is_not_in_force(
     foot: Foot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
-        raise StorageError("full")
-
     before = foot.node.live.tare
-    monkeypatch.setattr("service.sessions.tares.write_whole", full)
+    monkeypatch.setattr("service.sessions.tares.write_whole", refusing(StorageError, "full"))
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False)]
     assert foot.node.live.tare is before

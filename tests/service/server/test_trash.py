@@ -13,12 +13,14 @@ import pytest
 import service.api.routes.sessions
 import service.server
 import service.server.settling
+from devices.errors import StorageError
 from service.sessions.sealing import seal
 from storage.intervals import Intervals
 from storage.sessions.folder import DOOMED_PREFIX, SessionFolder
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, closed
+from tests.storage.faulty_disk import refusing
 from tests.waiting import until
 
 
@@ -164,13 +166,8 @@ def test_a_pending_session_in_the_trash_keeps_its_frames_until_the_trash_is_empt
 def test_a_session_is_in_one_place_however_a_delete_was_cut_off(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from devices.errors import StorageError
-
     session = sealed(tared)
-
-    def cut_off(*_: object) -> None:
-        raise StorageError("No space left on device")
-
+    cut_off = refusing(StorageError, "No space left")
     move = SessionFolder.move
     monkeypatch.setattr(SessionFolder, "move", cut_off)
     assert running.http.delete(session.url).status_code == 507
@@ -314,12 +311,7 @@ def test_frames_that_are_found_damaged_and_nobody_has_are_lost_and_said_to_be(
 def test_a_session_that_was_not_yet_sealed_when_the_server_ended_is_sealed_by_the_next(
     running: Running, tared: FakeNode, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from devices.errors import StorageError
-
-    def refusing(*_: object) -> None:
-        raise StorageError("No space left on device")
-
-    monkeypatch.setattr(service.server.settling, "seal", refusing)
+    monkeypatch.setattr(service.server.settling, "seal", refusing(StorageError, "No space left"))
     session = tared.record()
     tared.deliver(20)
     session.stop()

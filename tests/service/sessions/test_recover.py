@@ -31,6 +31,7 @@ from storage.verify.data import verdict_of, verify
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
+from tests.storage.faulty_disk import refusing
 
 ID = "20200101T000000Z-00000a"
 BOOT = "a" * 32
@@ -438,11 +439,7 @@ def test_a_full_disk_leaves_the_session_for_the_next_run(
 ) -> None:
     stream(tmp_path, info_of(), (0, 99), next_seq=100)
     session(tmp_path)
-
-    def full(*_: Any) -> Session:
-        raise StorageError("cannot be written: no space left")
-
-    monkeypatch.setattr(recover_module, "seal", full)
+    monkeypatch.setattr(recover_module, "seal", refusing(StorageError, "no space left"))
     (one,) = recover(tmp_path).sessions
     assert (one.outcome, loaded(tmp_path).state) == ("failed", "sealing")
     monkeypatch.undo()

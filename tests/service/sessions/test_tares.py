@@ -19,6 +19,7 @@ from service.estimation.tare.tare import Source, Tare
 from service.sessions.tares import KEPT_MAX, RecordedTare, TareHistory
 from tests.builders.arrays import make_array, make_tile
 from tests.builders.calibrations import make_tare
+from tests.storage.faulty_disk import NO_SPACE, refusing
 
 
 def array(*serials: str) -> ArrayInfo:
@@ -273,13 +274,10 @@ def test_only_the_newest_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_disk_that_cannot_be_written_leaves_the_history_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
     tares = history(tmp_path, 1, 2)
     before = tares.all
     with monkeypatch.context() as patch:
-        patch.setattr("os.fsync", full)
+        patch.setattr("os.fsync", refusing(*NO_SPACE))
         with pytest.raises(StorageError, match="No space left"):
             tares.add(tare(3), INFO)
         with pytest.raises(StorageError, match="No space left"):

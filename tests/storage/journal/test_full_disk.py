@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 from devices.errors import StorageError
 from storage.journal import segment as segment_module
 from storage.wire import encode
-from tests.storage.faulty_disk import disk_with_room_for
+from tests.storage.faulty_disk import IO_ERROR, NO_SPACE, disk_with_room_for, failing_if, refusing
 from tests.storage.journal.journals import (
     HEADER,
     LONG,
@@ -94,15 +95,8 @@ def test_a_disk_that_fills_between_the_gaps_of_a_batch_holds_what_was_written_an
 ) -> None:
     """A batch that fills three gaps is three writes."""
     journal, held = filled(tmp_path, (5, 9), (15, 19)), {*range(5, 10), *range(15, 20)}
-    whole, writes = segment_module.write_all, 0
-
-    def full(file: Any, data: bytes) -> None:
-        nonlocal writes
-        writes += 1
-        if writes > 3 * written:  # of each gap a header, a batch and a record
-            raise OSError(28, "No space left on device")
-        whole(file, data)
-
+    writes = itertools.count(1)  # of each gap a header, a batch and a record
+    full = failing_if(lambda *_: next(writes) > 3 * written, segment_module.write_all, *NO_SPACE)
     with monkeypatch.context() as patch:
         patch.setattr(segment_module, "write_all", full)
         with pytest.raises(StorageError):
@@ -138,12 +132,9 @@ def test_appending_never_waits_for_the_disk(
 def test_a_disk_that_does_not_sync_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(descriptor: int) -> None:
-        raise OSError(5, "Input/output error")
-
     journal = filled(tmp_path, (0, 9))
     with monkeypatch.context() as patch:
-        patch.setattr("os.fsync", refuse)
+        patch.setattr("os.fsync", refusing(*IO_ERROR))
         with pytest.raises(StorageError, match="Input/output error"):
             journal.sync()
         with pytest.raises(StorageError, match="Input/output error"):

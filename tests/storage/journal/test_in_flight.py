@@ -24,6 +24,7 @@ from storage.journal.in_flight import (
 )
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits
+from tests.storage.faulty_disk import NO_SPACE, refusing
 from tests.storage.stream import frames, take_in_flight
 
 
@@ -81,10 +82,7 @@ def test_a_full_disk_is_known_at_once_and_leaves_nothing_behind(
 ) -> None:
     """Without room that is reserved, the first write to a mapped page would end the process."""
 
-    def full(descriptor: int, offset: int, length: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "posix_fallocate", full)
+    monkeypatch.setattr(os, "posix_fallocate", refusing(*NO_SPACE))
     assert open_in_flight(tmp_path, make_array()) is None
     assert list(tmp_path.iterdir()) == []
     assert open_in_flight(None, make_array()) is None

@@ -22,6 +22,7 @@ from storage.sessions.folder import (
     SessionFolder,
     new_session_id,
 )
+from tests.storage.faulty_disk import NO_SPACE, refusing
 
 ID = "20200131T235959Z-0a1b2c"
 BOOT = "f" * 32
@@ -244,12 +245,9 @@ def test_a_folder_in_place_of_the_file_is_damage_too(tmp_path: Path) -> None:
 def test_a_session_that_cannot_be_written_stays_what_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
     folder = SessionFolder(tmp_path)
     folder.save(session())
-    monkeypatch.setattr("os.fsync", full)
+    monkeypatch.setattr("os.fsync", refusing(*NO_SPACE))
     with pytest.raises(StorageError, match="No space left"):
         folder.save(whole())
     assert folder.load(ID) == session()

@@ -7,7 +7,6 @@ import os
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -16,7 +15,13 @@ from storage.journal import node_journal, segment
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
 from tests.builders.arrays import make_array
-from tests.storage.faulty_disk import before_each_sync_of_frames
+from tests.storage.faulty_disk import (
+    IO_ERROR,
+    NO_SPACE,
+    before_each_sync_of_frames,
+    failing_once,
+    refusing,
+)
 from tests.storage.journal.node.leg import Start, fill, given, store
 from tests.waiting import until
 
@@ -41,11 +46,8 @@ def test_a_disk_that_takes_nothing_costs_what_memory_cannot_hold_and_goes_on_whe
     fill(journal, stream, 0, 49)
     until(lambda: stream.stored.last == 49 and stream.is_synced)
 
-    def refuse(file: Any, data: bytes) -> None:
-        raise OSError(number, os.strerror(number))
-
     with monkeypatch.context() as patch:
-        patch.setattr(segment, "write_all", refuse)
+        patch.setattr(segment, "write_all", refusing(OSError, number, os.strerror(number)))
         fill(journal, stream, 50, 69)
         until(lambda: journal.troubles)
         assert words in journal.troubles[0]
@@ -87,17 +89,10 @@ def test_what_the_disk_could_not_sync_is_written_once_more(
     """After a failed fsync the kernel may have forgotten the pages, and says so only once."""
     fill(journal, stream, 0, 49)
     until(lambda: stream.stored.last == 49 and stream.is_synced)
-    failures = 1
-
-    def fail_once() -> None:
-        nonlocal failures
-        if failures:
-            failures -= 1
-            raise OSError(errno.EIO, "Input/output error")
-
-    before_each_sync_of_frames(monkeypatch, fail_once)
+    tried: list[bool] = []
+    before_each_sync_of_frames(monkeypatch, failing_once(lambda: tried.append(True), *IO_ERROR))
     fill(journal, stream, 50, 99)
-    until(lambda: not failures and stream.is_synced)
+    until(lambda: tried and stream.is_synced)
     assert stream.stored == Intervals([(0, 99)])
     names = sorted(path.name for path in stream.folder.glob("*.arrows"))
     assert len(names) >= 2
@@ -136,10 +131,7 @@ def test_over_the_bound_of_memory_the_oldest_goes_first_of_whichever_stream(
     """A stream that ended while the disk took nothing does not leave the next one without room."""
     monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
 
-    def refuse(file: Any, data: bytes) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(segment, "write_all", refuse)
+    monkeypatch.setattr(segment, "write_all", refusing(*NO_SPACE))
     journal = start()
     before = journal.begin(make_array())
     fill(journal, before, 0, 149)
