@@ -21,7 +21,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import make_folder, storage_errors
 from storage.intervals import NO_END, Intervals, union
 from storage.journal.open_segments import OpenSegments
-from storage.journal.segment import SUFFIX, Segment, recover
+from storage.journal.segment import SUFFIX, UNREAD_SUFFIX, Segment, recover
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD, numbers, payload_of, read_header
 from storage.journal.stream_notes import StreamNotes
 from storage.losses import CORRUPT, Losses
@@ -60,11 +60,11 @@ class Journal:
                 if segment is not None:
                     self._take_in(segment)
             for path in folder.glob("*" + INDEX_SUFFIX):
-                # Without power the name of an index may stay and that of its segment, which was
-                # made before it, may go: nothing in it was promised.
+                # A power cut may take the name of a segment and leave that of its index. Nothing in
+                # it was promised then; but somebody may have deleted it, so it is set aside.
                 if not path.with_suffix(SUFFIX).exists():
                     with suppress(OSError):
-                        path.unlink()
+                        path.rename(path.with_suffix(UNREAD_SUFFIX))
         self.lost.found(self.held)
 
     @classmethod

@@ -140,7 +140,7 @@ def test_a_journal_of_nothing_holds_nothing(tmp_path: Path) -> None:
         reopened(tmp_path / "a" / "b")
 
 
-def test_an_index_of_which_a_power_cut_took_the_segment_goes_when_the_journal_is_opened(
+def test_an_index_whose_segment_a_power_cut_took_is_set_aside_when_the_journal_is_opened(
     tmp_path: Path,
 ) -> None:
     journal = filled(tmp_path, (0, 9), (20, 29))
@@ -151,6 +151,7 @@ def test_an_index_of_which_a_power_cut_took_the_segment_goes_when_the_journal_is
     gone.unlink()
     assert_holds(reopened(tmp_path), {*range(10), *range(20, 30)})
     assert not gone.with_suffix(".idx").exists()
+    assert gone.with_suffix(".unread").exists()
 
 
 def test_a_deleted_journal_is_gone(tmp_path: Path) -> None:
