@@ -22,7 +22,7 @@ from storage.durable import make_folder, storage_errors
 from storage.intervals import NO_END, Intervals, union
 from storage.journal.open_segments import OpenSegments
 from storage.journal.segment import SUFFIX, Segment, recover
-from storage.journal.segment_format import RECORD, numbers, payload_of, read_header
+from storage.journal.segment_format import INDEX_SUFFIX, RECORD, numbers, payload_of, read_header
 from storage.journal.stream_notes import StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.schema import array_info, wire_schema
@@ -59,6 +59,12 @@ class Journal:
                 self.lost.add(damaged, CORRUPT)
                 if segment is not None:
                     self._take_in(segment)
+            for path in folder.glob("*" + INDEX_SUFFIX):
+                # Without power the name of an index may stay and that of its segment, which was
+                # made before it, may go: nothing in it was promised.
+                if not path.with_suffix(SUFFIX).exists():
+                    with suppress(OSError):
+                        path.unlink()
         self.lost.found(self.held)
 
     @classmethod

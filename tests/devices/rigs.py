@@ -18,6 +18,7 @@ from devices.emulation.buses.line import Line
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.faults import Faults
+from devices.emulation.parts import random_of
 from devices.frames import TileInfo
 from devices.recovery.recovery import BusRecovery
 from devices.scene.emulation import ReadDuringConversion
@@ -203,3 +204,15 @@ def timed_scan(array: TileArray, wires: Wires) -> tuple[Scan, int]:
     """One frame, and how long it took in ns."""
     begin_ns = wires.clock.now_ns()
     return array.scan(), wires.clock.now_ns() - begin_ns
+
+
+def hesitating(wires: Wires, seed: int, least_ns: int = 500_000) -> None:
+    """Now and then the machine hesitates before a transfer, by so much or up to 5 ms."""
+    rng = random_of(f"machine {seed}")
+
+    def hesitate(_: int, __: tuple[i2c_msg, ...]) -> None:
+        if rng.random() < 0.05:
+            late_ns = int(rng.integers(least_ns, 5_000_000))
+            wires.clock.sleep_until_ns(wires.clock.now_ns() + late_ns)
+
+    wires.on_transaction = hesitate

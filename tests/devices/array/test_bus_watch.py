@@ -48,6 +48,13 @@ def watch_on(wires: Wires, helper: Helper | None = None) -> BusWatch:
     return BusWatch(MuxRouter(wires.bus, (mux for mux, _ in TWO_MUXES)), wires.clock, helper)
 
 
+def helped() -> tuple[Wires, Helper, BusWatch]:
+    """A bus, what can help it, and who watches it."""
+    wires = Wires(TWO_MUXES)
+    helper = Helper(wires)
+    return wires, helper, watch_on(wires, helper)
+
+
 def scan_on(wires: Wires) -> Scan:
     return Scan.blank(4, wires.clock.now_ns(), 0)
 
@@ -90,9 +97,7 @@ def test_a_bus_that_fell_is_down_until_it_moves_again() -> None:
 
 
 def test_a_stuck_bus_is_helped_at_once_and_then_ever_more_rarely() -> None:
-    wires = Wires(TWO_MUXES)
-    helper = Helper(wires)
-    watch = watch_on(wires, helper)
+    wires, helper, watch = helped()
     with wires.fault("sda_low"):
         watch.fall()
         begin_ns = wires.clock.now_ns()
@@ -114,10 +119,8 @@ def test_a_stuck_bus_is_helped_at_once_and_then_ever_more_rarely() -> None:
 
 
 def test_clocks_that_free_the_bus_are_all_that_is_done() -> None:
-    wires = Wires(TWO_MUXES)
-    helper = Helper(wires)
+    wires, helper, watch = helped()
     helper.clocks_free = True
-    watch = watch_on(wires, helper)
     with wires.fault("sda_low"):
         watch.fall()
         assert watch.comes_back()
@@ -155,9 +158,7 @@ def test_what_kept_the_bus_from_being_helped_is_told_until_it_is_back() -> None:
 
 
 def test_after_it_was_well_a_stuck_bus_is_helped_at_once_again() -> None:
-    wires = Wires(TWO_MUXES)
-    helper = Helper(wires)
-    watch = watch_on(wires, helper)
+    wires, helper, watch = helped()
     for _ in range(3):
         with wires.fault("sda_low"):
             watch.fall()
@@ -168,10 +169,8 @@ def test_after_it_was_well_a_stuck_bus_is_helped_at_once_again() -> None:
 
 
 def test_a_line_that_cannot_be_had_now_does_not_end_the_stream() -> None:
-    wires = Wires(TWO_MUXES)
-    helper = Helper(wires)
+    wires, helper, watch = helped()
     helper.fails = True
-    watch = watch_on(wires, helper)
     with wires.fault("sda_low"):
         watch.fall()
         assert not watch.comes_back()
@@ -180,9 +179,7 @@ def test_a_line_that_cannot_be_had_now_does_not_end_the_stream() -> None:
 
 
 def test_a_bus_that_moves_needs_no_help() -> None:
-    wires = Wires(TWO_MUXES)
-    helper = Helper(wires)
-    watch = watch_on(wires, helper)
+    _, helper, watch = helped()
     watch.fall()
     assert watch.comes_back()
     assert helper.asked_ns == []

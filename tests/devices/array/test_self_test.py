@@ -25,7 +25,7 @@ from devices.errors import BusFaultError, TileSetupError
 from devices.scene.emulation import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 from tests.builders.scenes import make_scene
-from tests.devices.rigs import FOUR, ONE, TWO_MUXES, Plugs, Wires
+from tests.devices.rigs import FOUR, ONE, TWO_MUXES, Plugs, Wires, hesitating
 
 THIRD = (0x3000, 0xB000, 0xC000, 0x3000)
 
@@ -315,25 +315,13 @@ def test_a_machine_that_sleeps_too_long_measures_too_long_and_never_too_short() 
     assert 1_600_000 <= found <= 1.015 * 1_600_000 + 80_000
 
 
-def hesitating(wires: Wires, seed: int) -> None:
-    """Now and then the machine hesitates before a transfer."""
-    rng = random_of(f"machine {seed}")
-
-    def hesitate(_: int, __: tuple[i2c_msg, ...]) -> None:
-        if rng.random() < 0.05:
-            late_ns = int(rng.integers(100_000, 5_000_000))
-            wires.clock.sleep_until_ns(wires.clock.now_ns() + late_ns)
-
-    wires.on_transaction = hesitate
-
-
 @pytest.mark.parametrize("mode", ["stale", "abort", "torn"])
 def test_a_machine_that_hesitates_before_a_transfer_never_measures_too_short(
     mode: ReadDuringConversion,
 ) -> None:
     for seed in range(30):
         wires = part_with(1_600_000, mode, noisy(f"hesitates {seed}"), 400_000)
-        hesitating(wires, seed)
+        hesitating(wires, seed, least_ns=100_000)
         wires_timing = WireTiming(400_000, 0.0)
         found = measure_conversion_ns(wires.bus, wires.clock, wires.infos[0], wires_timing)
         assert found is not None

@@ -12,7 +12,7 @@ from devices.array import schedules
 from devices.array.startup import Ready, free_bus, make_ready, measured, renew
 from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import VirtualClock
-from devices.emulation.parts import draw_chip
+from devices.emulation.parts import ChipPart, draw_chip
 from devices.emulation.world import World
 from devices.errors import BusFaultError, BusSetupError, SceneError, TileSetupError
 from devices.scene.faults import FaultKind
@@ -255,30 +255,27 @@ def test_what_kept_a_bus_from_being_freed_is_told() -> None:
 # Another part
 
 
-def test_a_replaced_part_is_identified_alone_whatever_the_array_left_open() -> None:
-    scene = make_scene(((0x70, 0), (0x71, 0)), emulation=NOISY, array={"schedule": "pipelined"})
+def renewed(scene: Scene, serial: str) -> tuple[Ready, Ready, ChipPart]:
+    """An array before and after one of its tiles was replaced, and the part that is there now."""
     before, bus, clock, world = started(scene)
-    with world.fault("replaced", "T01"):
+    with world.fault("replaced", serial):
         before.array.scan()
     for _ in range(100):
         before.array.scan()
-    assert before.array.replaced == ("T01",)
-    after = renew(bus, scene, clock, before)
-    spare = draw_chip("T01.spare", 0)
+    assert before.array.replaced == (serial,)
+    return before, renew(bus, scene, clock, before), draw_chip(f"{serial}.spare", 0)
+
+
+def test_a_replaced_part_is_identified_alone_whatever_the_array_left_open() -> None:
+    scene = make_scene(((0x70, 0), (0x71, 0)), emulation=NOISY, array={"schedule": "pipelined"})
+    _, after, spare = renewed(scene, "T01")
     assert after.tiles[0].coefficient_words == spare.coefficients.to_words()
     assert after.tiles[0].conversion_ms == pytest.approx(spare.conversion_ns / 1e6, rel=0.015)
 
 
 def test_a_replaced_part_is_identified_and_measured_anew() -> None:
     scene = make_scene(emulation=NOISY, array={"schedule": "pipelined"})
-    before, bus, clock, world = started(scene)
-    with world.fault("replaced", "T02"):
-        before.array.scan()
-    for _ in range(100):
-        before.array.scan()
-    assert before.array.replaced == ("T02",)
-    after = renew(bus, scene, clock, before)
-    spare = draw_chip("T02.spare", 0)
+    before, after, spare = renewed(scene, "T02")
     assert after.tiles[1].coefficient_words == spare.coefficients.to_words()
     true_ms = spare.conversion_ns / 1e6
     assert true_ms <= after.tiles[1].conversion_ms <= 1.015 * true_ms

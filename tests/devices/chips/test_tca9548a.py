@@ -221,20 +221,19 @@ def test_an_audit_reads_back_every_mux_of_which_something_is_known(protocol: Pro
         assert muxes.audit()
 
 
-def test_a_mux_that_was_reset_behind_our_back_is_found_by_an_audit(protocol: Protocol) -> None:
+@pytest.mark.parametrize(
+    ("read", "mended"),
+    [(("70>00", "71>00"), "70<04"), (("70>04", "71>01"), "71<00")],
+    ids=["reset", "opened"],
+)
+def test_a_mux_that_was_reset_or_opened_behind_our_back_is_found_by_an_audit(
+    protocol: Protocol, read: tuple[str, str], mended: str
+) -> None:
     muxes = router(protocol)
     protocol.connects(muxes, 0x70, 2, "71<00", "70<04")
-    with protocol.exchanged("70>00", "71>00"):
+    with protocol.exchanged(*read):
         assert not muxes.audit()
-    protocol.connects(muxes, 0x70, 2, "70<04")
-
-
-def test_a_mux_that_somebody_opened_is_found_by_an_audit(protocol: Protocol) -> None:
-    muxes = router(protocol)
-    protocol.connects(muxes, 0x70, 2, "71<00", "70<04")
-    with protocol.exchanged("70>04", "71>01"):
-        assert not muxes.audit()
-    protocol.connects(muxes, 0x70, 2, "71<00")
+    protocol.connects(muxes, 0x70, 2, mended)
 
 
 def test_a_mux_that_does_not_answer_an_audit_is_not_taken_as_known(protocol: Protocol) -> None:

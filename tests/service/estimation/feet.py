@@ -6,6 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from devices.frames import NO_SERVO_COUNTS, NOT_READ, FrameBatch
+from tests.builders.frames import loaded_frames, with_columns
+
 SQUARE = [(0.0, 0.0, -0.15), (0.02, 0.0, -0.15), (0.0, 0.01, -0.15), (0.02, 0.01, -0.15)]
 
 COP = ("cop_x_m", "cop_y_m", "cop_sigma_x_m", "cop_sigma_y_m", "cop_index_x", "cop_index_y")
@@ -14,3 +17,35 @@ COP = ("cop_x_m", "cop_y_m", "cop_sigma_x_m", "cop_sigma_y_m", "cop_index_x", "c
 def held(forces_n: Sequence[float], rows: int = 12) -> np.ndarray:
     """The same forces for so many frames, 2 ms each: with 12, contact is believed at the end."""
     return np.tile(np.array(forces_n, dtype=np.float64), (rows, 1))
+
+
+def wild_frames(rows: int, tiles: int, seed: int) -> FrameBatch:
+    """Loads that come and go, faults of every kind, gaps, servo drop-outs, tares grown old."""
+    rng = np.random.default_rng(seed)
+    on = np.repeat(rng.integers(0, 2, rows), rng.integers(1, 9, rows))[:rows]
+    forces_n = on[:, None] * rng.integers(0, 70, tiles) + rng.normal(0, 1.5, (rows, tiles))
+    forces_n[rng.random((rows, tiles)) < 0.03] = np.nan
+    forces_n[rng.random((rows, tiles)) < 0.02] = rng.choice([130.0, 200.0, 499.0, 501.0, 510.0])
+    frames = loaded_frames(forces_n)
+    steps_ns = rng.choice([2_000_000] * 9 + [2_000_007, 900_000, 3_100_000, 60_000_000_000], rows)
+    t_mono_ns = np.cumsum(steps_ns)
+    # Readings 1 to 9 ms apart, each for several frames; some jump by more than half a turn.
+    since_ns = np.cumsum(np.minimum(steps_ns, 4_000_000))
+    sampled_ns = np.cumsum(rng.integers(1_000_000, 9_000_000, 4 * rows + 9)) - 9_000_000
+    newest = np.clip(np.searchsorted(sampled_ns, since_ns) - 1, 0, None)
+    counts = np.cumsum(rng.choice([-700, -1, 0, 3, 900, 3000], len(sampled_ns)))
+    age_us = np.clip((since_ns - sampled_ns[newest]) // 1000, 0, None)
+    status = frames.status | np.where(
+        rng.random((rows, tiles)) < 0.05, 2 ** rng.integers(0, 6, (rows, tiles)), 0
+    )
+    return with_columns(
+        frames,
+        seq=np.cumsum(rng.choice([1] * 20 + [2, 900], rows)),
+        t_mono_ns=t_mono_ns,
+        tadc=np.where(frames.tadc == NOT_READ, NOT_READ, rng.integers(440, 560, (rows, tiles))),
+        status=status,
+        frame_status=np.where(rng.random(rows) < 0.1, rng.integers(0, 32, rows), 0),
+        servo_counts=np.where(rng.random(rows) < 0.05, NO_SERVO_COUNTS, counts[newest]),
+        servo_age_us=np.where(rng.random(rows) < 0.05, rng.integers(-1, 3000, rows), age_us),
+        reference_force_n=rng.choice([np.nan, np.inf, 3.0], rows),
+    )

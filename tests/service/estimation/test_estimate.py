@@ -6,7 +6,6 @@ Tiles read one newton a count (see tests/builders), so forces below are what the
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
 from dataclasses import fields, replace
 from itertools import pairwise
 
@@ -16,98 +15,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
-from devices.frames import NO_SERVO_COUNTS, NOT_READ, FrameBatch
+from devices.frames import FrameBatch
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import EstimateStatus
 from service.estimation.lower import ApparentForces
 from service.estimation.plan import make_plan
 from service.estimation.tare.recorded import take_tare
-from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
+from tests.builders.arrays import array_at, make_servo
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.builders.estimates import estimate, newton_plan
-from tests.builders.frames import LAYOUTS, assert_same_bits, cut_up, loaded_frames, with_columns
-from tests.service.estimation.feet import SQUARE, held
+from tests.builders.frames import assert_same_bits, loaded_frames
+from tests.service.estimation.feet import SQUARE, held, wild_frames
 
 Position = tuple[float, float, float]
 
 
 # --- any split, any memory order ------------------------------------------------------------------
-
-
-def wild_frames(rows: int, tiles: int, seed: int) -> FrameBatch:
-    """Loads that come and go, faults of every kind, gaps, servo drop-outs, tares grown old."""
-    rng = np.random.default_rng(seed)
-    on = np.repeat(rng.integers(0, 2, rows), rng.integers(1, 9, rows))[:rows]
-    forces_n = on[:, None] * rng.integers(0, 70, tiles) + rng.normal(0, 1.5, (rows, tiles))
-    forces_n[rng.random((rows, tiles)) < 0.03] = np.nan
-    forces_n[rng.random((rows, tiles)) < 0.02] = rng.choice([130.0, 200.0, 499.0, 501.0, 510.0])
-    frames = loaded_frames(forces_n)
-    steps_ns = rng.choice([2_000_000] * 9 + [2_000_007, 900_000, 3_100_000, 60_000_000_000], rows)
-    t_mono_ns = np.cumsum(steps_ns)
-    # Readings 1 to 9 ms apart, each for several frames; some jump by more than half a turn.
-    since_ns = np.cumsum(np.minimum(steps_ns, 4_000_000))
-    sampled_ns = np.cumsum(rng.integers(1_000_000, 9_000_000, 4 * rows + 9)) - 9_000_000
-    newest = np.clip(np.searchsorted(sampled_ns, since_ns) - 1, 0, None)
-    counts = np.cumsum(rng.choice([-700, -1, 0, 3, 900, 3000], len(sampled_ns)))
-    age_us = np.clip((since_ns - sampled_ns[newest]) // 1000, 0, None)
-    status = frames.status | np.where(
-        rng.random((rows, tiles)) < 0.05, 2 ** rng.integers(0, 6, (rows, tiles)), 0
-    )
-    return with_columns(
-        frames,
-        seq=np.cumsum(rng.choice([1] * 20 + [2, 900], rows)),
-        t_mono_ns=t_mono_ns,
-        tadc=np.where(frames.tadc == NOT_READ, NOT_READ, rng.integers(440, 560, (rows, tiles))),
-        status=status,
-        frame_status=np.where(rng.random(rows) < 0.1, rng.integers(0, 32, rows), 0),
-        servo_counts=np.where(rng.random(rows) < 0.05, NO_SERVO_COUNTS, counts[newest]),
-        servo_age_us=np.where(rng.random(rows) < 0.05, rng.integers(-1, 3000, rows), age_us),
-        reference_force_n=rng.choice([np.nan, np.inf, 3.0], rows),
-    )
-
-
-@pytest.mark.parametrize("lag_ms", [0, 5, 10, 100])
-@settings(max_examples=100, deadline=None)
-@given(
-    rows=st.integers(1, 70),
-    tiles=st.integers(1, 5),
-    seed=st.integers(0, 2**32 - 1),
-    models=st.sampled_from([("unwrap", "static"), ("static",)]),
-    cuts=st.one_of(st.just(range(70)), st.sets(st.integers(1, 69))),
-    how=st.sampled_from(list(LAYOUTS)),
-)
-def test_any_split_in_any_memory_order_gives_the_same_bits(
-    lag_ms: float,
-    rows: int,
-    tiles: int,
-    seed: int,
-    models: tuple[str, ...],
-    cuts: Collection[int],
-    how: str,
-) -> None:
-    rng = np.random.default_rng(seed)
-    positions = [(0.013 * i, 0.01 * (i % 2), -0.15) for i in range(tiles)]
-    info = array_at(
-        positions,
-        servo=make_servo(ratio=0.1),
-        references=[tiles - 1] if tiles > 2 else [],
-        chips=[DATA_SHEET_CHIP, FORUM_CHIP] * 3 if seed % 2 else None,
-    )
-    curves = [
-        newton_tile(
-            serial,
-            coefficients=(0.1, rng.uniform(1, 2), rng.uniform(0, 0.01), rng.uniform(0, 1e-4)),
-            covariance=tuple(tuple(row) for row in (1e-3 * np.eye(3)).tolist()),
-            relative_misfit=0.01,
-        )
-        for serial in info.serials
-    ]
-    plan = newton_plan(info, lag_ms=lag_ms, models=models, tiles=curves)
-    frames = wild_frames(rows, tiles, seed)
-    whole, split = estimate(plan, frames), estimate(plan, *cut_up(frames, cuts, how))
-    assert_same_bits(whole, split)
-    assert split.seq.tolist() == frames.seq.tolist()
-    assert split.t_ns.tolist() == frames.t_ns.tolist()
 
 
 def test_long_batches_give_the_bits_of_short_ones() -> None:

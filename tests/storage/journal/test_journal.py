@@ -140,6 +140,19 @@ def test_a_journal_of_nothing_holds_nothing(tmp_path: Path) -> None:
         reopened(tmp_path / "a" / "b")
 
 
+def test_an_index_of_which_a_power_cut_took_the_segment_goes_when_the_journal_is_opened(
+    tmp_path: Path,
+) -> None:
+    journal = filled(tmp_path, (0, 9), (20, 29))
+    journal.close()
+    journal.append(part(10, 19))
+    journal.close()
+    gone = tmp_path / f"{10:020d}.arrows"
+    gone.unlink()
+    assert_holds(reopened(tmp_path), {*range(10), *range(20, 30)})
+    assert not gone.with_suffix(".idx").exists()
+
+
 def test_a_deleted_journal_is_gone(tmp_path: Path) -> None:
     journal = filled(tmp_path / "journal", (0, 9))
     journal.delete()

@@ -64,13 +64,6 @@ def counts(chip: EmulatedMpl115a2, t_ns: int) -> tuple[int, int]:
     return int.from_bytes(raw[:2], "big") >> 6, int.from_bytes(raw[2:], "big") >> 6
 
 
-def test_a_part_answers_at_0x60_in_both_directions() -> None:
-    chip = part()
-    assert chip.address == 0x60
-    assert chip.start(False, 0)
-    assert chip.start(True, 0)
-
-
 def test_the_new_words_are_there_exactly_at_the_end_of_the_conversion() -> None:
     chip = part()
     convert(chip, 1_000)
@@ -199,13 +192,6 @@ def test_torn_words_are_the_new_pressure_and_the_old_temperature() -> None:
     assert counts(chip, TC_NS // 2 - 1) == (0, 0)
     assert counts(chip, TC_NS // 2) == (1, 0)
     assert counts(chip, TC_NS) == (1, 101)
-
-
-def test_an_aborted_conversion_never_arrives() -> None:
-    chip = part(mode="abort")
-    convert(chip, 0)
-    assert counts(chip, TC_NS - 1) == (0, 0)
-    assert counts(chip, 100 * TC_NS) == (0, 0)
 
 
 @pytest.mark.parametrize("mode", ["stale", "abort", "torn"])

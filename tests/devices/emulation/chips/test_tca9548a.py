@@ -19,15 +19,6 @@ def write(mux: EmulatedTca9548a, *values: int) -> None:
     assert all(mux.write(value) for value in values)
 
 
-def test_at_power_up_every_channel_is_off() -> None:
-    mux = EmulatedTca9548a(0x72, {0: tile(), 7: tile()})
-    assert mux.address == 0x72
-    assert mux.mask == 0
-    assert list(mux.connected()) == []
-    assert mux.start(True, 0)
-    assert mux.read(1) == b"\0"
-
-
 @given(before=st.integers(0, 255), after=st.integers(0, 255))
 def test_a_written_mask_is_latched_at_once_and_in_force_from_the_stop(
     before: int, after: int
