@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -12,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.faults.facts import Facts, journal_of
-from tests.faults.machines import REPOSITORY, Machine, RoundError, wait_for
-from tests.faults.product import NODE, clean_environment, command
+from tests.faults.machines import Machine, RoundError, wait_for
+from tests.faults.product import NODE, run_command
 from tests.faults.stage import Stage
 from tests.faults.stories import Fault
 
@@ -122,13 +121,6 @@ class Alone(Stage):
         then()
         self.facts.stopped_s = time.monotonic()
         self._stopped = True
-        recovered = subprocess.run(
-            command("recover", self.node.root),
-            cwd=REPOSITORY,
-            env=clean_environment() | self.node.disk.environment(),
-            capture_output=True,
-            text=True,
-            timeout=60.0,
-        )
+        recovered = run_command("recover", self.node.root, **self.node.disk.environment())
         if recovered.returncode not in _RECOVERED:
             raise RoundError(f"recover ended with {recovered.returncode}: {recovered.stderr}")

@@ -18,9 +18,8 @@ import httpx
 from tests.faults.clock_step import WallClock
 from tests.faults.disk import SlowSync
 from tests.faults.power import Disk
-from tests.faults.product import NODE, clean_environment, command, product
+from tests.faults.product import NODE, REPOSITORY, clean_environment, command, product
 
-REPOSITORY = Path(__file__).parents[2]
 T = TypeVar("T")
 
 

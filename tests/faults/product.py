@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+REPOSITORY = Path(__file__).parents[2]
 NODE = "foot"
 """What the node is called."""
 
@@ -64,14 +65,19 @@ def product() -> Product:
     )
 
 
-def _help(*arguments: str) -> str:
-    asked = subprocess.run(
-        command(*arguments, "--help"),
-        cwd=Path(__file__).parents[2],
-        env={**clean_environment(), "COLUMNS": "200"},
+def run_command(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run it to its end; what it says is kept."""
+    return subprocess.run(
+        command(*arguments),
+        cwd=REPOSITORY,
+        env={**clean_environment(), **environment},
         capture_output=True,
         text=True,
         timeout=60.0,
-        check=True,
     )
+
+
+def _help(*arguments: str) -> str:
+    asked = run_command(*arguments, "--help", COLUMNS="200")
+    asked.check_returncode()
     return asked.stdout

@@ -8,7 +8,6 @@ import json
 import os
 import random
 import signal
-import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -21,15 +20,8 @@ from tests.faults.clock_step import HOUR_NS
 from tests.faults.disk import SmallDisk, small_disk
 from tests.faults.facts import End, Facts
 from tests.faults.link_witness import Witness
-from tests.faults.machines import (
-    REPOSITORY,
-    Machine,
-    NodeMachine,
-    RoundError,
-    ServerMachine,
-    wait_for,
-)
-from tests.faults.product import NODE, clean_environment, command, product
+from tests.faults.machines import Machine, NodeMachine, RoundError, ServerMachine, wait_for
+from tests.faults.product import NODE, product, run_command
 from tests.faults.proxy import Proxy, Quality
 from tests.faults.stories import SMALL_DISK_BYTES, Fault, Story
 
@@ -250,30 +242,22 @@ class Stage:
 
     def _verify(self, root: Path) -> None:
         if product().verify:
-            verified = subprocess.run(
-                command("verify", root, "--json"),
-                cwd=REPOSITORY,
-                env=clean_environment(),
-                capture_output=True,
-                text=True,
-                timeout=60.0,
-            )
+            verified = run_command("verify", root, "--json")
             self.facts.verify_code = verified.returncode
             self.facts.verify_said = verified.stdout + verified.stderr
 
     # --- kills ------------------------------------------------------------------------------------
 
     def _kill_node(self, fault: Fault) -> None:
-        boot_id = self._end_node("killed", self.node.kill)
-        time.sleep(fault.length_s)
-        self.node.start()
-        self.wait_back(boot_id)
+        self._kill_node_by(self.node.kill, fault)
 
     def _kill_node_parent(self, fault: Fault) -> None:
-        boot_id = self._end_node("killed", self.node.kill_first)
+        self._kill_node_by(self.node.kill_first, fault)
+
+    def _kill_node_by(self, kill: Callable[[], None], fault: Fault) -> None:
+        boot_id = self._end_node("killed", kill)
         time.sleep(fault.length_s)
-        self.node.start()
-        self.wait_back(boot_id)
+        self._node_again(boot_id)
 
     def _kill_acquisition(self, fault: Fault) -> None:
         children = self.node.children()
@@ -308,9 +292,7 @@ class Stage:
         boot_id = self._end_node("killed", self.node.kill)
         self.node.start()
         time.sleep(0.3 + 2.5 * fault.amount)
-        boot_id = self._end_node("killed", self.node.kill) or boot_id
-        self.node.start()
-        self.wait_back(boot_id)
+        self._node_again(self._end_node("killed", self.node.kill) or boot_id)
 
     # --- power ------------------------------------------------------------------------------------
 
@@ -318,8 +300,7 @@ class Stage:
         boot_id = self._end_node("power", self.node.kill)
         self._cut(self.node)
         time.sleep(fault.length_s)
-        self.node.start()
-        self.wait_back(boot_id)
+        self._node_again(boot_id)
 
     def _power_server(self, fault: Fault) -> None:
         self._cut(self.server)
@@ -336,13 +317,13 @@ class Stage:
     # --- the link ---------------------------------------------------------------------------------
 
     def _cut_link(self, fault: Fault) -> None:
-        self.proxy.cut()
-        time.sleep(fault.length_s)
-        self.proxy.mend()
-        self.wait_back()
+        self._lose_link(self.proxy.cut, fault)
 
     def _black_hole(self, fault: Fault) -> None:
-        self.proxy.black_hole()
+        self._lose_link(self.proxy.black_hole, fault)
+
+    def _lose_link(self, lose: Callable[[], None], fault: Fault) -> None:
+        lose()
         time.sleep(fault.length_s)
         self.proxy.mend()
         self.wait_back()
@@ -379,8 +360,7 @@ class Stage:
                 boot_id = self._end_node("power", self.node.kill, slow_s=slow_s)
                 self._cut(self.node)
                 machine.slow.set_s(0.0)
-                self.node.start()
-                self.wait_back(boot_id)
+                self._node_again(boot_id)
             else:
                 self._cut(self.server)
                 machine.slow.set_s(0.0)
@@ -401,18 +381,15 @@ class Stage:
         machine.clock.step_to(self._rng.choice((HOUR_NS, -HOUR_NS)))
         time.sleep(fault.length_s)
 
-    def _full_disk_of_server(self, fault: Fault) -> None:
-        self._full_disk(fault)
-
-    def _full_disk_of_node(self, fault: Fault) -> None:
-        self._full_disk(fault)
-
     def _full_disk(self, fault: Fault) -> None:
+        """Of the machine whose disk is small in this story."""
         assert self._small is not None
         self._small.fill(leave_bytes=round(64e3 * fault.amount))
         time.sleep(1.0 + fault.length_s)
         self._small.free()
         time.sleep(1.0)  # it is noticed that there is room again
+
+    _full_disk_of_server = _full_disk_of_node = _full_disk
 
     # --- at the end -------------------------------------------------------------------------------
 
@@ -431,8 +408,7 @@ class Stage:
         time.sleep(0.2)
         boot_id = self._end_node("killed", self.node.kill)
         self.proxy.mend()
-        self.node.start()
-        self.wait_back(boot_id)
+        self._node_again(boot_id)
 
     def _kill_while_sealing(self, fault: Fault) -> None:
         self._die_while_sealing(fault, self.server.kill)
@@ -486,6 +462,10 @@ class Stage:
 
     def _cut(self, machine: Machine) -> None:
         self.note(f"power of the {machine.name}: {machine.cut_power(self._rng)}")
+
+    def _node_again(self, boot_id: str | None) -> None:
+        self.node.start()
+        self.wait_back(boot_id)
 
     def _server_again(self) -> None:
         self.server.start()
