@@ -94,8 +94,7 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     from storage.sessions import file as session_file
     from storage.sessions.content_hash import ContentDigest, write_file_hash
     from storage.sessions.folder import Part, Session, SessionFolder
-    from storage.sessions.ledger import ledger_of
-    from storage.sessions.states import StreamState
+    from storage.sessions.ledger import StreamState, ledger_of
 
     hash_s = 0.0
 

@@ -17,10 +17,8 @@ import typer.main
 from pydantic import BaseModel
 from typer.core import TyperGroup
 
-from devices.scene.emulation import EmulationScene
-from devices.scene.faults import FaultScene
+from devices.scene.emulated import EmulationScene, FaultScene, GroundScene, MudGround, PoppyGround
 from devices.scene.file import Scene, builtin_scenes
-from devices.scene.grounds import GroundScene, MudGround, PoppyGround
 from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
 from service.api.app import make_app
 from service.api.settings import Settings

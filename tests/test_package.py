@@ -35,7 +35,7 @@ def test_an_installed_wheel_and_a_checkout_both_find_the_page(tmp_path: Path) ->
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
     (wheel,) = tmp_path.glob("*.whl")
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
-    code = "import service.api.page; print(service.api.page.page_folder())"
+    code = "import service.api.app; print(service.api.app.page_folder())"
     for root, page in (
         (tmp_path / "installed", tmp_path / "installed" / "service" / "web"),
         (ROOT, ROOT / "web"),

@@ -21,7 +21,7 @@ from scipy.signal import lfilter
 from devices.arrays import Floats
 from devices.emulation.parts import DomePart, random_of
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulation import EmulationScene
+from devices.scene.emulated import EmulationScene
 
 GRID_S = 0.0005
 """Between grid points pressure is taken as linear: in a tap of 20 ms that is off by 0.01 kPa."""

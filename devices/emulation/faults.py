@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import NamedTuple
 
-from devices.scene.faults import BUS, RATE, FaultKind, FaultScene
+from devices.scene.emulated import BUS, RATE, FaultKind, FaultScene
 
 _BEFORE_NS = 2**62  # later than any instant of the clock
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.emulation.parts import random_of
-from devices.scene.emulation import EmulationScene
+from devices.scene.emulated import EmulationScene
 
 _WEATHER_KPA = (99.0, 101.0)
 """An ordinary day between sea level and 200 m (hardware.md 8: 1.17 kPa per 100 m)."""

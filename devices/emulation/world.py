@@ -19,8 +19,7 @@ import numpy as np
 from devices.arrays import Floats, Times
 from devices.chips.dynamixel.models import COUNTS_PER_TURN
 from devices.clock import Clock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter
-from devices.emulation.buses.line import Line
+from devices.emulation.buses.i2c import EmulatedI2cAdapter, Line
 from devices.emulation.chips.dynamixel import EmulatedServo
 from devices.emulation.chips.front_end import FrontEnd
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
@@ -33,9 +32,8 @@ from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation, Mill
 from devices.emulation.parts import draw_chip, draw_dome, random_of
 from devices.emulation.surroundings import Surroundings
-from devices.scene.faults import BUS, FaultKind, TileFault
+from devices.scene.emulated import BUS, FaultKind, MudGround, TileFault
 from devices.scene.file import Scene
-from devices.scene.grounds import MudGround
 from devices.scene.hardware import ServoScene
 
 _FORESIGHT_S = 0.4  # a thread that is late by less delays no sample

@@ -19,9 +19,7 @@ from typing import Annotated, Self
 from pydantic import Field, ValidationError, model_validator
 
 from devices.errors import SceneError
-from devices.scene.emulation import EmulationScene
-from devices.scene.faults import FaultScene
-from devices.scene.grounds import GroundScene, MudGround, NoGround
+from devices.scene.emulated import EmulationScene, FaultScene, GroundScene, MudGround, NoGround
 from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
 from devices.scene.quantities import NotNegative, Section
 

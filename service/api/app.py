@@ -5,15 +5,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 from fastapi import APIRouter, FastAPI
 from fastapi.responses import FileResponse
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
+from devices.errors import FootTileError
 from service.api import problems
 from service.api.guard import Guard
-from service.api.page import page_folder
 from service.api.routes import access, clock, data, health, nodes, sessions, trash
 from service.api.routes.live import live
 from service.link import INGEST_PATH, LIVE_PATH
@@ -90,3 +91,21 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
     app.mount("/static", StaticFiles(directory=page), name="static")
     app.add_middleware(Guard, hosts=tuple(hosts), token=token)
     return app
+
+
+def page_folder() -> Path:
+    """Folder with `index.html`.
+
+    Raises:
+        FootTileError: the installation lacks it.
+    """
+    here = Path(__file__).resolve().parent
+    # A wheel carries it as service/web, a checkout has it next to service.
+    for folder in (here.parent / "web", here.parents[1] / "web"):
+        if (folder / "index.html").is_file():
+            return folder
+    raise FootTileError(
+        "the live page is not installed",
+        where=str(here.parent / "web"),
+        remedy="Install foottile again",
+    )

@@ -16,9 +16,8 @@ from websockets.frames import CloseCode
 
 from devices.errors import LinkError
 from service.link import MESSAGE_BYTES_MAX, SILENCE_S, SUBPROTOCOL, Hello, Welcome, say
-from service.node.back_off import BackOff, reason_of
 from service.node.connection import Connection, parse
-from service.node.dial import dial, ingest_url
+from service.node.dial import BackOff, dial, ingest_url, reason_of
 from service.node.sending import Greeted, Source
 
 

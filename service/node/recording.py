@@ -22,8 +22,7 @@ from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
 from storage.sessions.folder import Part, Session, SessionFolder
-from storage.sessions.ledger import ledger_of
-from storage.sessions.states import numbers_of, states_of
+from storage.sessions.ledger import ledger_of, numbers_of, states_of
 
 
 class NodeRecording:

@@ -13,7 +13,7 @@ from devices.errors import FootTileError
 from service.estimation.calibration import Calibration
 from service.link import Status, Wanted
 from service.node.acquisition import AcquisitionProcess, Batch, Failed, Health, Message, Started
-from service.node.introduction import hello_of
+from service.node.connection import hello_of
 from service.node.publisher import Publisher
 from service.node.recording import NodeRecording
 from service.node.sending import Source

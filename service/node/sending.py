@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import count
 
@@ -17,7 +17,6 @@ from websockets.asyncio.client import ClientConnection
 
 from devices.errors import DamagedFramesError, LinkError, StorageError
 from service.link import FramesOf, Hello, Status, Wanted, Welcome, say, with_check
-from service.node.backlog import Backlog
 from service.node.flow import Flow
 from storage.intervals import NO_END, Intervals, closed
 from storage.journal.node_stream import NodeStream
@@ -191,3 +190,43 @@ def _before(pair: tuple[int, int | None], hello: Hello, boot_id: str) -> Interva
     """What is lacking and was taken before hello; of the present stream all newer frames follow."""
     newest = hello.next_seq - 1 if boot_id == hello.array_info.boot_id else NO_END
     return closed([pair]).within(0, newest)
+
+
+class Backlog:
+    """Numbers still to be sent behind the newest ones.
+
+    Args:
+        lacks: streams and their numbers, most urgent first; a stream may come more than once.
+    """
+
+    def __init__(self, lacks: Iterable[tuple[str, Intervals]] = ()) -> None:
+        self._lacks = [(boot_id, numbers) for boot_id, numbers in lacks if numbers]
+
+    @property
+    def count(self) -> int:
+        """How many frames."""
+        streams: dict[str, Intervals] = {}
+        for boot_id, numbers in self._lacks:
+            streams[boot_id] = numbers | streams.get(boot_id, Intervals())
+        return sum(numbers.count for numbers in streams.values())
+
+    def add(self, boot_id: str, first: int, last: int) -> None:
+        """These frames could not be sent when they were new."""
+        for stream, numbers in self._lacks:
+            if stream == boot_id:
+                numbers.add(first, last)
+                return
+        self._lacks.append((boot_id, Intervals([(first, last)])))
+
+    def next(self, frames_max: int) -> tuple[str, int, int] | None:
+        """Stream, first and last number of what is to be sent next; None: there is nothing."""
+        for boot_id, numbers in self._lacks:
+            for first, last in numbers:
+                return boot_id, first, min(last, first + frames_max - 1)
+        return None
+
+    def done(self, boot_id: str, first: int, last: int) -> None:
+        """These are sent, or cannot be."""
+        gone = Intervals([(first, last)])
+        left = [(s, n - gone if s == boot_id else n) for s, n in self._lacks]
+        self._lacks = [(stream, numbers) for stream, numbers in left if numbers]

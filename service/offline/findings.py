@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.frames import FrameBatch
-from service.estimation.foot.stances import Stance, Stances
+from service.estimation.foot.contact import Stance, Stances
 from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from service.sessions.ends import at_stop
 from service.sessions.sources import Sources, sources_of
 from service.sessions.streams import SessionStream
 from storage.sessions.folder import Ledger, Session
-from storage.sessions.ledger import ledger_of
-from storage.sessions.states import numbers_of, states_of
+from storage.sessions.ledger import ledger_of, numbers_of, states_of
 
 
 def ledger_now(session: Session, node: ServerNode | None) -> Ledger:

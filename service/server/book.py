@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from devices.errors import UnknownError
 from service.server.trash import Trash
 from service.server_clock import utc_ns
-from storage.sessions.events import write_events
 from storage.sessions.folder import Event, Session, SessionFolder
+from storage.sessions.tables import write_events
 
 log = logging.getLogger("foottile.recorder")
 

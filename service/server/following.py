@@ -14,10 +14,10 @@ from service.server_clock import utc_ns
 from service.sessions.begin import taken_up
 from service.sessions.ends import at_end, at_stop, broken_off, ended
 from service.sessions.streams import SessionStream
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockOffset
 from storage.intervals import NO_END, Intervals
 from storage.sessions.folder import Part, Session
-from storage.sessions.states import numbers_of
+from storage.sessions.ledger import numbers_of
 
 _UNHEARD_S = 1.0
 _SLOWEST = 1.5

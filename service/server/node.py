@@ -23,7 +23,7 @@ from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
 from service.sessions.pipeline import Columns
 from service.sessions.tares import RecordedTare, TareHistory
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockOffset
 from storage.durable import make_folder, storage_errors, write_whole
 from storage.intervals import NO_END, Intervals, with_open_ends
 from storage.journal.journal import RING_NS, Journal

@@ -24,7 +24,7 @@ from service.sessions.begin import begun
 from service.sessions.sources import Sources
 from storage.intervals import NO_END, Intervals, with_open_ends
 from storage.sessions.folder import Ledger, Session
-from storage.sessions.states import numbers_of
+from storage.sessions.ledger import numbers_of
 
 log = logging.getLogger("foottile.recorder")
 

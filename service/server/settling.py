@@ -20,8 +20,8 @@ from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.sessions.sealing import seal
 from storage.intervals import Intervals
-from storage.sessions.events import write_events
 from storage.sessions.folder import Session
+from storage.sessions.tables import write_events
 
 log = logging.getLogger("foottile.recorder")
 

@@ -14,8 +14,7 @@ from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.link import ClockRow, EarlierStream, Hello, PairsByReason
 from service.sessions.streams import SessionStream, around_in
-from storage.clock.log import ClockLog
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockLog, ClockOffset
 from storage.intervals import NO_END, Intervals
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes

@@ -30,10 +30,9 @@ from storage.durable import remove_stale_temporaries
 from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import settle_left_over
 from storage.journal.segment import UNREAD_SUFFIX
-from storage.sessions.events import EVENTS_NAME, write_events
 from storage.sessions.folder import Ledger, Part, Session, SessionFolder, new_session_id
-from storage.sessions.ledger import ledger_of
-from storage.sessions.states import numbers_of, states_of
+from storage.sessions.ledger import ledger_of, numbers_of, states_of
+from storage.sessions.tables import EVENTS_NAME, write_events
 from storage.verify.session import verify_session
 
 Outcome = Literal["sealed", "waiting", "failed"]

@@ -19,8 +19,7 @@ from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
 from storage.intervals import NO_END
 from storage.journal.journal import Journal
 from storage.sessions.folder import Session
-from storage.sessions.ledger import lost_numbers
-from storage.sessions.states import states_of
+from storage.sessions.ledger import lost_numbers, states_of
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Protocol
 from devices.frames import ArrayInfo
 from storage.intervals import NO_END
 from storage.journal.journal import Journal
-from storage.sessions.states import StreamState
+from storage.sessions.ledger import StreamState
 
 
 class Around(Protocol):

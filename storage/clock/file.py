@@ -14,7 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import FileFormatError
 from storage.clock.bounds import Rows
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockOffset
 from storage.clock.table import StreamFacts
 from storage.durable import write_whole
 

@@ -12,10 +12,9 @@ import zlib
 from contextlib import suppress
 from pathlib import Path
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from devices.errors import StorageError
-from storage.clock.offset import ClockOffset
 from storage.durable import make_folder, storage_errors, sync_folder
 
 NAME = "clock.jsonl"
@@ -109,3 +108,15 @@ def _write(descriptor: int, data: bytes) -> None:
     view = memoryview(data)
     while view:
         view = view[os.write(descriptor, view) :]
+
+
+class ClockOffset(BaseModel):
+    """How far the server's UTC was from the `t_ns` of a stream, at one instant."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    boot_id: str
+    t_mono_ns: int
+    server_minus_node_ns: int
+    uncertainty_ns: int
+    """The truth is within plus or minus this: half the probe's round trip."""

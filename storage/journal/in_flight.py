@@ -21,7 +21,6 @@ from devices.acquisition import FrameRow, RangeFlag
 from devices.errors import StorageError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from storage.durable import make_folder, storage_errors
-from storage.kernel import kernel_boot_id
 
 IN_FLIGHT_FILE = "in_flight"
 ROWS = 8192
@@ -179,4 +178,15 @@ def _described(content: bytes) -> ArrayInfo | None:
     try:
         return ArrayInfo.model_validate_json(description)
     except ValueError:
+        return None
+
+
+BOOT_ID_FILE = Path("/proc/sys/kernel/random/boot_id")
+
+
+def kernel_boot_id() -> str | None:
+    """The kernel's name of its present start; None where there is no such thing."""
+    try:
+        return BOOT_ID_FILE.read_text(encoding="ascii").strip() or None
+    except (OSError, ValueError):
         return None

@@ -21,12 +21,12 @@ from devices.frames import ArrayInfo
 from storage.durable import make_folder, storage_errors
 from storage.folder_lock import locked
 from storage.intervals import Intervals
+from storage.journal.in_flight import kernel_boot_id
 from storage.journal.left_over import recover_stream
 from storage.journal.node_stream import NodeStream
 from storage.journal.retention import BUDGET_BYTES, Retention
 from storage.journal.stream_notes import StreamNotes
 from storage.journal.wanted import ServerWants, Wanted
-from storage.kernel import kernel_boot_id
 from storage.losses import DISK_FULL, DISK_SLOW, READ_ONLY
 from storage.wire import EncodedBatch
 

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import FileFormatError, FootTileError, UnknownError
 from storage.checked_json import with_check, without_check
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockOffset
 from storage.durable import make_folder, storage_errors, sync_folder, write_whole
 
 FRAMES_NAME = "frames.parquet"

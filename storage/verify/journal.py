@@ -16,7 +16,7 @@ from storage.journal.segment_format import INDEX_SUFFIX, RECORD
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.losses import CORRUPT, Losses
 from storage.sessions.claims import bytes_of
-from storage.sessions.states import StreamState
+from storage.sessions.ledger import StreamState
 from storage.verify.segment import SegmentReport, verify_segment
 
 

@@ -13,16 +13,14 @@ from devices.array.budget import BusTiming
 from devices.array.scan import Scan
 from devices.buses.i2c import I2cBus
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter
-from devices.emulation.buses.line import Line
+from devices.emulation.buses.i2c import EmulatedI2cAdapter, Line
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.faults import Faults
 from devices.emulation.parts import random_of
 from devices.frames import TileInfo
 from devices.recovery.recovery import BusRecovery
-from devices.scene.emulation import ReadDuringConversion
-from devices.scene.faults import BUS, FaultKind, TileFault
+from devices.scene.emulated import BUS, FaultKind, ReadDuringConversion, TileFault
 from devices.scene.hardware import ScheduleName
 from tests.builders.arrays import DATA_SHEET_CHIP, make_tile
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import random
 from collections.abc import Iterable, Sequence
 from functools import partial, reduce
 from operator import and_
@@ -19,8 +20,7 @@ from typing import Protocol
 
 from devices.buses.i2c import i2c_msg
 from devices.clock import Clock
-from devices.emulation.buses.line import Line
-from devices.emulation.faults import Faults
+from devices.emulation.faults import Fault, Faults
 
 I2C_RDWR_IOCTL_MAX_MSGS = 42  # include/uapi/linux/i2c-dev.h
 MESSAGE_BYTES_MAX = 8192  # the kernel's limit of one message
@@ -239,3 +239,47 @@ def _read(
     if disturbed is not None:
         values = bytes([disturbed.disturbed(value, t_ns) for value in values])
     ctypes.memmove(message.buf, values, message.len)
+
+
+_ADDRESS_BITS = 8
+
+
+class Line:
+    """SDA and SCL, healthy but for `faults`; chance is drawn from `label`."""
+
+    def __init__(self, faults: Faults, label: str) -> None:
+        self.sda_low = faults.of("sda_low")
+        self.sda_high = faults.of("sda_high")
+        self.scl_low = faults.of("scl_low")
+        self.adapter_timeout = faults.of("adapter_timeout")
+        self._nack_storm = faults.of("nack_storm")
+        self._bit_errors = faults.of("bit_errors")
+        self._faults = faults
+        # Not numpy's: a draw for every byte has to be cheap. A label's text seeds it the same way
+        # on every machine.
+        self._rng = random.Random(label)  # noqa: S311  # no secret
+
+    @property
+    def sound(self) -> bool:
+        """Is nothing wrong on this bus, now or later?"""
+        return not self._faults.possible
+
+    def wedged(self, t_ns: int) -> bool:
+        """Does a transfer that begins now end in the adapter's time-out?"""
+        if self.scl_low(t_ns):
+            return True
+        return self._happens(self.adapter_timeout, t_ns)
+
+    def loses_acknowledge(self, t_ns: int) -> bool:
+        """Is this acknowledge not seen?"""
+        return self._happens(self._nack_storm, t_ns)
+
+    def disturbed(self, value: int, t_ns: int) -> int:
+        """The byte as it arrives: with one bit turned over, by chance."""
+        if self._happens(self._bit_errors, t_ns):
+            return value ^ 1 << self._rng.randrange(_ADDRESS_BITS)
+        return value
+
+    def _happens(self, fault: Fault, t_ns: int) -> bool:
+        rate = fault.rate(t_ns)
+        return rate > 0.0 and self._rng.random() < rate

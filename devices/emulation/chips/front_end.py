@@ -15,7 +15,7 @@ from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.emulation.faults import Fault
 from devices.emulation.parts import ChipPart, DomePart, random_of
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulation import EmulationScene
+from devices.scene.emulated import EmulationScene
 
 _KPA_PER_PCOMP = (PRESSURE_MAX_KPA - PRESSURE_MIN_KPA) / 1023
 _TADC_PER_KELVIN = -5.35

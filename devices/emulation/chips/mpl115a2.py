@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from devices.emulation.faults import Fault, Faults
-from devices.scene.emulation import ReadDuringConversion
+from devices.scene.emulated import ReadDuringConversion
 
 _CONVERT = 0x12
 _REGISTERS = 0x80

@@ -14,8 +14,7 @@ from devices.emulation.ground.load_trace import CopTransform, LoadTrace, Pressed
 from devices.emulation.ground.mill import Indentation
 from devices.emulation.parts import random_of
 from devices.errors import SceneError, UsageError
-from devices.scene.file import Scene
-from devices.scene.grounds import (
+from devices.scene.emulated import (
     IndentationGround,
     MudGround,
     NoGround,
@@ -24,6 +23,7 @@ from devices.scene.grounds import (
     RollingGround,
     TraceGround,
 )
+from devices.scene.file import Scene
 from devices.scene.hardware import TileScene
 
 

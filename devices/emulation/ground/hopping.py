@@ -21,7 +21,7 @@ from devices.emulation.ground.hopping_leg import STEP_S, HoppingLeg, Leg, Strip
 from devices.emulation.ground.soft_ground import SoftGround
 from devices.emulation.parts import random_of
 from devices.errors import SceneError
-from devices.scene.grounds import MudGround, PoppyGround
+from devices.scene.emulated import MudGround, PoppyGround
 
 HOPS = 3
 

@@ -16,7 +16,7 @@ from devices.arrays import Floats, Ints, Times
 from devices.clock import Clock
 from devices.emulation.chips.mcp3208 import EmulatedMcp3208, amplifier_volts
 from devices.emulation.ground.ground import Ground
-from devices.scene.grounds import IndentationGround
+from devices.scene.emulated import IndentationGround
 from devices.scene.hardware import ReferenceScene, TileScene
 
 _MILL_NOISE_N = 0.02

@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from devices.scene.grounds import MudGround, PoppyGround
+from devices.scene.emulated import MudGround, PoppyGround
 
 GRAVITY_M_S2 = 9.81
 _PA_M_PER_N_CM3 = 1e6

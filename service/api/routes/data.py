@@ -27,10 +27,10 @@ from service.version import SOFTWARE
 from storage.clock.file import CLOCK_NAME
 from storage.formats.export import MEDIA_TYPES, ClockName, Format, Slice, export
 from storage.schema import KNOWN
-from storage.sessions.clock import clock_beside
 from storage.sessions.content_hash import sha256_of
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import FRAMES_NAME, Session
+from storage.sessions.tables import clock_beside
 
 router = APIRouter(prefix="/sessions", tags=["data"])
 

@@ -36,8 +36,14 @@ from service.estimation.bench.indentation import (
     strokes,
     unloaded,
 )
-from service.estimation.bench_facts import BandPoint, BenchFacts
-from service.estimation.calibration import LOOP_OPENS_N, TileCalibration, is_monotonic, loop_share
+from service.estimation.calibration import (
+    LOOP_OPENS_N,
+    BandPoint,
+    BenchFacts,
+    TileCalibration,
+    is_monotonic,
+    loop_share,
+)
 
 BAND_STEPS = 10  # of the band in the file
 MEAN_STEPS = 30  # of the mean curve, fine enough for a cubic

@@ -10,7 +10,7 @@ from smbus2 import i2c_msg
 
 from devices.errors import BusMisuseError, BusSetupError
 from devices.frames import NOT_READ, TileStatus
-from devices.scene.faults import FaultKind
+from devices.scene.emulated import FaultKind
 from devices.scene.hardware import ScheduleName
 from tests.devices.array.wiring import every_schedule, failing, to_tiles
 from tests.devices.rigs import (

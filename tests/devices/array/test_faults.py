@@ -22,7 +22,7 @@ from devices.emulation.buses.gpio import EmulatedLines
 from devices.emulation.world import World
 from devices.frames import NOT_READ, FrameBatch, FrameStatus, TileStatus
 from devices.recovery.recovery import GpioRecovery
-from devices.scene.faults import BusFault, FaultKind, MuxFault, TileFault
+from devices.scene.emulated import BusFault, FaultKind, MuxFault, TileFault
 from devices.scene.file import build_scene
 from devices.scene.hardware import ScheduleName
 from tests.builders.witness import Verdict, Witness

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from smbus2 import i2c_msg
 
 from devices.array.budget import BusTiming, frame_s
-from devices.scene.emulation import ReadDuringConversion
+from devices.scene.emulated import ReadDuringConversion
 from devices.scene.hardware import ScheduleName
 from tests.devices.rigs import (
     CONVERT,

@@ -22,7 +22,7 @@ from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.parts import draw_chip, random_of
 from devices.emulation.world import World
 from devices.errors import BusFaultError, TileSetupError
-from devices.scene.emulation import ReadDuringConversion
+from devices.scene.emulated import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 from tests.builders.scenes import make_scene
 from tests.devices.rigs import FOUR, ONE, TWO_MUXES, Plugs, Wires, hesitating

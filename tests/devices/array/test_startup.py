@@ -15,7 +15,7 @@ from devices.clock import VirtualClock
 from devices.emulation.parts import ChipPart, draw_chip
 from devices.emulation.world import World
 from devices.errors import BusFaultError, BusSetupError, SceneError, TileSetupError
-from devices.scene.faults import FaultKind
+from devices.scene.emulated import FaultKind
 from devices.scene.file import Scene, load_scene
 from devices.scene.hardware import ScheduleName
 from tests.builders.scenes import make_scene

@@ -12,8 +12,7 @@ from smbus2 import SMBus, i2c_msg
 
 from devices.buses.i2c import I2cBus, PatientBus, open_bus
 from devices.clock import VirtualClock
-from devices.emulation.buses.i2c import EmulatedI2cAdapter
-from devices.emulation.buses.line import Line
+from devices.emulation.buses.i2c import EmulatedI2cAdapter, Line
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.faults import Faults
 from devices.errors import (

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from devices.emulation.dome import GRID_S, Domes
 from devices.emulation.parts import DomePart
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulation import EmulationScene
+from devices.scene.emulated import EmulationScene
 
 Floats = npt.NDArray[np.float64]
 Force = Callable[[Floats], Floats]

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.emulation.faults import Fault, Faults
-from devices.scene.faults import FaultKind, FaultScene
+from devices.scene.emulated import FaultKind, FaultScene
 
 S = 1_000_000_000
 EPOCH_NS = 77 * S

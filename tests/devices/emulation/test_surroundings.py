@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.integrate import solve_ivp
 
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulation import EmulationScene
+from devices.scene.emulated import EmulationScene
 
 Floats = npt.NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from devices.scene.emulated import MudGround, PoppyGround
 from devices.scene.file import builtin_scenes, load_scene
-from devices.scene.grounds import MudGround, PoppyGround
 from tests.devices.scene.texts import refused, scene, tile
 
 # What loads

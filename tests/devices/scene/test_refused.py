@@ -9,7 +9,7 @@ from typing import get_args
 import pytest
 
 from devices.errors import SceneError
-from devices.scene.faults import FaultKind
+from devices.scene.emulated import FaultKind
 from devices.scene.file import load_scene, parse_scene
 from tests.devices.scene.texts import refused, scene, tile
 

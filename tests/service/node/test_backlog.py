@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.node.backlog import Backlog
+from service.node.sending import Backlog
 from storage.intervals import Intervals
 
 pairs = st.lists(

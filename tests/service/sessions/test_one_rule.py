@@ -24,14 +24,13 @@ from service.server.settling import Settling
 from service.server.trash import Trash
 from service.sessions.recover import recover
 from service.sessions.tares import TareHistory
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockOffset
 from storage.journal.journal import Journal
 from storage.journal.node_journal import NodeJournal
 from storage.journal.stream_notes import StreamNotes
 from storage.losses import Losses
 from storage.sessions.folder import Part, Session, SessionFolder
-from storage.sessions.ledger import ledger_of
-from storage.sessions.states import states_of
+from storage.sessions.ledger import ledger_of, states_of
 from storage.verify.session import verify_session
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration, make_tare

@@ -19,7 +19,7 @@ from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from service.sessions import recover as recover_module
 from service.sessions.recover import Recovery, recover
 from service.sessions.sealing import seal
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockOffset
 from storage.folder_lock import locked
 from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import StorageError
-from storage.clock.log import ClockLog
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockLog, ClockOffset
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 

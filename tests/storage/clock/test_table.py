@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from storage.clock.bounds import Rows
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockOffset
 from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
 from storage.schema import NO_INSTANT
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, StorageError, UnknownError
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockOffset
 from storage.sessions.folder import (
     Event,
     Ledger,

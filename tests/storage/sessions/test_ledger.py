@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from storage.intervals import NO_END, Intervals
 from storage.losses import Losses
 from storage.sessions.folder import Part
-from storage.sessions.ledger import ledger_of
-from storage.sessions.states import StreamState
+from storage.sessions.ledger import StreamState, ledger_of
 
 pairs = st.lists(
     st.tuples(st.integers(0, 60), st.integers(0, 20)).map(lambda p: (p[0], p[0] + p[1])), max_size=5

@@ -18,13 +18,12 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.sessions.sealing import seal
 from service.sessions.sources import Sources
 from storage.checked_json import with_check
-from storage.clock.offset import ClockOffset
+from storage.clock.log import ClockOffset
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.losses import Losses
 from storage.sessions.folder import Event, Part, Session, SessionFolder
-from storage.sessions.ledger import ledger_of
-from storage.sessions.states import StreamState
+from storage.sessions.ledger import StreamState, ledger_of
 from storage.verify.data import verdict_of, verify
 from storage.verify.file import verify_file
 from storage.verify.session import SessionReport, verify_session

@@ -11,7 +11,7 @@ from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
-from devices.scene.emulation import ReadDuringConversion
+from devices.scene.emulated import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP
 
 MUX, OTHER_MUX, TILE = 0x70, 0x71, 0x60

@@ -18,7 +18,7 @@ from devices.emulation.chips.front_end import FrontEnd
 from devices.emulation.faults import Fault
 from devices.emulation.parts import ChipPart, DomePart
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulation import EmulationScene
+from devices.scene.emulated import EmulationScene
 from tests.builders.arrays import DATA_SHEET_CHIP
 
 Floats = npt.NDArray[np.float64]

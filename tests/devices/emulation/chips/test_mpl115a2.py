@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Sense, Silicon
 from devices.emulation.faults import Fault
-from devices.scene.emulation import ReadDuringConversion
+from devices.scene.emulated import ReadDuringConversion
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 
 TC_NS = 1_900_000

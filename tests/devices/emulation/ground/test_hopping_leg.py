@@ -12,7 +12,7 @@ from devices.emulation.ground import hopping_leg
 from devices.emulation.ground.hopping_leg import LEG_M, HoppingLeg, Leg, Strip
 from devices.emulation.ground.soft_ground import GRAVITY_M_S2, SoftGround
 from devices.errors import SceneError
-from devices.scene.grounds import MudGround, PoppyGround
+from devices.scene.emulated import MudGround, PoppyGround
 
 Floats = npt.NDArray[np.float64]
 

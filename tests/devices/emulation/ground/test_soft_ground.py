@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.emulation.ground.soft_ground import SoftGround
-from devices.scene.grounds import MudGround, PoppyGround
+from devices.scene.emulated import MudGround, PoppyGround
 
 POPPY = SoftGround.of(PoppyGround(kind="poppy"))
 MUD = SoftGround.of(MudGround(kind="mud"))

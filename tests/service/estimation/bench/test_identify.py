@@ -15,7 +15,7 @@ import pytest
 from devices.emulation.dome import Domes
 from devices.emulation.parts import DomePart, draw_dome
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulation import EmulationScene
+from devices.scene.emulated import EmulationScene
 from service.estimation.bench.effects_fit import fit_effects
 from service.estimation.bench.fit import fit_tile
 from service.estimation.bench.indentation import Indentation

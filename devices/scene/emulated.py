@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self, get_args
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from devices.scene.quantities import Kelvin, LoadN, NotNegative, Positive, Section
 
@@ -108,3 +108,85 @@ GroundScene = Annotated[
     | TraceGround,
     Field(discriminator="kind"),
 ]
+
+
+ReadDuringConversion = Literal["stale", "abort", "torn"]
+
+
+class EmulationScene(Section):
+    """`[emulation]`: which effects the emulated domes and chips show. A real node ignores it."""
+
+    noise_kpa: Annotated[float, Field(ge=0, le=100)] = 0.165
+    """Standard deviation of a single reading in all: core, outliers and rounding."""
+    correlated_ms: NotNegative = 0.0
+    """Correlation time of the noise's core; 0: white."""
+    repeatability: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Standard deviation of the normalised output between loadings (paper III-A: 0.03)."""
+    gas: bool = True
+    """Adiabatic overshoot of fast loads."""
+    rubber: bool = True
+    """Creep of the dome."""
+    hysteresis: bool = True
+    """Rate-independent loop of the dome."""
+    ambient_degc: Annotated[float, Field(gt=-273.15, allow_inf_nan=False)] = 21.0
+    ambient_kpa: Annotated[float, Field(ge=50, le=115)] | None = None
+    """Pressure of the atmosphere, which only a reference tile feels: the chip's range. Absent: an
+    ordinary day's, drawn from 99 to 101."""
+    temperature_step_k: Kelvin = 0.0
+    """A step of the surroundings' temperature ..."""
+    temperature_step_s: NotNegative = 0.0
+    """... this long after power-up. Chip and gas follow with different delays."""
+    head_kpa: NotNegative = 0.0
+    """Hydrostatic pressure on the domes ..."""
+    head_s: NotNegative = 0.0
+    """... from this long after power-up on."""
+    clip_kpa: NotNegative = 0.0
+    """Analogue clip of the chips; 0: none, they wrap (as real parts do)."""
+    read_during_conversion: ReadDuringConversion = "stale"
+    scl_part: Annotated[float, Field(gt=0, le=4)] = 1.0
+    """What the bus clock really is, relative to `array.scl_hz`: 0.625 is the Raspberry Pi whose
+    core idles at 250 MHz (hardware.md 3.2)."""
+
+
+TileFault = Literal["no_answer", "unplugged", "replaced", "stale", "slow", "all_ones", "over_range"]
+MuxFault = Literal["brown_out", "mux_reset"]
+BusFault = Literal["sda_low", "sda_high", "scl_low", "adapter_timeout", "nack_storm", "bit_errors"]
+FaultKind = Literal[TileFault, MuxFault, BusFault]
+
+RATE = 0.01
+"""How often a fault strikes that comes by chance, unless a scene says otherwise."""
+
+BUS = "bus"
+"""Target of a fault that is no tile's and no multiplexer's."""
+
+
+class FaultScene(Section):
+    """`[[fault]]`: something fails `t_s` after the scene began, for `duration_s`.
+
+    At `t_s` = 0 it has failed before the start.
+    """
+
+    kind: FaultKind
+    tile: str | None = None
+    """Which tile; for faults of a tile."""
+    mux: int | None = None
+    """Which multiplexer; for faults of one."""
+    t_s: NotNegative
+    duration_s: Positive
+    rate: Annotated[float, Field(gt=0, le=1)] = RATE
+    """How often, for what comes by chance: of the bytes for `nack_storm` and `bit_errors`, of the
+    transfers for `adapter_timeout`."""
+
+    @property
+    def target(self) -> str:
+        """What fails: a tile's serial, a mux as "0x70", or the bus."""
+        return self.tile or (BUS if self.mux is None else f"0x{self.mux:02x}")
+
+    @model_validator(mode="after")
+    def _names_what_fails(self) -> Self:
+        needs_tile, needs_mux = self.kind in get_args(TileFault), self.kind in get_args(MuxFault)
+        if needs_tile != (self.tile is not None):
+            raise ValueError(f"{self.kind} is {'' if needs_tile else 'no '}fault of a tile")
+        if needs_mux != (self.mux is not None):
+            raise ValueError(f"{self.kind} is {'' if needs_mux else 'no '}fault of a mux")
+        return self
