@@ -9,35 +9,52 @@ is d).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
 
+from devices.array.scan import Scan
 from devices.scene.hardware import ScheduleName
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
-    from devices.array.array import TileArray
-    from devices.array.scan import Scan
+class Transfers(Protocol):
+    """What a schedule puts in order: the transfers of an array, as `TileArray` does them."""
 
-    Schedule = Callable[[TileArray, Scan], None]
+    @property
+    def indices(self) -> Sequence[int]:
+        """All tiles."""
+
+    @property
+    def by_mux(self) -> Sequence[Sequence[int]]:
+        """Tiles of each multiplexer."""
+
+    def convert(self, scan: Scan, tiles: Sequence[int]) -> None:
+        """Start a conversion in all of these tiles at once."""
+
+    def collect(self, scan: Scan, tile: int) -> None:
+        """Read the conversion of a tile as soon as it is finished."""
+
+    def close_ranks(self) -> None:
+        """Wait until all tiles can be read and started one right after the other."""
 
 
-def sequential(array: TileArray, scan: Scan) -> None:
+Schedule = Callable[[Transfers, Scan], None]
+
+
+def sequential(array: Transfers, scan: Scan) -> None:
     """Tile by tile: select, convert, wait, read. The slow and plain reference."""
     for tile in array.indices:
         array.convert(scan, [tile])
         array.collect(scan, tile)
 
 
-def simultaneous(array: TileArray, scan: Scan) -> None:
+def simultaneous(array: Transfers, scan: Scan) -> None:
     """Open all channels, one CONVERT for all tiles, wait once, then read each: no skew."""
     array.convert(scan, array.indices)
     for tile in array.indices:
         array.collect(scan, tile)
 
 
-def pipelined(array: TileArray, scan: Scan) -> None:
+def pipelined(array: Transfers, scan: Scan) -> None:
     """Read what a tile has converted since the last frame, and start it again at once.
 
     While one tile converts, the others are served, so that the wait costs nothing but for the
@@ -49,7 +66,7 @@ def pipelined(array: TileArray, scan: Scan) -> None:
         array.convert(scan, [tile])
 
 
-def per_mux(array: TileArray, scan: Scan) -> None:
+def per_mux(array: Transfers, scan: Scan) -> None:
     """One CONVERT for all tiles of a mux, while the tiles of the other muxes are read.
 
     Before the tiles of a mux are read, those of the mux before it, which were read last, are

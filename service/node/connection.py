@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Coroutine
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -24,12 +24,10 @@ from service.link import (
     say,
 )
 from service.node.clock_probes import ClockProbes
+from service.node.options import NodeOptions
 from service.node.sending import Greeted, Sending
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
-
-if TYPE_CHECKING:
-    from service.node.run import NodeOptions
 
 STATUS_EVERY_S = 1.0
 """It is for people to read."""

@@ -6,18 +6,16 @@ import asyncio
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from devices.errors import FootTileError
-from service.estimation.calibration import Calibration
 from service.link import Status, Wanted
 from service.node.acquisition import AcquisitionProcess, Batch, Failed, Health, Message, Started
 from service.node.connection import hello_of
+from service.node.options import NodeOptions
 from service.node.publisher import Publisher
 from service.node.recording import NodeRecording
 from service.node.sending import Source
-from service.rig.rig import RigOptions
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
 from storage.journal.wanted import ServerWants
@@ -30,29 +28,6 @@ _AWAY_LOOKS = 50
 """Without a link for a second it does not wait at all."""
 _TROUBLES_S = 0.5
 """Between two looks at the disk's troubles."""
-
-
-@dataclass(frozen=True)
-class NodeOptions:
-    """What a node does.
-
-    Attributes:
-        rig: the array to open.
-        journal: the node's folder.
-        server: address of the server; None: none, it records for itself.
-        record: name of a session that is recorded on the node itself; None: none is.
-        calibration: of its tiles, for the server to estimate with.
-        calibration_problem: why there is none.
-        token: for servers that want one.
-    """
-
-    rig: RigOptions
-    journal: Path
-    server: str | None
-    record: str | None = None
-    calibration: Calibration | None = None
-    calibration_problem: str | None = None
-    token: str | None = None
 
 
 @dataclass(frozen=True)

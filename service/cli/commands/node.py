@@ -18,7 +18,8 @@ from service.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
-    from service.node.run import NodeOptions, Outcome
+    from service.node.options import NodeOptions
+    from service.node.run import Outcome
     from service.rig.rig import RigOptions
 
 SERVER = "http://127.0.0.1:8000"
@@ -67,7 +68,7 @@ def node_command(
     from platformdirs import user_state_path
 
     from service.node.dial import ingest_url
-    from service.node.run import NodeOptions
+    from service.node.options import NodeOptions
     from service.rig.rig import RigOptions
 
     if end_with_parent:
