@@ -27,6 +27,13 @@ from tests.service.recording import Recording
 T = TypeVar("T")
 
 
+def assert_refused(answer: httpx.Response, status: int, *words: str) -> None:
+    """The answer is a problem with this status, and its detail has all of these words."""
+    assert answer.status_code == status, answer.text
+    for word in words:
+        assert word in answer.json()["detail"]
+
+
 class Running:
     """A server in a thread with an event loop of its own."""
 

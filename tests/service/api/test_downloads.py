@@ -21,7 +21,7 @@ from devices.errors import LinkError, StateError
 from service.offline.client import Client
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
-from tests.service.running import Running
+from tests.service.running import Running, assert_refused
 
 
 @dataclass(frozen=True)
@@ -243,9 +243,7 @@ def test_queries_that_ask_for_different_data_have_different_tags(sealed: Sealed)
 
 def test_parquet_of_a_recording_session_is_not_there_yet(sealed: Sealed) -> None:
     for query in ({}, {"format": "parquet"}, {"columns": "seq"}):
-        answer = sealed.made(sealed.recording, **query)
-        assert answer.status_code == 409
-        assert "csv" in answer.json()["detail"]
+        assert_refused(sealed.made(sealed.recording, **query), 409, "csv")
 
 
 @pytest.mark.parametrize("to", ["arrow", "csv"])
@@ -301,9 +299,7 @@ def test_an_odd_id_is_not_found(sealed: Sealed) -> None:
 def test_a_file_that_was_taken_away_is_said_to_be(sealed: Sealed) -> None:
     path = sealed.session.folder / "frames.parquet"
     path.unlink()
-    answer = sealed.get()
-    assert answer.status_code == 404
-    assert "taken away" in answer.json()["detail"]
+    assert_refused(sealed.get(), 404, "taken away")
     assert sealed.made(format="csv").status_code in (404, 500)
     assert sealed.running.http.get("/health").status_code == 200
 

@@ -10,7 +10,7 @@ import service.server.recorder
 from devices.frames import FrameBatch
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf, Play
-from tests.service.running import Running
+from tests.service.running import Running, assert_refused
 from tests.waiting import until
 
 
@@ -64,16 +64,13 @@ def test_a_stop_answers_sealed_while_the_node_streams(
 def test_a_session_is_stopped_once(running: Running, tared: FakeNode) -> None:
     session = tared.record()
     session.stop()
-    answer = running.http.post(f"{session.url}/stop")
-    assert answer.status_code == 409
-    assert "stopped already" in answer.json()["detail"]
+    assert_refused(running.http.post(f"{session.url}/stop"), 409, "stopped already")
 
 
 def test_a_node_that_is_away_cannot_be_recorded(running: Running, tared: FakeNode) -> None:
     tared.leave()
     answer = running.http.post("/sessions", json={"node": "bench", "name": "x"})
-    assert answer.status_code == 409
-    assert "not sending" in answer.json()["detail"]
+    assert_refused(answer, 409, "not sending")
 
 
 def test_a_node_without_frames_cannot_be_recorded(running: Running, node: FakeNode) -> None:
@@ -95,9 +92,7 @@ def test_a_node_without_frames_cannot_be_recorded(running: Running, node: FakeNo
 def test_an_unknown_node_is_not_found(
     running: Running, method: str, path: str, body: object
 ) -> None:
-    answer = running.http.request(method, path, json=body)
-    assert answer.status_code == 404
-    assert "'nobody'" in answer.json()["detail"]
+    assert_refused(running.http.request(method, path, json=body), 404, "'nobody'")
 
 
 def test_a_session_that_is_stopped_while_the_node_is_away_completes_when_it_is_back(
@@ -299,5 +294,4 @@ def test_a_node_that_is_still_catching_up_is_not_recorded(
 ) -> None:
     monkeypatch.setattr(service.server.recorder, "BEHIND_S", 2.0)
     answer = running.http.post("/sessions", json={"node": "bench", "name": "too early"})
-    assert answer.status_code == 409
-    assert "behind" in answer.json()["detail"]
+    assert_refused(answer, 409, "behind")

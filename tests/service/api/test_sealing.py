@@ -16,7 +16,7 @@ from service.sessions.sealing import seal
 from tests.builders.arrays import COUNT_KPA
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf
-from tests.service.running import Running
+from tests.service.running import Running, assert_refused
 from tests.storage.faulty_disk import failing_once
 from tests.waiting import until
 
@@ -52,10 +52,7 @@ def test_a_tare_under_load_is_refused_and_names_the_tile(running: Running, tared
     # Longer than the ten seconds that a tare looks back.
     tared.next_t_mono_ns += 11_000_000_000
     tared.deliver(300, [0.0, 40.0])
-    answer = running.http.post("/nodes/bench/tare", json={})
-    assert answer.status_code == 409
-    assert "T02" in answer.json()["detail"]
-    assert "loaded" in answer.json()["detail"]
+    assert_refused(running.http.post("/nodes/bench/tare", json={}), 409, "T02", "loaded")
     assert len(running.http.get("/nodes/bench/tares").json()["items"]) == 1
 
 
@@ -99,9 +96,7 @@ def test_tares_outlive_the_server(running: Running, tared: FakeNode) -> None:
 
 def test_a_node_that_is_away_is_not_tared(running: Running, tared: FakeNode) -> None:
     tared.leave()
-    answer = running.http.post("/nodes/bench/tare", json={})
-    assert answer.status_code == 409
-    assert "away" in answer.json()["detail"]
+    assert_refused(running.http.post("/nodes/bench/tare", json={}), 409, "away")
 
 
 def test_a_tare_during_a_recording_serves_from_then_on(running: Running, tared: FakeNode) -> None:

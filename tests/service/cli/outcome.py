@@ -15,6 +15,12 @@ class Outcome:
     out: str
     err: str
 
+    def fails(self, code: int, *words: str) -> None:
+        """It has ended with this code, and its second stream has all of these words."""
+        assert self.code == code, self.err
+        for word in words:
+            assert word in self.err
+
 
 Run = Callable[..., Outcome]
 

@@ -19,7 +19,7 @@ from storage.intervals import Intervals
 from storage.sessions.folder import DOOMED_PREFIX, SessionFolder
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
-from tests.service.running import Running, closed
+from tests.service.running import Running, assert_refused, closed
 from tests.storage.faulty_disk import refusing
 from tests.waiting import until
 
@@ -57,9 +57,7 @@ def test_a_deleted_session_is_in_the_trash_and_can_be_had_back_as_it_was(
     assert (answer.status_code, answer.content) == (204, b"")
     assert ids(running, "/sessions") == []
     assert running.http.get("/trash").json()["items"] == [kept]
-    gone = running.http.get(session.url)
-    assert gone.status_code == 404
-    assert "trash" in gone.json()["detail"]
+    assert_refused(running.http.get(session.url), 404, "trash")
     assert running.http.get(f"{session.url}/data").status_code == 404
     answer = running.http.post(f"/trash/{session.id}/restore")
     assert answer.status_code == 200
@@ -95,9 +93,7 @@ def test_emptying_the_trash_deletes_for_good_and_says_how_much(
 
 def test_a_session_that_is_recorded_is_not_deleted(running: Running, tared: FakeNode) -> None:
     session = tared.record()
-    answer = running.http.delete(session.url)
-    assert answer.status_code == 409
-    assert "Stop it first" in answer.json()["detail"]
+    assert_refused(running.http.delete(session.url), 409, "Stop it first")
     assert session.now()["state"] == "recording"
 
 
@@ -117,9 +113,7 @@ def test_a_session_that_is_being_sealed_is_not_deleted(
         session.stop()
         tared.send(10, now=True)
         until(lambda: session.now()["state"] == "sealing")
-        answer = running.http.delete(session.url)
-        assert answer.status_code == 409
-        assert "sealed" in answer.json()["detail"]
+        assert_refused(running.http.delete(session.url), 409, "sealed")
     finally:
         may_seal.set()
     session.sealed()
@@ -252,9 +246,7 @@ def test_what_is_given_up_within_a_session_is_lost_for_that_reason(
 
 def test_only_a_pending_session_can_be_given_up(running: Running, tared: FakeNode) -> None:
     recording = tared.record()
-    answer = running.http.post(f"{recording.url}/seal")
-    assert answer.status_code == 409
-    assert "Stop it first" in answer.json()["detail"]
+    assert_refused(running.http.post(f"{recording.url}/seal"), 409, "Stop it first")
     tared.finish(recording)
     assert running.http.post(f"{recording.url}/seal").status_code == 409
 

@@ -31,8 +31,7 @@ def scene(tmp_path: Path) -> Path:
 
 def test_bench_writes_json_tables_and_plot(run: Run, scene: Path, tmp_path: Path) -> None:
     outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "new/folder", "--json")
-    assert outcome.code == 0, outcome.err
-    assert "rolling: 2 of 2 draws" in outcome.err
+    outcome.fails(0, "rolling: 2 of 2 draws")
     folder = tmp_path / "new" / "folder"
     content = json.loads((folder / "bench.json").read_text())
     assert json.loads(outcome.out) == content
@@ -72,8 +71,7 @@ def test_a_draw_that_fails_is_reported_and_the_others_count(
 
     monkeypatch.setattr(draws, "find_calibration", refuses)
     outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
-    assert outcome.code == 3
-    assert "rolling, draw 1: tile T03 does not rise" in outcome.err
+    outcome.fails(3, "rolling, draw 1: tile T03 does not rise")
     assert "- draw 1: tile T03 does not rise" in (tmp_path / "o" / "bench.md").read_text()
     (rolling,) = json.loads((tmp_path / "o" / "bench.json").read_text())["scenes"]
     assert rolling["draws"] == 1
@@ -85,9 +83,7 @@ def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(
 ) -> None:
     scene.write_text(scene.read_text().replace("paper-eq2-shape", "nowhere.json"))
     outcome = run("bench", "--scene", scene, "--draws", 2, *QUICK, "--out", "o")
-    assert outcome.code == 1
-    assert "none of 2 draws gave a figure" in outcome.err
-    assert "nowhere.json" in outcome.err
+    outcome.fails(1, "none of 2 draws gave a figure", "nowhere.json")
     assert not list((tmp_path / "o").iterdir())
 
 
@@ -103,16 +99,12 @@ def test_a_scene_of_which_no_draw_can_be_used_leaves_nothing_behind(
 def test_what_cannot_be_meant_is_refused_before_anything_takes_time(
     run: Run, arguments: tuple[object, ...], says: str
 ) -> None:
-    outcome = run("bench", *arguments, "--out", "o")
-    assert outcome.code == 2
-    assert says in outcome.err
+    run("bench", *arguments, "--out", "o").fails(2, says)
 
 
 def test_a_scene_of_real_hardware_is_refused(run: Run, scene: Path) -> None:
     scene.write_text(scene.read_text() + '\n[array]\nbus = "/dev/i2c-1"\n')
-    outcome = run("bench", "--scene", scene, "--out", "o")
-    assert outcome.code == 2
-    assert "only emulates" in outcome.err
+    run("bench", "--scene", scene, "--out", "o").fails(2, "only emulates")
 
 
 def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
@@ -122,5 +114,4 @@ def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
 
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     outcome = run("bench", "--scene", "rolling", "--out", "o")
-    assert outcome.code == 2
-    assert "pip install 'foottile[plot]'" in outcome.err
+    outcome.fails(2, "pip install 'foottile[plot]'")

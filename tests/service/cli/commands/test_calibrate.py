@@ -32,13 +32,11 @@ def test_calibrate_merges_files_and_its_tables_fit_a_narrow_terminal(
     assert "…" not in outcome.out
     assert max(len(line) for line in outcome.out.splitlines()) <= 80
     twice = run("calibrate", "1.parquet", "1.parquet", "--out", "twice.json")
-    assert twice.code == 1
-    assert "the same frames are given twice" in twice.err
+    twice.fails(1, "the same frames are given twice")
     parts = ("--parts-seed", 9, "--out", "parts.parquet")
     run("simulate", "--scene", "short.toml", "--tiles", "T01", *parts)
     other = run("calibrate", "1.parquet", "parts.parquet", "--out", "other.json")
-    assert other.code == 1
-    assert "tile T01 has another chip" in other.err
+    other.fails(1, "tile T01 has another chip")
     assert not Path("other.json").exists()
 
 
@@ -59,8 +57,7 @@ def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, be
     assert "saturated" in printed["refused"]["T02"]
     assert "tile T02 refused" in outcome.err
     estimate = run("estimate", "bench.parquet", "--out", "e.parquet", "--calibration", "cal.json")
-    assert estimate.code == 1
-    assert "no calibration for tile T02: it was refused" in estimate.err
+    estimate.fails(1, "no calibration for tile T02: it was refused")
 
 
 def test_an_assumed_scale_is_said_in_text_json_and_file(run: Run) -> None:

@@ -136,9 +136,7 @@ def test_more_channels_than_allowed_at_once_is_no_schedule(run: Run) -> None:
 
 
 def test_which_bus_has_to_be_said(run: Run) -> None:
-    outcome = run("doctor")
-    assert outcome.code == 2
-    assert "--bus" in outcome.err
+    run("doctor").fails(2, "--bus")
 
 
 def test_a_bus_that_does_not_exist_is_a_failure_in_one_line(run: Run) -> None:
@@ -201,6 +199,5 @@ def test_without_help_a_bus_that_hangs_is_named_and_no_tile_is_blamed(
 ) -> None:
     (tmp_path / "scene.toml").write_text(scene_text("standing") + faulty("sda_low"))
     outcome = run("simulate", "--scene", "scene.toml", "--seconds", 1, "--no-estimates")
-    assert outcome.code == 1
-    assert "SDA is stuck low" in outcome.err
+    outcome.fails(1, "SDA is stuck low")
     assert "T01" not in outcome.err

@@ -122,9 +122,7 @@ def test_a_journal_and_its_segment_are_proven_alone(run: Run, data: Path) -> Non
 
 def test_what_is_lone_says_what_it_does_not_prove(run: Run, data: Path) -> None:
     run("recover", data)
-    found = run("verify", data / "sessions" / ID / "frames.parquet")
-    assert found.code == 0
-    assert "not proven: " in found.err
+    run("verify", data / "sessions" / ID / "frames.parquet").fails(0, "not proven: ")
 
 
 @pytest.mark.parametrize("command", ["verify", "recover"])
@@ -178,6 +176,5 @@ def test_estimates_of_frames_out_of_order_are_refused(run: Run, data: Path, tmp_
     assert len(pq.read_table(mixed)) == 60
     out = tmp_path / "out.parquet"
     found = run("estimate", mixed, "--out", out, "--calibration", "paper-eq2-shape")
-    assert found.code == 1
-    assert "out of order: part 0: frame 0 follows frame 59" in found.err
+    found.fails(1, "out of order: part 0: frame 0 follows frame 59")
     assert not out.exists()
