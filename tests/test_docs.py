@@ -276,7 +276,7 @@ def test_every_module_that_is_made_for_one_pressure_chip_is_named() -> None:
         if name.startswith(("devices/", "storage/", "service/")) and re.search(
             r"^from devices\.chips\.mpl115a2 import", path.read_text("utf-8"), re.MULTILINE
         ):
-            assert f"`{name}`" in part, name
+            assert f"`{name}`" in part, f"CONTRIBUTING.md has to name {name}"
 
 
 PATH = re.compile(
