@@ -162,8 +162,7 @@ def test_a_node_that_was_switched_on_anew_has_a_clock_for_each_start(
     node.send(50)
     node.taken_in()
     first = node.boot_id
-    node.leave()
-    node.reboot()
+    node.restart()
     begun(node, HOUR_NS)
     node.send(50)
     node.taken_in()

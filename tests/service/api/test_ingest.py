@@ -178,8 +178,7 @@ def test_a_node_that_has_left_may_come_back_with_another_boot(
 ) -> None:
     node.connect()
     node.deliver(10)
-    node.leave()
-    node.reboot()
+    node.restart()
     assert node.connect() == [(0, None)]
     assert running.node()["boot_id"] == node.boot_id
     node.deliver(10)
