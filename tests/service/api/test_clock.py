@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from service.cli.main import main
-from service.offline.client import Client
+from service.client import Client
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused

@@ -7,8 +7,8 @@ import threading
 
 import pytest
 
+import service.api.routes.ingest
 import service.server
-import service.server.ingest
 import service.server.node
 import service.server.streams
 import storage.journal.segment
