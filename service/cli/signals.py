@@ -1,4 +1,4 @@
-"""How a command that runs until it is told to stop is told."""
+"""Signals that stop a long-running command."""
 
 from __future__ import annotations
 

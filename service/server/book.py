@@ -12,7 +12,7 @@ from service.server_clock import utc_ns
 from storage.sessions.folder import Event, Session, SessionFolder
 from storage.sessions.tables import write_events
 
-log = logging.getLogger("foottile.recorder")
+log = logging.getLogger("foottile.book")
 
 
 class SessionBook:

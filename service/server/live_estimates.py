@@ -58,7 +58,7 @@ class LiveEstimates:
                 EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
                 self._calibration = calibration
                 self._know_ranges(calibration)
-            except FootTileError as error:  # does not fit these tiles: said, and done without
+            except FootTileError as error:  # does not fit these tiles: report it and go without
                 self.calibration_problem = str(error)
         self.use(tare)
 

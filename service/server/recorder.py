@@ -1,7 +1,7 @@
-"""Recording: sessions are started, stopped, given up, deleted and had back, and told of.
+"""Recording: starts, stops, gives up, deletes and restores sessions, and reports them.
 
-Starting and stopping only note numbers and instants; the frames are in the journals anyway. What
-becomes of a session after that is `service.server.settling`'s.
+Starting and stopping only note numbers and instants; the frames are in the journals anyway.
+`service.server.settling` does what follows.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class Recorder:
         self._settling.forget(session_id)
 
     def restore(self, session_id: str) -> Session:
-        """Have a session back from the trash; if it was pending, it goes on to be so.
+        """Restore a session from the trash; if it was pending, it stays pending.
 
         Raises:
             UnknownError: it is not in the trash.
@@ -205,7 +205,7 @@ class Recorder:
         return frames / node.info.nominal_rate_hz
 
     def sources(self, session_id: str) -> Sources:
-        """What a session is made from, sealed or given away before.
+        """Sources that a session can be sealed or exported from.
 
         Raises:
             UnknownError: no such session, or its node is not known here.
@@ -229,7 +229,7 @@ class Recorder:
         )
 
     def wanted(self, node_name: str) -> Wanted:
-        """The same as the node is told it."""
+        """The same numbers as the message that the node gets."""
         streams = tuple(
             StreamNumbers(boot_id=boot_id, numbers=with_open_ends(numbers))
             for boot_id, numbers in sorted(self.needed(node_name).items())

@@ -1,4 +1,4 @@
-"""What one server process holds (nodes, recorder, subscribers, links), and does each tick."""
+"""One server process: its nodes, recorder, subscribers and links, and its tick."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ class Link:
         self.news.set()
 
     def acks(self) -> dict[str, Intervals]:
-        """What it is to be told of that, once."""
+        """Take the acknowledgements that wait to be sent; each is returned once."""
         acks, self._acks = self._acks, {}
         return acks
 
     def end(self, code: Close, reason: str) -> None:
-        """Have the connection closed."""
+        """Ask for the connection to be closed."""
         self.closing = self.closing or (code, reason)
         self.ended.set()
 

@@ -23,7 +23,7 @@ from storage.intervals import Intervals
 from storage.sessions.folder import Session
 from storage.sessions.tables import write_events
 
-log = logging.getLogger("foottile.recorder")
+log = logging.getLogger("foottile.settling")
 
 _SEAL_AGAIN_S = 10.0
 
@@ -70,7 +70,7 @@ class Settling:
                 continue
             try:
                 self._settle(session)
-            except FootTileError as error:  # one that cannot be must not hold up the others
+            except FootTileError as error:  # it must not hold up the others
                 log.warning("session %s: %s", session.id, error)
                 self._again_after[session.id] = time.monotonic() + _SEAL_AGAIN_S
 

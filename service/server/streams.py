@@ -191,11 +191,11 @@ class ServerStream:
         return self.held.missing(self._first_seq, newest) - self._forgotten
 
     def lacks(self, needed: Intervals, *, all_of_it: bool) -> Intervals:
-        """What the node has and is missing here.
+        """Numbers that the node has and that are missing here.
 
         Args:
-            needed: by sessions.
-            all_of_it: not only that.
+            needed: numbers that sessions need.
+            all_of_it: ask for all that is missing; False: only for `needed`.
         """
         if self.node_has is None:
             return Intervals()

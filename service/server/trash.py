@@ -61,7 +61,7 @@ class Trash:
         return self._sessions.pop(session_id)
 
     def doom(self) -> list[Path]:
-        """Have none of its sessions come back; gives the folders that are to be deleted.
+        """Give up all sessions of the trash for good; return the folders to delete.
 
         Raises:
             StorageError: one of them cannot be moved; it and those after it are still here.

@@ -110,7 +110,7 @@ def recover(
     recovery.removed += remove_stale_temporaries(data)
     set_aside = _set_aside(data)
     if _is_local(data):
-        settle_left_over(data)  # a node's: what it had in flight when it was killed is there yet
+        settle_left_over(data)  # a killed node leaves its frames in flight in a file
     opened, recovery.problems = open_streams(data, tell, is_local=_is_local(data))
     for path in sorted(_set_aside(data) - set_aside):
         name = f"{path.parent.parent.name}/{path.parent.name}"
@@ -198,15 +198,16 @@ def _described(
 def _of_no_session(
     data: Path, known: list[Session], streams: Streams, now: Callable[[], datetime]
 ) -> list[Session]:
-    """Sessions of the frames that belong to none, one for every run of a stream."""
-    # What was deleted is not wanted back, and what of it cannot be read says nothing of its frames.
+    """Sessions for frames that belong to no session, one for each run of a stream."""
+    # Frames of a deleted session must not come back as a new one. A session in the trash that
+    # cannot be read does not say which frames it has.
     known = [*known, *SessionFolder(data / "trash").load_all()[0]]
     found = []
     for (node, boot_id), stream in streams.items():
         parts = (part for session in known if session.node == node for part in session.parts)
         taken = numbers_of(parts).get(boot_id, Intervals())
         journal, hello = stream.journal, hello_of(data, node)
-        # What was lost between two frames does not part them; what a session took does.
+        # Lost frames do not split a run; frames that belong to a session do.
         own = (journal.held | stream.lost.all | stream.damaged) - taken
         for run in own:
             held = list(journal.held.within(*run))

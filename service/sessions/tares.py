@@ -168,8 +168,8 @@ def _read_chips(content: Any) -> tuple[tuple[int, ...], ...] | None:
 def _bounded(tares: list[RecordedTare]) -> list[RecordedTare]:
     automatic = [t for t in tares if t.is_automatic]
     if len(automatic) > AUTOMATIC_KEPT_MAX:
-        # The one that says least: of the older half that whose neighbours are closest. Not the very
-        # first, for others may be held against it.
+        # Drop the tare that says least: in the older half, the one with the closest neighbours. The
+        # very first stays, because others may be compared with it.
         gaps_ns = {
             now.id: after.tare.t_ns - before.tare.t_ns
             for before, now, after in zip(automatic, automatic[1:], automatic[2:], strict=False)
