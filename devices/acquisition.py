@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from devices.array.array import TileArray
-from devices.array.scan import Scan
+from devices.array.ports import Scan
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.clock import Clock, UtcAnchor

@@ -31,11 +31,43 @@
 Every error keeps its facts: `what` happened, `where`, what was `expected`, and the `remedy`. Those
 that a stranger would catch by a built-in type are that type too. In a running stream a fault is a
 status bit and a NaN (see `devices.frames`); these errors stop a command, never a stream.
+
+`needs_extra` stands where packages are imported that not every installation has.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar, TypedDict, Unpack
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import ClassVar, Literal, TypedDict, Unpack
+
+Extra = Literal["server", "emulation", "plot", "gpio", "rig"]
+
+_OURS = ("devices", "storage", "service")
+
+
+@contextmanager
+def needs_extra(extra: Extra, what: str, *, remedy: str = "") -> Iterator[None]:
+    """Where packages of an extra are imported: a `with` block, or the decorator of a function.
+
+    Args:
+        extra: the extra of `pyproject.toml` that brings them.
+        what: does not work without them; the error's text begins with it.
+        remedy: what else helps.
+
+    Raises:
+        MissingExtraError: one of them is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in _OURS:  # a mistake of ours, which no package mends
+            raise
+        raise MissingExtraError(
+            f"{what} needs {package}, which is not installed",
+            remedy=remedy or f"Install it: pip install 'foottile[{extra}]'",
+        ) from error
 
 
 class _Facts(TypedDict, total=False):

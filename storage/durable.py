@@ -1,7 +1,13 @@
-"""Writing so that it stays written: whole files or none, synced, and errors a user can act on."""
+"""Writing so that it stays written: whole files or none, synced, and errors a user can act on.
+
+Here also: the lock of a folder, since two processes that write in it would each undo what the other
+does, and JSON that carries a hash of its own text as its last key, so that an edit is seen.
+"""
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import os
 import re
 import secrets
@@ -148,3 +154,68 @@ def storage_errors(path: Path, remedy: str = "") -> Iterator[None]:
             remedy=remedy or "Free space on the disk, or write elsewhere",
             errno=error.errno,
         ) from error
+
+
+LOCK_NAME = ".lock"
+
+
+@contextmanager
+def locked(
+    folder: Path,
+    *,
+    is_shared: bool = False,
+    refusal: str = "a foottile server or node uses this folder",
+    remedy: str = "Stop it first: while it runs, it completes sessions by itself",
+) -> Iterator[None]:
+    """Hold the folder's lock; a running server or node holds it as long as it runs.
+
+    Args:
+        folder: must be there.
+        is_shared: others that hold it shared do not matter.
+        refusal: what is said if another process holds it.
+        remedy: what to do then.
+
+    Raises:
+        StorageError: another process holds it (`errno` is None), or it cannot be opened.
+    """
+    with storage_errors(folder):
+        # To read is enough for a lock, and possible on a disk that takes nothing any more.
+        descriptor = os.open(folder / LOCK_NAME, os.O_RDONLY | os.O_CREAT, 0o666)
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise StorageError(refusal, where=str(folder), remedy=remedy) from error
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+CHECK = "check"
+_END = re.compile(rb',\n "check": "([0-9a-f]{64})"\n\}\Z')
+
+
+def with_check(text: bytes) -> bytes:
+    """The object with its hash as the last key.
+
+    Args:
+        text: a JSON object with at least one key, and without this one.
+    """
+    body = text.rstrip().removesuffix(b"}").rstrip()
+    digits = hashlib.sha256(body).hexdigest()
+    return body + b',\n "check": "' + digits.encode() + b'"\n}'
+
+
+def without_check(text: bytes) -> bytes:
+    """The object without its hash; the same bytes if it carries none."""
+    end = _END.search(text)
+    return text if end is None else text[: end.start()] + b"\n}"
+
+
+def is_unchanged(text: bytes) -> bool | None:
+    """Has the text the hash that it states? None if it states none."""
+    end = _END.search(text)
+    if end is None:
+        return None
+    return hashlib.sha256(text[: end.start()]).hexdigest().encode() == end[1]

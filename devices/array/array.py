@@ -18,8 +18,7 @@ from devices.array.bus_watch import BusWatch
 from devices.array.conversion_watch import ConversionWatch
 from devices.array.health import TileHealth
 from devices.array.judge import Judge
-from devices.array.ports import TilePorts
-from devices.array.scan import Scan
+from devices.array.ports import Scan, TilePorts
 from devices.array.schedules import SCHEDULES
 from devices.array.search import Search
 from devices.buses.i2c import I2cBus

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from devices.array.scan import Scan
+from devices.array.ports import Scan
 from devices.chips.tca9548a import MuxRouter
 from devices.clock import Clock
 from devices.errors import BusFaultError, BusSetupError

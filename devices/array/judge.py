@@ -12,8 +12,7 @@ from contextlib import suppress
 
 from devices.array.bus_watch import BusWatch
 from devices.array.health import TileHealth, is_impossible
-from devices.array.ports import TilePorts
-from devices.array.scan import Scan
+from devices.array.ports import Scan, TilePorts
 from devices.clock import Clock
 from devices.errors import NoAcknowledgeError
 from devices.frames import TileStatus

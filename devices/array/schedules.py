@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-from devices.array.scan import Scan
+from devices.array.ports import Scan
 from devices.scene.hardware import ScheduleName
 
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from devices.array.health import TileHealth
-from devices.array.ports import TilePorts
-from devices.array.scan import Scan
+from devices.array.ports import Scan, TilePorts
 from devices.clock import Clock
 from devices.errors import NoAcknowledgeError, TileSetupError
 from devices.frames import TileStatus

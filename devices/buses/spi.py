@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from devices.errors import SpiSetupError, UsageError
-from devices.extras import needs_extra
+from devices.errors import SpiSetupError, UsageError, needs_extra
 
 MAX_SPEED_HZ = 1_000_000
 """What an MCP3208 stands at the Pi's 3.3 V (hardware.md 6)."""

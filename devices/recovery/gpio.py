@@ -16,8 +16,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING
 
-from devices.errors import BusSetupError
-from devices.extras import needs_extra
+from devices.errors import BusSetupError, needs_extra
 from devices.scene.hardware import RecoveryScene
 
 if TYPE_CHECKING:

@@ -104,7 +104,7 @@ async def serving(app: FastAPI, listening: socket.socket) -> AsyncIterator[None]
         timeout_graceful_shutdown=_GRACE_S,
     )
     logging.getLogger("uvicorn.error").addFilter(_is_news)
-    server = _Server(config)
+    server = _UvicornWithoutSignals(config)
     task = asyncio.create_task(server.serve([listening]))
     try:
         while not server.started and not task.done():
@@ -122,7 +122,7 @@ def _is_news(record: logging.LogRecord) -> bool:
     return "without completing handshake" not in record.getMessage()
 
 
-class _Server(uvicorn.Server):
+class _UvicornWithoutSignals(uvicorn.Server):
     """Leaves signals to its caller."""
 
     @contextmanager

@@ -1,21 +1,33 @@
-"""What several commands share: options that are pairs, output paths, progress, and JSON."""
+"""What several commands share: options that are pairs, output paths, progress, and JSON.
+
+With them the options of an emulated foot, and how a command is told to stop.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import json
 import math
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
 from devices.errors import UsageError
+from devices.scene.file import Scene, load_scene
+from devices.scene.hardware import EMULATED
+
+if TYPE_CHECKING:
+    from service.rig.emulated import EmulatedFoot
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
@@ -126,3 +138,130 @@ def say(message: str) -> None:
 def remark(message: str) -> None:
     """A line on stderr that a user should see, wherever it goes."""
     stderr.print(message, style="dim", highlight=False, markup=False, soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class FootOptions:
+    """An emulated foot, as options of a command that is decorated by `with_foot_options`."""
+
+    load: Annotated[
+        Path | None, typer.Option(help="Recorded load to press instead of the scene's ground.")
+    ] = None
+    load_scale: Annotated[float, typer.Option(help="Factor on every force of the load.")] = 1.0
+    cop_scale: Annotated[float, typer.Option(help="Factor on the load's COP about its mean.")] = 1.0
+    cop_offset_m: Annotated[
+        str, typer.Option(metavar="X,Y", help="Where the load's mean COP comes to lie.")
+    ] = "0,0"
+    cop_axes: Annotated[
+        str, typer.Option(help="Axes of the load that become x and y: xy, yx, -yx, ...")
+    ] = "xy"
+    lead_s: Annotated[float, typer.Option(help="Seconds without load first: the tare.")] = 1.0
+    seed: Annotated[int, typer.Option(min=0, help="Draws noise and ground, not the parts.")] = 0
+    parts_seed: Annotated[int, typer.Option(min=0, help="Draws other parts.")] = 0
+
+    def foot(self, scene: Scene) -> EmulatedFoot:
+        """What they ask for, in a scene.
+
+        Raises:
+            UsageError: options that do not fit, or a number that cannot be meant.
+            LoadTraceError: the load is not readable.
+        """
+        from devices.emulation.ground.load_trace import CopTransform
+        from service.rig.emulated import EmulatedFoot
+        from storage.formats.load_trace import read_load_trace
+
+        for option, value, least in (
+            ("--load-scale", self.load_scale, 0.0),
+            ("--cop-scale", self.cop_scale, None),
+            ("--lead-s", self.lead_s, -1e-9),
+        ):
+            if not abs(value) < 1e9 or (least is not None and value <= least):
+                raise UsageError(f"{option} {value:g}", expected="a sensible positive number")
+        if self.load is not None and scene.array.bus != EMULATED:
+            raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
+        if scene.array.bus == EMULATED and scene.ground.kind == "trace" and self.load is None:
+            raise UsageError(
+                f"scene {scene.name!r} presses a recorded load, and none was given",
+                remedy="Add --load FILE",
+            )
+        offset_m = pair(self.cop_offset_m, "--cop-offset-m") or (0.0, 0.0)
+        return EmulatedFoot(
+            load=read_load_trace(self.load) if self.load is not None else None,
+            load_scale=self.load_scale,
+            cop=CopTransform(self.cop_scale, offset_m, self.cop_axes),
+            lead_s=self.lead_s,
+            seed=self.seed,
+            parts_seed=self.parts_seed,
+        )
+
+    def as_arguments(self) -> list[str]:
+        """The same options for another command."""
+        values = {f.name.replace("_", "-"): getattr(self, f.name) for f in fields(self)}
+        return [f"--{name}={value}" for name, value in values.items() if value is not None]
+
+
+def with_foot_options(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose parameter `options`, a `FootOptions`, is an option for each of its fields."""
+    own = inspect.signature(command, eval_str=True)
+    of_foot = inspect.signature(FootOptions, eval_str=True).parameters
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        options = FootOptions(**{name: given.pop(name) for name in of_foot})
+        command(**given, options=options)
+
+    parameters = [p for p in own.parameters.values() if p.name != "options"] + [*of_foot.values()]
+    # What typer reads of a function.
+    run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+def check_emulated(scene: Scene) -> None:
+    """Refuse a scene of real hardware in a command that only emulates.
+
+    Raises:
+        UsageError: its bus or its servo is real.
+    """
+    if scene.array.bus != EMULATED:
+        raise UsageError(
+            f"scene {scene.name!r} is for {scene.array.bus}, and this command only emulates",
+            remedy='Set array.bus = "emulated"',
+        )
+    if scene.servo is not None and scene.servo.port != EMULATED:
+        raise UsageError(
+            f"the servo of scene {scene.name!r} is at {scene.servo.port}, and this command only "
+            "emulates",
+            remedy='Set servo.port = "emulated"',
+        )
+
+
+def scene_with(name: str, *, bus: str | None, servo: str | None) -> Scene:
+    """A scene, on another bus or with its servo elsewhere if that is asked for.
+
+    Raises:
+        SceneError: no such scene.
+        UsageError: a servo's port for a scene without servo.
+    """
+    scene = load_scene(name)
+    if bus is not None:
+        scene = scene.model_copy(update={"array": scene.array.model_copy(update={"bus": bus})})
+    if servo == "none":
+        return scene.model_copy(update={"servo": None})
+    if servo is not None:
+        if scene.servo is None:
+            raise UsageError(
+                f"scene {scene.name!r} has no servo, and --servo {servo} names its port",
+                remedy="Add a [servo] section to the scene",
+            )
+        scene = scene.model_copy(update={"servo": scene.servo.model_copy(update={"port": servo})})
+    return scene
+
+
+def stop_on_signals() -> asyncio.Event:
+    """An event that Ctrl-C or SIGTERM sets, in the running loop."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    return stop

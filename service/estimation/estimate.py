@@ -26,8 +26,7 @@ from service.estimation.foot.contact import (
 )
 from service.estimation.foot.geometry import angle_rad, to_ground_x_m
 from service.estimation.foot.kinematics import Readings, counts_at, readings_of
-from service.estimation.lower import LowerState, apparent_forces, tile_kpa
-from service.estimation.pending import Pending, PendingFrames
+from service.estimation.lower import LowerState, Pending, PendingFrames, apparent_forces, tile_kpa
 from service.estimation.plan import SIGMAS, EstimationPlan
 from service.estimation.upper import Foot, UpperState, foot_of, grid_index, summed, tile_forces
 

@@ -1,6 +1,8 @@
 """The lower part of the ladder: counts to the apparent force on every dome, reading by reading.
 
 Apparent is what the static curve gives, before hysteresis and creep of the rubber are undone.
+
+`Pending` holds the frames whose look-ahead is not complete.
 """
 
 from __future__ import annotations
@@ -14,11 +16,76 @@ from devices.arrays import Arrays, Bools, Floats, Ints, Times
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.estimates import EstimateStatus
-from service.estimation.models import ambient, gas, skew, temperature
+from service.estimation.foot.kinematics import Readings
+from service.estimation.models import ambient, denoise, gas, skew, temperature
 from service.estimation.models.outliers import despiked
 from service.estimation.models.unwrap import unwrap
 from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
-from service.estimation.tare.drift import has_warmed
+from service.estimation.tare.tare import has_warmed
+
+
+@dataclass(frozen=True)
+class PendingFrames(Arrays):
+    """Facts of frames that are needed once, when their estimate is due; arrays (n,).
+
+    Attributes:
+        seq: number in the stream.
+        t_ns: UTC.
+        loaded: does the foot seem loaded, from `contact.seeming`?
+        since_ns: since when it has seemed so.
+    """
+
+    seq: npt.NDArray[np.uint64]
+    t_ns: Times
+    loaded: Ints
+    since_ns: Times
+
+
+@dataclass(frozen=True)
+class Pending:
+    """What is known of frames without an estimate so far.
+
+    Attributes:
+        forces: of these frames, after those that are only there to be reached back to.
+        frames: these frames.
+        readings: of the servo in these frames; None without one.
+    """
+
+    forces: ApparentForces
+    frames: PendingFrames
+    readings: Readings | None
+
+    @property
+    def first(self) -> int:
+        """Row of `forces` at which `frames` begins."""
+        return len(self.forces.run) - len(self.frames.seq)
+
+    def followed_by(self, later: Pending) -> Pending:
+        """These frames and then later ones."""
+        readings = later.readings
+        if readings is not None and self.readings is not None:
+            readings = Readings.concatenate([self.readings, readings])
+        return Pending(
+            ApparentForces.concatenate([self.forces, later.forces]),
+            PendingFrames.concatenate([self.frames, later.frames]),
+            readings,
+        )
+
+    def after(self, given: int, *, reach_back: bool) -> Pending:
+        """Without the first `given` frames, but for what averages will reach back to."""
+        n, end = len(self.frames.seq), len(self.forces.run)
+        keep = first = self.first + given
+        if reach_back:
+            t_mono_ns = self.forces.t_mono_ns
+            # The next one may not be here yet; it will be no earlier than the last that is.
+            oldest_ns = t_mono_ns[min(first, end - 1)] - denoise.PAST_NS
+            keep = max(int(np.searchsorted(t_mono_ns, oldest_ns)), first - int(denoise.REACHES[-1]))
+        return Pending(
+            self.forces.rows(keep, end),
+            self.frames.rows(given, n),
+            None if self.readings is None else self.readings.rows(given, n),
+        )
+
 
 NEVER_NS = -(1 << 62)
 

@@ -15,8 +15,7 @@ from devices.errors import FootTileError, StorageError
 from service.estimation.calibration import Calibration
 from service.server_clock import utc_ns
 from service.sessions.begin import begun, numbered, taken_up
-from service.sessions.ends import at_end, broken_off
-from service.sessions.streams import SessionStream
+from service.sessions.ends import SessionStream, at_end, broken_off
 from storage.durable import remove_stale_temporaries
 from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import NodeJournal

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from service.estimation.bench.confidence import curve_n, mean_band_n, new_loading_band_n
+from service.estimation.bench.effects_fit import Replay, replays
 from service.estimation.bench.indentation import Indentation, pressed_in, strokes
-from service.estimation.bench.replay import Replay, replays
 from service.estimation.calibration import Calibration, TileCalibration
 from service.offline.plots import new_figure, png_of
 

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from devices.errors import CalibrationError
-from devices.extras import needs_extra
+from devices.errors import CalibrationError, needs_extra
 from devices.scene.file import Scene, build_scene, load_scene
 from service.estimation.calibration import PRESETS, Calibration
 from service.rig.emulated import EmulatedFoot

@@ -5,7 +5,7 @@ from __future__ import annotations
 from io import BytesIO
 from typing import TYPE_CHECKING
 
-from devices.extras import needs_extra
+from devices.errors import needs_extra
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

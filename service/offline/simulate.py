@@ -33,7 +33,7 @@ from devices.scene.hardware import AnySchedule, ServoScene
 from service.offline.findings import Findings, FindingsOf
 from service.rig.description import describe
 from service.rig.emulated import EmulatedFoot
-from service.rig.peripherals import open_recovery_lines, open_reference_sensor
+from service.rig.rig import open_recovery_lines, open_reference_sensor
 from service.sessions.pipeline import EstimateOptions, EstimateStream, Extra, notes_of
 from storage.sessions.file import SessionWriter
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from devices.clock import Clock
 from devices.emulation.ground.grounds import press_on
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace
-from devices.extras import needs_extra
+from devices.errors import needs_extra
 from devices.scene.file import Scene
 
 if TYPE_CHECKING:

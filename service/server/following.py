@@ -3,21 +3,25 @@
 A session is a list of intervals of streams. A node that is switched on again adds a part, and so
 does every stream that it took meanwhile and brings home. Where a part ends is decided in
 `service.sessions.ends`.
+
+What is known of a session as of now follows from them: its ledger, and what it is made from.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 
+from devices.errors import FootTileError
 from service.server.node import ServerNode
 from service.server_clock import utc_ns
 from service.sessions.begin import taken_up
-from service.sessions.ends import at_end, at_stop, broken_off, ended
-from service.sessions.streams import SessionStream
+from service.sessions.ends import SessionStream, at_end, at_stop, broken_off, ended
+from service.sessions.sources import Sources, sources_of
 from storage.clock.log import ClockOffset
 from storage.intervals import NO_END, Intervals
-from storage.sessions.folder import Part, Session
-from storage.sessions.ledger import numbers_of
+from storage.sessions.folder import Ledger, Part, Session
+from storage.sessions.ledger import ledger_of, numbers_of, states_of
 
 _UNHEARD_S = 1.0
 _SLOWEST = 1.5
@@ -205,3 +209,45 @@ def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
     if stream.may_come.within(0, oldest[0] - 1):
         return None
     return taken_t_ns + offset_ns - round(oldest[0] / rate_hz * 1e9) <= stop_t_ns
+
+
+def ledger_now(session: Session, node: ServerNode | None) -> Ledger:
+    """What became of every frame of a session."""
+    if session.state == "sealed" and session.ledger is not None:
+        return session.ledger
+    finished = session.stopped_t_ns is not None and session.parts[-1].seq_last is not None
+    about, streams = _provisional(session, node)
+    return ledger_of(about.parts, states_of(about, streams), finished=finished)
+
+
+def sources_now(session: Session, node: ServerNode) -> Sources:
+    """What a session is made from, sealed or given away before."""
+    session, streams = _provisional(session, node)
+    return sources_of(
+        session,
+        streams,
+        tares=lambda: node.tares,
+        emulated=node.hello.emulated,
+        no_array=node.info,
+    )
+
+
+def is_all_here(session: Session, node: ServerNode | None) -> bool:
+    """Is nothing more to come, and what is here on the disk?"""
+    if session.parts[-1].seq_last is None:
+        return False
+    for boot_id, numbers in numbers_of(session.parts).items():
+        stream = node.streams.get(boot_id) if node is not None else None
+        if stream is not None and stream.unsynced & numbers:
+            return False
+    return not any(part.pending for part in ledger_now(session, node).parts)
+
+
+def _provisional(
+    session: Session, node: ServerNode | None
+) -> tuple[Session, dict[str, SessionStream]]:
+    """A session with the end that it will have nearly, and its streams."""
+    streams = streams_of(session, node)
+    with suppress(FootTileError):  # the frames that tell are damaged
+        session = at_stop(session, streams)
+    return session, streams

@@ -15,8 +15,13 @@ from service.estimation.calibration import Calibration
 from service.estimation.foot.contact import UNSEEN_NS
 from service.estimation.models.static import StaticCurves
 from service.estimation.plan import make_plan
-from service.estimation.tare.automatic import Look, first_in_flight, look_in_flight
-from service.estimation.tare.flight import LOOK_BACK_NS, tare_in_flight
+from service.estimation.tare.automatic import (
+    LOOK_BACK_NS,
+    Look,
+    first_in_flight,
+    look_in_flight,
+    tare_in_flight,
+)
 from service.estimation.tare.recorded import take_tare
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import TareFrames

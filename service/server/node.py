@@ -25,9 +25,8 @@ from service.sessions.pipeline import Columns
 from service.sessions.tares import RecordedTare, TareHistory
 from storage.clock.log import ClockOffset
 from storage.durable import make_folder, storage_errors, write_whole
-from storage.intervals import NO_END, Intervals, with_open_ends
+from storage.intervals import NO_END, NODE_RESTARTED, Intervals, with_open_ends
 from storage.journal.journal import RING_NS, Journal
-from storage.losses import NODE_RESTARTED
 from storage.wire import decode
 
 log = logging.getLogger("foottile.nodes")

@@ -14,8 +14,8 @@ from devices.errors import (
 )
 from service.link import ClockRow, StreamNumbers, Wanted
 from service.server import following
-from service.server.accounts import ledger_now, sources_now
 from service.server.book import SessionBook
+from service.server.following import ledger_now, sources_now
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.settling import Settling

@@ -12,18 +12,22 @@ from pathlib import Path
 
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
-from service.server.book import SessionBook
+from service.server.book import SessionBook, Trash, destroy
 from service.server.live import Hub
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
 from service.server.settling import Settling
 from service.server.streams import ServerStream
-from service.server.trash import Trash, destroy
 from service.server.views import NodeView, SessionView
 from service.server_clock import utc_ns
-from storage.durable import make_folder, remove_stale_temporaries, storage_errors, write_whole
-from storage.folder_lock import locked
+from storage.durable import (
+    locked,
+    make_folder,
+    remove_stale_temporaries,
+    storage_errors,
+    write_whole,
+)
 from storage.intervals import Intervals
 from storage.sessions.folder import Session, SessionFolder
 

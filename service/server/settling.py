@@ -14,14 +14,13 @@ from pathlib import Path
 
 from devices.errors import DamagedFramesError, FootTileError
 from service.server import following
-from service.server.accounts import is_all_here, ledger_now, sources_now
 from service.server.book import SessionBook
+from service.server.following import is_all_here, ledger_now, sources_now
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.sessions.sealing import seal
 from storage.intervals import Intervals
-from storage.sessions.folder import Session
-from storage.sessions.tables import write_events
+from storage.sessions.folder import Session, write_events
 
 log = logging.getLogger("foottile.settling")
 

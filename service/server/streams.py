@@ -13,12 +13,11 @@ from pathlib import Path
 from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.link import ClockRow, EarlierStream, Hello, PairsByReason
-from service.sessions.streams import SessionStream, around_in
+from service.sessions.ends import SessionStream, around_in
 from storage.clock.log import ClockLog, ClockOffset
-from storage.intervals import NO_END, Intervals
+from storage.intervals import CORRUPT, NO_END, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
-from storage.losses import CORRUPT, Losses
 from storage.schema import wire_schema
 
 CLOCK_ROWS = 128

@@ -11,8 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from devices.frames import ServoInfo
 from service.estimation.calibration import Calibration
-from service.estimation.tare.drift import expected_shift_kpa, trend, warmer_k
-from service.estimation.tare.tare import Source
+from service.estimation.tare.tare import Source, expected_shift_kpa, trend, warmer_k
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
 from service.server.tare_keeper import AutoTare

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from devices.errors import FootTileError
-from devices.extras import needs_extra
+from devices.errors import FootTileError, needs_extra
 from devices.frames import FrameBatch
 from service.estimation import OFFLINE_LAG_MS
 from service.sessions.sources import Sources

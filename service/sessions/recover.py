@@ -19,20 +19,26 @@ import pyarrow.parquet as pq
 
 from devices.errors import FootTileError
 from service.sessions.begin import begun
-from service.sessions.ends import at_stop, broken_off, open_tail
+from service.sessions.ends import SessionStream, at_stop, broken_off, open_tail
 from service.sessions.recover_streams import OpenedStream, hello_of, open_streams
 from service.sessions.sealing import seal
 from service.sessions.sources import sources_of
-from service.sessions.streams import SessionStream
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockLog
 from storage.durable import remove_stale_temporaries
 from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import settle_left_over
 from storage.journal.segment import UNREAD_SUFFIX
-from storage.sessions.folder import Ledger, Part, Session, SessionFolder, new_session_id
+from storage.sessions.folder import (
+    EVENTS_NAME,
+    Ledger,
+    Part,
+    Session,
+    SessionFolder,
+    new_session_id,
+    write_events,
+)
 from storage.sessions.ledger import ledger_of, numbers_of, states_of
-from storage.sessions.tables import EVENTS_NAME, write_events
 from storage.verify.session import verify_session
 
 Outcome = Literal["sealed", "waiting", "failed"]

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from devices.errors import DamagedFramesError, FileFormatError
-from service.sessions.streams import SessionStream, around_in
+from service.sessions.ends import SessionStream, around_in
 from storage.durable import remove_stale_temporaries
-from storage.intervals import NO_END, Intervals
+from storage.intervals import CORRUPT, NO_END, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.segment import SUFFIX
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
-from storage.losses import CORRUPT, Losses
 from storage.sessions.folder import Session
 
 

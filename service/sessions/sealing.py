@@ -7,11 +7,10 @@ from pathlib import Path
 from devices.errors import FileFormatError
 from service.sessions.frames import SessionFrames
 from service.sessions.sources import Sources
-from storage.clock.file import CLOCK_NAME, write_clock
+from storage.clock.table import CLOCK_NAME, write_clock
 from storage.sessions.content_hash import sha256_of
 from storage.sessions.file import SessionWriter
-from storage.sessions.folder import FRAMES_NAME, Ledger, Session
-from storage.sessions.tables import write_events
+from storage.sessions.folder import FRAMES_NAME, Ledger, Session, write_events
 
 
 def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:

@@ -12,8 +12,7 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare
-from service.sessions.ends import RATE_MAX_HZ
-from service.sessions.streams import SessionStream
+from service.sessions.ends import RATE_MAX_HZ, SessionStream
 from service.sessions.tares import TareHistory
 from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
 from storage.intervals import NO_END

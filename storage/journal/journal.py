@@ -19,12 +19,11 @@ import numpy as np
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import make_folder, storage_errors
-from storage.intervals import NO_END, Intervals, union
+from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
 from storage.journal.open_segments import OpenSegments
 from storage.journal.segment import SUFFIX, UNREAD_SUFFIX, Segment, recover
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD, numbers, payload_of, read_header
 from storage.journal.stream_notes import StreamNotes
-from storage.losses import CORRUPT, Losses
 from storage.schema import array_info, wire_schema
 from storage.wire import FRAMES_MAX, EncodedBatch, decode, encode
 

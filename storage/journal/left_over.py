@@ -6,11 +6,11 @@ from contextlib import suppress
 from pathlib import Path
 
 from devices.errors import FileFormatError
+from storage.intervals import DISK_SLOW
 from storage.journal.in_flight import kernel_boot_id, read_in_flight
 from storage.journal.journal import Journal
 from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
-from storage.losses import DISK_SLOW
 from storage.wire import messages_of
 
 

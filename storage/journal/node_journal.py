@@ -18,16 +18,14 @@ from pathlib import Path
 
 from devices.errors import StorageError
 from devices.frames import ArrayInfo
-from storage.durable import make_folder, storage_errors
-from storage.folder_lock import locked
-from storage.intervals import Intervals
+from storage.durable import locked, make_folder, storage_errors
+from storage.intervals import DISK_FULL, DISK_SLOW, READ_ONLY, Intervals
 from storage.journal.in_flight import kernel_boot_id
 from storage.journal.left_over import recover_stream
 from storage.journal.node_stream import NodeStream
 from storage.journal.retention import BUDGET_BYTES, Retention
 from storage.journal.stream_notes import StreamNotes
 from storage.journal.wanted import ServerWants, Wanted
-from storage.losses import DISK_FULL, DISK_SLOW, READ_ONLY
 from storage.wire import EncodedBatch
 
 log = logging.getLogger("foottile.journal")

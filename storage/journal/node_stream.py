@@ -17,12 +17,11 @@ from itertools import takewhile
 from pathlib import Path
 
 from devices.errors import StorageError
-from storage.intervals import Intervals, union
+from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, union
 from storage.journal.in_flight import delete_in_flight, read_in_flight
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import PROMISE_S, StreamNotes
 from storage.journal.wanted import Wanted
-from storage.losses import CORRUPT, EVICTED, NODE_BUSY, Losses
 from storage.wire import EncodedBatch, messages_of
 
 RECENT_BYTES = 4 << 20

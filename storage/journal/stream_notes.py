@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
 from storage.durable import write_whole
-from storage.losses import AsPairs
+from storage.intervals import AsPairs
 
 NOTES_FILE = "stream.json"
 PROMISE_S = 0.5

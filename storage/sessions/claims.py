@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from storage.checked_json import CHECK, is_unchanged, without_check
+from storage.durable import CHECK, is_unchanged, without_check
 from storage.sessions.folder import Ledger, Part, Session
 
 SESSION_NAME = "session.json"

@@ -9,8 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
-from storage.intervals import NO_END, Intervals
-from storage.losses import CORRUPT, GIVEN_UP, NODE_RESTARTED, Losses
+from storage.intervals import CORRUPT, GIVEN_UP, NO_END, NODE_RESTARTED, Intervals, Losses
 from storage.sessions.folder import Ledger, Part, PartLedger, Session
 
 

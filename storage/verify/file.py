@@ -13,8 +13,7 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import FileFormatError
-from storage.intervals import Intervals, union
-from storage.losses import AsPairs, Losses
+from storage.intervals import AsPairs, Intervals, Losses, union
 from storage.sessions.content_hash import ContentDigest, file_hashes
 from storage.sessions.file import FORMAT_WITHOUT_HASH, SessionReader
 from storage.sessions.folder import Ledger, Part, PartLedger

@@ -10,11 +10,10 @@ import numpy as np
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
-from storage.intervals import Intervals
+from storage.intervals import CORRUPT, Intervals, Losses
 from storage.journal.segment import SUFFIX, UNREAD_SUFFIX
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
-from storage.losses import CORRUPT, Losses
 from storage.sessions.claims import bytes_of
 from storage.sessions.ledger import StreamState
 from storage.verify.segment import SegmentReport, verify_segment

@@ -16,13 +16,12 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import FileFormatError
-from storage.clock.file import CLOCK_NAME
+from storage.clock.table import CLOCK_NAME
 from storage.intervals import NO_END, Intervals
 from storage.sessions.claims import SESSION_NAME, Claims, bytes_of, claims_in, claims_of, first_line
 from storage.sessions.content_hash import file_hashes, sha256_of
-from storage.sessions.folder import FRAMES_NAME, Event, Ledger, Session
+from storage.sessions.folder import EVENTS_NAME, FRAMES_NAME, Event, Ledger, Session
 from storage.sessions.ledger import ledger_of, states_of
-from storage.sessions.tables import EVENTS_NAME
 from storage.verify.file import FileReport, ledger_problems, verify_file
 from storage.verify.journal import StreamReport, verify_stream
 

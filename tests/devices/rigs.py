@@ -10,7 +10,7 @@ from smbus2 import i2c_msg
 
 from devices.array.array import TileArray
 from devices.array.budget import BusTiming
-from devices.array.scan import Scan
+from devices.array.ports import Scan
 from devices.buses.i2c import I2cBus
 from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter, Line

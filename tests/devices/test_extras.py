@@ -6,8 +6,7 @@ import sys
 
 import pytest
 
-from devices.errors import MissingExtraError
-from devices.extras import needs_extra
+from devices.errors import MissingExtraError, needs_extra
 
 
 def test_a_missing_package_is_named_with_the_extra_that_brings_it(

@@ -7,7 +7,7 @@ import json
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.checked_json import is_unchanged, with_check, without_check
+from storage.durable import is_unchanged, with_check, without_check
 
 objects = st.dictionaries(
     st.text(max_size=5).filter(lambda key: key != "check"),

@@ -8,11 +8,17 @@ from typing import Annotated
 
 import typer
 
-from devices.errors import UsageError
-from devices.extras import needs_extra
+from devices.errors import UsageError, needs_extra
 from devices.scene.file import load_scene
-from service.cli.emulation import check_emulated
-from service.cli.options import JsonOption, json_text, print_json, progress, remark, say
+from service.cli.options import (
+    JsonOption,
+    check_emulated,
+    json_text,
+    print_json,
+    progress,
+    remark,
+    say,
+)
 
 SCENES = ("rolling", "poppy", "mud")
 DRAWS, QUICK_DRAWS = 20, 3

@@ -11,13 +11,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from devices.errors import FootTileError
-from devices.extras import needs_extra
+from devices.errors import FootTileError, needs_extra
 from service.cli.commands.node import calibration_of
 from service.cli.commands.serve import PREPARING, announce
-from service.cli.emulation import FootOptions, check_emulated, scene_with, with_foot_options
-from service.cli.options import remark
-from service.cli.signals import stop_on_signals
+from service.cli.options import (
+    FootOptions,
+    check_emulated,
+    remark,
+    scene_with,
+    stop_on_signals,
+    with_foot_options,
+)
 
 if TYPE_CHECKING:
     from service.server.server import Server

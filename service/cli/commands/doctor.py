@@ -12,8 +12,7 @@ from rich.table import Table
 
 from devices.buses.i2c import I2cBus, open_bus
 from devices.clock import Clock, SystemClock, VirtualClock
-from devices.errors import UsageError
-from devices.extras import needs_extra
+from devices.errors import UsageError, needs_extra
 from devices.scene.file import Scene, load_scene
 from devices.scene.hardware import EMULATED, ServoScene
 from service.cli.options import JsonOption, print_json, progress, say, stdout

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from devices.extras import needs_extra
+from devices.errors import needs_extra
 from service.cli.options import (
     JsonOption,
     output_path,

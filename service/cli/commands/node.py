@@ -12,9 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import CalibrationError, MissingExtraError, UsageError
-from service.cli.emulation import FootOptions, scene_with, with_foot_options
-from service.cli.options import remark, say
-from service.cli.signals import stop_on_signals
+from service.cli.options import (
+    FootOptions,
+    remark,
+    say,
+    scene_with,
+    stop_on_signals,
+    with_foot_options,
+)
 
 if TYPE_CHECKING:
     from service.estimation.calibration import Calibration

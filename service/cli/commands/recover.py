@@ -38,7 +38,7 @@ def recover_command(
     recovered, 2 wrong usage, 3 done, but a session is lossy, or waits for its node.
     """
     from service.sessions.recover import recover
-    from storage.folder_lock import locked
+    from storage.durable import locked
 
     if not any((folder / name).is_dir() for name in ("journal", "sessions")):
         raise UsageError(

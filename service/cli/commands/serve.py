@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from devices.extras import needs_extra
-from service.cli.options import remark, say
-from service.cli.signals import stop_on_signals
+from devices.errors import needs_extra
+from service.cli.options import remark, say, stop_on_signals
 
 if TYPE_CHECKING:
     from service.api.settings import Settings

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from devices.errors import UsageError
-from devices.extras import needs_extra
+from devices.errors import UsageError, needs_extra
 from service.cli.options import (
     JsonOption,
     data_folder,
@@ -129,7 +128,7 @@ def export_command(
     from storage.formats.export import CLOCKS, FORMATS, Slice, export
     from storage.schema import FRAMES, KNOWN
     from storage.sessions.file import SessionReader
-    from storage.sessions.tables import clock_beside
+    from storage.sessions.folder import clock_beside
 
     if to not in FORMATS:
         raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))

@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
-from devices.errors import UsageError
-from devices.extras import needs_extra
+from devices.errors import UsageError, needs_extra
 from devices.scene.file import load_scene
 from devices.scene.hardware import AnySchedule, ScheduleName
-from service.cli.emulation import FootOptions, check_emulated, with_foot_options
 from service.cli.options import (
+    FootOptions,
     JsonOption,
+    check_emulated,
     output_path,
     print_json,
     progress,
     remark,
     say,
+    with_foot_options,
 )
 from service.cli.report import findings_json, tell_findings
 from service.estimation import OFFLINE_LAG_MS

@@ -1,14 +1,19 @@
-"""The tare: each tile's baseline and noise, from an interval without load."""
+"""The tare: each tile's baseline and noise, from an interval without load.
+
+Here also: how baselines move, with temperature since a tare and over a history of tares.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from devices.arrays import Floats
+from devices.arrays import Bools, Floats
+from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import TareError
 
 Source = Literal["interval", "lead", "recognised", "unloaded", "flight"]
@@ -72,3 +77,76 @@ class Tare:
             return cls(**values)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise TareError(f"a recorded tare is not readable: {error}") from error
+
+
+SEALED_AT_K = 298.0
+"""A sealed bubble's pressure is proportional to its absolute temperature; about 25 degC."""
+WARMED_COUNTS = 4.0
+"""A baseline is in doubt once a tile's chip has moved so far since the tare: 0.75 K are 0.25 kPa,
+half a newton on a tile and one and a half on a foot of four."""
+TREND_OVER_NS = 6 * 3_600_000_000_000
+"""A trend is that of the last hours; what was before was another day."""
+TREND_SPAN_MIN_NS = 600_000_000_000
+"""A straight line through less than ten minutes says nothing about an hour."""
+
+
+def warmer_k(tare: Tare, tadc_counts: Floats) -> Floats:
+    """How much warmer each chip is than at the tare; NaN where that is not known."""
+    return np.asarray((tadc_counts - tare.tadc_counts) / TADC_PER_KELVIN)
+
+
+def expected_shift_kpa(tare: Tare, warmer: Floats) -> Floats:
+    """What a sealed bubble's baseline moves by when it gets so much warmer, in kelvin."""
+    return np.asarray(tare.baseline_kpa / SEALED_AT_K * warmer)
+
+
+def has_warmed(tare: Tare, tadc_counts: npt.ArrayLike) -> Bools:
+    """Which tiles are warmer or colder than at the tare by more than the baseline can bear.
+
+    Args:
+        tare: the one in force; of an unknown temperature it never says so.
+        tadc_counts: (..., tiles), NaN where not known.
+    """
+    moved_counts = np.abs(np.asarray(tadc_counts, dtype=np.float64) - tare.tadc_counts)
+    return np.asarray(moved_counts > WARMED_COUNTS)
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Straight lines through a history of baselines; arrays over tiles, NaN if undetermined.
+
+    Attributes:
+        kpa_per_hour: of the baseline.
+        sigma_kpa_per_hour: its standard uncertainty, from the tares' own.
+        kelvin_per_hour: of the chip.
+    """
+
+    kpa_per_hour: Floats
+    sigma_kpa_per_hour: Floats
+    kelvin_per_hour: Floats
+
+
+def trend(tares: Sequence[Tare], *, tiles: int) -> Trend:
+    """The trend of the last hours.
+
+    Args:
+        tares: of the same tiles, that were in force, in any order.
+        tiles: how many tiles that is.
+    """
+    newest_ns = max((tare.t_ns for tare in tares), default=0)
+    recent = [tare for tare in tares if newest_ns - tare.t_ns <= TREND_OVER_NS]
+    t_ns = np.array([tare.t_ns - newest_ns for tare in recent], dtype=np.float64)
+    if not recent or -t_ns.min() < TREND_SPAN_MIN_NS:
+        unknown = np.full(tiles, np.nan)
+        return Trend(unknown, unknown, unknown)
+    hours = t_ns / 3.6e12
+    lever = (hours - hours.mean()) / ((hours - hours.mean()) ** 2).sum()
+    by_tare = {
+        name: np.array([getattr(tare, name) for tare in recent])
+        for name in ("baseline_kpa", "baseline_sigma_kpa", "tadc_counts")
+    }
+    return Trend(
+        kpa_per_hour=(lever[:, None] * by_tare["baseline_kpa"]).sum(axis=0),
+        sigma_kpa_per_hour=np.sqrt(((lever[:, None] * by_tare["baseline_sigma_kpa"]) ** 2).sum(0)),
+        kelvin_per_hour=(lever[:, None] * by_tare["tadc_counts"]).sum(axis=0) / TADC_PER_KELVIN,
+    )

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from service.offline.benchmark.draws import LAGS_MS
-from service.offline.benchmark.figures import SceneFigures, Spread, pareto
-from service.offline.benchmark.goals import GRF_MAE_N
+from service.offline.benchmark.figures import GRF_MAE_N, SceneFigures, Spread, pareto
 from service.offline.benchmark.report import draws_text
 from service.offline.benchmark.rungs import Rung
 from service.offline.plots import DPI, new_figure, png_of

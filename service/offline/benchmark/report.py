@@ -5,11 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from service.offline.benchmark.draws import LAGS_MS
-from service.offline.benchmark.figures import Measured, SceneFigures, Spread
-from service.offline.benchmark.goals import COVERAGE_DRAWS, COVERED, Goal, goals_of
+from service.offline.benchmark.draws import BATCH, LAGS_MS
+from service.offline.benchmark.figures import (
+    COVERAGE_DRAWS,
+    COVERED,
+    Goal,
+    Measured,
+    SceneFigures,
+    Spread,
+    goals_of,
+)
 from service.offline.benchmark.run import Bench
-from service.offline.benchmark.timing import BATCH
 
 EMULATED = (
     "Errors here are those of an emulated foot; the paper's (GRF within 1 N, COP within 4 mm) are "

@@ -23,6 +23,7 @@ from devices.scene.file import Scene
 from service.estimation.calibration import PRESETS
 from service.estimation.ladder import MODELS
 from service.offline.benchmark.draws import (
+    BATCH,
     Drawn,
     Failure,
     Recording,
@@ -30,11 +31,10 @@ from service.offline.benchmark.draws import (
     reason,
     record,
     run_draw,
+    time_rungs,
 )
-from service.offline.benchmark.figures import SceneFigures, Spread, measured_of
-from service.offline.benchmark.goals import Goal, goals_of
+from service.offline.benchmark.figures import Goal, SceneFigures, Spread, goals_of, measured_of
 from service.offline.benchmark.rungs import Rung, absent, rungs
-from service.offline.benchmark.timing import BATCH, time_rungs
 from service.version import SOFTWARE
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devices.array.bus_watch import BusWatch
-from devices.array.scan import Scan
+from devices.array.ports import Scan
 from devices.chips.tca9548a import MuxRouter
 from devices.errors import BusSetupError
 from tests.devices.rigs import TWO_MUXES, Wires

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from devices.scene.file import build_scene, load_scene
-from service.estimation.bench.effects_fit import fit_effects
+from service.estimation.bench.effects_fit import fit_effects, replays
 from service.estimation.bench.indentation import Indentation
-from service.estimation.bench.replay import replays
 from service.estimation.calibration import Calibration
 from service.offline.calibrate import calibrate_recordings, read_recordings
 from service.offline.calibrations import with_tiles

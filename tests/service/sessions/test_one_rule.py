@@ -16,19 +16,18 @@ from hypothesis import strategies as st
 from service.link import PROTOCOL, Hello
 from service.node.recording import NodeRecording
 from service.server import following
-from service.server.book import SessionBook
+from service.server.book import SessionBook, Trash
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
 from service.server.settling import Settling
-from service.server.trash import Trash
 from service.sessions.recover import recover
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockOffset
+from storage.intervals import Losses
 from storage.journal.journal import Journal
 from storage.journal.node_journal import NodeJournal
 from storage.journal.stream_notes import StreamNotes
-from storage.losses import Losses
 from storage.sessions.folder import Part, Session, SessionFolder
 from storage.sessions.ledger import ledger_of, states_of
 from storage.verify.session import verify_session

@@ -20,11 +20,11 @@ from service.sessions import recover as recover_module
 from service.sessions.recover import Recovery, recover
 from service.sessions.sealing import seal
 from storage.clock.log import ClockOffset
-from storage.folder_lock import locked
+from storage.durable import locked
+from storage.intervals import Losses
 from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
-from storage.losses import Losses
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event, Part, Session, SessionFolder
 from storage.verify.data import verdict_of, verify

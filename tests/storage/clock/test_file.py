@@ -12,11 +12,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from storage.clock.file import read_clock, write_clock
 from storage.clock.log import ClockOffset
-from storage.clock.table import StreamFacts
+from storage.clock.table import StreamFacts, read_clock, write_clock
 from storage.sessions.file import SessionReader, SessionWriter
-from storage.sessions.tables import clock_beside
+from storage.sessions.folder import clock_beside
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.intervals import NO_END, Intervals
-from storage.losses import Losses
+from storage.intervals import NO_END, Intervals, Losses
 from storage.sessions.folder import Part
 from storage.sessions.ledger import StreamState, ledger_of
 

@@ -17,11 +17,11 @@ from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from service.sessions.sealing import seal
 from service.sessions.sources import Sources
-from storage.checked_json import with_check
 from storage.clock.log import ClockOffset
+from storage.durable import with_check
+from storage.intervals import Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
-from storage.losses import Losses
 from storage.sessions.folder import Event, Part, Session, SessionFolder
 from storage.sessions.ledger import StreamState, ledger_of
 from storage.verify.data import verdict_of, verify

@@ -24,11 +24,11 @@ from service.estimation.tare.automatic import (
     FAR_KPA,
     NEAR_KPA,
     SETTLE_NS,
+    WINDOW_NS,
     Look,
     first_in_flight,
     look_in_flight,
 )
-from service.estimation.tare.flight import WINDOW_NS
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import TareFrames
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, UTC_NS, make_array

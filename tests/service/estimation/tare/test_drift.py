@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
-from service.estimation.tare.drift import (
+from service.estimation.tare.tare import (
     TREND_OVER_NS,
     TREND_SPAN_MIN_NS,
     WARMED_COUNTS,
+    Tare,
     expected_shift_kpa,
     has_warmed,
     trend,
     warmer_k,
 )
-from service.estimation.tare.tare import Tare
 from tests.builders.arrays import UTC_NS
 from tests.builders.calibrations import make_tare
 

@@ -15,7 +15,7 @@ from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration, paper_eq2_shape
-from service.estimation.tare.flight import LOOK_BACK_NS, WINDOW_NS, tare_in_flight
+from service.estimation.tare.automatic import LOOK_BACK_NS, WINDOW_NS, tare_in_flight
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import FRAMES_MIN, TareFrames
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, make_array

@@ -8,9 +8,15 @@ import pytest
 from devices.scene.file import load_scene
 from service.estimation.estimate import EstimationState, step
 from service.estimation.estimates import EstimateStatus
-from service.offline.benchmark.draws import Recording, estimated, record
+from service.offline.benchmark.draws import (
+    Endless,
+    Recording,
+    estimated,
+    plan_of,
+    record,
+    time_rungs,
+)
 from service.offline.benchmark.rungs import Rung, rungs
-from service.offline.benchmark.timing import Endless, plan_of, time_rungs
 
 
 @pytest.fixture(scope="module")
