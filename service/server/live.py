@@ -76,7 +76,7 @@ class Piece:
 
 
 class Subscriber:
-    """What one client has yet to be told.
+    """What one client is still to be sent.
 
     Args:
         only: the node it wants to see; None: all.

@@ -168,7 +168,7 @@ class Recorder:
     def note_clock(self, node: ServerNode, row: ClockRow) -> None:
         """Keep a new measurement of a node's clock, with its sessions too.
 
-        It is in the stream's log; theirs are written down with the next change.
+        The stream's log has it already; sessions are written with their next change.
         """
         try:
             node.present.note_clock(row)
@@ -198,7 +198,7 @@ class Recorder:
         return self._settling.problem_of(session)
 
     def duration_s(self, session: Session, frames: int) -> float:
-        """How long it is: of a sealed one exactly, else by the stream's nominal rate."""
+        """Its length: exact for a sealed session, else estimated from the stream's nominal rate."""
         node = self._nodes.find(session.node)
         if session.state == "sealed" or node is None:
             return session.duration_s
@@ -216,7 +216,7 @@ class Recorder:
     def needed(self, node_name: str) -> dict[str, Intervals]:
         """Numbers by boot_id that sessions of a node, not sealed yet, need in its journals.
 
-        What is in the trash can be had back, so it needs its frames as well.
+        A session in the trash can be restored, so it needs its frames as well.
         """
         node = self._nodes.find(node_name)
         if self._book.has_unreadable and node is not None:

@@ -69,7 +69,7 @@ class Recovery:
     Attributes:
         sessions: that were not sealed before.
         removed: half-written files of dead processes.
-        cut: journals of which something was cut off, and how many bytes; set aside, not deleted.
+        cut: bytes that were cut off, by journal; they are set aside, not deleted.
         mended: sessions whose `events.parquet` was written again.
         problems: what could not be recovered, beside sessions.
     """
@@ -103,7 +103,7 @@ def recover(
 
     Args:
         data: the folder, whose lock the caller holds.
-        streams: make sessions of frames that belong to none.
+        streams: make sessions for frames that belong to no session.
         give_up: on a server's folder, seal what its nodes have not brought as lost.
         tell: told what is being done.
         now: for the ids of new sessions.
@@ -187,7 +187,7 @@ def _complete(
 
 
 def _is_local(data: Path) -> bool:
-    """Is it a node's own folder? Then nothing more will come."""
+    """Is this a node's own folder? Then no more frames will come."""
     return not (data / "nodes").is_dir()
 
 
@@ -240,12 +240,12 @@ def _of_no_session(
 
 
 def _set_aside(data: Path) -> set[Path]:
-    """What stood behind the last whole batch of a segment."""
+    """Files with what followed the last whole batch of a segment."""
     return set(data.glob("journal/*/*/*" + UNREAD_SUFFIX))
 
 
 def _mend_events(session: Session, folder: Path) -> bool:
-    """Write `events.parquet` again if it is not what `session.json` says: that is written first."""
+    """Write `events.parquet` again if it differs from `session.json`, which is written first."""
     wanted = [event.model_dump() for event in session.events]
     try:
         with pq.ParquetFile(folder / EVENTS_NAME) as file:
