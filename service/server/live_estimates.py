@@ -20,7 +20,7 @@ from service.estimation.tare.automatic import (
     Look,
     first_in_flight,
     look_in_flight,
-    tare_in_flight,
+    newest_unloaded_tare,
 )
 from service.estimation.tare.recorded import take_tare
 from service.estimation.tare.tare import Tare
@@ -181,7 +181,7 @@ class LiveEstimates:
             bears=self._bears,
         )
 
-    def tare_from_flight(self) -> Tare:
+    def tare_now(self) -> Tare:
         """The tare from the newest unloaded interval of the last seconds.
 
         Raises:
@@ -192,7 +192,7 @@ class LiveEstimates:
             raise TareError("no frames have come yet", remedy="Is the node connected?")
         frames = FrameBatch.concatenate(list(self._recent))
         seen = self._seen(frames, calibration)
-        return tare_in_flight(seen, present=self.tare, bears=self._bears)
+        return newest_unloaded_tare(seen, present=self.tare, bears=self._bears)
 
     def _seen(self, frames: FrameBatch, calibration: Calibration) -> TareFrames:
         return TareFrames(frames, self._compensation, calibration, self._info.serials)

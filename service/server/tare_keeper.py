@@ -104,7 +104,7 @@ class TareKeeper:
             TareError: the foot was loaded, or there is nothing to tare.
             StorageError: it cannot be kept.
         """
-        recorded = self._history.add(self._live.tare_from_flight(), self._info, reason)
+        recorded = self._history.add(self._live.tare_now(), self._info, reason)
         self._put_in_force(recorded)
         return recorded
 
