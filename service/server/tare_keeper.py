@@ -22,7 +22,7 @@ from storage.journal.journal import Journal
 LOOK_EVERY_NS = 5_000_000_000
 """A look at the last seconds costs some milliseconds."""
 LEAD_WAIT_NS = 10_000_000_000
-"""Frames of a lead that are still missing so long after it will not come."""
+"""Frames of a lead that are still missing this long after its end will not come."""
 _BY_HAND = "lift the foot, hold it still, and tare"
 
 AutoTare = Literal["on", "paused", "off"]

@@ -130,7 +130,7 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
     found: dict[str, Replay] = {}
     for name, centre in _moments(points.t_s, points.force_n, points.loading, points.fast).items():
         here = points.loading == points.loading[centre]
-        # A loading has a gain of its own about one; of what it shows itself.
+        # Each loading has its own gain, about one, fitted to its own readings.
         usable = here & np.isfinite(measured_kpa)
         square = float((modelled_kpa[usable] ** 2).sum())
         product = float((modelled_kpa[usable] * measured_kpa[usable]).sum())

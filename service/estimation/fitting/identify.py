@@ -66,7 +66,7 @@ def identify(
         reasons = _undetermined(fit, free)
         if not reasons:
             break
-        # One at a time: what looked undetermined may be so only beside another.
+        # One at a time: without the worst effect, the others may be determined.
         worst = next(name for name in ("gas", "hysteresis", "rubber") if name in reasons)
         refused[worst] = reasons[worst]
         free -= {worst}

@@ -144,13 +144,13 @@ NEAR_KPA = 0.15
 """How far a baseline may be moved at once beyond what the temperature explains: 0.3 N on a tile,
 the noise of a single reading."""
 FAR_KPA = 0.25
-"""And how far in all since the last tare that was not automatic: half a newton on a tile."""
+"""Limit of the whole shift since the last tare that was not automatic: half a newton."""
 EXPLAINED_PART = 0.5
 """Gas and chip do not warm at once, and the wall gives way: half of what is explained is open."""
 SETTLE_NS = 100_000_000
-"""The rubber recovers for so long after a contact, before a window may begin."""
+"""How long the rubber recovers after a contact before a window may begin."""
 CONFIRM_NS = 900_000_000_000
-"""Where nothing has moved the tare is renewed so seldom, long before it is called old."""
+"""If nothing has moved, the tare is renewed only after this, long before it counts as old."""
 MOVED_SIGMAS = 4.0  # of both tares: less may be chance
 MOVED_MIN_KPA = 0.02
 """Less than this is not worth an entry in the history."""
