@@ -23,11 +23,11 @@ _TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-
 _OLDER_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
 _NO_LONGER = {"Z", "X"}
 _STARTED_FIELD = 19
-"""Of /proc/PID/stat, behind the name: when the process started."""
+"""Field of /proc/PID/stat, counted after the name: when the process started."""
 
 
 def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
-    """Write a file, whole or not at all, and have it on the disk when this returns.
+    """Write a file, whole or not at all; it is on the disk when this returns.
 
     Args:
         path: the file; one that is there is replaced.
@@ -63,24 +63,24 @@ def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[BinaryIO]:
 
 
 def temporary_of(path: Path) -> Path:
-    """A name of its own beside `path`, to write under until it is whole; it says whose it is."""
+    """A temporary name beside `path` for a file in writing; it names the process that writes."""
     process = os.getpid()
     name = f".{path.name}.{process}.{_started(process) or 0}.{secrets.token_hex(4)}.tmp"
     return path.with_name(name)
 
 
 def remove_stale_temporaries(folder: Path) -> list[Path]:
-    """Delete what dead processes have left half-written in a folder and below; which files.
+    """Delete files that dead processes left half-written in a folder and below; return their paths.
 
-    What a living process may still be writing stays. A number that was given to another process
-    since is told by when that one started.
+    Files of living processes stay: they may still be written. If a process number was given to
+    another process since, the start time shows it.
 
     Raises:
         StorageError: the folder cannot be read, or a file not deleted.
     """
     removed = []
     with storage_errors(folder):
-        folder.stat()  # a folder that is not there has no files, says a search
+        folder.stat()  # fails if the folder is missing, where rglob just finds no files
         for path in sorted(folder.rglob(".*.tmp")):
             if _is_stale(path.name) and path.is_file():
                 path.unlink(missing_ok=True)
@@ -99,9 +99,9 @@ def _is_stale(name: str) -> bool:
 
 
 def _started(process: int) -> int | None:
-    """When a process started, in ticks since the machine did; None if there is none of this number.
+    """When a process started, in ticks after the machine's start; None if no such process runs.
 
-    A zombie, which has ended and was not waited for, is none.
+    A zombie has ended, though its parent has not waited for it: None as well.
     """
     try:
         fields = Path(f"/proc/{process}/stat").read_text("utf-8", "replace").rsplit(") ", 1)[1]
@@ -112,10 +112,9 @@ def _started(process: int) -> int | None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, and have their names on the disk when this returns.
+    """Make a folder and those above it; their names are on the disk when this returns.
 
-    The name of a folder that another process has made is not known to be there: the last one's is
-    synced in any case.
+    Another process may have made the last folder and not synced its name: it is synced in any case.
 
     Raises:
         OSError: it cannot be made.
@@ -129,7 +128,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk: a rename is not, until its folder is synced."""
+    """Put the names in a folder on the disk: a rename is not there until its folder is synced."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)

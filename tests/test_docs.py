@@ -153,11 +153,12 @@ def openapi() -> dict[str, Any]:
 
 
 def test_the_api_description_in_the_repository_is_the_one_that_is_served() -> None:
-    # After a change on purpose: FOOTTILE_WRITE_OPENAPI=1 sh scripts/test tests/test_docs.py
     kept = ROOT / "docs" / "openapi.json"
     if os.environ.get("FOOTTILE_WRITE_OPENAPI"):
         kept.write_text(json.dumps(openapi(), indent=1, sort_keys=True) + "\n")
-    assert json.loads(kept.read_text("utf-8")) == openapi()
+    assert json.loads(kept.read_text("utf-8")) == openapi(), (
+        "if that is on purpose: FOOTTILE_WRITE_OPENAPI=1 sh scripts/test tests/test_docs.py"
+    )
 
 
 def test_every_route_is_documented() -> None:
@@ -252,7 +253,6 @@ def test_every_package_has_a_sign(package: str) -> None:
 
 
 def test_the_map_says_what_the_signs_say() -> None:
-    # After a package has moved: FOOTTILE_WRITE_MAP=1 sh scripts/test tests/test_docs.py
     page = ROOT / "CONTRIBUTING.md"
     text = page.read_text("utf-8")
     rows = ["| package | what lives there |", "|---|---|"]
@@ -262,7 +262,21 @@ def test_the_map_says_what_the_signs_say() -> None:
     drawn = head + "writes it -->\n" + "\n".join(rows) + "\n" + tail
     if os.environ.get("FOOTTILE_WRITE_MAP"):
         page.write_text(drawn, "utf-8")
-    assert page.read_text("utf-8") == drawn
+    assert page.read_text("utf-8") == drawn, (
+        "if packages or their signs have changed: "
+        "FOOTTILE_WRITE_MAP=1 sh scripts/test tests/test_docs.py"
+    )
+
+
+def test_every_module_that_is_made_for_one_pressure_chip_is_named() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    part = text.split("### A second kind of pressure chip\n")[1].split("\n### ")[0]
+    for path in sources():
+        name = str(path.relative_to(ROOT))
+        if name.startswith(("devices/", "storage/", "service/")) and re.search(
+            r"^from devices\.chips\.mpl115a2 import", path.read_text("utf-8"), re.MULTILINE
+        ):
+            assert f"`{name}`" in part, f"CONTRIBUTING.md has to name {name}"
 
 
 PATH = re.compile(
@@ -270,14 +284,26 @@ PATH = re.compile(
 )
 
 
-@pytest.mark.parametrize(
+SENTENCE_END = re.compile(r"[.:;!?]\)?\s+|\n\s*\n|\||\n\s*(?:[-*]|\d+\.) ")
+of_today = pytest.mark.parametrize(
     "document",
     [d for d in DOCUMENTS if d.name != "CHANGELOG.md" and d.parent.name != "results"],
     ids=lambda path: str(path.relative_to(ROOT)),
 )
+
+
+@of_today
 def test_every_path_in_a_document_exists(document: Path) -> None:
     for path in PATH.findall(document.read_text("utf-8")):
         assert (ROOT / path).exists(), path
+
+
+@of_today
+def test_no_sentence_names_a_path_twice(document: Path) -> None:
+    # As it happens when two modules become one and their names are replaced.
+    for sentence in SENTENCE_END.split(document.read_text("utf-8")):
+        paths = PATH.findall(sentence)
+        assert len(paths) == len(set(paths)), " ".join(sentence.split())
 
 
 def test_every_decision_is_in_the_list_and_says_what_would_change_our_mind() -> None:

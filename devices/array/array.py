@@ -113,7 +113,7 @@ class TileArray:
 
     @property
     def replaced(self) -> tuple[str, ...]:
-        """Serials of the tiles in whose place another part answers than the one identified."""
+        """Serials of the tiles that another part than the identified one now answers for."""
         return tuple(
             tile.serial
             for tile, health in zip(self.tiles, self.health, strict=True)
@@ -330,7 +330,7 @@ class TileArray:
             scan.note_bus_fault()
 
     def _look_again(self, scan: Scan, tiles: Sequence[int]) -> None:
-        """Before they are started again: was what was read of one of them its final result?"""
+        """Check one tile before the next start: were the words read from it its final result?"""
         tile = self._frames // self._look_frames % len(self.tiles)
         if tile not in tiles:
             return

@@ -127,10 +127,10 @@ class ConversionWatch:
         return self._converted(tile, CONVERSION_MAX_NS)[0]
 
     def _converted(self, tile: int, delay_ns: int) -> tuple[tuple[int, int], bool]:
-        """What is read so long after a CONVERT, and whether it was not read later than that.
+        """The words read `delay_ns` after a CONVERT, and whether they were read on time.
 
-        A busy machine may hesitate before either transfer, so all of the time counts that the wires
-        themselves did not take. The conversion is given its time in any case.
+        A busy machine may pause before either transfer, so all time except that on the wires counts
+        as waiting. The conversion always gets its time.
         """
         begin_ns = self._clock.now_ns()
         self._ports.convert([tile])

@@ -80,7 +80,7 @@ class TileHealth:
             self._probe_wait_ns = min(2 * self._probe_wait_ns, _PROBES_NS)
 
     def doubt(self, now_ns: int) -> None:
-        """It may be another that answers: its coefficients have to be read before its readings."""
+        """Another part may answer now: its coefficients must be read before its readings count."""
         self.present = False
         self._probe_due_ns = now_ns
         self._probe_wait_ns = _FIRST_PROBE_NS
@@ -89,7 +89,7 @@ class TileHealth:
         self._stale_evidence = 0
 
     def is_probe_due(self, now_ns: int) -> bool:
-        """Is it time to look whether it is back?"""
+        """Is it time to check whether the tile is back?"""
         return now_ns >= self._probe_due_ns
 
     def note(self, status: int) -> None:
@@ -117,7 +117,7 @@ class TileHealth:
         return abs(padc - self._median()) > limit or self._is_hot(tadc)
 
     def may_be_another(self, padc: int, tadc: int) -> bool:
-        """Although it came twice: may another tile have answered, or two of them at once?"""
+        """May another tile, or two at once, have sent this reading, although it came twice?"""
         if len(self._recent) < _RECENT:
             return False
         return abs(padc - self._median()) > self._far_jump or self._is_hot(tadc)
@@ -150,7 +150,7 @@ class TileHealth:
 
     @property
     def wants_trial(self) -> bool:
-        """Of its stale readings the first, and then one now and then, calls for a look at why."""
+        """Should the cause of stale readings be checked? At the first, then now and then."""
         return 0 <= (self._stale_evidence - STALE_EVIDENCE) % _TRIAL_EVERY < 2
 
     def _median(self) -> int:

@@ -1,1 +1,1 @@
-"""Models of the hardware at registers and bytes, and their world. Drivers never ask it."""
+"""Models of the hardware at registers and bytes, and their world. Drivers never import it."""

@@ -1,1 +1,1 @@
-"""Scene files: which tiles hang where, what the ground does, which models. Opens nothing."""
+"""Scene files: which tiles hang where, what the ground does, which models. Opens no hardware."""

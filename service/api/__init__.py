@@ -1,1 +1,1 @@
-"""The server's face: REST, websockets, page, and who may ask. What it does is the server's."""
+"""The server over HTTP: REST, websockets, page, and who may ask. Rules are in `service.server`."""

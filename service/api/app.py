@@ -16,9 +16,9 @@ from devices.errors import FootTileError
 from service.api import problems
 from service.api.guard import Guard
 from service.api.routes import access, clock, data, health, nodes, sessions, trash
+from service.api.routes.ingest import ingest
 from service.api.routes.live import live
 from service.link import INGEST_PATH, LIVE_PATH
-from service.server.ingest import ingest
 from service.server.server import Server
 from service.version import SOFTWARE
 

@@ -133,7 +133,7 @@ def _hardened(send: Send) -> Send:
 
 
 def _parts(url: str) -> SplitResult:
-    """A URL's parts; none of them of what is no URL."""
+    """A URL's parts; all empty if it is not a URL."""
     try:
         return urlsplit(url)
     except ValueError:

@@ -9,6 +9,7 @@ from http import HTTPStatus
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
 from devices.errors import (
@@ -31,6 +32,16 @@ _STATUS: tuple[tuple[type[FootTileError], HTTPStatus], ...] = (
     (StorageError, HTTPStatus.INSUFFICIENT_STORAGE),
     (UsageError, HTTPStatus.UNPROCESSABLE_ENTITY),
 )
+
+
+class Problem(BaseModel):
+    """RFC 9457: what went wrong, where, and what to do."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    instance: str
 
 
 def problem(

@@ -1,1 +1,1 @@
-"""The command `foottile`: options to calls, results to text or JSON, errors to exit codes."""
+"""The command line `foottile`: entry point, shared options, reports, errors to exit codes."""

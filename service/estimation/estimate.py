@@ -241,10 +241,10 @@ def _cop_masked(plan: EstimationPlan, foot: Foot) -> Bools:
 
 
 def _unseen(frames: FrameBatch, state: EstimationState) -> Bools:
-    """Frames before which the foot was not seen for so long that it may have been anywhere.
+    """Frames after a pause of more than `UNSEEN_NS`: the foot may have been anywhere meanwhile.
 
-    A frame lost here and there is no reason to start over, or a link that loses every third would
-    never see a contact last.
+    A few lost frames are no reason to start over: on a link that loses every third frame no contact
+    would ever last.
     """
     last_t_ns = frames.t_mono_ns[0] if state.last_seq is None else state.last_t_ns
     return np.asarray(np.diff(frames.t_mono_ns, prepend=last_t_ns) > UNSEEN_NS)

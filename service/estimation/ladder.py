@@ -116,7 +116,7 @@ def make_ladder(
 
 
 def check_models(models: Sequence[str]) -> None:
-    """Refuse models that there are not, and a ladder without force.
+    """Refuse unknown models, and a ladder without force.
 
     Raises:
         UsageError: an unknown model, or no `static`.

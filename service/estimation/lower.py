@@ -246,7 +246,7 @@ def _since(
     before_ns: Times | None,
     memory_ns: Floats,
 ) -> tuple[Bools, Ints]:
-    """Where something has happened within so long before, and when last; arrays over tiles."""
+    """Where something happened in the last `memory_ns`, and when it last did; arrays over tiles."""
     first = np.full(happened.shape[1], NEVER_NS) if before_ns is None else before_ns
     last_ns = np.maximum.accumulate(np.where(happened, t_ns, NEVER_NS), axis=0)
     last_ns = np.maximum(last_ns, first)

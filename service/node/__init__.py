@@ -2,5 +2,6 @@
 
 `run.py` joins the parts. The link is, from the outside in, `publisher` (dials, again and again),
 `connection` (what goes each way), `sending` (which frames are next) and `flow` (how many at once).
-May touch hardware by `service.rig` and the disk by `storage.journal`; serves no web page.
+Touches hardware through `service.rig`, and the disk through `storage.journal` and, for a recording
+of its own, `storage.sessions`; serves no web page.
 """

@@ -14,10 +14,10 @@ from devices.chips.mpl115a2 import PRESSURE_MIN_KPA
 from devices.errors import CalibrationError
 from devices.frames import NOT_READ, FrameBatch
 from devices.temperature import hold_temperature
-from service.estimation.bench.effects_fit import fit_effects
-from service.estimation.bench.fit import fit_tile
-from service.estimation.bench.indentation import Indentation, pressed_in
 from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.fitting.effects_fit import fit_effects
+from service.estimation.fitting.fit import fit_tile
+from service.estimation.fitting.indentation import Indentation, pressed_in
 from storage.sessions.file import SessionReader
 
 

@@ -44,7 +44,7 @@ NODE = "emulated"
 
 _GATHER = 64
 
-# Real time, in which a busy machine may be late: a reading lost to that would be another file.
+# Real time. Generous: a reading lost because the machine is busy would change the file.
 _ANSWER_S = 10.0
 
 

@@ -1,4 +1,5 @@
-"""The server: streams of nodes, live estimates, recording. It knows no hardware and no HTTP.
+"""The server: streams of nodes, live estimates, recording. It opens no hardware and serves no HTTP.
 
-A *server's node* is what a node said of itself, a *server's stream* what came of its streams.
+A *server's node* holds a node's streams, estimates, tares and clock; a *server's stream* holds the
+journal of one stream and what the node has said of it.
 """

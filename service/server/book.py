@@ -43,7 +43,7 @@ class Trash:
         return sorted(self._sessions.values(), key=lambda s: (s.started_t_ns, s.id), reverse=True)
 
     def take(self, session: Session, out_of: SessionFolder) -> None:
-        """Have a session here.
+        """Move a session into the trash.
 
         Raises:
             StorageError: it cannot be moved.
@@ -52,7 +52,7 @@ class Trash:
         self._sessions[session.id] = session
 
     def give_back(self, session_id: str, to: SessionFolder) -> Session:
-        """Have a session where it was before.
+        """Move a session back to where it was.
 
         Raises:
             UnknownError: it is not here.
@@ -65,7 +65,7 @@ class Trash:
         return self._sessions.pop(session_id)
 
     def doom(self) -> list[Path]:
-        """Have none of its sessions come back; gives the folders that are to be deleted.
+        """Give up all its sessions for good; return the folders to delete.
 
         Raises:
             StorageError: one of them cannot be moved; it and those after it are still here.
@@ -78,7 +78,7 @@ class Trash:
 
 
 def destroy(folders: list[Path]) -> int:
-    """Delete folders with all that is in them; how many bytes that were.
+    """Delete folders with all their files; return how many bytes they took.
 
     Raises:
         StorageError: one of them cannot be deleted; the next start tries it again.
@@ -92,7 +92,7 @@ def destroy(folders: list[Path]) -> int:
     return size_bytes
 
 
-log = logging.getLogger("foottile.recorder")
+log = logging.getLogger("foottile.book")
 
 
 class SessionBook:
@@ -114,7 +114,7 @@ class SessionBook:
         for session_id, error in unreadable.items():
             log.warning("session %s is left out: %s", session_id, error)
         self.has_unreadable = bool(unreadable) or trash.has_unreadable
-        """Is there one that cannot be read? What it needs is not known."""
+        """Is a session unreadable? Then it is not known which frames it needs."""
         self._sessions = {session.id: session for session in found}
 
     def __iter__(self) -> Iterator[Session]:
@@ -141,7 +141,7 @@ class SessionBook:
         return self._sessions[session_id]
 
     def keep(self, session: Session) -> Session:
-        """Have a session, new or changed, on the disk, and tell of it.
+        """Write a new or changed session to the disk, and report it.
 
         Raises:
             StorageError: it cannot be written down; what is known here is as it was.
@@ -152,7 +152,7 @@ class SessionBook:
         return session
 
     def note(self, session: Session) -> None:
-        """Know a session so; it is written down with its next change."""
+        """Replace what is known of a session in memory; its next change is written to disk."""
         self._sessions[session.id] = session
 
     def change(self, session_id: str, **changes: object) -> Session:

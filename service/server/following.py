@@ -1,4 +1,4 @@
-"""Sessions of a node that comes and goes: in which of its streams they begin, go on and end.
+"""Sessions of a node that comes and goes: where in its streams they begin, go on and end.
 
 A session is a list of intervals of streams. A node that is switched on again adds a part, and so
 does every stream that it took meanwhile and brings home. Where a part ends is decided in
@@ -25,7 +25,7 @@ from storage.sessions.ledger import ledger_of, numbers_of, states_of
 
 _UNHEARD_S = 1.0
 _SLOWEST = 1.5
-"""A stream is surely no more than so many times as old as its frames make it."""
+"""Upper limit of a stream's age, as a multiple of the time that its frames span."""
 
 
 def streams_of(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
@@ -97,7 +97,7 @@ def parts_needed(session: Session, node: ServerNode | None) -> Iterator[Part]:
     """Parts of streams that a session, not sealed yet, needs in the journals."""
     yield from session.parts
     if session.parts[-1].seq_last is None and node is not None:
-        # It is not known yet in which of them it was stopped.
+        # It is not known yet which stream it was stopped in.
         for boot_id in _following(session, node):
             yield Part(boot_id=boot_id, seq_first=0)
 
@@ -170,7 +170,7 @@ def _offset_ns(session: Session, node: ServerNode | None, boot_id: str) -> int |
     rows = [row for row in session.clock if row.boot_id == boot_id]
     if rows:
         return rows[-1].server_minus_node_ns
-    # The node was never linked in that stream: its date is most likely as wrong as it is now.
+    # The node had no link during that stream: its clock was most likely as wrong as it is now.
     return node.clock.server_minus_node_ns if node is not None and node.clock is not None else None
 
 
@@ -183,8 +183,8 @@ def _begin_t_ns(session: Session, node: ServerNode, boot_id: str) -> int:
 def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
     """Had a stream begun when the session was stopped? None: not known yet.
 
-    The instant that an earlier stream's oldest frame has is its own word; of the present one only
-    frames tell, or that it cannot be so old.
+    For an earlier stream the node says when its oldest frame was taken. For the present stream only
+    its frames say so, or the fact that it cannot be that old.
     """
     stream, rate_hz = node.streams[boot_id], node.streams[boot_id].info.nominal_rate_hz
     stop_t_ns = session.stopped_t_ns or utc_ns()
@@ -221,7 +221,7 @@ def ledger_now(session: Session, node: ServerNode | None) -> Ledger:
 
 
 def sources_now(session: Session, node: ServerNode) -> Sources:
-    """What a session is made from, sealed or given away before."""
+    """Sources that a session can be sealed or exported from."""
     session, streams = _provisional(session, node)
     return sources_of(
         session,
@@ -233,7 +233,7 @@ def sources_now(session: Session, node: ServerNode) -> Sources:
 
 
 def is_all_here(session: Session, node: ServerNode | None) -> bool:
-    """Is nothing more to come, and what is here on the disk?"""
+    """Have all frames come, and are they on the disk?"""
     if session.parts[-1].seq_last is None:
         return False
     for boot_id, numbers in numbers_of(session.parts).items():
@@ -246,7 +246,7 @@ def is_all_here(session: Session, node: ServerNode | None) -> bool:
 def _provisional(
     session: Session, node: ServerNode | None
 ) -> tuple[Session, dict[str, SessionStream]]:
-    """A session with the end that it will have nearly, and its streams."""
+    """A session with its likely end, and its streams."""
     streams = streams_of(session, node)
     with suppress(FootTileError):  # the frames that tell are damaged
         session = at_stop(session, streams)

@@ -76,7 +76,7 @@ class Piece:
 
 
 class Subscriber:
-    """What one client has yet to be told.
+    """What one client is still to be sent.
 
     Args:
         only: the node it wants to see; None: all.
@@ -277,7 +277,7 @@ def one(value: float, unit: str) -> float | None:
 
 
 def min_of(a: float, b: float) -> float:
-    """The smaller of two numbers, of which NaN is none."""
+    """The smaller of two numbers; NaN does not count as a number."""
     return b if math.isnan(a) else a if math.isnan(b) else min(a, b)
 
 

@@ -20,7 +20,7 @@ from service.estimation.tare.automatic import (
     Look,
     first_in_flight,
     look_in_flight,
-    tare_in_flight,
+    newest_unloaded_tare,
 )
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import TareFrames, take_tare
@@ -50,7 +50,7 @@ class LiveEstimates:
         self.full_scale_n: Floats | None = None
         """Force at that end."""
         self.slope_n_per_kpa: Floats | None = None
-        """Newtons of a kilopascal about zero, per tile; NaN for those that bear no load."""
+        """Newtons for a kilopascal near zero, per tile; NaN for tiles that bear no load."""
         self.free_since_t_ns: int | None = None
         """Since when every estimate has said that there is no contact; None: not yet."""
         self._run: EstimateRun | None = None
@@ -62,7 +62,7 @@ class LiveEstimates:
                 EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
                 self._calibration = calibration
                 self._know_ranges(calibration)
-            except FootTileError as error:  # does not fit these tiles: said, and done without
+            except FootTileError as error:  # does not fit these tiles: report it and go without
                 self.calibration_problem = str(error)
         self.use(tare)
 
@@ -107,7 +107,7 @@ class LiveEstimates:
         self._run = EstimateRun(plan)
 
     def feed(self, frames: FrameBatch) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Take the next frames; give those that are due, with or without estimates."""
+        """Take the next frames; return the frames that are due, with or without estimates."""
         self._recent.append(frames)
         while int(frames.t_ns[-1]) - int(self._recent[0].t_ns[-1]) > LOOK_BACK_NS:
             self._recent.popleft()
@@ -160,7 +160,7 @@ class LiveEstimates:
         """Whether the last seconds give reason to tare unasked.
 
         Args:
-            anchor: what an automatic tare is held against; None if there has been no tare.
+            anchor: the tare that an automatic one is compared with; None if there was no tare.
         """
         calibration, tare = self._calibration, self.tare
         if calibration is None or not self._recent:
@@ -170,7 +170,7 @@ class LiveEstimates:
             return first_in_flight(self._seen(frames, calibration))
         if self.free_since_t_ns is None or self._due_t_ns is None:
             return Look()
-        # Of younger frames it is not yet known whether there was contact.
+        # For younger frames it is not known yet whether there was contact.
         known = int(np.searchsorted(frames.t_ns, self._due_t_ns, side="right"))
         return look_in_flight(
             self._seen(frames.rows(0, known), calibration),
@@ -180,7 +180,7 @@ class LiveEstimates:
             bears=self._bears,
         )
 
-    def tare_from_flight(self) -> Tare:
+    def tare_now(self) -> Tare:
         """The tare from the newest unloaded interval of the last seconds.
 
         Raises:
@@ -191,7 +191,7 @@ class LiveEstimates:
             raise TareError("no frames have come yet", remedy="Is the node connected?")
         frames = FrameBatch.concatenate(list(self._recent))
         seen = self._seen(frames, calibration)
-        return tare_in_flight(seen, present=self.tare, bears=self._bears)
+        return newest_unloaded_tare(seen, present=self.tare, bears=self._bears)
 
     def _seen(self, frames: FrameBatch, calibration: Calibration) -> TareFrames:
         return TareFrames(frames, self._compensation, calibration, self._info.serials)
@@ -206,7 +206,7 @@ class LiveEstimates:
 
     def _note_contact(self, frames: FrameBatch, columns: Columns) -> None:
         before_t_ns = self._due_t_ns if self._due_t_ns is not None else int(frames.t_ns[0])
-        # In a gap too short for a step, a slot missed here and there, nothing can have happened.
+        # A gap that is too short for a step, such as a missed slot, cannot hide a contact.
         gap = np.diff(frames.t_ns, prepend=before_t_ns) > UNSEEN_NS
         taken = np.flatnonzero((columns["contact"] != 0) | gap)  # or not known
         self._due_t_ns = int(frames.t_ns[-1])

@@ -56,7 +56,7 @@ class ServerNode:
         self.has_spoken = False
         """Has it said hello since the server was started?"""
         self.greeted_t_ns: int | None = None
-        """When it said so last, server's UTC."""
+        """When it last said hello, server's UTC."""
         self.storage_problem: str | None = None
         self.troubles: tuple[str, ...] = ()
         """What is wrong with its array or its disk, as it said last."""
@@ -97,7 +97,7 @@ class ServerNode:
 
     @property
     def journals(self) -> dict[str, Journal]:
-        """Journals by boot_id, of streams of which frames have come."""
+        """Journals by boot_id, for streams that have sent frames."""
         return {name: s.journal for name, s in self.streams.items() if s.journal is not None}
 
     @property
@@ -112,7 +112,7 @@ class ServerNode:
 
     @property
     def missing(self) -> Intervals:
-        """What of the present stream should be here and is not: lost, or still to come."""
+        """Numbers of the present stream that should be here and are not: lost, or still to come."""
         newest = -1 if self.last_seq is None else self.last_seq
         if self.has_spoken:
             newest = max(newest, self.hello.next_seq - 1)
@@ -120,12 +120,12 @@ class ServerNode:
 
     @property
     def backlog_frames(self) -> int:
-        """How many of them the node still has."""
+        """How many of the missing frames the node still has."""
         return (self.missing & self.present.may_come).count
 
     @property
     def lost(self) -> dict[str, int]:
-        """How many of them it has not, by reason."""
+        """How many of the missing frames are lost, by reason."""
         gone = self.missing - self.present.may_come
         named = {why: lost.count for why, lost in self.present.lost.within(gone).items()}
         if unnamed := gone.count - sum(named.values()):
@@ -146,7 +146,7 @@ class ServerNode:
         """The node has connected, and said which frames it has.
 
         Args:
-            hello: in which every stream has the array that it had before.
+            hello: its message; every stream in it has the array that it had before.
             now_t_ns: the server's UTC.
         """
         if hello.array_info.boot_id != self.boot_id or self.last_seq is None:
@@ -176,7 +176,7 @@ class ServerNode:
             self.storage_problem = str(error)
 
     def lacks(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
-        """What it is asked for: first what sessions need, then the rest of the present stream.
+        """Frames to ask it for: first what sessions need, then the rest of the present stream.
 
         Args:
             needed: numbers by stream.
@@ -311,7 +311,7 @@ class ServerNode:
 
 
 def _joined(numbers: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The same in the same order, neighbours that follow each other as one."""
+    """The same numbers in the same order; neighbours that follow each other are joined."""
     joined: list[tuple[int, int]] = []
     for first, last in numbers:
         if joined and joined[-1][1] + 1 == first:

@@ -1,7 +1,7 @@
-"""Recording: sessions are started, stopped, given up, deleted and had back, and told of.
+"""Recording: starts, stops, gives up, deletes and restores sessions, and reports them.
 
-Starting and stopping only note numbers and instants; the frames are in the journals anyway. What
-becomes of a session after that is `service.server.settling`'s.
+Starting and stopping only note numbers and instants; the frames are in the journals anyway.
+`service.server.settling` does what follows.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class Recorder:
         self._settling.forget(session_id)
 
     def restore(self, session_id: str) -> Session:
-        """Have a session back from the trash; if it was pending, it goes on to be so.
+        """Restore a session from the trash; if it was pending, it stays pending.
 
         Raises:
             UnknownError: it is not in the trash.
@@ -168,7 +168,7 @@ class Recorder:
     def note_clock(self, node: ServerNode, row: ClockRow) -> None:
         """Keep a new measurement of a node's clock, with its sessions too.
 
-        It is in the stream's log; theirs are written down with the next change.
+        The stream's log has it already; sessions are written with their next change.
         """
         try:
             node.present.note_clock(row)
@@ -198,14 +198,14 @@ class Recorder:
         return self._settling.problem_of(session)
 
     def duration_s(self, session: Session, frames: int) -> float:
-        """How long it is: of a sealed one exactly, else by the stream's nominal rate."""
+        """Its length: exact for a sealed session, else estimated from the stream's nominal rate."""
         node = self._nodes.find(session.node)
         if session.state == "sealed" or node is None:
             return session.duration_s
         return frames / node.info.nominal_rate_hz
 
     def sources(self, session_id: str) -> Sources:
-        """What a session is made from, sealed or given away before.
+        """Sources that a session can be sealed or exported from.
 
         Raises:
             UnknownError: no such session, or its node is not known here.
@@ -216,7 +216,7 @@ class Recorder:
     def needed(self, node_name: str) -> dict[str, Intervals]:
         """Numbers by boot_id that sessions of a node, not sealed yet, need in its journals.
 
-        What is in the trash can be had back, so it needs its frames as well.
+        A session in the trash can be restored, so it needs its frames as well.
         """
         node = self._nodes.find(node_name)
         if self._book.has_unreadable and node is not None:
@@ -229,7 +229,7 @@ class Recorder:
         )
 
     def wanted(self, node_name: str) -> Wanted:
-        """The same as the node is told it."""
+        """The same numbers as the message that the node gets."""
         streams = tuple(
             StreamNumbers(boot_id=boot_id, numbers=with_open_ends(numbers))
             for boot_id, numbers in sorted(self.needed(node_name).items())

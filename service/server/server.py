@@ -1,4 +1,4 @@
-"""What one server process holds (nodes, recorder, subscribers, links), and does each tick."""
+"""One server process: its nodes, recorder, subscribers and links, and its tick."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Link:
         self.wanted: Wanted | None = None
         """What sessions need, as the node was told last."""
         self.news = asyncio.Event()
-        """There is something to tell the node."""
+        """Set when there is something to tell the node."""
         self._acks: dict[str, Intervals] = {}
         self.closing: tuple[Close, str] | None = None
         self.ended = asyncio.Event()
@@ -62,12 +62,12 @@ class Link:
         self.news.set()
 
     def acks(self) -> dict[str, Intervals]:
-        """What it is to be told of that, once."""
+        """Take the acknowledgements that wait to be sent; each is returned once."""
         acks, self._acks = self._acks, {}
         return acks
 
     def end(self, code: Close, reason: str) -> None:
-        """Have the connection closed."""
+        """Ask for the connection to be closed."""
         self.closing = self.closing or (code, reason)
         self.ended.set()
 
@@ -157,7 +157,7 @@ class Server:
         write_whole(self.data / ".writable", bytes(_PROBE_BYTES))
 
     async def empty_trash(self) -> tuple[int, int]:
-        """Delete what is in the trash for good; how many sessions, and bytes, they were.
+        """Delete what is in the trash for good; return the number of sessions and of bytes.
 
         Raises:
             StorageError: one of them cannot be deleted.
@@ -210,7 +210,7 @@ class Server:
                 self._tell_session(session)
 
     async def _sync(self, node: ServerNode) -> None:
-        """Have a node's journals on disk, then acknowledge what was in them before."""
+        """Sync a node's journals to disk, then acknowledge the frames that were in them before."""
         if node.storage_problem is not None:  # perhaps not even a journal could be begun
             await self._try_again(node)
             return
@@ -233,7 +233,7 @@ class Server:
             link.acknowledge(stream.boot_id, owed)
 
     async def _try_again(self, node: ServerNode) -> None:
-        """After a full disk: once it can be written again, have the node send what is missing."""
+        """After a full disk: once it can be written again, ask the node for what is missing."""
         try:
             await asyncio.to_thread(self.check_storage)
         except StorageError:

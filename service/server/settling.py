@@ -22,7 +22,7 @@ from service.sessions.sealing import seal
 from storage.intervals import Intervals
 from storage.sessions.folder import Session, write_events
 
-log = logging.getLogger("foottile.recorder")
+log = logging.getLogger("foottile.settling")
 
 _SEAL_AGAIN_S = 10.0
 
@@ -33,7 +33,7 @@ class Settling:
     Args:
         book: the sessions.
         nodes: whose frames they are made of.
-        ask_again: told of a node that may still have frames that are damaged here.
+        ask_again: called with a node that may still have frames that are damaged here.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Settling:
                 continue
             try:
                 self._settle(session)
-            except FootTileError as error:  # one that cannot be must not hold up the others
+            except FootTileError as error:  # it must not hold up the others
                 log.warning("session %s: %s", session.id, error)
                 self._again_after[session.id] = time.monotonic() + _SEAL_AGAIN_S
 
@@ -89,7 +89,7 @@ class Settling:
         return session_id in self._sealing
 
     def forget(self, session_id: str) -> None:
-        """Do not wait any longer before it is tried again, and do not speak of what failed."""
+        """Forget that sealing failed: try again at once, and do not report the failure."""
         self._again_after.pop(session_id, None)
         self._not_sealed.pop(session_id, None)
 
@@ -115,14 +115,14 @@ class Settling:
         if node is None:
             return session
         followed = following.followed(session, node)
-        # Those that take it up first: if the server is killed between, none is forgotten.
+        # Save the sessions that continue it first: if the server is killed between, none is lost.
         if not any(known.continues == session.id for known in self._book):
             for further in reversed(followed[1:]):
                 self._book.keep(further)
         return session if followed[0] is session else self._book.keep(followed[0])
 
     def _disown(self, session: Session, error: DamagedFramesError) -> None:
-        """Frames on the disk are not what was written: have them again, or count them as lost."""
+        """Drop frames damaged on disk: get them from the node again, or count them as lost."""
         node, folder = self._nodes.get(session.node), Path(error.where).parent
         for stream in node.streams.values():
             if stream.folder == folder:

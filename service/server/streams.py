@@ -21,7 +21,7 @@ from storage.journal.stream_notes import StreamNotes
 from storage.schema import wire_schema
 
 CLOCK_ROWS = 128
-"""So many measurements of a clock are at hand for a pre-roll; all of them are in the log."""
+"""Clock measurements that are kept in memory for a pre-roll; the log has all of them."""
 _AROUND_MAX = 32
 
 
@@ -49,7 +49,7 @@ class ServerStream:
         """When its last frame came, server's UTC."""
         self.missed_slots = 0
         self.unsynced = Intervals()
-        """Frames that were appended to the journal since it was synced."""
+        """Frames appended to the journal since the last sync."""
         self.owed = Intervals()
         """Frames to be acknowledged once the journal is synced."""
         self._first_seq: int | None = None
@@ -136,7 +136,7 @@ class ServerStream:
         return lost
 
     def for_session(self, offset_ns: int | None) -> SessionStream:
-        """What sessions know of it.
+        """The stream as sessions see it.
 
         Args:
             offset_ns: what to add to its instants for the server's.
@@ -184,17 +184,17 @@ class ServerStream:
         return found
 
     def missing(self, newest: int) -> Intervals:
-        """What should be here and is not, from the first frame known of up to `newest`."""
+        """Numbers that should be here and are not, from the first known frame to `newest`."""
         if self._first_seq is None or newest < self._first_seq:
             return Intervals()
         return self.held.missing(self._first_seq, newest) - self._forgotten
 
     def lacks(self, needed: Intervals, *, all_of_it: bool) -> Intervals:
-        """What the node has and is missing here.
+        """Numbers that the node has and that are missing here.
 
         Args:
-            needed: by sessions.
-            all_of_it: not only that.
+            needed: numbers that sessions need.
+            all_of_it: ask for all that is missing; False: only for `needed`.
         """
         if self.node_has is None:
             return Intervals()
@@ -224,7 +224,7 @@ class ServerStream:
         self.node_has = Intervals()
 
     def note_losses(self, lost: PairsByReason) -> None:
-        """All that the node has lost of it by now."""
+        """Note all frames of this stream that the node has lost so far."""
         notes = self.notes
         self._said(lost, next_seq=notes.next_seq, unsynced_tail_max=notes.unsynced_tail_max)
 
@@ -246,7 +246,7 @@ class ServerStream:
         self.owed.add(first, last)
 
     def sync(self) -> None:
-        """Have journal and notes on the disk; may run in another thread.
+        """Sync journal and notes to the disk; may run in another thread.
 
         Raises:
             StorageError: the disk refused.
@@ -268,7 +268,7 @@ class ServerStream:
         return bool(self.unsynced or self.owed or unsaved or self._clock_unsynced)
 
     def disown(self, doubtful: Intervals, *, corrupt: bool = False) -> None:
-        """Hold these frames no longer: what is on the disk may not be what was written."""
+        """Stop holding these frames: the disk may not have what was written."""
         if self.journal is None:
             return
         self.journal.disown(doubtful)

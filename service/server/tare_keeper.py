@@ -22,7 +22,7 @@ from storage.journal.journal import Journal
 LOOK_EVERY_NS = 5_000_000_000
 """A look at the last seconds costs some milliseconds."""
 LEAD_WAIT_NS = 10_000_000_000
-"""Frames of a lead that are still missing so long after it will not come."""
+"""Frames of a lead that are still missing this long after its end will not come."""
 _BY_HAND = "lift the foot, hold it still, and tare"
 
 AutoTare = Literal["on", "paused", "off"]
@@ -104,7 +104,7 @@ class TareKeeper:
             TareError: the foot was loaded, or there is nothing to tare.
             StorageError: it cannot be kept.
         """
-        recorded = self._history.add(self._live.tare_from_flight(), self._info, reason)
+        recorded = self._history.add(self._live.tare_now(), self._info, reason)
         self._put_in_force(recorded)
         return recorded
 

@@ -307,16 +307,6 @@ class EventView(View):
     t_ns: int = Field(description="Server's UTC.")
 
 
-class Problem(BaseModel):
-    """RFC 9457: what went wrong, where, and what to do."""
-
-    type: str = "about:blank"
-    title: str
-    status: int
-    detail: str
-    instance: str
-
-
 def _tiles(node: ServerNode) -> list[TileView]:
     calibration, full_scale_n = node.live.calibration, node.live.full_scale_n
     full_scales = [None] * len(node.info.tiles) if full_scale_n is None else _known(full_scale_n)

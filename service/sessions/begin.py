@@ -86,6 +86,6 @@ def taken_up(
 
 
 def numbered(name: str) -> tuple[str, int]:
-    """The name that a recording was given, and which of its sessions this is: `mud (2)` is two."""
+    """The name given to a recording, and the number of this session in it: 2 for `mud (2)`."""
     match = re.fullmatch(r"(.*) \((\d+)\)", name)
     return (match[1], int(match[2])) if match else (name, 1)

@@ -31,7 +31,7 @@ class Around(Protocol):
     def __call__(
         self, t_ns: int, *, at_least: int, waiting: bool = False
     ) -> tuple[int, int] | None:
-        """As `around_in`; `waiting`: what was found may be given while frames between may come."""
+        """As `around_in`; `waiting`: may return an earlier result while frames between may come."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def around_in(
         journal: of the stream.
         t_ns: the instant.
         at_least: earlier numbers do not count; the last is `at_least` - 1 if there is none.
-        waiting: makes no difference here, for nothing is remembered.
+        waiting: has no effect here, because nothing is remembered.
 
     Returns:
         Both; None while the stream has not passed the instant.
@@ -82,7 +82,7 @@ def around_in(
 
 
 RATE_MAX_HZ = 1000.0
-"""Of a stream of which not even the description is left: no bus is faster."""
+"""Assumed rate of a stream without a description: no bus is faster."""
 
 Streams = Mapping[str, SessionStream]
 
@@ -112,8 +112,8 @@ def at_end(session: Session, streams: Streams, now_t_ns: int | None = None) -> S
     Args:
         session: the session.
         streams: by boot_id, of all of its parts.
-        now_t_ns: until when a stream may have gone on that has not said how it ended; None: its
-            session ends with the newest frame there is.
+        now_t_ns: a stream whose end is not known may have gone on until then; None: its session
+            ends with the newest frame there is.
     """
     for part in session.parts:
         if part.seq_last is None:
@@ -130,7 +130,7 @@ def at_end(session: Session, streams: Streams, now_t_ns: int | None = None) -> S
 
 
 def broken_off(session: Session, streams: Streams, now_t_ns: int | None = None) -> Session:
-    """The session with every part ended by what is here: nothing more will come to tell.
+    """The session with every part ended by the frames that are here: no more will come.
 
     If it was never stopped, it was stopped with its newest frame.
 
@@ -154,7 +154,7 @@ def broken_off(session: Session, streams: Streams, now_t_ns: int | None = None) 
 
 
 def ended(session: Session, part: Part, seq_last: int, tail: int = 0) -> Session:
-    """The session with this end of a part, behind which `tail` frames may have been."""
+    """The session with this end of a part; up to `tail` frames may have followed it."""
     closed = part.model_copy(update={"seq_last": max(seq_last, part.seq_first - 1)})
     parts = tuple(closed if each is part else each for each in session.parts)
     update: dict[str, object] = {"parts": parts}
@@ -164,7 +164,7 @@ def ended(session: Session, part: Part, seq_last: int, tail: int = 0) -> Session
 
 
 def open_tail(stream: SessionStream) -> int:
-    """How many frames a stream may have had behind its newest, as far as that is known of it."""
+    """How many frames a stream may have had after its newest one, as far as that is known."""
     if stream.next_seq is not None:
         return stream.unsynced_tail_max
     return max(stream.unsynced_tail_max, unsynced_tail_max(_rate_hz(stream)))
@@ -185,14 +185,14 @@ def _seq_at_stop(
         return last
     if waiting and stream.may_come & Intervals([(last + 1, after - 1)]):
         return None
-    # The stop lies among frames that are lost: by the rate, so many of them came after it.
+    # The stop lies among lost frames: the rate tells how many of them came after it.
     after_t_ns = stream.t_ns_near(after, newest=False) or stop_t_ns
     late = math.ceil((after_t_ns - stop_t_ns) * 1e-9 * _rate_hz(stream))
     return min(after - 1, max(last, after - late))
 
 
 def _unheard(session: Session, stream: SessionStream, now_t_ns: int | None) -> int:
-    """How many frames there may have been behind the last that is known of.
+    """How many frames there may have been after the last known one.
 
     Until the stop or now, whichever was first; if neither is known, until the newest was synced.
     """

@@ -66,7 +66,7 @@ class SessionFrames:
             yield frames, columns
 
     def _without_estimates(self, reason: object) -> None:
-        """Say why there are none, and keep what `foottile estimate` can make them with later."""
+        """Say why there are no estimates, and keep what `foottile estimate` needs for them."""
         calibration, tares = self._sources.calibration, self._sources.tares
         self.problem = f"no estimates: {reason}"
         self.notes = {"estimates": self.problem}
@@ -91,7 +91,7 @@ _LATER = "`foottile estimate` adds them where foottile[server] is installed"
 
 
 def _gathered(batches: Iterator[FrameBatch]) -> Iterator[FrameBatch]:
-    """Fewer and longer batches: estimates of ten rows cost nearly what those of thousands do."""
+    """Join batches: estimating ten rows costs nearly as much as estimating thousands."""
     waiting: list[FrameBatch] = []
     count = 0
     for batch in batches:

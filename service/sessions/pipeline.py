@@ -54,7 +54,7 @@ class EstimateRun:
         self._held: deque[tuple[FrameBatch, Extra]] = deque()
 
     def feed(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Take the next frames; give those whose estimates are due, in order."""
+        """Take the next frames; return those whose estimates are due, in order."""
         for begin in range(0, len(frames), CHUNK):
             end = min(begin + CHUNK, len(frames))
             rows = frames.rows(begin, end)
@@ -63,7 +63,7 @@ class EstimateRun:
             yield from _paired(self._held, estimates)
 
     def finish(self) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Give the frames that still wait for a look-ahead, which will not come."""
+        """Return the frames that still wait for their look-ahead: no more frames will come."""
         last = finish(self.plan, self._state)
         self._state = EstimationState()
         if last is not None:

@@ -69,7 +69,7 @@ class Recovery:
     Attributes:
         sessions: that were not sealed before.
         removed: half-written files of dead processes.
-        cut: journals of which something was cut off, and how many bytes; set aside, not deleted.
+        cut: bytes that were cut off, by journal; they are set aside, not deleted.
         mended: sessions whose `events.parquet` was written again.
         problems: what could not be recovered, beside sessions.
     """
@@ -103,7 +103,7 @@ def recover(
 
     Args:
         data: the folder, whose lock the caller holds.
-        streams: make sessions of frames that belong to none.
+        streams: make sessions for frames that belong to no session.
         give_up: on a server's folder, seal what its nodes have not brought as lost.
         tell: told what is being done.
         now: for the ids of new sessions.
@@ -116,7 +116,7 @@ def recover(
     recovery.removed += remove_stale_temporaries(data)
     set_aside = _set_aside(data)
     if _is_local(data):
-        settle_left_over(data)  # a node's: what it had in flight when it was killed is there yet
+        settle_left_over(data)  # a killed node leaves its frames in flight in a file
     opened, recovery.problems = open_streams(data, tell, is_local=_is_local(data))
     for path in sorted(_set_aside(data) - set_aside):
         name = f"{path.parent.parent.name}/{path.parent.name}"
@@ -187,7 +187,7 @@ def _complete(
 
 
 def _is_local(data: Path) -> bool:
-    """Is it a node's own folder? Then nothing more will come."""
+    """Is this a node's own folder? Then no more frames will come."""
     return not (data / "nodes").is_dir()
 
 
@@ -204,15 +204,16 @@ def _described(
 def _of_no_session(
     data: Path, known: list[Session], streams: Streams, now: Callable[[], datetime]
 ) -> list[Session]:
-    """Sessions of the frames that belong to none, one for every run of a stream."""
-    # What was deleted is not wanted back, and what of it cannot be read says nothing of its frames.
+    """Sessions for frames that belong to no session, one for each run of a stream."""
+    # Frames of a deleted session must not come back as a new one. A session in the trash that
+    # cannot be read does not say which frames it has.
     known = [*known, *SessionFolder(data / "trash").load_all()[0]]
     found = []
     for (node, boot_id), stream in streams.items():
         parts = (part for session in known if session.node == node for part in session.parts)
         taken = numbers_of(parts).get(boot_id, Intervals())
         journal, hello = stream.journal, hello_of(data, node)
-        # What was lost between two frames does not part them; what a session took does.
+        # Lost frames do not split a run; frames that belong to a session do.
         own = (journal.held | stream.lost.all | stream.damaged) - taken
         for run in own:
             held = list(journal.held.within(*run))
@@ -239,12 +240,12 @@ def _of_no_session(
 
 
 def _set_aside(data: Path) -> set[Path]:
-    """What stood behind the last whole batch of a segment."""
+    """Files with what followed the last whole batch of a segment."""
     return set(data.glob("journal/*/*/*" + UNREAD_SUFFIX))
 
 
 def _mend_events(session: Session, folder: Path) -> bool:
-    """Write `events.parquet` again if it is not what `session.json` says: that is written first."""
+    """Write `events.parquet` again if it differs from `session.json`, which is written first."""
     wanted = [event.model_dump() for event in session.events]
     try:
         with pq.ParquetFile(folder / EVENTS_NAME) as file:

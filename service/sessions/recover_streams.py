@@ -66,7 +66,7 @@ class OpenedStream:
     def note_losses(self) -> None:
         """Write down what was found damaged: once it is cut off, nothing else says so.
 
-        A server does not: its node may have these frames, and says what it has lost itself.
+        A server's folder is left alone: the node may have these frames, and says what it lost.
 
         Raises:
             StorageError: the disk is full or not writable.
@@ -78,7 +78,7 @@ class OpenedStream:
             self.notes.save(self.journal.folder)
 
     def disown_damaged(self, first: int, last: int) -> None:
-        """Read what is held from `first` to `last`; what does not agree with its checksum is lost.
+        """Read the frames held from `first` to `last`; those with a wrong checksum count as lost.
 
         Raises:
             StorageError: it cannot be read.
@@ -135,7 +135,7 @@ def open_streams(
 
 
 def hello_of(data: Path, node: str) -> dict[str, Any]:
-    """What a server kept of what a node said last; empty if there is nothing."""
+    """The node's last hello as the server kept it; empty if there is none."""
     try:
         content = json.loads((data / "nodes" / node / "hello.json").read_bytes())
     except (OSError, ValueError):

@@ -14,7 +14,7 @@ from storage.sessions.folder import FRAMES_NAME, Ledger, Session, write_events
 
 
 def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
-    """Write the session's files; give the session as it is then.
+    """Write the session's files; return the sealed session.
 
     Args:
         sources: what to seal; every part has an end.

@@ -79,7 +79,7 @@ def sources_of(
         streams: by boot_id, of all of its parts.
         tares: gives those of its node; None: nothing is kept of them.
         emulated: are its frames emulated? None: not known.
-        no_array: stands for the array where no stream tells of one.
+        no_array: used as the array if no stream describes one.
     """
     infos = [streams[part.boot_id].info for part in session.parts]
     info = next((info for info in infos if info is not None), no_array or _no_array(session))
@@ -137,7 +137,7 @@ def _tares_of(
 
 
 def _no_array(session: Session) -> ArrayInfo:
-    """In place of the array of a session that has no frames left."""
+    """Stands for the array of a session that has no frames left."""
     return ArrayInfo(
         node=session.node,
         boot_id=session.parts[0].boot_id,

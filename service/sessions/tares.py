@@ -20,7 +20,7 @@ from storage.durable import make_folder, storage_errors, write_whole
 
 KEPT_MAX = 1000
 AUTOMATIC_KEPT_MAX = 200
-"""Beyond, their older half is thinned out: the course of hours stays."""
+"""Above this number the older half is thinned out, which keeps the trend over hours."""
 REASON_LENGTH_MAX = 200
 
 _REASONS = {
@@ -44,7 +44,7 @@ class RecordedTare:
     """Coefficients of the tiles' chips; None in tares of older versions, which kept none."""
 
     def is_of(self, info: ArrayInfo) -> bool:
-        """Is it of these very tiles? A swapped part has the same serial and another chip."""
+        """Does it belong to these tiles? A swapped part has the same serial but another chip."""
         return self.serials == info.serials and self.chips in (None, _chips(info))
 
     @property
@@ -75,12 +75,12 @@ class TareHistory:
         return fitting[-1] if fitting else None
 
     def anchor(self, info: ArrayInfo) -> RecordedTare | None:
-        """What automatic tares are held against: the last one that is none, else the oldest."""
+        """What automatic tares are compared with: the last other tare, else the oldest."""
         fitting = self._of(info)
         return next((t for t in reversed(fitting) if not t.is_automatic), (*fitting, None)[0])
 
     def is_automatic_paused(self, info: ArrayInfo) -> bool:
-        """Was an automatic one undone, and none taken otherwise since?"""
+        """Was an automatic tare undone, with no other kind taken since?"""
         for recorded in reversed(self._tares):
             if not recorded.is_of(info):
                 continue
@@ -168,8 +168,8 @@ def _read_chips(content: Any) -> tuple[tuple[int, ...], ...] | None:
 def _bounded(tares: list[RecordedTare]) -> list[RecordedTare]:
     automatic = [t for t in tares if t.is_automatic]
     if len(automatic) > AUTOMATIC_KEPT_MAX:
-        # The one that says least: of the older half that whose neighbours are closest. Not the very
-        # first, for others may be held against it.
+        # Drop the tare that says least: in the older half, the one with the closest neighbours. The
+        # very first stays, because others may be compared with it.
         gaps_ns = {
             now.id: after.tare.t_ns - before.tare.t_ns
             for before, now, after in zip(automatic, automatic[1:], automatic[2:], strict=False)

@@ -117,7 +117,7 @@ class Stretch:
         low, high = _intervals(rows)
         wander = WANDER
         while not self._fit(x, low, high, limit, wander) and wander < 2 * limit:
-            # Its rate moves more than is assumed: by as much as the rows require, and up to twice.
+            # The rate wanders more than assumed: double the limit until it fits the rows.
             self.steady = False
             wander *= 2
 

@@ -100,7 +100,7 @@ def _row(line: bytes) -> ClockOffset | None:
         row = ClockOffset.model_validate(content)
     except (ValueError, ValidationError, TypeError, KeyError, RecursionError):
         return None
-    # Not only the sum: what reads the same, written otherwise, was not written here.
+    # The checksum is not enough: a line that parses alike but is spelt differently was edited.
     return row if _line(row) == line + b"\n" else None
 
 

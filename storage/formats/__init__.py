@@ -1,4 +1,5 @@
 """Other formats, read and written: a module for each.
 
-Stands on `storage.sessions` and `storage.schema`; touches no journal.
+Exports stand on `storage.sessions`, `storage.clock` and `storage.schema`, load traces on
+`devices.emulation`. Touches no journal.
 """

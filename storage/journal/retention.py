@@ -70,11 +70,11 @@ class Retention:
         return self._may_drop and any(stream.evict(self._wanted) for stream in streams)
 
     def tidy(self, streams: Sequence[NodeStream]) -> list[NodeStream]:
-        """Delete what has outlasted the ring; the streams of which nothing is left."""
+        """Delete frames that are older than the ring; return the streams that have none left."""
         return [stream for stream in streams if self._may_drop and self._tidy(stream)]
 
     def _tidy(self, stream: NodeStream) -> bool:
-        """Delete what has outlasted the ring; is nothing of the stream left or asked for?"""
+        """Delete frames that are older than the ring; is the stream empty and not wanted?"""
         journal = stream.journal
         if journal is None:
             return False

@@ -244,8 +244,8 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
             if found is None and is_whole(record):
                 doubtful.add(*numbers(record))
             elif found is not None:
-                # What is damaged before something whole was damaged later; at the end of a file
-                # that was not closed it never was on the disk, and was never promised.
+                # Damage followed by a good batch happened after writing; damage at the end of
+                # an unclosed file was never promised.
                 damaged, doubtful = damaged | doubtful, Intervals()
                 if found["count"]:
                     good.append(found)

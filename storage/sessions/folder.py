@@ -268,7 +268,7 @@ class SessionFolder:
         return found, unreadable
 
     def move(self, session_id: str, to: SessionFolder) -> None:
-        """Have a session's folder among those of `to`: it is in one place or the other, never both.
+        """Move a session's folder to those of `to`: it is in one place or the other, never both.
 
         Raises:
             UnknownError: there is no such session.
@@ -284,16 +284,19 @@ class SessionFolder:
             sync_folder(source.parent)
 
     def doom(self, session_id: str) -> Path:
-        """Have a session be none any more; what is left of it is to be deleted.
+        """Rename a session's folder so that it is no session any more.
+
+        Returns:
+            The renamed folder, to be deleted.
 
         Raises:
             UnknownError: there is no such session.
-            StorageError: it cannot be; it is as it was then.
+            StorageError: it cannot be renamed; the session is unchanged then.
         """
         folder = self.path(session_id)
         if not folder.is_dir():
             raise UnknownError(f"no session {session_id!r}")
-        # What is half deleted must not be taken for a session.
+        # A half-deleted folder must not look like a session.
         doomed = folder.with_name(DOOMED_PREFIX + session_id)
         with storage_errors(folder):
             folder.rename(doomed)

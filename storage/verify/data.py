@@ -1,4 +1,4 @@
-"""`foottile verify`: what files prove of themselves, without any server.
+"""Verifies whatever a path names, up to a whole data folder, and gives one verdict.
 
 Nothing is written, no lock is taken; a server or node may run beside it.
 """

@@ -151,7 +151,7 @@ def _check_batches(
                 said.append(f"frames {first} to {last} do not agree with their checksum")
                 doubtful.add(first, last)
                 continue
-            # What is damaged before something whole was whole once.
+            # Damage followed by a good batch happened after writing.
             report.damaged, doubtful = report.damaged | doubtful, Intervals()
             report.problems += said
             said = []

@@ -271,7 +271,7 @@ def _count(report: SessionReport, data: Path, session: Session, streams: Streams
             reports[part.boot_id] = found = streams(folder)
             report.problems += [f"journal {part.boot_id}: {problem}" for problem in found.problems]
         reports.setdefault(part.boot_id, StreamReport(session.node, part.boot_id))
-    # Of a server's folder a node may still bring frames; a node has what there is.
+    # In a server's folder a node may still deliver frames; a node's own folder has all there are.
     may_come = Intervals([(0, NO_END)] if (data / "nodes").is_dir() else ())
     states = states_of(session, {b: found.state(may_come) for b, found in reports.items()})
     ledger = ledger_of(session.parts, states, finished=session.stopped_t_ns is not None)

@@ -338,6 +338,11 @@ class FakeNode:
         self.socket.close()
         until(lambda: not self.running.node(self.name)["connected"])
 
+    def restart(self) -> None:
+        """Go away, and be switched on again with a new stream."""
+        self.leave()
+        self.reboot()
+
     def close(self) -> None:
         self._sockets.close()
 

@@ -1,1 +1,1 @@
-"""What the foot stands on: forces on the domes as a function of time, and nothing else."""
+"""What the foot stands on: forces and angle over time, notes, and the mill with its converter."""

@@ -1,1 +1,1 @@
-"""The HTTP API, a module for each kind of thing. No rule of a session stands here."""
+"""The HTTP API, a module for each kind of thing. No rule of a session is here."""

@@ -8,9 +8,8 @@ from typing import Annotated, Any
 from fastapi import Depends, Request
 
 from devices.errors import UnknownError
-from service.api.problems import MEDIA_TYPE
+from service.api.problems import MEDIA_TYPE, Problem
 from service.server.server import Server
-from service.server.views import Problem
 
 _SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}
 

@@ -1,1 +1,1 @@
-"""One module for each command: options to calls, results to text or JSON."""
+"""The commands of `foottile`, a module for each: options to calls, results to text or JSON."""

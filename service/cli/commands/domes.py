@@ -10,7 +10,7 @@ from rich.table import Table
 
 from devices.errors import UsageError
 from service.cli.options import JsonOption, print_json, say, stdout
-from service.estimation.bench.domes import DomeRange, dome_for, external_share, fast_share, ranges
+from service.estimation.domes import DomeRange, dome_for, external_share, fast_share, ranges
 
 
 def domes_command(

@@ -47,7 +47,7 @@ def sessions_command(
     if data is not None:
         found = _in_folder(data)
     else:
-        from service.offline.client import Client
+        from service.client import Client
 
         with Client(server or SERVER) as client:
             found = client.sessions()
@@ -88,7 +88,7 @@ def pull_command(
 
     The data is compared with its hash. Exit code 3: the session is complete on disk, but lossy.
     """
-    from service.offline.client import Client
+    from service.client import Client
 
     with Client(server or SERVER) as client, progress(f"pulling {session}"):
         pulled = client.pull(session, out)

@@ -34,7 +34,9 @@ WINDOW_MAX_NS = 1_000_000_000
 """A window is longer if an array is so slow that it would hold too few frames, up to this."""
 
 
-def tare_in_flight(seen: TareFrames, *, present: Tare | None, bears: Bools | None = None) -> Tare:
+def newest_unloaded_tare(
+    seen: TareFrames, *, present: Tare | None, bears: Bools | None = None
+) -> Tare:
     """The tare from the newest unloaded window of the frames seen.
 
     Of all windows in which every tile is quiet and still, those count in which no tile is higher
@@ -142,13 +144,13 @@ NEAR_KPA = 0.15
 """How far a baseline may be moved at once beyond what the temperature explains: 0.3 N on a tile,
 the noise of a single reading."""
 FAR_KPA = 0.25
-"""And how far in all since the last tare that was not automatic: half a newton on a tile."""
+"""Limit of the whole shift since the last tare that was not automatic: half a newton."""
 EXPLAINED_PART = 0.5
 """Gas and chip do not warm at once, and the wall gives way: half of what is explained is open."""
 SETTLE_NS = 100_000_000
-"""The rubber recovers for so long after a contact, before a window may begin."""
+"""How long the rubber recovers after a contact before a window may begin."""
 CONFIRM_NS = 900_000_000_000
-"""Where nothing has moved the tare is renewed so seldom, long before it is called old."""
+"""If nothing has moved, the tare is renewed only after this, long before it counts as old."""
 MOVED_SIGMAS = 4.0  # of both tares: less may be chance
 MOVED_MIN_KPA = 0.02
 """Less than this is not worth an entry in the history."""
@@ -195,7 +197,7 @@ def look_in_flight(
     if not len(frames) or frames.t_ns[-1] - free_since_t_ns < SETTLE_NS + WINDOW_NS:
         return NOTHING
     try:
-        tare = tare_in_flight(seen, present=present, bears=bears)
+        tare = newest_unloaded_tare(seen, present=present, bears=bears)
     except TareError:  # it moves, a tile is silent, or it bears a load: no flight
         return NOTHING
     begin_t_ns = int(frames.t_ns[0]) + round(tare.begin_s * 1e9)
@@ -232,7 +234,7 @@ def first_in_flight(seen: TareFrames) -> Look:
     if not seen.has_bench or not len(seen.frames):
         return NOTHING
     try:
-        tare = tare_in_flight(seen, present=None)
+        tare = newest_unloaded_tare(seen, present=None)
     except TareError:
         return NOTHING
     off_kpa = np.abs(tare.baseline_kpa - seen.bench_kpa)

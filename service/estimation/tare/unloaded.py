@@ -192,7 +192,7 @@ class TareFrames:
 
 
 def lowest(windows: list[Window]) -> list[Window]:
-    """Those in which no tile is higher than in the lowest of them, but for chance."""
+    """Windows where no tile is higher than in the lowest window, except by chance."""
     lowest_kpa = np.min([window.mean_kpa for window in windows], axis=0, initial=np.inf)
     return [
         window

@@ -91,5 +91,5 @@ def rungs(
 
 
 def absent(models_of_scene: Sequence[str], existing: Sequence[str] = MODELS) -> tuple[str, ...]:
-    """Models that a scene names and that there are not."""
+    """Models that a scene names but that do not exist."""
     return tuple(name for name in models_of_scene if name not in existing)

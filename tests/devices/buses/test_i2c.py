@@ -24,9 +24,10 @@ from devices.errors import (
     NoAcknowledgeError,
     UsageError,
 )
+from tests.devices.adapters import Adapter
 
 
-class BrokenAdapter:
+class BrokenAdapter(Adapter):
     """Every transaction fails with one errno."""
 
     def __init__(self, error: OSError) -> None:
@@ -34,12 +35,6 @@ class BrokenAdapter:
 
     def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
         raise self.error
-
-    def set_timeout(self, units_10ms: int) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
 
 
 def failure_of(error: OSError, *messages: i2c_msg) -> I2cError:

@@ -22,6 +22,7 @@ from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, Silicon
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.errors import NoAcknowledgeError, TileSetupError
+from tests.devices.adapters import Adapter
 
 DATA_SHEET = bytes.fromhex("3ECE B3F9 C517 33C8")
 FORUM = bytes.fromhex("3591 C0A2 C625 2C18")
@@ -99,7 +100,7 @@ def test_a_part_that_is_not_there_does_not_acknowledge() -> None:
 # The bytes of the transfers
 
 
-class Script:
+class Script(Adapter):
     """An adapter that expects exactly these transactions and gives these answers."""
 
     def __init__(self, *transactions: tuple[str, str]) -> None:
@@ -118,12 +119,6 @@ class Script:
         if answer:
             for i, value in enumerate(bytes.fromhex(answer)):
                 i2c_msgs[-1].buf[i] = value
-
-    def set_timeout(self, units_10ms: int) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
 
 
 def scripted(*transactions: tuple[str, str]) -> tuple[Mpl115a2, Script]:

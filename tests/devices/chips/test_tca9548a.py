@@ -16,11 +16,12 @@ from devices.clock import VirtualClock
 from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.errors import BusFaultError, BusMisuseError, I2cError, NoAcknowledgeError
+from tests.devices.adapters import Adapter
 
 NACK, TIMEOUT, REFUSED = 121, 110, 22
 
 
-class Protocol:
+class Protocol(Adapter):
     """An adapter that expects these transactions, one message each, and no other.
 
     "70<01" is the byte 0x01 written to 0x70, "70>01" the byte 0x01 read from it; a number behind it
@@ -43,12 +44,6 @@ class Protocol:
             assert step == f"{message.addr:02x}<{bytes(message).hex()}"
         if number:
             raise OSError(int(number), "scripted")
-
-    def set_timeout(self, units_10ms: int) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
 
     @contextmanager
     def exchanged(self, *steps: str) -> Iterator[None]:
@@ -268,7 +263,7 @@ def test_a_bus_on_which_nobody_answers_does_not_move(protocol: Protocol) -> None
         muxes.echoes()
 
 
-class Watch:
+class Watch(Adapter):
     """Emulated muxes beneath an adapter that fails when told, and looks at them at every STOP."""
 
     def __init__(self, addresses: list[int], outcomes: list[str]) -> None:
@@ -285,12 +280,6 @@ class Watch:
         self.most_open = max(self.most_open, sum(mux.mask != 0 for mux in self.muxes))
         if outcome == "late":
             raise OSError(TIMEOUT, "the mux heard it, but we were not told")
-
-    def set_timeout(self, units_10ms: int) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
 
     def routing(self) -> dict[int, int]:
         return {mux.address: mux.mask for mux in self.muxes if mux.mask}

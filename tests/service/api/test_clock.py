@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from service.cli.main import main
-from service.offline.client import Client
+from service.client import Client
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
@@ -162,8 +162,7 @@ def test_a_node_that_was_switched_on_anew_has_a_clock_for_each_start(
     node.send(50)
     node.taken_in()
     first = node.boot_id
-    node.leave()
-    node.reboot()
+    node.restart()
     begun(node, HOUR_NS)
     node.send(50)
     node.taken_in()

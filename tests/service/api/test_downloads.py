@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import LinkError, StateError
-from service.offline.client import Client
+from service.client import Client
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused

@@ -151,8 +151,7 @@ def test_a_node_that_is_switched_on_anew_goes_on_in_a_second_part(tared: FakeNod
     session = tared.record()
     first = tared.deliver(100, 10.0)
     first_boot_id = tared.boot_id
-    tared.leave()
-    tared.reboot()
+    tared.restart()
     assert tared.connect() == [(0, None)]
     second = tared.deliver(60, 10.0)
     sealed = tared.finish(session)
@@ -264,8 +263,7 @@ def test_a_pre_roll_reaches_no_further_than_what_is_held(tared: FakeNode) -> Non
 def test_a_session_ends_by_the_servers_clock(tared: FakeNode) -> None:
     # The node's clock is an hour behind; it says so.
     hour_ns = 3_600_000_000_000
-    tared.leave()
-    tared.reboot()
+    tared.restart()
     tared.utc_offset_ns -= hour_ns
     tared.connect()
     tared.say_clock(hour_ns, t_mono_ns=5)
@@ -279,8 +277,7 @@ def test_a_session_ends_by_the_servers_clock(tared: FakeNode) -> None:
 
 def test_a_part_without_frames_has_lost_none(tared: FakeNode) -> None:
     session = tared.record()
-    tared.leave()
-    tared.reboot()
+    tared.restart()
     tared.connect()
     tared.deliver(20)
     ledger = session.ledger()

@@ -313,8 +313,7 @@ def test_why_a_recording_ended_is_said_together_with_why_it_has_no_estimates(
     node.deliver(50)
     session = running.record()
     node.deliver(50)
-    node.leave()
-    node.reboot()
+    node.restart()
     node.tiles += 1
     node.connect()
     problem = session.sealed()["problem"]

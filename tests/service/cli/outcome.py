@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -14,6 +16,11 @@ class Outcome:
     code: int
     out: str
     err: str
+
+    def printed(self, code: int = 0) -> Any:
+        """What it has printed as JSON; it has ended with this code."""
+        assert self.code == code, self.err
+        return json.loads(self.out)
 
     def fails(self, code: int, *words: str) -> None:
         """It has ended with this code, and its second stream has all of these words."""
@@ -33,3 +40,10 @@ def scene_text(name: str, tiles: int | None = None) -> str:
     head, *each = text.split("[[tile]]")
     _, begin, rest = each[-1].partition("\n[")
     return "[[tile]]".join([head, *each[:tiles]]) + begin + rest
+
+
+def faulty(kind: str, *, t_s: float = 0.0, duration_s: float = 1000.0, **keys: object) -> str:
+    """The section of a scene's fault; without other times it is there from the beginning."""
+    keys |= {"t_s": t_s, "duration_s": duration_s}
+    lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items())
+    return f'\n[[fault]]\nkind = "{kind}"\n{lines}'

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from devices.scene.file import build_scene, load_scene
-from service.estimation.bench.effects_fit import fit_effects, replays
-from service.estimation.bench.indentation import Indentation
 from service.estimation.calibration import Calibration
+from service.estimation.fitting.effects_fit import fit_effects, replays
+from service.estimation.fitting.indentation import Indentation
 from service.offline.calibrate import calibrate_recordings, read_recordings
 from service.offline.calibrations import with_tiles
 from service.offline.simulate import SimulateOptions, simulate

@@ -203,8 +203,7 @@ def test_other_tiles_begin_a_session_of_their_own_also_in_an_earlier_stream(
 ) -> None:
     session = tared.record(name="mud")
     tared.deliver(50)
-    tared.leave()
-    tared.reboot()
+    tared.restart()
     tared.tiles = 3
     tared.frames(40)
     tared.reboot()
@@ -274,8 +273,7 @@ def test_the_node_is_told_what_sessions_need_whenever_that_changes(tared: FakeNo
     until(lambda: told() == ([], False) or (tared.receive("wanted") and False))
     third = tared.record()
     until(lambda: told()[1] or (tared.receive("wanted") and False))
-    tared.leave()
-    tared.reboot()
+    tared.restart()
     [before] = tared.before
     tared.connect(earlier=(before.said(),))
     first_seq = third["parts"][0]["seq_first"]

@@ -17,7 +17,7 @@ import pytest
 from devices.errors import StorageError
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from service.sessions import recover as recover_module
-from service.sessions.recover import Recovery, recover
+from service.sessions.recover import Recovered, Recovery, recover
 from service.sessions.sealing import seal
 from storage.clock.log import ClockOffset
 from storage.durable import locked
@@ -26,7 +26,7 @@ from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
 from storage.sessions.file import SessionReader
-from storage.sessions.folder import Event, Part, Session, SessionFolder
+from storage.sessions.folder import Event, Ledger, Part, Session, SessionFolder
 from storage.verify.data import verdict_of, verify
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration
@@ -99,6 +99,13 @@ def session(data: Path, session_id: str = ID, **changes: Any) -> Session:
 
 def loaded(data: Path, session_id: str = ID) -> Session:
     return SessionFolder(data / "sessions").load(session_id)
+
+
+def recovered(data: Path, **how: Any) -> tuple[Recovered, Ledger]:
+    """The one session that is recovered, and what became of its frames."""
+    (one,) = recover(data, **how).sessions
+    assert one.ledger is not None
+    return one, one.ledger
 
 
 def state_of(data: Path) -> dict[str, bytes]:
@@ -193,10 +200,9 @@ def test_a_stream_whose_end_is_known_is_counted_to_it(tmp_path: Path) -> None:
     lost = {"disk_full": ((100, 119),)}
     stream(tmp_path, info_of(), (0, 99), next_seq=120, lost=lost, missed_slots=3)
     session(tmp_path, missed_slots_at_start=1)
-    (one,) = recover(tmp_path).sessions
-    assert one.ledger is not None
-    assert one.ledger.parts[0].lost == {"disk_full": 20}
-    assert (one.ledger.parts[0].unsynced_tail_max, one.ledger.missed_slots) == (0, 2)
+    _, ledger = recovered(tmp_path)
+    assert ledger.parts[0].lost == {"disk_full": 20}
+    assert (ledger.parts[0].unsynced_tail_max, ledger.missed_slots) == (0, 2)
     with SessionReader(tmp_path / "sessions" / ID / "frames.parquet") as reader:
         assert reader.notes["lost"] == {BOOT: {"disk_full": [[100, 119]]}}
 
@@ -204,10 +210,9 @@ def test_a_stream_whose_end_is_known_is_counted_to_it(tmp_path: Path) -> None:
 def test_a_session_that_was_stopped_ends_where_it_was_stopped(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 199), closed=False)
     session(tmp_path, state="pending", stopped_t_ns=t_ns(150) + 1)
-    (one,) = recover(tmp_path).sessions
+    one, ledger = recovered(tmp_path)
     assert one.session.parts[0].seq_last == 150
-    assert one.ledger is not None
-    assert one.ledger.complete
+    assert ledger.complete
 
 
 def test_several_parts_become_one_file(tmp_path: Path) -> None:
@@ -230,9 +235,8 @@ def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) ->
     content[len(content) // 2] ^= 1
     segment.write_bytes(content)
     session(tmp_path)
-    (one,) = recover(tmp_path).sessions
-    assert one.ledger is not None
-    assert one.ledger.parts[0].lost == {"corrupt": 10}
+    _, ledger = recovered(tmp_path)
+    assert ledger.parts[0].lost == {"corrupt": 10}
     assert loaded(tmp_path).frames == 90
     notes = StreamNotes.load(folder)
     assert notes is not None
@@ -242,10 +246,9 @@ def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) ->
 
 def test_a_session_of_which_nothing_reached_the_disk_is_sealed_as_that(tmp_path: Path) -> None:
     session(tmp_path)
-    (one,) = recover(tmp_path).sessions
+    one, ledger = recovered(tmp_path)
     assert one.outcome == "sealed"
-    assert one.ledger is not None
-    assert one.ledger.parts[0].unsynced_tail_max == unsynced_tail_max(1000.0)
+    assert ledger.parts[0].unsynced_tail_max == unsynced_tail_max(1000.0)
     assert (loaded(tmp_path).frames, loaded(tmp_path).problem) == (0, "not one frame was recorded")
     assert recover(tmp_path).is_nothing
 
@@ -271,10 +274,9 @@ def test_what_a_node_may_still_bring_is_waited_for(tmp_path: Path) -> None:
 def test_what_is_given_up_is_lost_and_says_so(tmp_path: Path) -> None:
     stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
     session(tmp_path)
-    (one,) = recover(tmp_path, give_up=True).sessions
-    assert one.ledger is not None
-    assert one.ledger.parts[0].lost == {"given_up": 20}
-    assert one.ledger.parts[0].unsynced_tail_max == TAIL
+    _, ledger = recovered(tmp_path, give_up=True)
+    assert ledger.parts[0].lost == {"given_up": 20}
+    assert ledger.parts[0].unsynced_tail_max == TAIL
     assert loaded(tmp_path).frames == 180
 
 
@@ -300,18 +302,16 @@ def test_what_was_given_up_before_the_crash_is_not_waited_for(tmp_path: Path) ->
     stream(servers(tmp_path), info_of(), (0, 99), (120, 199))
     parts = (Part(boot_id=BOOT, seq_first=0, seq_last=150),)
     session(tmp_path, state="pending", stopped_t_ns=t_ns(150), parts=parts, given_up=True)
-    (one,) = recover(tmp_path).sessions
-    assert one.ledger is not None
-    assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"given_up": 20})
+    one, ledger = recovered(tmp_path)
+    assert (one.outcome, ledger.parts[0].lost) == ("sealed", {"given_up": 20})
 
 
 def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tmp_path: Path) -> None:
     stream(tmp_path, info_of(), (0, 99), (150, 199), next_seq=200, lost={"evicted": ((100, 149),)})
     session(tmp_path, state="pending", stopped_t_ns=t_ns(119) + 1)
-    (one,) = recover(tmp_path).sessions
+    one, ledger = recovered(tmp_path)
     assert one.session.parts[0].seq_last == 119
-    assert one.ledger is not None
-    assert one.ledger.parts[0].lost == {"evicted": 20}
+    assert ledger.parts[0].lost == {"evicted": 20}
 
 
 def test_what_is_damaged_on_a_server_may_come_again_until_it_is_given_up(

@@ -51,8 +51,7 @@ def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, be
     table = table.set_column(column, field, pa.array(force, field.type))
     pq.write_table(table, "limited.parquet")
     outcome = run("calibrate", "limited.parquet", "--out", "cal.json", "--json")
-    assert outcome.code == 3, outcome.err
-    printed = json.loads(outcome.out)
+    printed = outcome.printed(3)
     assert [tile["serial"] for tile in printed["tiles"]] == ["T01"]
     assert "saturated" in printed["refused"]["T02"]
     assert "tile T02 refused" in outcome.err

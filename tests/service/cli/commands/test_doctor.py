@@ -6,38 +6,28 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from devices.scene.file import load_scene
-from tests.service.cli.outcome import Outcome, Run, scene_text
+from tests.service.cli.outcome import Outcome, Run, faulty, scene_text
 
-
-def faulty(kind: str, **keys: object) -> str:
-    lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items())
-    return f'\n[[fault]]\nkind = "{kind}"\nt_s = 0.0\nduration_s = 1000.0\n{lines}'
-
-
-Doctor = Callable[..., tuple[Outcome, Any]]
+Doctor = Callable[..., Outcome]
 
 
 @pytest.fixture
 def doctor(run: Run, tmp_path: Path) -> Doctor:
     """Run the doctor with --json on a scene of this text."""
 
-    def examine(text: str, *arguments: object) -> tuple[Outcome, Any]:
+    def examine(text: str, *arguments: object) -> Outcome:
         (tmp_path / "scene.toml").write_text(text)
-        outcome = run("doctor", "--scene", "scene.toml", "--json", *arguments)
-        return outcome, json.loads(outcome.out) if outcome.out else None
+        return run("doctor", "--scene", "scene.toml", "--json", *arguments)
 
     return examine
 
 
 def test_a_healthy_bus_is_said_to_be_well_and_how_fast_it_is(run: Run) -> None:
-    outcome = run("doctor", "--bus", "emulated", "--json")
-    assert outcome.code == 0, outcome.err
-    found = json.loads(outcome.out)
+    found = run("doctor", "--bus", "emulated", "--json").printed()
     assert [tile["serial"] for tile in found["tiles"]] == ["T01", "T02", "T03", "T04"]
     assert all(tile["problem"] == "" for tile in found["tiles"])
     # The scene's parts take 1.6 ms; hardware.md 4 has the rates.
@@ -59,23 +49,19 @@ def test_what_people_read_says_the_same(run: Run) -> None:
 
 
 def test_a_rate_that_will_not_hold_is_said_with_what_would(run: Run) -> None:
-    outcome = run("doctor", "--scene", "standing", "--rate-hz", 700, "--json")
-    assert outcome.code == 3
-    found = json.loads(outcome.out)
+    found = run("doctor", "--scene", "standing", "--rate-hz", 700, "--json").printed(3)
     assert found["holds"] is False
     assert "700 frames/s asked for will not hold: ask for 531 or less" in found["verdict"]
 
 
 def test_a_rate_that_another_schedule_would_hold_is_said_with_its_name(doctor: Doctor) -> None:
     text = scene_text("standing").replace("[array]", '[array]\nschedule = "sequential"')
-    outcome, found = doctor(text, "--rate-hz", 300)
-    assert outcome.code == 3
+    found = doctor(text, "--rate-hz", 300).printed(3)
     assert "will not hold: use schedule simultaneous" in found["verdict"]
 
 
 def test_the_raspberry_pi_that_runs_at_five_eighths_is_recognised(doctor: Doctor) -> None:
-    outcome, found = doctor(scene_text("standing") + "\n[emulation]\nscl_part = 0.625\n")
-    assert outcome.code == 0
+    found = doctor(scene_text("standing") + "\n[emulation]\nscl_part = 0.625\n").printed()
     assert found["scl_hz"] == pytest.approx(250_000, rel=1e-3)
     assert "runs at 250 kHz where 400 are asked for" in found["verdict"]
     assert "core_freq" in found["verdict"]
@@ -83,23 +69,20 @@ def test_the_raspberry_pi_that_runs_at_five_eighths_is_recognised(doctor: Doctor
 
 def test_a_slow_part_is_named_with_what_it_costs(run: Run) -> None:
     outcome = run("doctor", "--scene", "rolling", "--servo", "none", "--json")
-    assert outcome.code == 0
-    slowest = max(json.loads(outcome.out)["tiles"], key=lambda tile: tile["conversion_ms"])
+    slowest = max(outcome.printed()["tiles"], key=lambda tile: tile["conversion_ms"])
     assert f"{slowest['serial']} converts slowest" in json.loads(outcome.out)["verdict"]
 
 
 @pytest.mark.parametrize("kind", ["no_answer", "unplugged"])
 def test_a_tile_that_is_not_there_needs_attention(doctor: Doctor, kind: str) -> None:
-    outcome, found = doctor(scene_text("standing") + faulty(kind, tile="T02"))
-    assert outcome.code == 3
+    found = doctor(scene_text("standing") + faulty(kind, tile="T02")).printed(3)
     assert [tile["serial"] for tile in found["tiles"] if tile["problem"]] == ["T02"]
     assert "T02 needs attention first" in found["verdict"]
     assert found["rates_hz"]["pipelined"] is not None, "the others are measured all the same"
 
 
 def test_a_part_that_does_not_convert_needs_attention(doctor: Doctor) -> None:
-    outcome, found = doctor(scene_text("standing") + faulty("stale", tile="T03"))
-    assert outcome.code == 3
+    found = doctor(scene_text("standing") + faulty("stale", tile="T03")).printed(3)
     (tile,) = [tile for tile in found["tiles"] if tile["problem"]]
     assert tile["serial"] == "T03"
     assert tile["conversion_ms"] is None
@@ -107,20 +90,19 @@ def test_a_part_that_does_not_convert_needs_attention(doctor: Doctor) -> None:
 
 
 def test_a_part_that_does_not_convert_is_not_said_to_set_the_pace(doctor: Doctor) -> None:
-    _, found = doctor(scene_text("standing") + faulty("stale", tile="T03"))
+    found = json.loads(doctor(scene_text("standing") + faulty("stale", tile="T03")).out)
     assert "converts slowest" not in found["verdict"]
 
 
 def test_a_bus_on_which_nobody_answers_is_a_failure_with_advice(doctor: Doctor) -> None:
-    outcome, found = doctor(scene_text("standing") + faulty("sda_high"))
-    assert outcome.code == 1
+    found = doctor(scene_text("standing") + faulty("sda_high")).printed(1)
     assert found["scl_hz"] is None
     assert "Nothing answers at 0x70 to 0x77" in found["verdict"]
 
 
 @pytest.mark.parametrize(("kind", "word"), [("sda_low", "SDA is stuck low"), ("scl_low", "bus")])
 def test_a_stuck_bus_is_a_failure_in_one_line(doctor: Doctor, kind: str, word: str) -> None:
-    outcome, _ = doctor(scene_text("standing") + faulty(kind))
+    outcome = doctor(scene_text("standing") + faulty(kind))
     assert outcome.code == 1
     assert outcome.out == ""
     assert outcome.err.startswith("foottile: ")
@@ -161,15 +143,14 @@ def test_a_servo_that_is_not_what_the_scene_says_is_said(
 
     with EmulatedServo(lambda _: 0, SystemClock(), protocol=1, model="MX-64") as servo:
         outcome = run("doctor", "--scene", "rolling", "--servo", servo.port, "--json")
-    assert outcome.code == 3
-    found = json.loads(outcome.out)["servo"]
+    found = outcome.printed(3)["servo"]
     assert "MX-64, protocol 1" in found["verdict"]
     assert "The scene says MX-28, protocol 2" in found["verdict"]
 
 
 def test_a_wait_that_the_scene_fixes_is_the_one_that_counts(doctor: Doctor) -> None:
     text = scene_text("standing").replace("[array]", "[array]\nwait_ms = 3.0")
-    _, found = doctor(text)
+    found = json.loads(doctor(text).out)
     assert found["rates_hz"]["pipelined"] == pytest.approx(309.0, rel=0.005)  # hardware.md 4
 
 
@@ -179,8 +160,7 @@ def test_beside_a_reference_sensor_tiles_are_asked_at_once(run: Run) -> None:
 
 
 def test_single_lost_acknowledges_do_not_make_tiles_look_ill(doctor: Doctor) -> None:
-    outcome, found = doctor(scene_text("standing") + faulty("nack_storm", rate=0.002))
-    assert outcome.code == 0, found
+    found = doctor(scene_text("standing") + faulty("nack_storm", rate=0.002)).printed()
     assert not any(tile["problem"] for tile in found["tiles"])
     assert re.search(r"\d+ transfers were acknowledged only when repeated", found["verdict"])
 

@@ -12,7 +12,7 @@ import pytest
 
 from service.offline.simulate import START_NS
 from storage.schema import ESTIMATES, FRAMES, TRUTH
-from tests.service.cli.outcome import Run, scene_text
+from tests.service.cli.outcome import Run, faulty, scene_text
 
 pytestmark = pytest.mark.slow
 
@@ -26,25 +26,13 @@ hysteresis = false
 
 
 def test_the_same_command_gives_the_same_bytes(run: Run, tmp_path: Path) -> None:
-    for name in ("a.parquet", "b.parquet"):
-        outcome = run(
-            "simulate", "--scene", "rolling", "--seconds", 3, "--truth", "--seed", 5, "--out", name
-        )
+    simulate = ("simulate", "--scene", "rolling", "--seconds", 3, "--truth")
+    for name, seed in (("a.parquet", 5), ("b.parquet", 5), ("c.parquet", 6)):
+        outcome = run(*simulate, "--seed", seed, "--out", name)
         assert outcome.code == 0, outcome.err
-    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
-    run(
-        "simulate",
-        "--scene",
-        "rolling",
-        "--seconds",
-        3,
-        "--truth",
-        "--seed",
-        6,
-        "--out",
-        "c.parquet",
-    )
-    assert (tmp_path / "a.parquet").read_bytes() != (tmp_path / "c.parquet").read_bytes()
+    a, b, c = ((tmp_path / f"{name}.parquet").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
 
 
 def test_a_fresh_bench_and_a_kept_one_give_the_same_bytes(
@@ -98,16 +86,14 @@ def test_bench_to_session_to_estimate_closes_on_a_quiet_dome(run: Run, tmp_path:
     (tmp_path / "bench.toml").write_text(bench)
     assert run("simulate", "--scene", "bench.toml", "--out", "bench.parquet").code == 0
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--json")
-    assert outcome.code == 0, outcome.err
-    assert min(tile["r2"] for tile in json.loads(outcome.out)["tiles"]) > 0.9999
+    assert min(tile["r2"] for tile in outcome.printed()["tiles"]) > 0.9999
     (tmp_path / "foot.toml").write_text(scene_text("standing") + QUIET)
     options = ("--seconds", 5, "--truth", "--no-estimates", "--out", "s.parquet")
     run("simulate", "--scene", "foot.toml", *options)
     outcome = run(
         "estimate", "s.parquet", "--out", "e.parquet", "--calibration", "cal.json", "--json"
     )
-    assert outcome.code == 0, outcome.err
-    accuracy = json.loads(outcome.out)["accuracy"]
+    accuracy = outcome.printed()["accuracy"]
     assert accuracy["grf_mae_n"] < 0.15
     assert abs(accuracy["flight_mean_n"]) < 0.02
     assert accuracy["cop_p95_m"] < 0.0005
@@ -120,8 +106,7 @@ def test_measured_jumps_through_all_effects_stay_within_the_papers_errors(
         *("simulate", "--scene", "standing", "--truth", "--json"),
         *("--load", recording("squat_jump_plate1.csv"), "--load-scale", 0.03, "--cop-scale", 0.2),
     )
-    assert outcome.code == 0, outcome.err
-    accuracy = json.loads(outcome.out)["accuracy"]
+    accuracy = outcome.printed()["accuracy"]
     assert accuracy["grf_mae_n"] < 1.0
     assert accuracy["cop_p95_m"] < 0.004
     assert accuracy["stances"] >= 3
@@ -167,10 +152,8 @@ def test_an_assumed_scale_is_said_on_the_terminal_and_in_the_file(run: Run, tmp_
 def test_a_fault_of_the_scene_is_null_and_flagged_while_the_others_go_on(
     run: Run, tmp_path: Path
 ) -> None:
-    (tmp_path / "faulty.toml").write_text(
-        scene_text("standing")
-        + '[[fault]]\nkind = "no_answer"\ntile = "T02"\nt_s = 1.5\nduration_s = 0.5\n'
-    )
+    fault = faulty("no_answer", tile="T02", t_s=1.5, duration_s=0.5)
+    (tmp_path / "faulty.toml").write_text(scene_text("standing") + fault)
     outcome = run("simulate", "--scene", "faulty.toml", "--seconds", 3, "--out", "s.parquet")
     assert outcome.code == 0, outcome.err
     table = pq.read_table(tmp_path / "s.parquet")
@@ -228,8 +211,7 @@ def test_json_is_on_stdout_alone(run: Run) -> None:
 def test_calibrate_prints_the_contract_and_draws(run: Run, tmp_path: Path, bench: bytes) -> None:
     (tmp_path / "bench.parquet").write_bytes(bench)
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--plot", "cal.png", "--json")
-    assert outcome.code == 0, outcome.err
-    printed = json.loads(outcome.out)
+    printed = outcome.printed()
     assert [tile["serial"] for tile in printed["tiles"]] == ["T01", "T02"]
     tile = printed["tiles"][0]
     assert set(tile) >= {
@@ -246,10 +228,8 @@ def test_calibrate_prints_the_contract_and_draws(run: Run, tmp_path: Path, bench
 
 
 def test_what_befell_a_tile_is_said_on_the_terminal(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "faulty.toml").write_text(
-        scene_text("standing")
-        + '[[fault]]\nkind = "unplugged"\ntile = "T02"\nt_s = 0.5\nduration_s = 0.5\n'
-    )
+    fault = faulty("unplugged", tile="T02", t_s=0.5, duration_s=0.5)
+    (tmp_path / "faulty.toml").write_text(scene_text("standing") + fault)
     arguments = ("simulate", "--scene", "faulty.toml", "--seconds", 2, "--no-estimates")
     assert "tile T02: of " in run(*arguments).out
     flags = json.loads(run(*arguments, "--json").out)["flags"]
@@ -261,10 +241,8 @@ def test_what_befell_a_tile_is_said_on_the_terminal(run: Run, tmp_path: Path) ->
 def test_a_part_that_could_not_be_measured_is_said_on_the_terminal(
     run: Run, tmp_path: Path
 ) -> None:
-    (tmp_path / "faulty.toml").write_text(
-        scene_text("standing")
-        + '[[fault]]\nkind = "stale"\ntile = "T03"\nt_s = 0.0\nduration_s = 0.5\n'
-    )
+    fault = faulty("stale", tile="T03", t_s=0.0, duration_s=0.5)
+    (tmp_path / "faulty.toml").write_text(scene_text("standing") + fault)
     arguments = ("simulate", "--scene", "faulty.toml", "--seconds", 1, "--no-estimates")
     said = "tile T03: its conversion time could not be measured, so it was given 3 ms"
     assert said in run(*arguments).out

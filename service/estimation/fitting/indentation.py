@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from devices.arrays import Arrays, Bools, Floats, Ints, Times
 from devices.errors import CalibrationError
-from service.estimation.bench.soak import Soak
+from service.estimation.fitting.soak import Soak
 
 BLOCKS_PER_STROKE = 60  # many for a cubic, and each averages many readings
 BASELINE_NS = 1_000_000_000  # before the first press

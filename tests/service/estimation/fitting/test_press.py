@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.estimation.bench.indentation import Indentation, Unloaded
-from service.estimation.bench.press import joined, presses
+from service.estimation.fitting.indentation import Indentation, Unloaded
+from service.estimation.fitting.press import joined, presses
 
 ZERO = Unloaded(baseline_kpa=100.0, noise_kpa=0.1, reference_zero_n=0.0)
 

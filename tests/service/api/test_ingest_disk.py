@@ -7,8 +7,8 @@ import threading
 
 import pytest
 
+import service.api.routes.ingest
 import service.server
-import service.server.ingest
 import service.server.node
 import service.server.streams
 import storage.journal.segment
@@ -159,8 +159,7 @@ def test_what_a_node_says_is_followed_although_it_cannot_be_written_down(
 ) -> None:
     node.connect()
     node.deliver(10)
-    node.leave()
-    node.reboot()
+    node.restart()
     node.tiles += 1
     with monkeypatch.context() as patch:
         patch.setattr(service.server.node.ServerNode, "keep", refusing(*STORAGE_FULL))

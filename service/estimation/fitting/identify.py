@@ -7,9 +7,6 @@ from collections.abc import Iterable
 import numpy as np
 
 from devices.arrays import Floats
-from service.estimation.bench.model import DomeModel
-from service.estimation.bench.output_error import Fit, OutputErrorProblem
-from service.estimation.bench.press import Presses
 from service.estimation.effects import (
     EffectName,
     Effects,
@@ -19,6 +16,9 @@ from service.estimation.effects import (
     RubberEffect,
     TemperatureEffect,
 )
+from service.estimation.fitting.model import DomeModel
+from service.estimation.fitting.output_error import Fit, OutputErrorProblem
+from service.estimation.fitting.press import Presses
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _CLEAR = 3.0
@@ -66,7 +66,7 @@ def identify(
         reasons = _undetermined(fit, free)
         if not reasons:
             break
-        # One at a time: what looked undetermined may be so only beside another.
+        # One at a time: without the worst effect, the others may be determined.
         worst = next(name for name in ("gas", "hysteresis", "rubber") if name in reasons)
         refused[worst] = reasons[worst]
         free -= {worst}

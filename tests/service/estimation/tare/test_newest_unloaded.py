@@ -15,7 +15,7 @@ from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch
 from service.estimation.calibration import Calibration, paper_eq2_shape
-from service.estimation.tare.automatic import LOOK_BACK_NS, WINDOW_NS, tare_in_flight
+from service.estimation.tare.automatic import LOOK_BACK_NS, WINDOW_NS, newest_unloaded_tare
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import FRAMES_MIN, TareFrames
 from tests.builders.arrays import COUNT_KPA, UNLOADED_KPA, make_array
@@ -39,7 +39,7 @@ def flight_of(
     if calibration is None:
         calibration = make_calibration(*(newton_tile(s, **bench) for s in info.serials))
     seen = TareFrames(frames, Compensation(info.tiles), calibration, info.serials)
-    return tare_in_flight(seen, present=present)
+    return newest_unloaded_tare(seen, present=present)
 
 
 def present(counts: float = 0.0, *, tiles: int = 2, noise_counts: float = 1.0) -> Tare:

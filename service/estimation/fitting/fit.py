@@ -14,28 +14,6 @@ from scipy.optimize import nnls
 from devices.arrays import Floats
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, indicative_degc
 from devices.errors import CalibrationError
-from service.estimation.bench.checks import (
-    baseline_drift_kpa,
-    before_saturation,
-    refuse_contradictions,
-    refuse_poor_fit,
-    refuse_saturated_reference,
-    refuse_unloaded,
-)
-from service.estimation.bench.confidence import (
-    cubic_basis,
-    curve_n,
-    mean_band_n,
-    new_loading_band_n,
-)
-from service.estimation.bench.indentation import (
-    Indentation,
-    Strokes,
-    place,
-    stroke_rows,
-    strokes,
-    unloaded,
-)
 from service.estimation.calibration import (
     LOOP_OPENS_N,
     BandPoint,
@@ -43,6 +21,28 @@ from service.estimation.calibration import (
     TileCalibration,
     is_monotonic,
     loop_share,
+)
+from service.estimation.fitting.checks import (
+    baseline_drift_kpa,
+    before_saturation,
+    refuse_contradictions,
+    refuse_poor_fit,
+    refuse_saturated_reference,
+    refuse_unloaded,
+)
+from service.estimation.fitting.confidence import (
+    cubic_basis,
+    curve_n,
+    mean_band_n,
+    new_loading_band_n,
+)
+from service.estimation.fitting.indentation import (
+    Indentation,
+    Strokes,
+    place,
+    stroke_rows,
+    strokes,
+    unloaded,
 )
 
 BAND_STEPS = 10  # of the band in the file

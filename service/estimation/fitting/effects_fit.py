@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from devices.arrays import Bools, Floats, Ints
-from service.estimation.bench.identify import identify
-from service.estimation.bench.indentation import Indentation, pressed_in, soak, unloaded
-from service.estimation.bench.model import DomeModel
-from service.estimation.bench.press import Presses, joined, presses
-from service.estimation.bench.soak import fit_soak
 from service.estimation.calibration import TileCalibration, is_monotonic
 from service.estimation.effects import Effects, TemperatureEffect, values
+from service.estimation.fitting.identify import identify
+from service.estimation.fitting.indentation import Indentation, pressed_in, soak, unloaded
+from service.estimation.fitting.model import DomeModel
+from service.estimation.fitting.press import Presses, joined, presses
+from service.estimation.fitting.soak import fit_soak
 
 _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])
 """Takes a cubic in x = gauge / range without constant term to u = 2 x - 1, as far as it varies."""
@@ -130,7 +130,7 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
     found: dict[str, Replay] = {}
     for name, centre in _moments(points.t_s, points.force_n, points.loading, points.fast).items():
         here = points.loading == points.loading[centre]
-        # A loading has a gain of its own about one; of what it shows itself.
+        # Each loading has its own gain, about one, fitted to its own readings.
         usable = here & np.isfinite(measured_kpa)
         square = float((modelled_kpa[usable] ** 2).sum())
         product = float((modelled_kpa[usable] * measured_kpa[usable]).sum())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.estimation.bench.domes import (
+from service.estimation.domes import (
     ADIABATIC,
     DOMES,
     PAPER_DOME,

@@ -14,8 +14,8 @@ from scipy.signal import lfilter
 
 from devices.arrays import Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN, indicative_degc
-from service.estimation.bench.confidence import fit_covariance
 from service.estimation.effects import Parameter, TemperatureEffect
+from service.estimation.fitting.confidence import fit_covariance
 
 STEP_MIN_K = 1.0
 _LAG_S = (0.3, 30.0)  # shortest and longest lag that is looked for

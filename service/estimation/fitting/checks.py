@@ -12,7 +12,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import CalibrationError
-from service.estimation.bench.indentation import (
+from service.estimation.fitting.indentation import (
     Indentation,
     Strokes,
     place,

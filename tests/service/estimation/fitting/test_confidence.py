@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.estimation.bench.confidence import (
+from service.estimation.fitting.confidence import (
     curve_n,
     mean_band_n,
     new_loading_band_n,

@@ -169,7 +169,7 @@ async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
     while True:
         await link.news.wait()
         link.news.clear()
-        # First what is to be kept: what is acknowledged before may be forgotten.
+        # What the node must keep goes first: it may forget frames once they are acknowledged.
         wanted = server.recorder.wanted(link.node.name)
         if wanted != link.wanted:
             link.wanted = wanted
@@ -210,7 +210,7 @@ def _parse(message: str | bytes, code: Close) -> SaidByNode:
 
 
 def _protocol_of(message: str | bytes) -> int | None:
-    """The protocol that a hello names, whatever else is in it; None if it names none."""
+    """The protocol version in a hello, whatever else the hello holds; None without one."""
     try:
         said = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed
 
+import service.api.routes.ingest
 import service.server
-import service.server.ingest
 import service.server.streams
 from devices.frames import FrameBatch
 from storage.intervals import Intervals
@@ -178,8 +178,7 @@ def test_a_node_that_has_left_may_come_back_with_another_boot(
 ) -> None:
     node.connect()
     node.deliver(10)
-    node.leave()
-    node.reboot()
+    node.restart()
     assert node.connect() == [(0, None)]
     assert running.node()["boot_id"] == node.boot_id
     node.deliver(10)
@@ -189,7 +188,7 @@ def test_a_node_that_has_left_may_come_back_with_another_boot(
 def test_a_node_that_says_nothing_is_let_go(
     running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch, greeted: bool
 ) -> None:
-    monkeypatch.setattr(service.server.ingest, "SILENCE_S", 0.3)
+    monkeypatch.setattr(service.api.routes.ingest, "SILENCE_S", 0.3)
     if greeted:
         node.connect()
     else:

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import CalibrationError
-from service.estimation.bench.fit import fit_tile
-from service.estimation.bench.indentation import Indentation
 from service.estimation.calibration import TileCalibration
+from service.estimation.fitting.fit import fit_tile
+from service.estimation.fitting.indentation import Indentation
 from service.estimation.models.static import StaticCurves
 
 Curve = Callable[[np.ndarray], np.ndarray]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.estimation.bench.soak import Soak, fit_soak
 from service.estimation.effects import TemperatureEffect
+from service.estimation.fitting.soak import Soak, fit_soak
 
 CHIP_LAG_S, GAS_LAG_S, KPA_PER_K, BASE_KPA = 1.2, 3.3, 0.297, 100.3
 STEP_S = 0.00184

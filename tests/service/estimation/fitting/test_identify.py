@@ -16,11 +16,11 @@ from devices.emulation.dome import Domes
 from devices.emulation.parts import DomePart, draw_dome
 from devices.emulation.surroundings import Surroundings
 from devices.scene.emulated import EmulationScene
-from service.estimation.bench.effects_fit import fit_effects
-from service.estimation.bench.fit import fit_tile
-from service.estimation.bench.indentation import Indentation
-from service.estimation.bench.model import pressed
 from service.estimation.effects import WALL_PER_KPA, EffectName, Effects
+from service.estimation.fitting.effects_fit import fit_effects
+from service.estimation.fitting.fit import fit_tile
+from service.estimation.fitting.indentation import Indentation
+from service.estimation.fitting.model import pressed
 from service.estimation.models.hysteresis import WIDTHS_N
 from tests.builders.calibrations import make_calibration
 

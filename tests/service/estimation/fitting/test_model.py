@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.bench.model import pressed
+from service.estimation.fitting.model import pressed
 from service.estimation.models import gas
 from service.estimation.models.hysteresis import WIDTHS_N, Hysteresis
 from service.estimation.models.rubber import Rubber

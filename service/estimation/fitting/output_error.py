@@ -13,10 +13,10 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from devices.arrays import Bools, Floats
-from service.estimation.bench.confidence import fit_covariance
-from service.estimation.bench.model import DomeModel
-from service.estimation.bench.press import Presses
 from service.estimation.effects import EffectName
+from service.estimation.fitting.confidence import fit_covariance
+from service.estimation.fitting.model import DomeModel
+from service.estimation.fitting.press import Presses
 from service.estimation.models.hysteresis import WIDTHS_N
 
 TERMS = 2  # of the creep: one fast, one slow
