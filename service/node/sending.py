@@ -18,7 +18,7 @@ from websockets.asyncio.client import ClientConnection
 from devices.errors import DamagedFramesError, LinkError, StorageError
 from service.link import FramesOf, Hello, Status, Wanted, Welcome, say, with_check
 from service.node.flow import Flow
-from storage.intervals import NO_END, Intervals, closed
+from storage.intervals import NO_END, Intervals, closed, union
 from storage.journal.node_stream import NodeStream
 from storage.wire import EncodedBatch
 
@@ -90,6 +90,8 @@ class Sending:
             for pair in lacks.numbers
         )
         """What is still to be sent of the past."""
+        self._not_found: tuple[str, int, int] | None = None
+        """What was looked for last in vain."""
 
     async def run(self) -> None:
         """The newest frames as they come, and behind them what the server lacks."""
@@ -167,22 +169,27 @@ class Sending:
         boot_id, first, last = wanted
         stream = self._link.source.streams().get(boot_id)
         found: list[EncodedBatch] = []
+        done = asked = Intervals([(first, last)])
         if stream is not None:
+            has_failed, damaged = False, Intervals()
             try:
                 found.extend(stream.batches(first, last))
             except DamagedFramesError as error:
-                self._link.source.damaged(stream, Intervals([(error.seq_first, error.seq_last)]))
-                backlog.done(boot_id, error.seq_first, error.seq_last)
-                last = max(first, error.seq_first) - 1
+                damaged = Intervals([(error.seq_first, error.seq_last)])
+                self._link.source.damaged(stream, damaged)
             except StorageError:
-                # Evicted meanwhile, and counted; what is still there is tried again.
-                for gone in Intervals([(first, last)]) - stream.held:
-                    backlog.done(boot_id, *gone)
+                has_failed = True
+            # What is not held was evicted meanwhile, and counted; what still is may be on its way
+            # between disk and memory, and is looked for again. Batches are sent whole, and may
+            # reach further than what was asked for.
+            done = union(batch.numbers for batch in found) | damaged | (asked - stream.held)
+            if not asked & done:
                 time.sleep(_READ_AGAIN_S)
-                return []
-        if last >= first:
-            # Batches are sent whole, and may reach further than what was asked for.
-            backlog.done(boot_id, first, max([last, *(b.seq_last for b in found[-1:])]))
+                if not has_failed and wanted == self._not_found:  # its index may be damaged
+                    done = asked
+                self._not_found = wanted
+        for numbers in done:
+            backlog.done(boot_id, *numbers)
         return [(boot_id, batch) for batch in found]
 
 

@@ -287,11 +287,12 @@ class NodeStream:
         try:
             journal.sync()
         except StorageError:
-            journal.disown(Intervals((b.seq_first, b.seq_last) for b in self._unsynced))
+            refused = Intervals((b.seq_first, b.seq_last) for b in self._unsynced)
             with self._lock:
                 self._waiting.give_back(self._unsynced)
                 self._unsynced = []
                 self._waiting_since_s = since_s
+            journal.disown(refused)  # only now: until then they are in memory as well
             return
         with self._lock:
             self._unsynced = []

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterator
+from itertools import count
 
 import pytest
 
 import service.node.sending
 import service.server
+from storage.journal.node_stream import NodeStream
+from storage.wire import EncodedBatch
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.node.publishing import Publishing, assert_all_arrived
 from tests.service.running import Running, ServeWith
@@ -127,3 +131,22 @@ async def test_a_name_that_is_taken_is_reported(
         await asyncio.sleep(0.3)
     assert len(publishing.reports) == 1, publishing.reports
     assert "--name" in publishing.reports[0]
+
+
+@in_a_loop
+async def test_frames_on_their_way_between_memory_and_disk_are_sent_a_moment_later(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A look at both may miss what goes from one to the other; it is held all the same."""
+    given, looks = NodeStream.batches, count()
+
+    def not_at_first(stream: NodeStream, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
+        return iter(()) if next(looks) == 0 else given(stream, seq_first, seq_last)
+
+    monkeypatch.setattr(NodeStream, "batches", not_at_first)
+    publishing = Publishing(node, running.url)
+    publishing.take(100)
+    async with publishing:
+        await publishing.emptied()
+    assert next(looks) > 1
+    assert_all_arrived(running, node)

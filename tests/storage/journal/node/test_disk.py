@@ -12,6 +12,7 @@ import pytest
 
 from storage.intervals import Intervals
 from storage.journal import node_journal, segment
+from storage.journal.journal import Journal
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
 from tests.builders.arrays import make_array
@@ -96,6 +97,26 @@ def test_what_the_disk_could_not_sync_is_written_once_more(
     assert stream.stored == Intervals([(0, 99)])
     names = sorted(path.name for path in stream.folder.glob("*.arrows"))
     assert len(names) >= 2
+
+
+def test_frames_that_the_disk_could_not_sync_are_given_all_the_while(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disown = Journal.disown
+    seen: list[tuple[Intervals, list[int]]] = []
+
+    def then_looked_at(journal_: Journal, numbers: Intervals) -> None:
+        disown(journal_, numbers)
+        seen.append((stream.held, given(stream, 0, 49)))
+
+    monkeypatch.setattr(Journal, "disown", then_looked_at)
+    before_each_sync_of_frames(monkeypatch, failing_once(lambda: None, *IO_ERROR))
+    fill(journal, stream, 0, 49)
+    until(lambda: seen and stream.held.last == 49 and stream.is_synced)
+    held, batches = seen[0]
+    assert (held.first, held.count) == (0, 10 * len(batches))
+    assert batches == list(range(0, held.count, 10))
+    assert batches
 
 
 def test_frames_that_turn_out_damaged_are_named_and_given_no_more(
