@@ -9,6 +9,7 @@ import asyncio
 import time
 from collections.abc import Coroutine
 from contextlib import suppress
+from itertools import takewhile
 from typing import Any
 
 from pydantic import ValidationError
@@ -142,7 +143,8 @@ def hello_of(options: NodeOptions, journal: NodeJournal, present: NodeStream) ->
         StorageError: one of them cannot be read.
     """
     next_seq = present.next_seq  # before what is held, which may go on meanwhile
-    others = [stream for stream in journal.streams if stream is not present]
+    # Another one may have begun meanwhile: that one has not ended.
+    others = list(takewhile(lambda stream: stream is not present, journal.streams))
     # Those that a session waits for first, then the newest.
     waited_for = [stream for stream in others if journal.undelivered(stream)]
     rest = [stream for stream in others if stream not in waited_for]
