@@ -60,10 +60,12 @@ class Journal:
                     self._take_in(segment)
             for path in folder.glob("*" + INDEX_SUFFIX):
                 # A power cut may take the name of a segment and leave that of its index. Nothing in
-                # it was promised then; but somebody may have deleted it, so it is set aside.
-                if not path.with_suffix(SUFFIX).exists():
+                # it was promised then; but somebody may have deleted it, so it is set aside, unless
+                # what was set aside before has its name.
+                aside = path.with_suffix(UNREAD_SUFFIX)
+                if not path.with_suffix(SUFFIX).exists() and not aside.exists():
                     with suppress(OSError):
-                        path.rename(path.with_suffix(UNREAD_SUFFIX))
+                        path.rename(aside)
         self.lost.found(self.held)
 
     @classmethod
