@@ -32,16 +32,6 @@ class Pressed:
     """First and last frame."""
 
 
-def calibrate(paths: Sequence[Path], *, name: str, reference: str) -> Calibration:
-    """Fit every tile that was pressed in the files; see `calibrate_recordings`.
-
-    Raises:
-        FileFormatError: a file is no such recording.
-        CalibrationError: files contradict one another, or no tile has a curve.
-    """
-    return calibrate_recordings(read_recordings(paths), name=name, reference=reference)
-
-
 def calibrate_recordings(
     recordings: Mapping[str, Sequence[Pressed]], *, name: str, reference: str
 ) -> Calibration:

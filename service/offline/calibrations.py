@@ -90,7 +90,7 @@ def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) 
             kept.unlink(missing_ok=True)  # a damaged cache is no calibration, and no reason to fail
     # Here, because only the emulated bench needs the physics.
     with needs_extra("server", "the emulated bench"):
-        from service.offline.calibrate import calibrate
+        from service.offline.calibrate import calibrate_recordings, read_recordings
         from service.offline.simulate import SimulateOptions, simulate
 
     progress(f"pressing tile {serial} on the emulated bench")
@@ -98,7 +98,9 @@ def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) 
     with tempfile.TemporaryDirectory(prefix="foottile-bench-") as work:
         recording = Path(work) / f"bench-{serial}.parquet"
         simulate(SimulateOptions(scene, foot=foot), recording, None)
-        calibration = calibrate([recording], name=f"{BENCH}-{serial}", reference=BENCH_REFERENCE)
+        calibration = calibrate_recordings(
+            read_recordings([recording]), name=f"{BENCH}-{serial}", reference=BENCH_REFERENCE
+        )
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(kept, calibration.to_json().encode())
     return calibration

@@ -22,9 +22,8 @@ from service.estimation.tare.automatic import (
     look_in_flight,
     newest_unloaded_tare,
 )
-from service.estimation.tare.recorded import take_tare
 from service.estimation.tare.tare import Tare
-from service.estimation.tare.unloaded import TareFrames
+from service.estimation.tare.unloaded import TareFrames, take_tare
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
 
 LIVE_LAG_MS = 10.0

@@ -165,10 +165,6 @@ class Server:
         doomed = self.sessions.trash.doom()
         return len(doomed), await asyncio.to_thread(destroy, doomed)
 
-    def tell_deleted(self, session_id: str) -> None:
-        """Tell every screen that a session is in the trash."""
-        self.hub.notice({"type": "deleted", "session_id": session_id})
-
     def tell_node(self, node: ServerNode) -> None:
         """Tell every screen how a node is."""
         view = NodeView.of(node, self.recorder).model_dump(mode="json")

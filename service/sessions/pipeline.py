@@ -23,8 +23,8 @@ from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.tare.recorded import RECOGNISE_WITHIN_NS, take_tare
 from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded import RECOGNISE_WITHIN_NS, take_tare
 
 Extra = Mapping[str, npt.NDArray[Any]]
 Columns = dict[str, npt.NDArray[Any]]

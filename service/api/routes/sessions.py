@@ -177,7 +177,7 @@ async def change(session_id: str, body: ChangeSession, server: ServerState) -> S
 async def delete(session_id: str, server: ServerState) -> None:
     """It can be had back until the trash is emptied; its space is free only then."""
     server.recorder.discard(session_id)
-    server.tell_deleted(session_id)
+    server.hub.notice({"type": "deleted", "session_id": session_id})
 
 
 @router.post(

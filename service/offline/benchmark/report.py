@@ -59,9 +59,9 @@ def markdown(bench: Bench) -> str:
         "",
         EMULATED,
     ]
-    if not o.as_scenes_say:
-        said = {"repeatability": o.repeatability, "noise correlated over ms": o.correlated_ms}
-        named = ", ".join(f"{name} {value:g}" for name, value in said.items() if value is not None)
+    said = {"repeatability": o.repeatability, "noise correlated over ms": o.correlated_ms}
+    named = ", ".join(f"{name} {value:g}" for name, value in said.items() if value is not None)
+    if named:
         lines += ["", f"The emulation differs from that of the scenes: {named}."]
     for figures in bench.scenes:
         lines += ["", *_scene(figures)]

@@ -63,11 +63,6 @@ class BenchOptions:
         emulation = scene.emulation.model_copy(update=given)
         return scene.model_copy(update={"emulation": emulation})
 
-    @property
-    def as_scenes_say(self) -> bool:
-        """Is the emulation that of the scenes?"""
-        return self.repeatability is None and self.correlated_ms is None
-
 
 @dataclass(frozen=True)
 class Bench:

@@ -20,7 +20,7 @@ from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import EstimateStatus
 from service.estimation.lower import ApparentForces
 from service.estimation.plan import make_plan
-from service.estimation.tare.recorded import take_tare
+from service.estimation.tare.unloaded import take_tare
 from tests.builders.arrays import array_at, make_servo
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.builders.estimates import estimate, newton_plan

@@ -17,8 +17,8 @@ from devices.chips.compensation import Compensation
 from devices.errors import TareError
 from devices.frames import FrameBatch, FrameStatus, TileStatus
 from service.estimation.calibration import Calibration, paper_eq2_shape
-from service.estimation.tare.recorded import take_tare
 from service.estimation.tare.tare import Tare
+from service.estimation.tare.unloaded import take_tare
 from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, UNLOADED_KPA, array_at, make_array
 from tests.builders.calibrations import make_calibration, newton_tile
 from tests.builders.frames import loaded_frames
