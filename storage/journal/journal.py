@@ -28,9 +28,9 @@ from storage.schema import array_info, wire_schema
 from storage.wire import FRAMES_MAX, EncodedBatch, decode, encode
 
 RING_NS = 600_000_000_000
-"""Frames of no session are kept so long, for pre-roll and for what was not recorded in time."""
+"""How long frames of no session are kept, for pre-roll and for late starts."""
 _WINDOW_FRAMES = 1 << 16
-"""So many frames' index is in memory when a journal of any length is read."""
+"""Frames whose index is in memory at once while a journal of any length is read."""
 
 
 class Journal:
@@ -60,7 +60,7 @@ class Journal:
                     self._take_in(segment)
             for path in folder.glob("*" + INDEX_SUFFIX):
                 # A power cut may take the name of a segment and leave that of its index. Nothing in
-                # it was promised then; but somebody may have deleted it, so it is set aside.
+                # it was promised then; but a person may have deleted it, so the index is set aside.
                 if not path.with_suffix(SUFFIX).exists():
                     with suppress(OSError):
                         path.rename(path.with_suffix(UNREAD_SUFFIX))
@@ -92,7 +92,7 @@ class Journal:
         return sum(segment.size_bytes for segment in self._segments)
 
     def append(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
-        """Hold the frames of `batch` that are not held yet; give back which ones these are.
+        """Hold the frames of `batch` that are not held yet; return their numbers.
 
         Args:
             batch: frames, `seq` rising by one.
@@ -105,7 +105,7 @@ class Journal:
         first, last = int(batch.seq[0]), int(batch.seq[-1])
         new = self.held.missing(first, last)
         for a, b in new:
-            if (a, b) == (first, last):  # nearly always, and views of it would cost a fifth
+            if (a, b) == (first, last):  # nearly always; views of the batch would cost a fifth more
                 payload = encode(batch, self._schema) if payload is None else payload
                 self._write(EncodedBatch.of(batch, payload))
             else:
@@ -133,7 +133,7 @@ class Journal:
         self._open.sync()
 
     def disown(self, doubtful: Intervals) -> None:
-        """Hold batches within `doubtful` no longer: they could not be synced, or are damaged.
+        """Stop holding batches within `doubtful`: they could not be synced, or are damaged.
 
         A segment that was closed forgets them for good, so that a copy that comes later is the one
         that counts after a restart.
@@ -229,7 +229,7 @@ class Journal:
         segments = [segment for segment in self._segments if segment.span[1] >= at_least]
         if all(segment.t_ns_last <= t_ns for segment in segments):
             return None
-        # Of segments that were taken before `t_ns` altogether only the last one counts.
+        # Among segments that end before `t_ns` only the last one counts.
         before = max((s.span[1] for s in segments if s.t_ns_last <= t_ns), default=None)
         records = np.concatenate(
             [np.zeros(0, RECORD)]
