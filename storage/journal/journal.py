@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -213,12 +213,12 @@ class Journal:
         near = self.held.within(0, seq).last if newest else self.held.within(seq, NO_END).first
         if near is None:
             return None
-        for segment in self._segments:
-            if segment.held.within(near, near):
-                records = segment.records()
-                record = records[np.searchsorted(records["seq_first"], near, side="right") - 1]
-                return int(record["t_ns_last" if newest else "t_ns_first"])
-        return None
+        holding = [segment for segment in self._segments if segment.held.within(near, near)]
+        # The record of a batch may be damaged: then the nearest one that is whole tells.
+        found = _nearest(holding, near, newest=newest) or _nearest(
+            self._segments, near, newest=newest
+        )
+        return (max(found) if newest else min(found))[1] if found else None
 
     def last_seq_until(self, t_ns: int, *, at_least: int) -> int | None:
         """The last number taken at `t_ns` or before, if frames after `t_ns` are held too.
@@ -343,3 +343,17 @@ class Journal:
         finally:
             for descriptor in opened.values():
                 os.close(descriptor)
+
+
+def _nearest(segments: Iterable[Segment], seq: int, *, newest: bool) -> list[tuple[int, int]]:
+    """First number and instant of each segment's last batch up to `seq`, or first from it on."""
+    found: list[tuple[int, int]] = []
+    for segment in segments:
+        records = segment.records()
+        if newest:
+            records = records[records["seq_first"] <= seq][-1:]
+        else:
+            records = records[records["seq_first"] + records["count"] > seq][:1]
+        name = "t_ns_last" if newest else "t_ns_first"
+        found += [(int(record["seq_first"]), int(record[name])) for record in records]
+    return found
