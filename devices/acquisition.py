@@ -32,7 +32,7 @@ BATCH_NS = 25_000_000
 """Length of a batch: at 10 ms two fifths of a message would be header (performance.md)."""
 
 STALLED_AFTER = 3
-"""Without a rate of its own, a loop that takes so many periods more than usual has been stalled."""
+"""A loop without a set rate was stalled if it takes this many periods longer than usual."""
 
 _BATCH_FRAMES_MAX = 64  # more than any schedule takes in `BATCH_NS`; columns are made for so many
 _AGE_MAX_US = 2**31 - 1  # an int32 holds no more
@@ -66,7 +66,7 @@ class FrameRow(NamedTuple):
 
 
 class FrameKeeper(Protocol):
-    """Is given every frame as it is taken, before its batch is whole."""
+    """Receives every frame as it is taken, before its batch is whole."""
 
     def put(self, frame: FrameRow) -> None:
         """Keep one frame; quick, for the loop waits."""
@@ -105,7 +105,7 @@ class Acquisition:
         lead_end_ns: int | None = None,
     ) -> None:
         self.missed_slots = 0
-        """Slots in which no frame was begun, because the loop was late."""
+        """Slots without a frame, because the loop was late."""
         self._array = array
         self._clock = clock
         self._anchor = anchor
@@ -166,7 +166,7 @@ class Acquisition:
             )
         ]
         first = next((i for i, padc in enumerate(scan.padc) if padc != NOT_READ), 0)
-        # Never back: a tile that was left out for a frame has its sample from before that.
+        # Never back: a tile left out for a frame keeps its earlier sample.
         t_mono_ns = max(samples_ns[first], self._last_t_mono_ns + 1)
         self._last_t_mono_ns = t_mono_ns
         if self._is_new:

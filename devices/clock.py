@@ -46,7 +46,7 @@ class SpinningClock(SystemClock):
     SPIN_NS = 150_000
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Return at `t_ns`, or as little after it as can be."""
+        """Return at `t_ns`, or as soon after it as possible."""
         super().sleep_until_ns(t_ns - self.SPIN_NS)
         while time.monotonic_ns() < t_ns:
             pass

@@ -27,7 +27,7 @@ class TileStatus(IntFlag):
     NO_ANSWER = 1
     """The tile did not acknowledge; its counts are `NOT_READ`."""
     STALE = 2
-    """The same two words came for so long that the part must have stopped converting."""
+    """The same two words came again and again: the part must have stopped converting."""
     RETRIED = 4
     """It took a second attempt, or a third reading, in this frame; the reading is good."""
     IMPLAUSIBLE = 8

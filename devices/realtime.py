@@ -18,7 +18,7 @@ _FIFO_PRIORITY = 50  # above ordinary work, level with threaded interrupts
 
 
 def sharpen_timers(slack_ns: int = 1_000) -> bool:
-    """Let this thread's sleeps end within `slack_ns` instead of 50 us; whether that was granted."""
+    """Let this thread's sleeps end within `slack_ns`, not 50 us; return if that was granted."""
     return bool(_libc().prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0) == 0)
 
 
@@ -32,7 +32,7 @@ def run_before_others() -> bool:
 
 
 def end_with_parent() -> None:
-    """Have this process terminated when the one that started it dies, however it dies."""
+    """Make the kernel terminate this process when its parent dies, however it dies."""
     _libc().prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 

@@ -1,6 +1,6 @@
 """The calibration rig's reference force: a load cell's amplifier, read through an MCP3208.
 
-What a volt means is the scene's to say. The scale of the paper's sensor and amplifier is not known
+The scene says what a volt means. The scale of the paper's sensor and amplifier is not known
 (hardware.md 6), so there is no default for it.
 """
 

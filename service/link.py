@@ -41,7 +41,7 @@ LIVE_PATH = "/api/v1/live"
 MESSAGE_BYTES_MAX = 1 << 20
 """Longest message either side takes. A batch of 64 tiles is 0.1 MB."""
 SILENCE_S = 5.0
-"""A side that has heard nothing for so long takes the link for dead."""
+"""A side that has heard nothing for this long takes the link for dead."""
 PROBES = 8
 _REASON_BYTES_MAX = 123
 _CHECK_BYTES = 4
@@ -86,7 +86,7 @@ PairsByReason = dict[Annotated[str, Field(pattern=r"^[a-z_]{1,40}$")], Pairs]
 
 
 class EarlierStream(_Message):
-    """A stream of this node that has ended, and of which it still has frames or knows losses."""
+    """An ended stream of this node, if the node still has frames of it or knows losses."""
 
     array_info: ArrayInfo
     held: Pairs
@@ -94,7 +94,7 @@ class EarlierStream(_Message):
     next_seq: _Seq
     """The number after the last frame that it knows of."""
     lost: PairsByReason = {}
-    """What it should have and has not, by reason."""
+    """Numbers that it should have and does not have, by reason."""
     unsynced_tail_max: Annotated[int, Field(ge=0)] = 0
     """How many more frames there may have been: its power failed. 0: it ended in order, or was
     killed, which loses nothing."""
@@ -114,7 +114,7 @@ class Hello(_Message):
     next_seq: _Seq
     """The number of the next frame to be taken."""
     lost: PairsByReason = {}
-    """What it should have of its present stream and has not, by reason."""
+    """Numbers of its present stream that it should have and does not have, by reason."""
     scene: dict[str, Any]
     """The scene file's content."""
     emulated: bool
@@ -124,7 +124,7 @@ class Hello(_Message):
     earlier: tuple[EarlierStream, ...] = ()
     """Its streams before this one, oldest first."""
     has_more: bool = False
-    """Are there still others, which did not fit? They are announced when these are delivered."""
+    """Are there more, which did not fit? They are announced once these are delivered."""
 
 
 class StreamNumbers(_Message):
@@ -152,7 +152,7 @@ class Welcome(_Message):
     type: Literal["welcome"] = "welcome"
     protocol: int
     server_id: str = ""
-    """Which data folder it is: what one server needs another does not give up."""
+    """Name of its data folder: one server cannot give up what another one needs."""
     lacks: tuple[StreamNumbers, ...]
     """Of the present stream everything that the node has and the server has not, of earlier ones
     what sessions need. The present stream's last interval has no end."""
@@ -196,7 +196,7 @@ class ClockRow(_Message):
 
 
 class Lost(_Message):
-    """What the node has lost of its present stream by now: all of it, whenever that changes."""
+    """All that the node has lost of its present stream so far; sent whenever that changes."""
 
     type: Literal["lost"] = "lost"
     boot_id: str
@@ -209,7 +209,7 @@ class Status(_Message):
     type: Literal["status"] = "status"
     missed_slots: Annotated[int, Field(ge=0)]
     backlog_frames: Annotated[int, Field(ge=0)] = 0
-    """How many the server lacks that the node has, and sends behind the newest ones."""
+    """Frames that the server lacks and the node has; they are sent after the newest ones."""
     troubles: tuple[str, ...] = ()
     """What is wrong with the array or with the node's disk now, in words."""
     counts: dict[str, dict[str, Annotated[int, Field(ge=0)]]] = {}

@@ -179,7 +179,7 @@ def locked(
         StorageError: another process holds it (`errno` is None), or it cannot be opened.
     """
     with storage_errors(folder):
-        # To read is enough for a lock, and possible on a disk that takes nothing any more.
+        # Opening for reading is enough for a lock, and works on a disk that takes no more writes.
         descriptor = os.open(folder / LOCK_NAME, os.O_RDONLY | os.O_CREAT, 0o666)
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
@@ -214,7 +214,7 @@ def without_check(text: bytes) -> bytes:
 
 
 def is_unchanged(text: bytes) -> bool | None:
-    """Has the text the hash that it states? None if it states none."""
+    """Does the text have the hash that it states? None if it states none."""
     end = _END.search(text)
     if end is None:
         return None

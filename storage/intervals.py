@@ -171,7 +171,7 @@ class Losses:
         }
 
     def within(self, numbers: Intervals) -> dict[str, Intervals]:
-        """Of these numbers the lost ones, by reason."""
+        """The lost numbers among these, by reason."""
         found = {reason: numbers & lost for reason, lost in self.by_reason.items()}
         return {reason: lost for reason, lost in found.items() if lost}
 

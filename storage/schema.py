@@ -198,7 +198,7 @@ def from_record_batch(record: pa.RecordBatch) -> FrameBatch:
 
 def _view(record: pa.RecordBatch, column: Column) -> Array:
     array = record.column(column.name)
-    if array.null_count:  # an empty row hides its values: what is left would shift to other rows
+    if array.null_count:  # a null row has no values: the rest would shift to other rows
         raise ValueError(f"column {column.name} has {array.null_count} empty rows")
     if isinstance(array, pa.FixedSizeListArray):
         values = array.flatten().to_numpy(zero_copy_only=True)

@@ -26,7 +26,7 @@ _MESSAGE_FRAMES = 64
 
 @dataclass(frozen=True)
 class EncodedBatch:
-    """Consecutive frames as one message, and what a journal notes of it without reading it."""
+    """Consecutive frames as one message, and what a journal notes of it without decoding it."""
 
     seq_first: int
     seq_last: int

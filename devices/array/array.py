@@ -30,7 +30,7 @@ from devices.recovery.recovery import BusRecovery
 from devices.scene.hardware import ScheduleName
 
 AUDIT_NS = 1_000_000_000
-"""The muxes' control registers are read back so often."""
+"""Interval at which the muxes' control registers are read back."""
 
 _LOOK_FRAMES, _LOOK_PART = 10, 0.008
 """In one of so many frames, and for no more than this part of the time, a tile is read again."""
@@ -39,7 +39,7 @@ _BUDGET_PART = 8
 _BUDGET_MIN_NS = 500_000
 """Second attempts may take an eighth of a frame, but always one reading and a look at who it is."""
 _DISTURBED_BUDGETS = 4
-"""On a line where bits turn over, to be right is worth some of the rate."""
+"""On a line with flipped bits, correct readings are worth some of the rate."""
 
 
 class TileArray:
@@ -99,7 +99,7 @@ class TileArray:
         self._temperature_every = temperature_every
         self._reference_n = reference_n
         self._frame_ns = round(frame_s(schedule, timing) * 1e9)
-        # Where a tile is started again as soon as it was read, there is nothing to look at again.
+        # A tile that is started again right after its read has nothing to be read again.
         self._look_frames = 0
         if schedule != "pipelined" and len(tiles) > 1:
             look_ns = (timing.select_s + timing.read_s) * 1e9
@@ -136,7 +136,7 @@ class TileArray:
         self._running = [False] * len(self.tiles)
 
     def troubles(self) -> dict[str, str]:
-        """What is wrong now, in words: by serial, and under "" what is wrong with the bus."""
+        """What is wrong now, in words, by serial; the bus's trouble is under ""."""
         found: dict[str, str] = {}
         if self.bus.is_down:
             unhelped = f" and could not be helped: {self.bus.problem}" if self.bus.problem else ""
@@ -179,12 +179,12 @@ class TileArray:
     def convert(self, scan: Scan, tiles: Sequence[int]) -> None:
         """Start a conversion in all `tiles` at once, except in those that are lost."""
         if len(tiles) == 1 and self._running[tiles[0]]:
-            return  # of a slow part, which is not waited for and not to be disturbed
+            return  # a slow part still converts: do not wait for it or disturb it
         if self._look_frames and self._frames % self._look_frames == self._look_frames - 1:
             self._look_again(scan, tiles)
         called = self._worth_calling(tiles)
         while called and not self._attempt(scan, called, partial(self._ports.convert, called)):
-            # One mux that does not answer must not keep the others from being started.
+            # A mux that does not answer must not keep the others from starting.
             silent = self._ports.router.refused
             gone = [i for i in called if silent in (None, self.tiles[i].mux)]
             for i in gone:
@@ -194,11 +194,11 @@ class TileArray:
         now_ns = self._clock.now_ns()
         for i in tiles:
             self._started_ns[i] = now_ns
-            # One that is not known to be there may have missed a broadcast.
+            # A tile that is not known to be there may have missed a broadcast.
             self._running[i] = i in called and self.health[i].present
 
     def _worth_calling(self, tiles: Sequence[int]) -> tuple[int, ...]:
-        """Those behind a mux with a tile present: a broadcast names muxes, not tiles."""
+        """Tiles behind a mux that has a tile present: a broadcast names muxes, not tiles."""
         if all(self.health[i].present for i in tiles):
             return tuple(tiles)
         muxes = {self.tiles[i].mux for i in tiles if self.health[i].present}
@@ -285,8 +285,8 @@ class TileArray:
     def _may_spend(self, scan: Scan, tile: int) -> bool:
         """Is there time left in this frame for more than one reading of a tile?
 
-        Each tile in turn has a frame in which there always is, or the first ones would use up what
-        the last ones need.
+        Each tile in turn has a frame where the answer is always yes; else the first tiles would
+        use up the time that the last ones need.
         """
         return scan.budget_ns > 0 or tile == self._frames % len(self.tiles)
 
@@ -313,7 +313,7 @@ class TileArray:
         return False
 
     def _audit(self, scan: Scan) -> None:
-        """Now and then, at the end of a frame: is everything still as it is taken to be?"""
+        """Now and then, at the end of a frame, check the muxes, and try a suspect's conversion."""
         now_ns = self._clock.now_ns()
         try:
             if now_ns >= self._audit_due_ns:
@@ -338,13 +338,13 @@ class TileArray:
             return
         try:
             self._watch.look_again(tile, self._words[tile])
-        except NoAcknowledgeError:  # reading it will tell
+        except NoAcknowledgeError:  # the next read will show it
             self._ports.forget([tile])
         except BusFaultError:
             scan.note_bus_fault()
 
     def _conclude(self, scan: Scan) -> None:
-        """What this frame says of the tiles' freshness and of the bus."""
+        """Judge from this frame whether tiles are stale and whether the bus works."""
         for i, health in enumerate(self.health):
             if health.is_stale(scan.padc[i], scan.tadc[i]):
                 scan.flag(i, TileStatus.STALE)

@@ -20,7 +20,7 @@ _READ_BITS = 30  # START, address, register, repeated START, address, STOP
 _BYTE_BITS = 9  # eight and the acknowledge
 
 PREFERENCE: tuple[ScheduleName, ...] = ("simultaneous", "per_mux", "pipelined", "sequential")
-"""Of schedules that are equally fast, the one with the least skew."""
+"""Order of preference of equally fast schedules: least skew first."""
 _AS_FAST = 0.995  # half a percent is no reason to prefer a schedule
 
 

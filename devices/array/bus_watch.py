@@ -77,7 +77,7 @@ class BusWatch:
         self._wait_ns, self._due_ns = _RECOVERY_NS[0], 0
 
     def comes_back(self) -> bool:
-        """Whether a bus that was down moves again, if need be with help."""
+        """Check whether a bus that was down moves again; help it if need be."""
         back = self._moves()
         if not back and self._recovery is not None and self._clock.now_ns() >= self._due_ns:
             self.recoveries += 1

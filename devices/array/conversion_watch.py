@@ -13,10 +13,10 @@ from devices.clock import Clock
 from devices.frames import NOT_READ
 
 SLOW_AUDIT_NS = 500_000_000
-"""A part that was found to be slow is tried so often, to notice when it no longer is."""
+"""Interval of trials of a slow part, to notice when it is quick again."""
 
 _HESITATION_NS = 100_000
-"""A read that came so much later than it was meant to does not show what it was meant to."""
+"""A read that comes later than planned by this much proves nothing."""
 
 _TRIES, _SLOW_TRIES, _SAME_MAX = 8, 2, 3
 """Every second pair of healthy readings has the same temperature: eight are one in 250. One that is
@@ -72,7 +72,7 @@ class ConversionWatch:
             self._suspects.append(tile)
 
     def to_try(self) -> int | None:
-        """A tile whose conversion should be tried now; None if there is none."""
+        """A tile whose conversion should be tried now, or None."""
         if self._suspects:
             return self._suspects.pop(0)
         now_ns = self._clock.now_ns()
@@ -123,7 +123,7 @@ class ConversionWatch:
         self.wait_ns[tile] = self._measured_ns[tile]
 
     def _settled(self, tile: int) -> tuple[int, int]:
-        """The words of a conversion that was given all its time."""
+        """The words of a conversion that had all its time."""
         return self._converted(tile, CONVERSION_MAX_NS)[0]
 
     def _converted(self, tile: int, delay_ns: int) -> tuple[tuple[int, int], bool]:

@@ -48,7 +48,7 @@ class TileHealth:
 
     def __init__(self, info: TileInfo) -> None:
         self.counts: Counter[str] = Counter()
-        """How often what went wrong, by reason."""
+        """Counts of faults, by reason."""
         self.coefficient_words = info.coefficient_words
         self.coefficient_bytes = b"".join(w.to_bytes(2, "big") for w in info.coefficient_words)
         self.present = True
@@ -72,7 +72,7 @@ class TileHealth:
     # Presence
 
     def lose(self, now_ns: int) -> None:
-        """It does not answer, or gives what cannot be; it is looked for less and less often."""
+        """The tile does not answer, or its words are impossible; probe it ever less often."""
         if self.present:
             self.doubt(now_ns)
         else:
@@ -93,17 +93,17 @@ class TileHealth:
         return now_ns >= self._probe_due_ns
 
     def note(self, status: int) -> None:
-        """Count what a frame says of it."""
+        """Count the faults that a frame shows of it."""
         self.counts.update(bit.name.lower() for bit in TileStatus(status) if bit.name)
 
     def find(self) -> None:
-        """It is back, and it is itself."""
+        """The tile is back, and it is the same part."""
         self.present = True
 
     # Readings
 
     def wants_temperature(self, now_ns: int) -> bool:
-        """Is there no temperature to go by, or only an old one?"""
+        """Is its last temperature missing or too old?"""
         return self._tadc is None or now_ns - self._tadc_ns > _TADC_MAX_NS
 
     def jumps(self, padc: int, tadc: int, *, strictly: bool = False) -> bool:
@@ -123,7 +123,7 @@ class TileHealth:
         return abs(padc - self._median()) > self._far_jump or self._is_hot(tadc)
 
     def believe(self, padc: int, tadc: int, now_ns: int) -> None:
-        """A reading that was accepted."""
+        """Take in a reading that was accepted."""
         self._recent.append(padc)
         if tadc != NOT_READ:
             self._tadc = tadc

@@ -18,7 +18,7 @@ from devices.errors import NoAcknowledgeError
 from devices.frames import TileStatus
 
 DISTURBED_NS = 1_000_000_000
-"""For so long after a reading was found disturbed, a jump that cannot be checked is no reading."""
+"""After a disturbed reading, a jump that cannot be checked is refused for this long."""
 
 _IMPLAUSIBLE = int(TileStatus.IMPLAUSIBLE)
 
@@ -38,7 +38,7 @@ class Judge:
 
     @property
     def is_disturbed(self) -> bool:
-        """Was a bit seen to turn over, not long ago?"""
+        """Was a flipped bit seen not long ago?"""
         return self._clock.now_ns() < self._disturbed_until_ns
 
     def judge(
@@ -66,7 +66,7 @@ class Judge:
             words = self._confirmed(scan, tile, words, with_temperature)
             jumps = health.jumps(*words)
         elif jumps and disturbed:
-            # Where bits are known to turn over, what cannot be checked is no reading.
+            # On a line with flipped bits a reading that cannot be checked is refused.
             scan.flag(tile, TileStatus.IMPLAUSIBLE)
         scan.padc[tile], scan.tadc[tile] = words
         if impossible := is_impossible(*words):
@@ -118,7 +118,7 @@ class Judge:
         return words
 
     def _make_sure(self, scan: Scan, tile: int) -> None:
-        """Is it this tile, and this one alone, that is connected? Its coefficients tell."""
+        """Check by the coefficients that this tile, and no other, is connected."""
         health = self._health[tile]
         found = b""
         with scan.second_attempt(self._clock), suppress(NoAcknowledgeError):

@@ -62,7 +62,7 @@ class TilePorts:
         return self._chip.read_coefficient_words(where=f"tile {self.tiles[tile].serial}")
 
     def forget(self, tiles: Sequence[int]) -> None:
-        """What the muxes of these tiles connect is not known any more."""
+        """Forget what the muxes of these tiles connect."""
         for mux in {self.tiles[i].mux for i in tiles}:
             self.router.forget(mux)
 
@@ -107,7 +107,7 @@ class Scan:
 
     @classmethod
     def blank(cls, tiles: int, begin_ns: int, budget_ns: int) -> Scan:
-        """A frame in which nothing has been read."""
+        """A frame without any reading."""
         return cls(
             [NOT_READ] * tiles, [NOT_READ] * tiles, [begin_ns] * tiles, [0] * tiles, budget_ns
         )

@@ -1,4 +1,4 @@
-"""The schedules: in which order one frame's transfers go over the bus.
+"""The schedules: the order of one frame's transfers on the bus.
 
 Each is one function that takes one frame of an array into a `Scan`. Whatever goes wrong in a
 transfer is dealt with, and flagged, in `TileArray`; a schedule is only the order. What each costs

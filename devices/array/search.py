@@ -29,7 +29,7 @@ class Search:
         scan.flag(tile, TileStatus.IMPLAUSIBLE if replaced else TileStatus.NO_ANSWER)
 
     def look_for(self, scan: Scan, tile: int) -> None:
-        """See whether a tile is back, if it is time to; its sample comes with the next frame."""
+        """Check whether a tile is back, if a probe is due; its sample comes with the next frame."""
         self.note_absence(scan, tile)
         health = self._health[tile]
         if not health.is_probe_due(self._clock.now_ns()):
@@ -52,7 +52,7 @@ class Search:
         if self._ports.read_coefficients() == health.coefficient_bytes:
             health.replaced = False
             return True
-        # A disturbed bit, in the reading or in the select before it, must not make another part.
+        # A flipped bit, in the reading or the select before it, must not look like another part.
         words = set()
         for _ in range(2):
             self._ports.router.forget()
@@ -61,6 +61,6 @@ class Search:
         if words == {health.coefficient_words}:
             health.replaced = False
             return True
-        # Each of them three times the same and plausible: a part, but not the one that was here.
+        # Three equal, plausible readings: a part, but not the one that was here.
         health.replaced = len(words) == 1 and not self._ports.router.silent
         return False

@@ -41,7 +41,7 @@ _MARGIN = 1.004
 """Allowance for the drift of a part's clock; a part that drifts further is noticed in the run."""
 
 _ADDRESS_BITS = 29
-"""START, address and register, repeated START and address: only then does a read take its data."""
+"""SCL periods before a read takes its data: START, address, register, START, address."""
 
 _SCL_READS = 100  # so that the median forgets what the machine did meanwhile
 _SCL_BYTES = (2, 12)  # far apart, within the part's registers
@@ -186,7 +186,7 @@ def measure_wires(bus: I2cBus, clock: Clock, tile: TileInfo) -> WireTiming:
 def measure_conversion_ns(
     bus: I2cBus, clock: Clock, tile: TileInfo, wires: WireTiming
 ) -> int | None:
-    """How long a conversion of this part takes at most; None if its words do not tell.
+    """The longest that a conversion of this part takes; None if its words do not show it.
 
     Bisects the delay from CONVERT to the one read. Each trial has two conversions: one read after
     the longest time that a conversion may take, and one read at the delay in question. If the
@@ -222,10 +222,10 @@ def measure_conversion_ns(
         return words, waited_ns
 
     def finished_within(delay_ns: int, known_ns: int) -> int | None:
-        """What was waited when a conversion was seen to be finished; None if none was.
+        """The wait after which a conversion was seen to be finished; None if none was.
 
-        What was waited as long as the `known_ns` in which one finishes proves nothing. If nothing
-        else was tried, that is what is given.
+        A wait of `known_ns` or more, which is known to be enough, proves nothing new. If too few
+        shorter waits were tried, the result is `known_ns`.
         """
         in_time = 0
         pressure_changed = False
@@ -258,7 +258,7 @@ def _bisected(finished_within: Callable[[int, int], int | None]) -> int | None:
         if waited_ns is None:
             unfinished_ns = middle_ns
         elif waited_ns < finished_ns:
-            finished_ns = waited_ns  # a sleep ends late, and what was waited is what was tried
+            finished_ns = waited_ns  # a sleep ends late: the real wait counts
         else:
-            break  # sleeps of this machine are no finer than that
+            break  # this machine's sleeps are not finer than that
     return finished_ns

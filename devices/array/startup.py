@@ -125,7 +125,7 @@ def renew(
     recovery: BusRecovery | None = None,
     reference_n: Callable[[], float] | None = None,
 ) -> Ready:
-    """The array with the parts that are there now in place of those that were replaced.
+    """The array with the new parts in place of those that were replaced.
 
     Only the new parts are identified and measured, so that the others rest for a moment only.
 
@@ -169,7 +169,7 @@ def _ready(
         recovery=recovery,
         reference_n=reference_n,
     )
-    # Schedules that read what the frame before has started have to be started once.
+    # A schedule that reads what the frame before started needs one start.
     array.scan()
     return Ready(found.tiles, found.timing, found.unmeasured, array, choice)
 

@@ -88,14 +88,14 @@ class I2cBus:
 
 
 class PatientBus(I2cBus):
-    """The same bus for a start-up on a disturbed line: what is not acknowledged is tried again."""
+    """The same bus for a start-up on a disturbed line: refused transfers are tried again."""
 
     TRIES = 4
 
     def __init__(self, bus: I2cBus) -> None:
         super().__init__(bus._adapter, bus.name)  # noqa: SLF001  # the same class
         self.repeated = 0
-        """Transfers that were not acknowledged at once, and then were."""
+        """Count of transfers that were acknowledged only on a later try."""
 
     def transfer(self, *messages: i2c_msg) -> None:
         """As `I2cBus.transfer`, up to `TRIES` times."""

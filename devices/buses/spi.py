@@ -1,4 +1,4 @@
-"""The SPI device as a driver sees it: one call, `xfer2`, in which every bit sent brings one back.
+"""The SPI device as a driver sees it: one call, `xfer2`, which returns a bit for every bit sent.
 
 On a Raspberry Pi that is `spidev.SpiDev`, in an emulation the bit-level model behind the same
 method. Both raise bare `OSError`; the driver says what it means.
@@ -11,7 +11,7 @@ from typing import Protocol
 from devices.errors import SpiSetupError, UsageError, needs_extra
 
 MAX_SPEED_HZ = 1_000_000
-"""What an MCP3208 stands at the Pi's 3.3 V (hardware.md 6)."""
+"""The highest clock for an MCP3208 at the Pi's 3.3 V (hardware.md 6)."""
 
 MODE = 0
 """Clock idle low, bits taken at its rising edge: mode 0,0 of the MCP3208 data sheet."""

@@ -38,7 +38,7 @@ class Tca9548a:
 
 
 class MuxRouter:
-    """Keeps all multiplexers of a bus such that only what is asked for is connected.
+    """Keeps all multiplexers of a bus so that only the channels asked for are connected.
 
     All tiles share one address, so a channel left open on another mux would answer too: reads would
     return the AND of two tiles, plausible and wrong. The state is cached, because a select costs
@@ -107,7 +107,7 @@ class MuxRouter:
         return sound
 
     def echoes(self) -> bool:
-        """Does a mux keep what is written to it? Of a bus whose SDA is stuck low none seems to.
+        """Does a mux keep what is written to it? On a bus with SDA stuck low no mux seems to.
 
         Such a bus acknowledges everything and reads as zeros (hardware.md 3.2), so one bit that
         comes back is proof that the wires move. Tries the muxes one after another.

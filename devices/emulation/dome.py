@@ -107,7 +107,7 @@ class Domes:
         return low + (position - index) * (high - low)
 
     def foresee(self, t_s: float) -> None:
-        """Have the pressures up to `t_s` ready, so that no sample has to wait for them."""
+        """Compute the pressures up to `t_s`, so that no sample has to wait for them."""
         if int(t_s / GRID_S) + 1 >= self._next:
             self._extend(int(t_s / GRID_S) + 1)
 
@@ -166,7 +166,7 @@ class Domes:
         return np.asarray(force_n + weight * (played - f).sum(axis=2))
 
     def _loading_gains(self, force_n: Floats) -> Floats:
-        """A gain of its own for every loading, drawn when the dome is touched."""
+        """A separate gain for every loading, drawn when the dome is touched."""
         gains = np.ones_like(force_n)
         if self._scene.repeatability == 0.0:
             return gains

@@ -16,7 +16,7 @@ _BEFORE_NS = 2**62  # later than any instant of the clock
 
 
 class _Window(NamedTuple):
-    """From when to when a fault is there, and how often it happens meanwhile."""
+    """When a fault begins and ends, and how often it happens in between."""
 
     begin_ns: int
     end_ns: int
@@ -37,7 +37,7 @@ class Fault:
     ) -> None:
         self._windows_s = tuple(windows_s)
         self._rates = tuple(rates) if rates is not None else (RATE,) * len(self._windows_s)
-        # What is there from the scene's first instant on was there before it.
+        # A fault at the scene's first instant was there before it.
         self._windows_ns = tuple(
             _Window(0, _BEFORE_NS, rate)
             for (begin, _), rate in zip(self._windows_s, self._rates, strict=True)
@@ -49,7 +49,7 @@ class Fault:
 
     @property
     def possible(self) -> bool:
-        """May it have been there, or come?"""
+        """Can this fault occur at any time, past or future?"""
         return bool(self._depth or self._windows_ns or self._was_injected)
 
     def begin(self, epoch_ns: int) -> None:
@@ -68,7 +68,7 @@ class Fault:
         return any(window.begin_ns <= t_ns < window.end_ns for window in self._windows_ns)
 
     def rate(self, t_ns: int) -> float:
-        """How often it happens at `t_ns`: the most often of what is there, 0 of nothing."""
+        """How often it happens at `t_ns`: the greatest rate of active faults, 0 without any."""
         by_hand = RATE if self._depth else 0.0
         if not self._windows_ns:  # asked at every byte
             return by_hand
@@ -114,7 +114,7 @@ class Faults:
 
     def __init__(self, scenes: Sequence[FaultScene]) -> None:
         self.possible = bool(scenes)
-        """May any of them be there, ever? Asked at every transfer before all else."""
+        """Can any fault ever occur? Checked first at every transfer."""
         self._scenes = scenes
         self._faults: dict[tuple[FaultKind, str], Fault] = {}
         self._epoch_ns: int | None = None

@@ -87,7 +87,7 @@ class GpioRecovery:
                     self._drive(scl, low=False)
                 elif self._stop(scl, sda):
                     return True
-                # Else a high bit came before a low one. The STOP that failed was a clock too.
+                # Else a high bit came before a low one. The failed STOP was a clock, too.
             return scl.high() and sda.high() and self._stop(scl, sda)
 
     def reset_muxes(self) -> bool:

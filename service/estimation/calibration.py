@@ -117,7 +117,7 @@ class Calibration(CalibrationPart):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
     def find(self, serial: str) -> TileCalibration | None:
-        """The entry for a serial; None if there is none, as for bare tiles, which bear nothing."""
+        """The entry for a serial; None without one, as for bare tiles, which bear no load."""
         for tile in self.tiles:
             if tile.serial in (serial, ANY_SERIAL):
                 return tile
@@ -179,7 +179,7 @@ class Calibration(CalibrationPart):
 
 
 def loop_share(force_n: Floats) -> Floats:
-    """How far a hysteresis loop is open at a force: closed at zero, half open at one newton."""
+    """How far a hysteresis loop is open at a force: 0 at zero load, half at one newton."""
     return np.asarray(1.0 - LOOP_OPENS_N / (np.abs(force_n) + LOOP_OPENS_N))
 
 

@@ -35,7 +35,7 @@ class Parameter(CalibrationPart):
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """Where it lies in 95 of 100 cases."""
+        """Interval that holds it in 95 of 100 cases."""
         return self.value - 1.96 * self.sigma, self.value + 1.96 * self.sigma
 
 
@@ -113,7 +113,7 @@ class TemperatureEffect(CalibrationPart):
 
 
 class Effects(CalibrationPart):
-    """All that the recording determined; None where it did not, and then `refused` says why."""
+    """All that the recording determined; None otherwise, and `refused` says why."""
 
     gas: GasEffect | None = None
     rubber: RubberEffect | None = None

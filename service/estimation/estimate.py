@@ -39,7 +39,7 @@ class EstimationState:
 
     pending: Pending | None = None
     waiting: FrameBatch | None = None
-    """The last frame, if it has to wait for the next one to be told from an outlier."""
+    """The last frame, if it waits for the next one to show whether it is an outlier."""
     before_kpa: Floats | None = None
     """Pressures of the frame before it."""
     temperature: HeldTemperature | None = None
@@ -57,7 +57,7 @@ class EstimationState:
 def step(
     plan: EstimationPlan, frames: FrameBatch, state: EstimationState
 ) -> tuple[Estimates, EstimationState]:
-    """Take the next frames, in order; give the estimates that are due.
+    """Take the next frames, in order; return the estimates that are due.
 
     Args:
         plan: constants of this estimate.
@@ -88,7 +88,7 @@ def step(
 
 
 def finish(plan: EstimationPlan, state: EstimationState) -> Estimates | None:
-    """The estimates that still wait for a look-ahead that will not come; None if none do."""
+    """The estimates that still wait for their look-ahead, at the end; None if none wait."""
     if state.waiting is not None:
         state = _taken(plan, state.waiting, 1, state)
     pending = state.pending
@@ -101,7 +101,7 @@ def finish(plan: EstimationPlan, state: EstimationState) -> Estimates | None:
 def _taken(
     plan: EstimationPlan, frames: FrameBatch, n: int, state: EstimationState
 ) -> EstimationState:
-    """Add the first `n` of `frames` to those pending; what comes after tells their outliers."""
+    """Add the first `n` of `frames` to those pending; later frames show their outliers."""
     broken = _after_gap(plan, frames, state)
     kpa = tile_kpa(plan, frames)
     neighbours = None

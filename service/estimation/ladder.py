@@ -38,7 +38,7 @@ MODELS = (
     "hysteresis",
     "rubber",
 )
-"""In the order in which they are applied."""
+"""Names of all models, in the order of their use."""
 
 
 MISFIT_MIN = 0.1

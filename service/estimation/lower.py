@@ -72,7 +72,7 @@ class Pending:
         )
 
     def after(self, given: int, *, reach_back: bool) -> Pending:
-        """Without the first `given` frames, but for what averages will reach back to."""
+        """These without the first `given`, but with those that averages will reach back to."""
         n, end = len(self.frames.seq), len(self.forces.run)
         keep = first = self.first + given
         if reach_back:
@@ -181,7 +181,7 @@ def apparent_forces(
         baseline_variance = baseline_variance + sigma_kpa**2
         state = replace(state, temperature=after)
     if ladder.ambient is not None:
-        # A bare tile beyond the chip's range tells of itself, not of what is around the foot.
+        # A bare tile beyond the chip's range shows a fault of its own, not the surroundings.
         beyond_chip = (frames.status & np.uint8(TileStatus.OVER_RANGE)) != 0
         outside_kpa = np.where(beyond_chip, np.nan, gauge_kpa)
         passed_kpa, sigma_kpa, outside = ladder.ambient.passed_on(
@@ -195,7 +195,7 @@ def apparent_forces(
         gauge_kpa[:, columns] = bearing_kpa - plan.baseline_kpa
     settled_kpa, uncertain = bearing_kpa, np.zeros(bearing_kpa.shape, dtype=bool)
     if ladder.gas is not None:
-        # What is beyond the range is a bound, which the gas must not take for the truth.
+        # A reading beyond the range is only a bound: the gas model must not take it as a value.
         bound = bearing_kpa - plan.baseline_kpa > ladder.curves.high_kpa
         settled_kpa, warm = ladder.gas.settled(
             np.where(bound, np.nan, bearing_kpa),
@@ -269,7 +269,7 @@ def _frame_status(
 
 
 def _mean_of(values: Floats, columns: npt.NDArray[np.intp]) -> Floats:
-    """Mean over some columns of those that are not NaN; one after the other, as in every sum."""
+    """Mean over columns, without NaN; summed column by column, as every sum here."""
     total, count = np.zeros(len(values)), np.zeros(len(values))
     for column in columns:
         good = np.isfinite(values[:, column])

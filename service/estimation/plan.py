@@ -47,7 +47,7 @@ class EstimationPlan:
     compensation: Compensation
     ladder: Ladder
     bearing: npt.NDArray[np.intp]
-    """Columns of the tiles that bear load; arrays below without another word are over these."""
+    """Columns of the tiles that bear load; arrays below are over these, unless stated."""
     references: npt.NDArray[np.intp]
     """Columns of bare reference tiles, which are in no sum."""
     baseline_kpa: Floats

@@ -28,9 +28,9 @@ _WAITING_MAX = 4096
 """Batches that may wait for a parent that does not read, 100 s; then frames are lost and counted
 as a gap in `seq`."""
 _END_S = 5.0
-"""What is told to end gets so long before it is killed."""
+"""How long a process that is told to end has before it is killed."""
 _LOOK_EVERY_NS = 500_000_000
-"""Of the stream's own time: so often is the array asked how it is."""
+"""Interval at which the array is asked for its health, in the stream's own time."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class AcquisitionProcess:
             self._connection.send(None)
 
     def close(self) -> None:
-        """Have it ended, gently if it lets itself be."""
+        """End the process: ask first, then kill it."""
         self.stop()
         self._process.join(_END_S)
         if self._process.is_alive():

@@ -1,4 +1,4 @@
-"""A connection on which a server has welcomed a node: what goes each way as long as it stands.
+"""A connection on which a server has welcomed a node: what goes each way while it lasts.
 
 Before frames go, the offset between the node's clock and the server's is measured.
 """
@@ -39,7 +39,7 @@ from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
 
 STATUS_EVERY_S = 1.0
-"""It is for people to read."""
+"""Interval of status messages, which are for people to read."""
 
 
 class Connection:
@@ -116,7 +116,7 @@ def parse(message: str | bytes) -> Welcome | Ack | Wanted | Probe:
 
 
 async def _until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
-    """Do all of it at once until one ends, and fail as that one failed.
+    """Run all of these at once until one ends; fail as that one failed.
 
     Not by a TaskGroup: before Python 3.13 one that ends while its owner is about to go on may leave
     the owner cancelled (CPython 117407), and a node without its link.
@@ -142,10 +142,10 @@ def hello_of(options: NodeOptions, journal: NodeJournal, present: NodeStream) ->
     Raises:
         StorageError: one of them cannot be read.
     """
-    next_seq = present.next_seq  # before what is held, which may go on meanwhile
-    # Another one may have begun meanwhile: that one has not ended.
+    next_seq = present.next_seq  # before `held`, which may grow meanwhile
+    # Another stream may have begun meanwhile; it has not ended.
     others = list(takewhile(lambda stream: stream is not present, journal.streams))
-    # Those that a session waits for first, then the newest.
+    # Streams that a session waits for come first, then the newest.
     waited_for = [stream for stream in others if journal.undelivered(stream)]
     rest = [stream for stream in others if stream not in waited_for]
     chosen = (*waited_for[:_EARLIER_MAX], *rest[-_EARLIER_MAX:])[:_EARLIER_MAX]
@@ -202,7 +202,7 @@ class ClockProbes:
             self._answers.put_nowait(probe)
 
     async def run(self) -> None:
-        """Measure and tell the server, again and again; what was not measured is not sent."""
+        """Measure again and again, and tell the server; a failed measurement is not sent."""
         number = 0
         while True:
             best: ClockRow | None = None

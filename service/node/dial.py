@@ -19,7 +19,7 @@ from devices.errors import UsageError
 from service.link import INGEST_PATH, Close
 
 EVERY_S = 0.5
-"""So soon at most does a link that has returned carry an attempt."""
+"""Interval of attempts: a link that has returned carries one at the latest after this."""
 GIVE_UP_S = 5.0
 """After that the address is looked up again."""
 _UNSENT_BYTES = 16 << 10
@@ -109,7 +109,7 @@ async def _attempt(host: str, port: int) -> socket.socket:
 BACK_OFF_S = (0.1, 0.5)
 """Between attempts at a server that cannot be reached: the picture is back within a second."""
 REFUSED_BACK_OFF_S = (0.2, 5.0)
-"""Between attempts at one that answered, and did not want us."""
+"""Between attempts at a server that answered and refused."""
 _UNAUTHORISED = 401
 
 
@@ -131,7 +131,7 @@ class BackOff:
             self._bounds, self._wait_s = bounds, bounds[0]
 
     def next_s(self) -> float:
-        """How long to wait now: each time longer, and never two nodes at the same instant."""
+        """How long to wait now: longer each time, with jitter so that nodes do not coincide."""
         least, most = self._bounds
         self._wait_s = min(max(2.0 * self._wait_s, least), most)
         return self._wait_s * random.uniform(0.5, 1.0)  # noqa: S311  # no secret
@@ -139,7 +139,7 @@ class BackOff:
 
 def _is_refusal(error: BaseException) -> bool:
     if isinstance(error, ConnectionClosed):
-        # One that is going down will be back, and what was damaged on its way is sent once more.
+        # A server that is going down will be back; what was damaged on its way is sent again.
         soon = (Close.RESTART, Close.MALFORMED)
         return error.rcvd is not None and error.rcvd.code not in soon
     return isinstance(error, InvalidStatus)

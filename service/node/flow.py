@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 
 QUEUE_S = 0.4
-"""How long what is under way may take: the newest frame waits so long at most."""
+"""How long the bytes under way may take: the newest frame waits no longer than this."""
 LEAST_BYTES = 32 << 10
 """Half a second or so of four tiles: with less, a link with a long delay would stand idle."""
 MOST_BYTES = 8 << 20
@@ -19,7 +19,7 @@ MOST_BYTES = 8 << 20
 _PACE_OVER_S = 1.0
 """The pace is that of the last second: links change."""
 _PIECES = 8
-"""So many questions are under way in a full window."""
+"""Number of questions that are under way in a full window."""
 
 
 class Flow:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 
 class Notices:
-    """Tells what lasts; what comes and goes between two looks is only in the frames' flags."""
+    """Reports what lasts; what comes and goes between two looks is only in the frames' flags."""
 
     def __init__(self) -> None:
         self._last: Mapping[str, str] = {}

@@ -17,9 +17,9 @@ class NodeOptions:
         rig: the array to open.
         journal: the node's folder.
         server: address of the server; None: none, it records for itself.
-        record: name of a session that is recorded on the node itself; None: none is.
+        record: name of a session to record on the node itself; None: no recording.
         calibration: of its tiles, for the server to estimate with.
-        calibration_problem: why there is none.
+        calibration_problem: why there is no calibration.
         token: for servers that want one.
     """
 

@@ -61,7 +61,7 @@ class NodeRecording:
         self._sealing = threading.Lock()
         """Held while what was left is sealed: a node may be stopped meanwhile."""
         found, self._unreadable = self._folder.load_all()
-        """Sessions that cannot be read: what they need is not known, so everything is kept."""
+        """Unreadable sessions: it is not known which frames they need, so all frames are kept."""
         for session_id, error in self._unreadable.items():
             report(f"session {session_id} is left out: {error}")
         self._left_over = [s for s in found if s.state != "sealed" and s.node == node]
@@ -98,7 +98,7 @@ class NodeRecording:
         self._note(session)
 
     def stop(self) -> tuple[str | None, bool]:
-        """Seal the session; its id, None if there is none, and whether it is lossy.
+        """Seal the session; return its id (None if there is none), and whether it is lossy.
 
         Raises:
             FootTileError: it cannot be sealed; everything stays, for `foottile recover`.
@@ -128,7 +128,7 @@ class NodeRecording:
                 self._need()
 
     def _broken_off(self) -> Session | None:
-        """The newest session that this recording left behind, but those that others took up."""
+        """The newest session that this recording left behind and that no other one continues."""
         for session in self._left_over:
             is_its_own = self._name in (session.name, numbered(session.name)[0])
             if is_its_own and session.state != "pending":
@@ -163,7 +163,7 @@ class NodeRecording:
         return {p.boot_id: known.get(p.boot_id, SessionStream()) for p in session.parts}
 
     def _need(self) -> None:
-        """Have the journal keep what is not sealed yet."""
+        """Tell the journal to keep the frames that are not sealed yet."""
         sessions = (*self._left_over, *((self._session,) if self._session else ()))
         needed = numbers_of(part for session in sessions for part in session.parts)
         if self._unreadable:

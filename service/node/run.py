@@ -25,7 +25,7 @@ _LOOK_S = 0.02
 _DRAIN_S = 3.0
 """A node that is stopped waits no longer for the server."""
 _AWAY_LOOKS = 50
-"""Without a link for a second it does not wait at all."""
+"""After this many looks without a link, a second in all, it waits no longer."""
 _TROUBLES_S = 0.5
 """Between two looks at the disk's troubles."""
 
@@ -36,8 +36,8 @@ class Outcome:
 
     Attributes:
         undelivered_frames: on the node's disk, for a server that has not got them yet.
-        lost_frames: neither on a disk of the node nor of a server, by reason; what was dropped
-            because no session wanted it is not among them.
+        lost_frames: on no disk of the node or of a server, by reason; frames that were dropped
+            because no session wanted them do not count.
         recorded: id of the session that was recorded here; None: none was, or it is not sealed.
         is_lossy: is that session not complete?
     """
@@ -145,7 +145,7 @@ class RunningNode:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def _tell_failure(self, task: asyncio.Task[None]) -> None:
-        """A publisher that ended by itself ends the node: better that than to go on in silence."""
+        """A publisher that ended by itself ends the node, which would else go on in silence."""
         if not self._is_closing:
             error = None if task.cancelled() else task.exception()
             self._messages.put_nowait(Failed(error or FootTileError("the publisher has ended")))
@@ -287,5 +287,5 @@ def _hand_over(
 ) -> None:
     try:
         loop.call_soon_threadsafe(messages.put_nowait, message)
-    except RuntimeError:  # the loop has ended, and with it all who listen
+    except RuntimeError:  # the loop has ended, so nothing listens
         return

@@ -25,7 +25,7 @@ from storage.wire import EncodedBatch
 _ASK_EVERY_S = 0.5
 """Asked even if nothing is sent, so that silence means something."""
 _NO_ANSWER_S = 4.0
-"""A link on which nothing comes back for so long is half open."""
+"""A link on which nothing comes back for this long is half open."""
 _LIVE_BEHIND_S = 0.5
 """Frames that wait longer to be sent are overtaken by newer ones."""
 _CHUNK_FRAMES = 512
@@ -43,8 +43,8 @@ class Source:
         streams: all streams that the node has, by boot_id.
         hello: describes them; asked for at every connection.
         status: what the node counts; is given how many frames are behind.
-        wanted: told what the server's sessions need, and of which streams it had heard.
-        damaged: told of frames that turned out to be damaged on disk.
+        wanted: called with what the server's sessions need, and the streams that it knows.
+        damaged: called with frames that turned out to be damaged on disk.
     """
 
     present: Callable[[], NodeStream]
@@ -108,7 +108,7 @@ class Sending:
                 continue
             newest = present.recent(at)
             if newest:
-                # What has waited too long is overtaken; a long batch is no reason to skip it.
+                # Overtake frames that waited too long; a long batch alone is no reason.
                 late = newest[-1].seq_last - behind_frames
                 batch = next((b for b in newest if b.seq_first > late), newest[-1])
                 if batch.seq_first > at:
@@ -194,7 +194,7 @@ class Sending:
 
 
 def _before(pair: tuple[int, int | None], hello: Hello, boot_id: str) -> Intervals:
-    """What is lacking and was taken before hello; of the present stream all newer frames follow."""
+    """Missing frames taken before hello; newer frames of the present stream follow anyway."""
     newest = hello.next_seq - 1 if boot_id == hello.array_info.boot_id else NO_END
     return closed([pair]).within(0, newest)
 

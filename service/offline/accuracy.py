@@ -103,7 +103,7 @@ class Accuracy:
     cop_covered: Covered
     """The same as counts."""
     cop_masked_frames: int
-    """Frames with more than 3 N of truth in which no COP is stated."""
+    """Frames with more than 3 N of truth but without a COP."""
     cop_masked_share: float
     """The same as a part of all frames with more than 3 N of truth."""
     saturated_frames: int

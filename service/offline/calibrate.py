@@ -94,7 +94,7 @@ def read_recordings(paths: Sequence[Path]) -> dict[str, list[Pressed]]:
                 for other in others:
                     _refuse_contradiction(other, pressed)
                 others.append(pressed)
-    # Tiles that were only soaked have nothing to be fitted to.
+    # Tiles that were only soaked have no data to fit.
     bench = {
         serial: recordings
         for serial, recordings in sorted(found.items())

@@ -21,7 +21,7 @@ Columns = Mapping[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class Findings:
-    """Of a session without estimates: nothing."""
+    """Findings of a session; empty without estimates."""
 
     stances: tuple[Stance, ...] = ()
     accuracy: Accuracy | None = None

@@ -55,7 +55,7 @@ class SimulateOptions:
     scene: Scene
     seconds: float | None = None
     otherwise_s: float | None = None
-    """Length of a scene that has no end of its own, if `seconds` does not say one either."""
+    """Length of a scene without an end, if `seconds` is not given either."""
     schedule: AnySchedule | None = None
     truth: bool = False
     foot: EmulatedFoot = EmulatedFoot()  # noqa: RUF009  # frozen, so one for all is safe
@@ -71,7 +71,7 @@ class Simulated:
     missed_slots: int
     choice: Choice
     replaced: tuple[str, ...]
-    """Serials in whose place another part answered."""
+    """Serials of tiles that another part answered for."""
     unmeasured: tuple[str, ...]
     """Serials whose conversion time could not be measured: they were given 3 ms."""
     flags: Mapping[str, Mapping[str, int]]
@@ -143,7 +143,7 @@ class Simulation:
                 extra |= asdict(self._world.truth(batch.t_mono_ns))
             if mill is not None:
                 extra |= mill.notes(batch.t_mono_ns)
-                # What the sensor reads while nothing is pressed is no reference for any tile.
+                # While nothing is pressed, the sensor's reading is no reference for any tile.
                 idle = np.array([tile is None for tile in extra["pressed_tile"]])
                 force_n = np.where(idle, np.float32(np.nan), batch.reference_force_n)
                 batch = replace(batch, reference_force_n=force_n)

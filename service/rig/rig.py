@@ -66,7 +66,7 @@ def open_reference_sensor(
 
 
 def open_recovery_lines(scene: Scene, clock: Clock, world: World | None) -> BusRecovery | None:
-    """Lines that can free the scene's bus; None if none are wired.
+    """Lines that can free the scene's bus; None if they are not wired.
 
     Raises:
         BusSetupError: the lines cannot be had.
@@ -79,7 +79,7 @@ def open_recovery_lines(scene: Scene, clock: Clock, world: World | None) -> BusR
 
 
 _TRIAL_FRAMES = 100
-"""From so many frames the bus's rate is taken: a fifth of a second."""
+"""Frames that the bus's rate is measured over: a fifth of a second."""
 _RENEW_AGAIN_NS = 2_000_000_000
 """Between attempts to identify a part that is being plugged."""
 

@@ -78,7 +78,9 @@ def around_in(
     last = journal.last_seq_until(t_ns, at_least=at_least)
     if last is None:
         return None
-    return last, next(iter(journal.held.within(last + 1, NO_END)))[0]
+    # Where time runs back, frames after the instant may have lower numbers than those before it.
+    after = journal.held.within(last + 1, NO_END).first
+    return last, last + 1 if after is None else after
 
 
 RATE_MAX_HZ = 1000.0

@@ -8,7 +8,7 @@ killed at any time: what was written is whole, and a second run comes to the sam
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Literal
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from devices.errors import FootTileError
+from devices.errors import DamagedFramesError, FootTileError
 from service.sessions.begin import begun
 from service.sessions.ends import SessionStream, at_stop, broken_off, open_tail
 from service.sessions.recover_streams import OpenedStream, hello_of, open_streams
@@ -149,11 +149,7 @@ def _complete(
         if stream is not None:
             session = session.with_clock(ClockLog(stream.journal.folder).rows())
     is_local, give_up = _is_local(data), give_up or session.given_up
-    streams = _described(session, own, is_local=is_local)
-    if is_local or give_up:
-        session = broken_off(session, streams).model_copy(update={"given_up": not is_local})
-    else:
-        session = at_stop(session, streams, waiting=True)
+    session = _with_ends(session, own, is_local=is_local, give_up=give_up)
     if any(part.seq_last is None for part in session.parts):
         return Recovered(session, "waiting", "its node may still be recording it")
     for part in session.parts:
@@ -184,6 +180,40 @@ def _complete(
     except FootTileError as error:
         return Recovered(session, "failed", str(error), ledger)
     return Recovered(sealed, "sealed", sealed.problem or "", ledger)
+
+
+def _with_ends(
+    session: Session,
+    own: Mapping[str, OpenedStream | None],
+    *,
+    is_local: bool,
+    give_up: bool,
+) -> Session:
+    """The session with its ends, as far as they are known."""
+    while True:
+        streams = _described(session, own, is_local=is_local)
+        try:
+            if is_local or give_up:
+                ended = broken_off(session, streams)
+                return ended.model_copy(update={"given_up": not is_local})
+            return at_stop(session, streams, waiting=True)
+        except DamagedFramesError as error:  # the frames that tell: ask the others
+            _disown(own.values(), error)
+
+
+def _disown(streams: Iterable[OpenedStream | None], error: DamagedFramesError) -> None:
+    """Hold damaged frames no longer.
+
+    Raises:
+        DamagedFramesError: the same, if no stream held them.
+    """
+    for stream in streams:
+        if stream is not None and stream.journal.folder == Path(error.where).parent:
+            before = stream.journal.held.count
+            stream.disown_damaged(error.seq_first, error.seq_last)
+            if stream.journal.held.count < before:
+                return
+    raise error
 
 
 def _is_local(data: Path) -> bool:

@@ -36,7 +36,7 @@ FAST = 500e-6
 _READING_NS = 1.0
 """Both clocks are read in whole ns."""
 _FIRST_LOOK_ROWS = 64
-"""Looked at first, then twice as many: a clock that steps often costs no square of its rows."""
+"""Rows looked at first, then twice as many: a clock that often steps costs no quadratic time."""
 _STEADY_ROWS_MIN = 4
 """A step between two rows or three looks like a steady rate."""
 
@@ -217,13 +217,13 @@ class ClockMap:
 def _intervals(rows: Rows) -> tuple[Float64, Float64]:
     """Lowest and highest offset at each row, relative to the first row's."""
     offset = (rows.offset_ns - rows.offset_ns[0]).astype(np.float64)
-    # The server was read somewhere in the round trip, the row is about its middle.
+    # The server read its clock at some instant of the round trip; the row is about the middle.
     half = rows.uncertainty_ns.astype(np.float64) * (1 + FAST) + _READING_NS
     return offset - half, offset + half
 
 
 def _reach(rows: Rows, limit: float) -> int:
-    """How many of the first rows one clock can have given whose rate is within the limit."""
+    """How many of the first rows one clock with a rate within the limit can have given."""
     look = _FIRST_LOOK_ROWS
     while True:
         part = rows.part(0, look)
@@ -273,7 +273,7 @@ def _stretches(rows: Rows) -> tuple[Stretch, ...]:
 
 
 def _certain_end(rows: Rows, begin: int, end: int, later: Stretch) -> int:
-    """Where the rows end that cannot belong to the later stretch: the step was after those."""
+    """Number of rows that cannot belong to the later stretch: the step was after them."""
     part = rows.part(begin, end)
     low, high = later.bounds(part.t_mono_ns)
     half = part.uncertainty_ns + part.uncertainty_ns // 2000 + 2  # as in _intervals, rounded up

@@ -25,7 +25,7 @@ from storage.durable import write_whole
 from storage.schema import NO_INSTANT, Array
 
 INSTANT_END_NS = 2**62
-"""The year 2116; up to it sums of an instant and an offset can be kept apart from nonsense."""
+"""The year 2116: a sum of an instant and an offset beyond it is nonsense."""
 UNCERTAINTY_END_NS = 2**60
 """36 years."""
 
@@ -37,7 +37,7 @@ class StreamFacts:
     Attributes:
         boot_id: its name.
         utc_offset_ns: `t_ns` minus `t_mono_ns` of its frames; None: not known.
-        clock_set: had anything set the node's clock when it started? None: not known.
+        clock_set: was the node's clock set before the stream started? None: not known.
     """
 
     boot_id: str

@@ -24,7 +24,7 @@ from storage.durable import make_folder, storage_errors
 
 IN_FLIGHT_FILE = "in_flight"
 ROWS = 8192
-"""A quarter of a minute at full rate: as long as frames may wait for a slow card in this way."""
+"""Rows for 15 s at full rate: frames may wait that long for a slow card."""
 _MAGIC = b"FootTile in flight 1\n"
 _HEAD = struct.Struct("<21sHII36sI")
 """Magic, tiles, rows, length of the description, kernel's boot id, CRC-32 of all that follows."""
@@ -55,7 +55,7 @@ class InFlight:
             make_folder(folder)
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
             try:
-                # Room that is not reserved would end the process with SIGBUS on a full disk.
+                # Reserve the room: else a write to the map ends with SIGBUS on a full disk.
                 os.posix_fallocate(descriptor, 0, length)
                 self._map = mmap.mmap(descriptor, length)
             except OSError:
@@ -89,8 +89,8 @@ class InFlight:
 def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     """What a killed process left, in order; None if there is nothing that can be trusted.
 
-    Nothing can be if the machine was restarted since: the file was never synced. The frames end
-    where the first one is missing, counted back from the newest.
+    After a restart of the machine nothing can be trusted: the file was never synced. Counted back
+    from the newest frame, the frames end where the first one is missing.
 
     Raises:
         StorageError: it cannot be read.
@@ -137,7 +137,7 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
 
 
 def delete_in_flight(folder: Path) -> None:
-    """What was in flight is in the journal."""
+    """Delete the file once its frames are in the journal."""
     with suppress(OSError):
         (folder / IN_FLIGHT_FILE).unlink(missing_ok=True)
 

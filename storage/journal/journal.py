@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -28,9 +28,9 @@ from storage.schema import array_info, wire_schema
 from storage.wire import FRAMES_MAX, EncodedBatch, decode, encode
 
 RING_NS = 600_000_000_000
-"""Frames of no session are kept so long, for pre-roll and for what was not recorded in time."""
+"""How long frames of no session are kept, for pre-roll and for late starts."""
 _WINDOW_FRAMES = 1 << 16
-"""So many frames' index is in memory when a journal of any length is read."""
+"""Frames whose index is in memory at once while a journal of any length is read."""
 
 
 class Journal:
@@ -60,8 +60,8 @@ class Journal:
                     self._take_in(segment)
             for path in folder.glob("*" + INDEX_SUFFIX):
                 # A power cut may take the name of a segment and leave that of its index. Nothing in
-                # it was promised then; but somebody may have deleted it, so it is set aside, unless
-                # what was set aside before has its name.
+                # it was promised then; but a person may have deleted it, so the index is set aside,
+                # unless what was set aside before has its name.
                 aside = path.with_suffix(UNREAD_SUFFIX)
                 if not path.with_suffix(SUFFIX).exists() and not aside.exists():
                     with suppress(OSError):
@@ -94,7 +94,7 @@ class Journal:
         return sum(segment.size_bytes for segment in self._segments)
 
     def append(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
-        """Hold the frames of `batch` that are not held yet; give back which ones these are.
+        """Hold the frames of `batch` that are not held yet; return their numbers.
 
         Args:
             batch: frames, `seq` rising by one.
@@ -107,7 +107,7 @@ class Journal:
         first, last = int(batch.seq[0]), int(batch.seq[-1])
         new = self.held.missing(first, last)
         for a, b in new:
-            if (a, b) == (first, last):  # nearly always, and views of it would cost a fifth
+            if (a, b) == (first, last):  # nearly always; views of the batch would cost a fifth more
                 payload = encode(batch, self._schema) if payload is None else payload
                 self._write(EncodedBatch.of(batch, payload))
             else:
@@ -135,7 +135,7 @@ class Journal:
         self._open.sync()
 
     def disown(self, doubtful: Intervals) -> None:
-        """Hold batches within `doubtful` no longer: they could not be synced, or are damaged.
+        """Stop holding batches within `doubtful`: they could not be synced, or are damaged.
 
         A segment that was closed forgets them for good, so that a copy that comes later is the one
         that counts after a restart.
@@ -215,12 +215,12 @@ class Journal:
         near = self.held.within(0, seq).last if newest else self.held.within(seq, NO_END).first
         if near is None:
             return None
-        for segment in self._segments:
-            if segment.held.within(near, near):
-                records = segment.records()
-                record = records[np.searchsorted(records["seq_first"], near, side="right") - 1]
-                return int(record["t_ns_last" if newest else "t_ns_first"])
-        return None
+        holding = [segment for segment in self._segments if segment.held.within(near, near)]
+        # The record of a batch may be damaged: then the nearest one that is whole tells.
+        found = _nearest(holding, near, newest=newest) or _nearest(
+            self._segments, near, newest=newest
+        )
+        return (max(found) if newest else min(found))[1] if found else None
 
     def last_seq_until(self, t_ns: int, *, at_least: int) -> int | None:
         """The last number taken at `t_ns` or before, if frames after `t_ns` are held too.
@@ -231,7 +231,7 @@ class Journal:
         segments = [segment for segment in self._segments if segment.span[1] >= at_least]
         if all(segment.t_ns_last <= t_ns for segment in segments):
             return None
-        # Of segments that were taken before `t_ns` altogether only the last one counts.
+        # Among segments that end before `t_ns` only the last one counts.
         before = max((s.span[1] for s in segments if s.t_ns_last <= t_ns), default=None)
         records = np.concatenate(
             [np.zeros(0, RECORD)]
@@ -345,3 +345,17 @@ class Journal:
         finally:
             for descriptor in opened.values():
                 os.close(descriptor)
+
+
+def _nearest(segments: Iterable[Segment], seq: int, *, newest: bool) -> list[tuple[int, int]]:
+    """First number and instant of each segment's last batch up to `seq`, or first from it on."""
+    found: list[tuple[int, int]] = []
+    for segment in segments:
+        records = segment.records()
+        if newest:
+            records = records[records["seq_first"] <= seq][-1:]
+        else:
+            records = records[records["seq_first"] + records["count"] > seq][:1]
+        name = "t_ns_last" if newest else "t_ns_first"
+        found += [(int(record["seq_first"]), int(record[name])) for record in records]
+    return found

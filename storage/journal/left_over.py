@@ -17,8 +17,8 @@ from storage.wire import messages_of
 def recover_stream(folder: Path) -> NodeStream | None:
     """A stream that an earlier process left, with what it had in flight; None if nothing is left.
 
-    If the machine itself went down, what was in flight is lost; how much that can have been is
-    noted: what was taken since the last sync, by the disk's slowest one.
+    If the machine itself went down, the frames in flight are lost. The notes say how many there may
+    have been: those taken since the last sync, by the slowest sync of this disk.
 
     Raises:
         StorageError: it cannot be read.
@@ -40,7 +40,7 @@ def recover_stream(folder: Path) -> NodeStream | None:
     frames = left[1]
     if frames is not None:
         held, first = stream.stored, int(frames.seq[0])
-        # What is older than everything that is held was evicted, not lost in flight.
+        # Frames older than all that are held were evicted, not lost in flight.
         for a, b in held.missing(max(first, held.first or 0), int(frames.seq[-1])):
             # If there is a gap before them, more waited for the disk than was in flight.
             for batch in messages_of(frames.rows(a - first, b + 1 - first), stream.info):
@@ -50,7 +50,7 @@ def recover_stream(folder: Path) -> NodeStream | None:
 
 
 def _open(folder: Path) -> NodeStream | None:
-    """A stream that is on disk; None if nothing of it can be read.
+    """Open a stream that is on disk; None if nothing of it can be read.
 
     Raises:
         StorageError: it cannot be read.

@@ -35,7 +35,7 @@ WAITING_BYTES = 32 << 20
 SYNC_S = 0.2
 """Less than half of `PROMISE_S`: what just missed one sync is on the disk with the next."""
 _TIDY_S = 2.0
-"""What is dropped is minutes old: so often is soon enough."""
+"""Between two looks at what can be dropped, which is minutes old."""
 _AGAIN_S = 1.0
 """Between attempts at a disk that takes nothing."""
 _CLOSE_S = 10.0
@@ -69,7 +69,7 @@ class NodeJournal:
         self.folder = root / "journal" / node
         self._locks = ExitStack()
         self._changing = threading.Lock()
-        """Held while `streams` becomes another list; one that was read before stays as it is."""
+        """Held while `streams` is replaced; a list that was read before does not change."""
         self._trouble: tuple[str, str] | None = None
         """Reason and words, while the disk takes nothing."""
         self._tried_s = -math.inf
@@ -145,11 +145,11 @@ class NodeJournal:
         self._wake.set()
 
     def undelivered(self, stream: NodeStream) -> Intervals:
-        """What sessions need of a stream and no server has yet, of what is held."""
+        """Held numbers of a stream that sessions need and no server has yet."""
         return stream.undelivered(self.wanted)
 
     def settle(self, timeout_s: float = _CLOSE_S) -> bool:
-        """Wait until every stream that has ended is on disk to its end; did it get there?"""
+        """Wait until every ended stream is whole on disk; False if that did not happen in time."""
         end_s = time.monotonic() + timeout_s
         while not all(stream.is_settled for stream in self.streams if stream.has_ended):
             if time.monotonic() > end_s or not self._thread.is_alive():
@@ -173,7 +173,7 @@ class NodeJournal:
             )
 
     def _drop_oldest(self) -> bool:
-        """Give up what has waited longest, in any stream; was there anything but the newest?"""
+        """Give up the batch that has waited longest; False if only the newest is left."""
         trouble = self._trouble
         reason = trouble[0] if trouble is not None else DISK_SLOW
         newest = self.streams[-1]
@@ -264,7 +264,7 @@ class NodeJournal:
                 stream = recover_stream(folder)
                 if stream is not None:
                     streams.append(stream)
-        # One that was killed before its notes were written has no number yet: it is the newest.
+        # A stream killed before its notes were written has no number yet: it is the newest.
         streams.sort(key=lambda stream: stream.notes.number or math.inf)
         for number, stream in enumerate(streams):
             if not stream.notes.number:
@@ -289,7 +289,7 @@ class NodeJournal:
 
 
 def settle_left_over(root: Path) -> None:
-    """Have what killed nodes left in flight in their journals, and note where their streams ended.
+    """Write what killed nodes left in flight to their journals; note where their streams ended.
 
     Args:
         root: the nodes' folder, whose lock the caller holds.

@@ -25,7 +25,7 @@ from storage.journal.wanted import Wanted
 from storage.wire import EncodedBatch, messages_of
 
 RECENT_BYTES = 4 << 20
-"""What is kept in memory of the newest frames, for the live picture."""
+"""Newest frames that are kept in memory, for the live picture."""
 
 
 class NodeStream:
@@ -63,7 +63,7 @@ class NodeStream:
         self._unsynced: list[EncodedBatch] = []
         """In the journal, but perhaps not on the disk yet."""
         self._waiting_since_s: float | None = None
-        """Since when the oldest frame that is not surely on the disk is here."""
+        """When the oldest frame came that may not be on the disk yet."""
         self._recent = _Queue()
         if journal is not None:
             self._lost.found(journal.held)
@@ -89,7 +89,7 @@ class NodeStream:
 
     @property
     def waiting_s(self) -> float:
-        """How long it took to take what waits in memory to be written."""
+        """Seconds of frames that wait in memory to be written."""
         with self._lock:
             return self._waiting.frames / self.info.nominal_rate_hz
 
@@ -118,7 +118,7 @@ class NodeStream:
             return self._acked()
 
     def undelivered(self, wanted: Wanted) -> Intervals:
-        """What servers need of it and have not got, of what is held."""
+        """Held numbers that servers need and do not have yet."""
         held = self.held
         with self._lock:
             return held & wanted.undelivered(self.boot_id, self._acked_by)
@@ -183,7 +183,7 @@ class NodeStream:
     def lose(self, numbers: Intervals, reason: str, wanted: Wanted) -> None:
         """Note frames that are not kept any more.
 
-        Those that a server has are not lost, but for what the node's own session needs.
+        Frames that a server has are not lost, except those that the node's own session needs.
         """
         needed_here = wanted.local(self.boot_id)
         with self._lock:
@@ -246,7 +246,7 @@ class NodeStream:
                 self.save_notes()
 
     def write_oldest(self) -> None:
-        """Have the batch that has waited longest in the journal, if there is one.
+        """Write the batch that has waited longest to the journal, if there is one.
 
         Raises:
             StorageError: the disk does not take it; it goes on waiting.
@@ -264,7 +264,7 @@ class NodeStream:
             self._unsynced.append(batch)
 
     def begin_journal(self) -> None:
-        """Have a journal, if there is none.
+        """Begin the journal, if there is none.
 
         Raises:
             StorageError: the disk does not let it be begun.
@@ -276,7 +276,7 @@ class NodeStream:
                 self.journal = journal
 
     def sync(self) -> None:
-        """Have on the disk what was written; what it refuses waits once more."""
+        """Sync what was written; what the disk refuses waits again."""
         journal = self.journal
         if journal is None or not self._unsynced:
             return
@@ -310,21 +310,21 @@ class NodeStream:
         try:
             if self.journal is not None:
                 self.journal.close()
-            # One that ended before its first frame is remembered if a server asks for it.
+            # A stream that ended before its first frame is remembered if a server asks for it.
             if self.next_seq or wanted.numbers(self.boot_id):
                 self.save_notes(next_seq=self.next_seq)
             elif self.folder.is_dir():
                 shutil.rmtree(self.folder, ignore_errors=True)
         except StorageError:
             return
-        # Only now: until its end is noted, what was in flight may be needed once more.
+        # Only now: until the end is noted, the frames in flight may be needed again.
         delete_in_flight(self.folder)
         with self._lock:
             self._recent = _Queue()
             self.is_settled = True
 
     def disown(self, damaged: Intervals, wanted: Wanted) -> None:
-        """Hold frames no longer that turned out not to be what was written."""
+        """Stop holding frames that turned out to be damaged on disk."""
         if self.journal is not None:
             self.journal.disown(damaged)
             self.lose(damaged, CORRUPT, wanted)
@@ -352,7 +352,7 @@ class NodeStream:
         return bool(gone)
 
     def _take_over_in_flight(self) -> bool:
-        """Take over what acquisition had taken when it was killed; was there anything?"""
+        """Take over the frames that acquisition had in flight when it was killed; False if none."""
         try:
             left = read_in_flight(self.folder)
         except StorageError:

@@ -54,7 +54,7 @@ class OpenSegments:
             with storage_errors(writer.segment.path):
                 writer.append(message)
         except StorageError:
-            # Whatever stands at the end of the file now: the next batch begins another one.
+            # The end of the file is not known now: the next batch begins another file.
             self._retire(writer)
             raise
         return writer
@@ -92,7 +92,7 @@ class OpenSegments:
             self._open = []
 
     def _writer_for(self, seq_first: int, t_ns: int) -> SegmentWriter:
-        """An open segment that these frames may follow in: the one that ends nearest before."""
+        """The open segment that these frames may follow in: of several, the one that ends last."""
         fitting = [w for w in self._open if w.segment.span[1] < seq_first]
         if fitting:
             writer = max(fitting, key=lambda w: w.segment.span[1])

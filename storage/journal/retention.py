@@ -66,7 +66,7 @@ class Retention:
                 )
 
     def evict(self, streams: Sequence[NodeStream]) -> bool:
-        """Make room: delete the oldest frames that no session needs; was there anything?"""
+        """Make room: delete the oldest frames that no session needs; False if there were none."""
         return self._may_drop and any(stream.evict(self._wanted) for stream in streams)
 
     def tidy(self, streams: Sequence[NodeStream]) -> list[NodeStream]:
@@ -93,7 +93,7 @@ class Retention:
         return False
 
     def _is_past_ring(self, stream: NodeStream) -> bool:
-        """Has a stream that ended outlasted the ring, in this process or since it was written?"""
+        """Did a stream end longer ago than the ring, in this process or by the age of its files?"""
         ring_s = RING_NS * 1e-9
         if time.monotonic() - self._began_s > ring_s:
             return True

@@ -60,7 +60,7 @@ class Segment:
     t_ns_last: int = 0
     size_bytes: int = 0
     is_doubtful: bool = False
-    """Has something in it been disowned while it was written? Then it is checked when opened."""
+    """Was part of it disowned while it was written? Then it is checked when it is opened."""
 
     @property
     def span(self) -> tuple[int, int]:
@@ -92,7 +92,7 @@ class Segment:
         return found[np.argsort(found["seq_first"], kind="stable")]
 
     def disown(self, doubtful: Intervals) -> None:
-        """Hold batches within these numbers no longer.
+        """Stop holding batches within these numbers.
 
         Raises:
             OSError: the index cannot be read.
@@ -103,7 +103,7 @@ class Segment:
                 self.held = self.held - batch
 
     def rewrite_index(self) -> None:
-        """Have only what counts in the index, which says that it was closed.
+        """Write an index of only the batches that count, marked as closed.
 
         Raises:
             StorageError: the disk is full or not writable; the old index is still there then.
@@ -201,7 +201,7 @@ class SegmentWriter:
             self.abandon()
 
     def _forget_doubtful(self) -> None:
-        """Have only what counts in the files: what was disowned was written again elsewhere."""
+        """Keep only the batches that count: those disowned were written again elsewhere."""
         with suppress(OSError, StorageError):
             records = self.segment.records()
             if not len(records):
@@ -301,7 +301,7 @@ def _checked(descriptor: int, path: Path, record: Any, end: int, schema: pa.Sche
 
 def _rebuilt_index(path: Path, begin: int, schema: pa.Schema) -> Records:
     records = [np.zeros(0, RECORD)]
-    # Without a whole header nothing behind it is known to be a batch.
+    # Without a whole header nothing after it is known to be a batch.
     for message in messages_from(path, begin, schema) if begin else ():
         records.append(record_of(message, begin))
         begin += len(message.payload)

@@ -93,7 +93,7 @@ def read_index(path: Path) -> Records:
 
 
 def read_header(path: Path) -> tuple[pa.Schema | None, int]:
-    """Schema of a segment, and where its first batch begins; None and 0 without a whole one.
+    """Schema of a segment, and where its first batch begins; None and 0 if the schema is cut off.
 
     Raises:
         OSError: there is no such file.
@@ -106,7 +106,7 @@ def read_header(path: Path) -> tuple[pa.Schema | None, int]:
 
 
 def messages_from(path: Path, begin: int, schema: pa.Schema) -> Iterator[EncodedBatch]:
-    """Batches that follow one another from a place on, up to what is no whole batch.
+    """Batches from a position on, up to the first bytes that are not a whole batch.
 
     Raises:
         OSError: there is no such file.

@@ -14,7 +14,7 @@ from storage.intervals import AsPairs
 
 NOTES_FILE = "stream.json"
 PROMISE_S = 0.5
-"""No frame of a node is longer unsynced, as long as its disk is not slower."""
+"""The longest that a frame of a node is unsynced, unless its disk is slower."""
 _BATCH_S = 0.033
 """The longest batch of a node."""
 
@@ -42,7 +42,7 @@ class StreamNotes(BaseModel):
     next_seq: int | None = None
     """The number after its last frame; None while it runs, or if that is not known."""
     unsynced_tail_max: int = 0
-    """How many more frames there may have been when it ended without saying so."""
+    """How many more frames there may have been if its end was not recorded."""
     missed_slots: int = 0
     """Slots in which no frame was taken; they never had a number."""
     sync_max_s: float = 0.0

@@ -87,14 +87,14 @@ class Wanted:
         return Intervals(self._local.get(boot_id, ()))
 
     def undelivered(self, boot_id: str, acked_by: Mapping[str, Intervals]) -> Intervals:
-        """What servers need and have not got."""
+        """What servers need and do not have yet."""
         return union(
             server.numbers(boot_id) - acked_by.get(server_id, Intervals())
             for server_id, server in list(self._servers.items())
         )
 
     def say(self, server_id: str, wants: ServerWants) -> bool:
-        """A server has said what it needs; has that changed anything?"""
+        """Note what a server says it needs; return whether that changes anything."""
         if self._servers.get(server_id, ServerWants()) == wants:
             return False
         self._servers = {**self._servers, server_id: wants}

@@ -23,7 +23,7 @@ class Claims:
     parts: tuple[Part, ...]
     ledger: Ledger | None
     whole: Session | None
-    """None of a pulled one, which says less."""
+    """None for a pulled session, which says less."""
 
 
 def claims_in(

@@ -121,7 +121,7 @@ def write_file_hash(path: Path) -> None:
 
 
 def file_hashes(path: Path) -> tuple[str, str] | None:
-    """The file hash that a Parquet file states and the one it has; None if it states none.
+    """The file hash that a Parquet file states, and the one that it has; None if it states none.
 
     Raises:
         OSError: it cannot be read.

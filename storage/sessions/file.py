@@ -164,7 +164,7 @@ class SessionWriter:
     def _discard(self) -> None:
         try:
             if self._writer is not None:
-                # What is thrown away need not get its footer, which a full disk has no room for.
+                # A file that is thrown away needs no footer, and a full disk has no room for one.
                 with suppress(OSError, pa.ArrowException):
                     self._writer.close()
                 self._writer = None
@@ -231,7 +231,7 @@ class SessionReader:
             raise FileFormatError("the session has no frames", where=str(path))
 
     def _content(self, metadata: Mapping[bytes, bytes]) -> tuple[str | None, dict[str, Any] | None]:
-        """What the file says of its content; None of a file that was not written by us last."""
+        """What the file says of its content; None if another program wrote it last."""
         said = self._file.metadata.metadata or {}
         content, stated = said.get(CONTENT_KEY), said.get(CONTENT_HASH_KEY)
         if content is None or stated is None:

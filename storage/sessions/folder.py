@@ -77,7 +77,7 @@ def clock_beside(reader: SessionReader) -> ClockTable:
 
 
 def _parts(reader: SessionReader) -> list[str]:
-    """Streams by number of part; a file that was never recorded is of one."""
+    """Streams by number of part; a file that was never recorded has one part."""
     session = reader.notes.get("session")
     if session is None:
         return [reader.info.boot_id]
@@ -187,9 +187,9 @@ class Session(_Record):
     unsynced_tail_max: dict[str, int] = Field(default_factory=dict)
     """By boot_id, of parts that ended because the node went away."""
     given_up: bool = False
-    """A person has said that what is still to come will not."""
+    """A person has given up the frames that are still to come."""
     continues: str | None = None
-    """Id of the session whose recording this one takes up, with other tiles."""
+    """Id of the session that this one continues, with other tiles."""
     problem: str | None = None
     """What a person should know: why it could not be sealed yet, why it has no estimates."""
     ledger: Ledger | None = None
@@ -202,7 +202,7 @@ class Session(_Record):
     absolute_scale: Literal["measured", "assumed"] | None = None
 
     def with_clock(self, rows: Iterable[ClockOffset]) -> Session:
-        """The session with those measurements of one of its streams that it has not yet."""
+        """The session with new clock measurements of one of its streams added."""
         known = sorted(self.clock, key=lambda row: row.t_mono_ns)
         newest = {row.boot_id: row.t_mono_ns for row in known}
         further = [row for row in rows if row.t_mono_ns > newest.get(row.boot_id, -1)]
@@ -258,7 +258,7 @@ class SessionFolder:
             raise FileFormatError(f"not a session: {error}", where=str(path)) from error
 
     def load_all(self) -> tuple[list[Session], dict[str, FootTileError]]:
-        """All sessions, newest first, and by its id why one cannot be read."""
+        """All sessions, newest first, and errors by id for those that cannot be read."""
         found, unreadable = [], {}
         for session_id in self.ids():
             try:

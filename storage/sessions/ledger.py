@@ -118,8 +118,8 @@ def states_of(session: Session, streams: Mapping[str, Stream]) -> dict[str, Stre
     """The streams as the session's ledger counts them.
 
     What is damaged here is lost unless the node may give it once more, and what may come is lost
-    once the session was given up. Of slots only those since the start and until the stop count, and
-    a tail only where a part reaches to the end of its stream.
+    once the session was given up. Slots count only from the start to the stop, and a tail counts
+    only if a part reaches the end of its stream.
 
     Args:
         session: whose ledger it is.

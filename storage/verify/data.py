@@ -29,7 +29,7 @@ class FolderReport:
 
     Attributes:
         path: the folder.
-        sessions: of its sessions, those in the trash among them.
+        sessions: of its sessions, including those in the trash.
         streams: of its journals.
         problems: what is wrong beside these.
     """
@@ -118,7 +118,7 @@ def verify_folder(path: Path) -> FolderReport:
 def verdict_of(report: Report) -> Verdict:
     """The worst of what was found.
 
-    Frames of a journal that no session needs come and go: that they went is no loss.
+    Frames of a journal that no session needs may be deleted: that is no loss.
     """
     if isinstance(report, FolderReport):
         parts: list[Report] = [*report.sessions, *report.streams]
@@ -141,7 +141,7 @@ def verdict_of(report: Report) -> Verdict:
 def _session_folders(place: Path) -> list[Path]:
     if not place.is_dir():
         return []
-    # One that was begun and never written down is empty.
+    # The folder of a session that was never written down is empty.
     return sorted(
         path
         for path in place.iterdir()

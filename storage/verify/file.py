@@ -33,7 +33,7 @@ class FileReport:
         problems: what is wrong with it; none: it is whole.
         unproven: what it cannot show by itself.
         notes: what it says of its session; empty if that cannot be read.
-        ledger: of its session, as it says; of one that says none, as its frames say.
+        ledger: of its session, as the file states it, else as counted from its frames.
         parts: its frames, by part.
         frames: how many there are.
         content_sha256: hash of what it says; None of an older or rewritten file.
@@ -77,7 +77,7 @@ def verify_file(path: Path) -> FileReport:
         if not report.problems and not _is_ours(path):
             raise
         report.problems.append(error.what)
-    except Exception as error:  # of bytes that are known to be damaged anything may come
+    except Exception as error:  # damaged bytes may cause any error
         if not report.problems:
             raise
         report.problems.append(f"it cannot be read: {error}")
@@ -87,7 +87,7 @@ def verify_file(path: Path) -> FileReport:
 
 
 def part_problems(parts: list[PartFrames], ledger: Ledger, lost: dict[str, Losses]) -> list[str]:
-    """What speaks against a ledger's being that of these frames.
+    """Reasons why a ledger cannot be that of these frames.
 
     Args:
         parts: the frames.
@@ -146,7 +146,7 @@ def ledger_problems(ledger: Ledger) -> list[str]:
 
 
 def named_losses(notes: dict[str, Any]) -> dict[str, Losses]:
-    """The numbers that a file's notes name as lost, by boot_id; of older files none.
+    """The numbers that a file's notes name as lost, by boot_id; older files name none.
 
     Raises:
         FileFormatError: they are not readable.
@@ -194,11 +194,11 @@ def _read_through(reader: SessionReader, report: FileReport, *, has_file_hash: b
 
 
 def _is_ours(path: Path) -> bool:
-    """Was it a sealed session once? A damaged one is to be called damaged, not foreign."""
+    """Was it once a sealed session? A damaged one is reported as damaged, not as foreign."""
     try:
         with pq.ParquetFile(path) as file:
             metadata = file.schema_arrow.metadata or {}
-    except Exception:  # whatever is wrong with it, it is not known as ours
+    except Exception:  # unreadable: not recognisable as ours
         return path.name == "frames.parquet"
     return any(key.startswith(b"foottile.") for key in metadata)
 
@@ -224,7 +224,7 @@ def _content_problems(stated: dict[str, Any], found: dict[str, Any]) -> list[str
 
 
 def _check_offset(report: FileReport, utc_offset_ns: int) -> None:
-    """Part 0 is of the stream that the file describes; later ones have anchors of their own."""
+    """Check part 0, the stream that the file describes; later parts have their own anchors."""
     first = next((part for part in report.parts if part.part == 0), None)
     if first is not None and first.offset_ns != utc_offset_ns:
         report.problems.append(

@@ -172,7 +172,7 @@ def _check_stream(report: StreamReport, segments: list[SegmentReport], *, is_ser
 
 
 def _segments(folder: Path) -> list[SegmentReport]:
-    """Every segment's report; what looks damaged is looked at again, as it may just be deleted."""
+    """Every segment's report; damage is checked again, as the file may just have been deleted."""
     first_look = [_if_there(path) for path in _names(folder, SUFFIX)]
     looked = [
         _if_there(report.path) if report is not None and report.problems else report

@@ -104,7 +104,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
     report.is_closed = index is not None and is_closed(index)
     schema, header_bytes = _schema_of(path, report)
     if schema is None:
-        # One that was just begun when the power failed may be empty; one with frames may not.
+        # A segment just begun when the power failed may be empty; one with frames may not.
         if report.is_closed or (index is not None and _holds_any(path, index)):
             report.problems.append("it does not begin with the description of an array")
         return
@@ -180,7 +180,7 @@ def _check_batches(
 
 
 def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, offset_ns: int) -> str:
-    """What speaks against the bytes' being what the index says of them; empty: nothing."""
+    """Why the bytes are not what the index says; empty if they are."""
     try:
         batch = decode(payload, schema)
     except FileFormatError as error:
@@ -195,7 +195,7 @@ def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, offset_ns: int
 
 
 def _holds_any(path: Path, index: Records) -> bool:
-    """Are any bytes in the segment those that the index says?"""
+    """Does any batch in the segment agree with the index?"""
     with path.open("rb") as file:
         batches = batches_in(index)
         return any(payload_of(file.fileno(), record) is not None for record in batches)

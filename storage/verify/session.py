@@ -38,12 +38,12 @@ class SessionReport:
 
     Attributes:
         path: the folder or file.
-        id: of the session; None if that cannot be read, or of a file that is of none.
+        id: of the session; None if it cannot be read, or if the file belongs to no session.
         name: as people call it.
         node: whose frames they are.
         state: as it says; `file` of a lone one.
         ledger: what became of every frame; None if that cannot be read.
-        sha256: hash of the sealed file as it is; None before.
+        sha256: hash of the sealed file; None if it is not sealed.
         problems: what is wrong; none: it is whole.
         unproven: what these files cannot show.
         in_trash: was it deleted?

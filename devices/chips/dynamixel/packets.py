@@ -68,7 +68,7 @@ class DynamixelProtocol(ABC):
 
     @abstractmethod
     def size(self, preamble: bytes) -> int:
-        """Bytes of the packet that begins so; 0 if none does, because it is noise."""
+        """Bytes of the packet with this beginning; 0 if it is noise."""
 
     @abstractmethod
     def pack(self, servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -88,7 +88,7 @@ class DynamixelProtocol(ABC):
 
     @abstractmethod
     def status(self, packet: Packet) -> Status | None:
-        """`packet` as an answer; None if it is certain to be none."""
+        """`packet` as an answer; None if it cannot be one."""
 
 
 class PacketDecoder:
@@ -100,7 +100,7 @@ class PacketDecoder:
 
     @property
     def missing(self) -> int:
-        """The fewest bytes that must still come. Who asks for no more never waits in vain."""
+        """The fewest bytes that must still come: asking for no more never waits in vain."""
         known = len(self._buffer) >= self._protocol.preamble_bytes
         size = self._size() if known else self._protocol.shortest_bytes
         return size - len(self._buffer)

@@ -10,7 +10,7 @@ from devices.emulation.buses.i2c import EmulatedI2cAdapter
 from devices.emulation.faults import Fault
 
 _CLOCKS_LEFT = 6
-"""A slave that hangs has so many bits of its byte, and the acknowledge, still to go."""
+"""Bits of its byte, and the acknowledge, that a hanging slave still has to send."""
 
 
 class EmulatedWire:
@@ -27,7 +27,7 @@ class EmulatedWire:
         self._low = low
 
     def high(self) -> bool:
-        """Does no device pull it low?"""
+        """Is it high, that is, does no device pull it low?"""
         return not self._low and not self._held(self._clock.now_ns())
 
 

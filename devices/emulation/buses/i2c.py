@@ -47,7 +47,7 @@ class I2cDevice(Protocol):
         """Give `count` bytes."""
 
     def stop(self, t_ns: int) -> None:
-        """STOP of a transaction in which it acknowledged, told once for each time it did."""
+        """STOP of a transaction that it acknowledged; called once for each acknowledge."""
 
 
 class MuxDevice(I2cDevice, Protocol):
@@ -154,7 +154,7 @@ class EmulatedI2cAdapter:
     def _called(
         self, address: int, reading: bool, t_ns: int, disturbed: Line
     ) -> Sequence[I2cDevice]:
-        """Devices that take a disturbed address byte for their own."""
+        """Devices whose address matches the address byte, which may be disturbed."""
         heard = disturbed.disturbed(address << 1 | reading, t_ns)
         if heard & 1 != reading:
             return _NO_DEVICE  # both sides would read, or both write
@@ -212,7 +212,7 @@ def _refuse_unsupported(messages: Sequence[i2c_msg]) -> None:
 def _write(
     message: i2c_msg, listeners: Sequence[I2cDevice], t_ns: int, disturbed: Line | None
 ) -> int:
-    """Give the bytes of a message to who listens; how many were acknowledged."""
+    """Give the bytes of a message to the listening devices; return how many were acknowledged."""
     sent = bytes(message)
     if disturbed is None and len(listeners) == 1:
         write = listeners[0].write

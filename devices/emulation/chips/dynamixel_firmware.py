@@ -84,7 +84,7 @@ class EmulatedFirmware(ABC):
         firmware = FIRMWARES[self.version]
         self.protocol = firmware.protocol
         self.alerts = Error(0)
-        """What it complains of in every answer, in 1.0; in 2.0 that is in its table."""
+        """Error bits of every answer in 1.0; in 2.0 they are in its table."""
         self._position = position
         self._position_address = firmware.position_address
         layout = self._layout
@@ -104,7 +104,7 @@ class EmulatedFirmware(ABC):
         return self.table[self._layout.return_delay] * 2000
 
     def is_answered(self, packet: Packet) -> bool:
-        """Does this servo say anything to `packet`?"""
+        """Does this servo answer `packet`?"""
         level = self.table[self._layout.status_return_level]
         if level < self._answered_from.get(packet.instruction, 2):
             return False

@@ -17,7 +17,7 @@ from devices.scene.hardware import ReferenceScene
 Volts = Callable[[int, int], float]
 """Input and instant in ns -> voltage there; noise and non-linearity are its business."""
 
-# Clocks behind the start bit: SGL/DIFF, D2, D1, D0, then the one in which sampling ends.
+# Clocks after the start bit: SGL/DIFF, D2, D1, D0, then the clock that ends sampling.
 _CONFIGURATION = 4
 _SAMPLING = 5
 

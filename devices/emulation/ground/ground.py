@@ -1,7 +1,7 @@
 """What every ground is: forces on the domes as a function of time.
 
-Forces are along each dome's axis, times in seconds since power-up. What is said here is the ground
-truth of a scene.
+Forces are along each dome's axis, times in seconds since power-up. They are the ground truth of a
+scene.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from devices.arrays import Floats
 
 
 class Ground(ABC):
-    """A load on all domes of a foot; unless said otherwise one that goes on, and does not turn."""
+    """A load on all domes of a foot; by default it never ends and the foot does not turn."""
 
     arc_rad: Floats | None = None
     """Angle of each dome's axis in the foot; None: all are upright, whatever the segment does."""

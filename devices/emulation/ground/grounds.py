@@ -70,7 +70,7 @@ class Standing(Ground):
         self._sway_m = ground.sway_m
 
     def forces_n(self, t_s: Floats) -> Floats:
-        """The least squares among the tile forces of this load and centre of pressure."""
+        """The tile forces with the least squares for this load and centre of pressure."""
         since = np.asarray(t_s) - self._lead_s
         load_n = self._load_n * np.clip(since / self._LOWERING_S, 0.0, 1.0)
         sway_m = sum(

@@ -29,7 +29,7 @@ _AIR_S = 2.0
 """In the air after the last hop, and before the first again: long enough for a tare."""
 _STANCE_S = 0.25
 """About as long landing and push-off take; the segment turns that much longer than it stands."""
-_SWING_S = 0.12  # in which the segment turns back for the next touch-down
+_SWING_S = 0.12  # the segment turns back in this time for the next touch-down
 _FIRMNESS = 0.05  # how much places differ, relative
 _HEIGHT = 0.03  # how much hops differ in height, relative
 _PITCH = 0.1  # how much they differ in pitch, relative
@@ -88,9 +88,9 @@ class Hopping(Ground):
         self._begins_s: list[float] = [0.0]
         self._turns: list[tuple[float, float, float]] = []
         self.touch_s: list[float] = []
-        """When the sole touches the ground, of each hop."""
+        """When the sole touches the ground, for each hop."""
         self.leave_s: list[float] = []
-        """When it has left it."""
+        """When the sole has left the ground, for each hop."""
         self.strokes_m: list[float] = []
         """By how much each push-off lengthens the leg."""
         self._hop(ground, leg, random_of(f"hop/{seed}"))
@@ -112,7 +112,7 @@ class Hopping(Ground):
             height_m = hopping.release_m + heights_m[hop]
             self.strokes_m.append(hopping.push_off(place, self._angle, height_m))
             self.leave_s.append(hopping.motion.t_s)
-            # After the last hop as before the first, should it be dropped again.
+            # After the last hop it turns as before the first, in case it is dropped again.
             self._turn(hopping.motion.t_s, _SWING_S, -pitches_rad[(hop + 1) % HOPS])
             hopping.rise(place, self._angle)
         self._end_s = hopping.motion.t_s + _AIR_S

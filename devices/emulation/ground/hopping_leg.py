@@ -21,9 +21,9 @@ of the scene's keys keep it stable."""
 
 LEG_M = 0.30
 _FOOT_SHARE = 0.13
-"""Of the mass, below the spring (assumed)."""
+"""Part of the mass that is below the spring (assumed)."""
 _STANDING_DAMPING, _PUSHING_DAMPING = 0.4, 0.1
-"""Of the leg's spring, relative to critical (assumed: geared servos hold it, or drive it)."""
+"""Damping of the leg's spring, relative to critical (assumed: geared servos hold or drive it)."""
 _STOP = 40.0
 """How many times stiffer than the spring the leg's end stop is; it is damped critically."""
 _FOLDED = 0.95  # of its length: a spring that is pressed further has no more travel

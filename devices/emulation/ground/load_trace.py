@@ -21,7 +21,7 @@ FORCE_LIMIT_N = 120.0
 lie saturation of all parts and, for one in eight, the count that wraps."""
 
 TOUCH_S = 0.010
-"""A trace that begins or ends under load is entered and left in this time."""
+"""Ramp time for a trace that begins or ends under load."""
 
 _COP_NEEDED_FROM = 0.01  # of the greatest force: below it a centre of pressure may be missing
 _NO_LOAD_N = 1e-12
@@ -89,7 +89,7 @@ class PressedTrace:
     moved_to_edge: int
     """Samples whose centre of pressure lay outside the tiles' hull and was moved to its edge."""
     limited: int
-    """Samples in which a tile would have borne more than `FORCE_LIMIT_N`."""
+    """Samples where a tile would have borne more than `FORCE_LIMIT_N`."""
 
 
 def press(

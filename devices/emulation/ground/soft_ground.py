@@ -34,7 +34,7 @@ _WETTED_M = 0.002
 """A strip is flat neither in itself nor against grains of a millimetre: it is in full touch when it
 is this deep. At 1.4 m/s that is 1.4 ms."""
 _FOOT_M = 0.02
-"""Thickness of the foot, which floats no more than that."""
+"""Thickness of the foot: buoyancy grows no deeper than that."""
 _SUCKS_M = 0.004
 _SUCKS_M_S = 0.05
 """Pulled more slowly than this, mud flows in as the gap opens."""
@@ -128,7 +128,7 @@ class SoftGround:
         return force_n
 
     def suction_at_pa(self, gap_m: float, rising_m_s: float) -> float:
-        """What sucks at a sole that rises: most at `_SUCKS_M`, gone when the gap has filled."""
+        """Suction on a rising sole: greatest at `_SUCKS_M`, gone when the gap has filled."""
         part = gap_m / _SUCKS_M
         flow = rising_m_s / (rising_m_s + _SUCKS_M_S)
         return self.suction_pa * part * math.exp(1.0 - part) * flow

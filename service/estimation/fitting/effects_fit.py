@@ -75,7 +75,7 @@ def curve_over_range(coefficients: Sequence[float]) -> Floats:
 
 
 def _best(soaks: Sequence[TemperatureEffect | str]) -> TemperatureEffect | str:
-    """The soak that tells the rise with temperature best; without any, the last one's reason."""
+    """The soak that determines the rise with temperature best, else the last soak's reason."""
     told = [warm for warm in soaks if isinstance(warm, TemperatureEffect)]
     return min(told, key=lambda warm: warm.kpa_per_k.sigma) if told else soaks[-1]
 

@@ -22,13 +22,13 @@ from service.estimation.fitting.press import Presses
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _CLEAR = 3.0
-"""An effect is determined if it is so many standard uncertainties from none."""
+"""An effect is determined if it differs from zero by this many standard uncertainties."""
 _LN_SIGMA_MAX = 0.7
 """A time constant is determined within a factor of two."""
 _GAMMA_MAX = 1.45
 """Air has 1.40; a single time constant for a sphere makes it less, never more."""
 _FAST_MIN = 50
-"""Readings of holds, releases and taps, without which nothing fast can be told."""
+"""Least number of readings of holds, releases and taps that determine fast effects."""
 
 
 def identify(
@@ -95,7 +95,7 @@ def identify(
 
 
 def _undetermined(fit: Fit, free: frozenset[EffectName]) -> dict[EffectName, str]:
-    """Why an effect that was fitted cannot be told from none."""
+    """Why a fitted effect cannot be told from zero."""
     model, sigmas = fit.model, fit.sigma
     reasons: dict[EffectName, str] = {}
     if "gas" in free:

@@ -150,7 +150,7 @@ _Block = tuple[float, float, int, bool]
 
 
 def stroke_rows(recording: Indentation) -> list[tuple[int, int, int]]:
-    """Of each slow stroke the row of its first reading, of its turning point, and past its end."""
+    """For each slow stroke the rows of its first reading, its turning point, and past its end."""
     label = np.where(recording.under_spindle, recording.phase, "")
     begins = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
     ends = np.append(begins[1:], len(label))
@@ -204,12 +204,12 @@ def _run_begin(rows: Bools) -> int:
 
 
 def pressed_in(recordings: Sequence[Indentation]) -> list[Indentation]:
-    """Those in which the tile is pressed: others are a soak and nothing else."""
+    """Recordings that press the tile; the others are only a soak."""
     return [recording for recording in recordings if recording.under_spindle.any()]
 
 
 def soak(recording: Indentation, noise_kpa: float) -> Soak:
-    """The part of the recording in which nothing presses and the surroundings warm up."""
+    """The part of the recording where nothing presses and the surroundings warm up."""
     rows = recording.phase == "soak"
     return Soak(
         t_s=(recording.t_ns[rows] - recording.t_ns[0]) * 1e-9,

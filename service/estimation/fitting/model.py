@@ -21,7 +21,7 @@ from service.estimation.models.rubber import crept_parts
 _NEWTON_STEPS = 30  # a bound; it ends when a step is below 1e-10
 _GAS_STEPS = 6  # of a fixed point that contracts by (gamma - 1) / gamma
 _FLATTEST = 0.05
-"""Of the curve's slope at zero: where a trial cubic turns over it is taken to go on like that."""
+"""Part of the slope at zero with which a trial cubic goes on where it turns over."""
 
 
 @dataclass(frozen=True)

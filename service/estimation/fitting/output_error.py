@@ -21,13 +21,13 @@ from service.estimation.models.hysteresis import WIDTHS_N
 
 TERMS = 2  # of the creep: one fast, one slow
 _SCATTER = (0.003, 0.03)
-"""Least scatter of loadings that is believed, and the paper's, to begin with."""
+"""Least scatter of loadings that is believed; and the paper's scatter, to begin with."""
 _ROUNDS = 2  # the second one knows how much loadings scatter
 _EVALUATIONS = 60  # of the residuals in a round, at most
 _NO_LIMIT = 1e3  # newtons: no coefficient of a curve of 30 N comes near
 _BINS = 15  # parts of the range that systematic errors are averaged over
 _OPENS_N = 0.1
-"""What is pressed with less is at rest."""
+"""A tile with less force is at rest."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Misfits:
-    """What is wrong, root mean square: of the gas' and the creep's corrections, and the curve."""
+    """Root mean square errors: of the gas' and the creep's corrections, and of the curve."""
 
     gas: float
     rubber: float

@@ -19,7 +19,7 @@ BLOCK = 10  # readings: 20 ms of a stroke that lasts seconds
 _NOISE_MIN_KPA = 0.03
 """Rounding to a count alone leaves this much."""
 _APART_S = 600.0
-"""Between two recordings the rubber forgets."""
+"""Time put between two recordings, for the rubber to forget."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def _kpa_per_n(kpa: Floats, force_n: Floats) -> float:
 
 
 def joined(parts: Sequence[Presses]) -> Presses:
-    """Several recordings as one run of loadings, far enough apart to know nothing of each other."""
+    """Several recordings as one run of loadings, far enough apart to be independent."""
     begin_s, loadings = 0.0, 0
     shifted = []
     for part in parts:

@@ -25,7 +25,7 @@ _KELVIN = 273.15
 _T_SIGMA = 5.0 / 298.0
 """The chip's thermometer is not calibrated: it may be off by 5 K (hardware.md 1.3)."""
 _RECOVERS_S = 5.0
-"""A dome that was pressed before creeps back; so long it is left alone."""
+"""How long a dome that was pressed before creeps back, and is left alone."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Soak:
 
 
 def fit_soak(soak: Soak) -> TemperatureEffect | str:
-    """How a tile's baseline follows temperature; or why the recording does not tell."""
+    """How a tile's baseline follows temperature, or why the recording does not show it."""
     binned = _binned(soak)
     if binned is None:
         return "the recording has no soak at two temperatures"

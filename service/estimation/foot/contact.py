@@ -15,7 +15,7 @@ from devices.arrays import Bools, Floats, Ints, Times
 
 UNKNOWN = 255
 UNSEEN_NS = 50_000_000
-"""A foot that was not seen for so long may have been lifted and put down again; for less, not."""
+"""A foot not seen for longer than this may have been lifted and put down again."""
 
 
 @dataclass(frozen=True)

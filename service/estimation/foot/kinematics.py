@@ -16,7 +16,7 @@ from devices.arrays import Arrays, Bools, Floats, Ints, Times
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
 
 _AGE_UNIT_NS = 1000
-"""Ages are cut to microseconds: of one reading, two frames may say instants that far apart."""
+"""Ages are cut to microseconds: two frames may date one reading this far apart."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from service.estimation.compiled import compiled
 
 SMOOTHING_S = 0.03  # long against noise, short against a foot that sinks in
 HELD_S = 0.2
-"""A foot sinks or is lifted in that time: what was read before says nothing of where it is."""
+"""A foot sinks or is lifted in this time: older readings do not tell its depth."""
 
 
 @dataclass(frozen=True)

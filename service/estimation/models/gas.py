@@ -24,7 +24,7 @@ from devices.arrays import Arrays, Floats, Times
 from service.estimation.compiled import compiled
 
 RESTART = 5.0
-"""After so many gamma tau without a reading the gas has the temperature of its wall."""
+"""After this many gamma tau without a reading the gas is as warm as its wall."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ WIDTHS_N = np.array([0.6, 1.5, 4.0])
 OPENS = 0.4
 _ITERATIONS = 100  # a bound; see `_inverted`
 _CLOSE = 1e-14
-"""Relative; a step so small changes nothing any more."""
+"""Relative; a smaller step changes nothing any more."""
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from devices.arrays import Arrays, Floats, Times
 from service.estimation.compiled import compiled
 
 SETTLE_S = 0.5
-"""So long is the mean of the chip's temperature taken for that of the gas."""
+"""How long the mean of the chip's temperature is taken as that of the gas."""
 NEAR_COUNTS = 2.0
-"""A chip that begins so near its temperature at the tare has a gas that is as near."""
+"""If a chip begins this near its temperature at the tare, its gas is as near."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Temperature:
             + (self.relative_lag_sigma * self.kpa_per_count * (chip - gas)) ** 2
             + (self.kpa_per_count * unknown) ** 2
         )
-        # Counts that would be below absolute zero are none.
+        # Counts below absolute zero are not valid.
         return kpa / np.where(scale > 0.0, scale, np.nan), sigma_kpa, after
 
 

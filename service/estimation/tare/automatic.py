@@ -31,7 +31,7 @@ WINDOW_NS = 250_000_000  # fits into the flight of a hop, and holds enough readi
 WARMING_COUNTS = 4.0
 """0.75 K: the gas may be that far from its chip, a quarter of a kilopascal or half a newton."""
 WINDOW_MAX_NS = 1_000_000_000
-"""A window is longer if an array is so slow that it would hold too few frames, up to this."""
+"""Longest window, for arrays so slow that a shorter one would hold too few frames."""
 
 
 def newest_unloaded_tare(
@@ -99,7 +99,7 @@ def _window_ns(since_ns: Times) -> int:
 
 
 def _refuse_warming(frames: FrameBatch, tare: Tare, serials: tuple[str, ...]) -> None:
-    """While a chip's temperature moves, its gas is seconds behind, and no baseline is one."""
+    """Refuse a tare while a chip's temperature changes: its gas lags by seconds."""
     tadc = np.where(frames.tadc == NOT_READ, np.nan, frames.tadc.astype(np.float64))
     since_ns = frames.t_ns - frames.t_ns[0]
     begin = tadc[since_ns <= WINDOW_NS]
@@ -182,12 +182,12 @@ def look_in_flight(
     free_since_t_ns: int,
     bears: Bools | None = None,
 ) -> Look:
-    """Whether the baseline should follow what a foot in the air reads.
+    """Decide whether the baseline should follow the readings of a foot in the air.
 
     Args:
         seen: the last `LOOK_BACK_NS` of the stream, in order.
         present: the tare in force.
-        anchor: the last one that was not automatic; None if there is none.
+        anchor: the last tare that was not automatic; None without one.
         free_since_t_ns: since when there has been no contact, nor any doubt about it.
         bears: (tiles,), False for bare tiles, which follow the weather and no load; None: all do.
     """
@@ -226,7 +226,7 @@ def look_in_flight(
 
 
 def first_in_flight(seen: TareFrames) -> Look:
-    """A first tare that nobody asked for, if it can be no mistake.
+    """A first tare without a request, if it cannot be a mistake.
 
     The foot has to have been loaded in these seconds and to be off the ground at their end, every
     tile near its baseline on the bench: a foot that stands light is quiet and near as well.

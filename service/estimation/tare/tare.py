@@ -82,10 +82,10 @@ class Tare:
 SEALED_AT_K = 298.0
 """A sealed bubble's pressure is proportional to its absolute temperature; about 25 degC."""
 WARMED_COUNTS = 4.0
-"""A baseline is in doubt once a tile's chip has moved so far since the tare: 0.75 K are 0.25 kPa,
+"""A baseline is in doubt if a tile's chip changed by more since the tare: 0.75 K are 0.25 kPa,
 half a newton on a tile and one and a half on a foot of four."""
 TREND_OVER_NS = 6 * 3_600_000_000_000
-"""A trend is that of the last hours; what was before was another day."""
+"""A trend is over the last hours; earlier tares are another day's."""
 TREND_SPAN_MIN_NS = 600_000_000_000
 """A straight line through less than ten minutes says nothing about an hour."""
 
@@ -104,7 +104,7 @@ def has_warmed(tare: Tare, tadc_counts: npt.ArrayLike) -> Bools:
     """Which tiles are warmer or colder than at the tare by more than the baseline can bear.
 
     Args:
-        tare: the one in force; of an unknown temperature it never says so.
+        tare: the one in force; with an unknown temperature the answer is never True.
         tadc_counts: (..., tiles), NaN where not known.
     """
     moved_counts = np.abs(np.asarray(tadc_counts, dtype=np.float64) - tare.tadc_counts)

@@ -30,16 +30,16 @@ LOADED_KPA = 3.0
 """A tile this far above its bench baseline, 10 K by p0 / T0, is not taken for an unloaded one, even
 if the user or a flag says so."""
 QUIET = 1.5
-"""An unloaded tile's readings scatter at most so much more than on the bench."""
+"""How much more an unloaded tile's readings scatter at most than on the bench."""
 STILL_SIGMAS = 4.0
 """The halves of a window, and the window and the lowest one, differ by no more than chance does."""
 STUCK_COUNTS = 0.5
-"""A part that scatters by more than so many counts does not read the same one twenty times."""
+"""A part with more scatter than this, in counts, does not read the same count twenty times."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """A window in which every tile is quiet and still.
+    """A window where every tile is quiet and still.
 
     Attributes:
         rows: of the frames.
@@ -88,17 +88,17 @@ class TareFrames:
 
     @property
     def has_bench(self) -> bool:
-        """Does the calibration say of all its tiles where they lie unloaded?"""
+        """Does the calibration have the unloaded baselines of all tiles?"""
         known = np.isfinite(self.bench_kpa) & np.isfinite(self.bench_noise_kpa)
         return bool(self.calibrated.any() and known[self.calibrated].all())
 
     @property
     def step_noise_kpa(self) -> Floats:
-        """(tiles,), noise by what changes between two frames, which a slow motion hardly does."""
+        """(tiles,), noise from differences between two frames, which slow motion hardly changes."""
         return np.asarray(np.nanstd(np.diff(self.kpa, axis=0), axis=0) / np.sqrt(2.0))
 
     def quiet_windows(self, spans: Iterable[tuple[int, int]], noise_kpa: Floats) -> list[Window]:
-        """Those of `spans`, first row and row after the last, that may be without load.
+        """The `spans`, each first row and row after the last, that may be without load.
 
         Args:
             spans: to be looked at.

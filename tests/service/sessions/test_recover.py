@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -331,6 +332,38 @@ def test_what_is_damaged_on_a_server_may_come_again_until_it_is_given_up(
     (one,) = recover(again, give_up=True).sessions
     assert one.ledger is not None
     assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
+
+
+def test_a_damaged_batch_at_the_stop_is_lost_and_the_others_tell_the_end(tmp_path: Path) -> None:
+    folder = stream(tmp_path, info_of(), (0, 99), next_seq=100)
+    (segment,) = folder.glob("*.arrows")
+    content = bytearray(segment.read_bytes())
+    content[len(content) // 2] ^= 1  # in the batch of frames 30 to 39
+    segment.write_bytes(content)
+    session(tmp_path, state="pending", stopped_t_ns=t_ns(35))
+    session(tmp_path, ID[:-1] + "b", state="pending", stopped_t_ns=t_ns(20))
+    here, other = recover(tmp_path).sessions
+    assert (here.outcome, other.outcome) == ("sealed", "sealed")
+    by_id = {one.session.id: one for one in (here, other)}
+    assert by_id[ID[:-1] + "b"].session.parts[0].seq_last == 20
+    ledger = by_id[ID].ledger
+    assert ledger is not None
+    assert ledger.parts[0].lost == {"corrupt": 6}
+    assert ledger.parts[0].seq_last == 35
+
+
+def test_a_stop_where_time_runs_back_fails_one_session_and_not_the_recovery(tmp_path: Path) -> None:
+    folder = stream(servers(tmp_path), info_of(), (0, 99))
+    journal = Journal.open(folder)
+    late = frames(100, 109)
+    back_ns = PERIOD_NS * 60
+    journal.append(replace(late, t_ns=late.t_ns - back_ns, t_mono_ns=late.t_mono_ns - back_ns))
+    journal.close()
+    clock = ClockOffset(boot_id=BOOT, t_mono_ns=0, server_minus_node_ns=0, uncertainty_ns=1)
+    session(tmp_path, state="pending", stopped_t_ns=t_ns(70), clock=(clock,))
+    (one,) = recover(tmp_path).sessions
+    assert one.outcome in ("failed", "waiting")
+    assert one.problem
 
 
 # --- streams of no session ------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
+from storage.journal.segment_format import RECORD
 from storage.schema import wire_schema
 from storage.wire import encode
 from tests.builders.arrays import make_array
@@ -257,3 +258,21 @@ def test_a_segment_that_is_gone_is_an_error_that_names_it(tmp_path: Path) -> Non
     path.unlink()
     with pytest.raises(StorageError, match=path.name):
         list(journal.read(0, 9))
+
+
+@pytest.mark.parametrize("record", [0, 1, 2])
+def test_a_damaged_record_of_the_index_gives_its_neighbours_instant_never_a_far_one(
+    tmp_path: Path, record: int
+) -> None:
+    journal = filled(tmp_path, (0, 9), (10, 19), (20, 29), (30, 39))
+    (path,) = segments(tmp_path)
+    index = path.with_suffix(".idx")
+    content = bytearray(index.read_bytes())
+    content[record * RECORD.itemsize + 9] ^= 1
+    index.write_bytes(content)
+    asked = 10 * record + 2
+    oldest, newest = (journal.t_ns_near(asked, newest=newest) for newest in (False, True))
+    assert oldest == part(10 * record + 10, 10 * record + 10).t_ns[0]
+    assert newest == (part(10 * record - 1, 10 * record - 1).t_ns[0] if record else None)
+    index.write_bytes(b"")
+    assert journal.t_ns_near(asked, newest=False) is None
