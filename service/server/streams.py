@@ -213,7 +213,8 @@ class ServerStream:
         """The node has taken it before, and says how it ended."""
         self.node_has = Intervals(said.held)
         self.t_ns_first = said.t_ns_first
-        self.missed_slots = said.missed_slots
+        # A node that was killed may know an older count than it had told.
+        self.missed_slots = max(self.missed_slots, said.missed_slots)
         # What a node lost with its power may have come here before.
         beyond = max(0, (-1 if self.held.last is None else self.held.last) + 1 - said.next_seq)
         tail = max(0, said.unsynced_tail_max - beyond)

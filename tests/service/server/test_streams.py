@@ -290,6 +290,16 @@ def test_what_the_node_said_of_a_stream_outlives_the_server(told: Told) -> None:
     assert (present.next_seq, present.lost) == (None, {"evicted": ((0, 4),)})
 
 
+def test_slots_that_a_killed_node_has_forgotten_are_still_counted(told: Told) -> None:
+    told.connect(held=((0, 9),), next_seq=10)
+    stream = told.node.present
+    stream.missed_slots = 4
+    stream.has_ended(told.earlier(held=((0, 9),), next_seq=10, missed_slots=0))
+    assert (stream.missed_slots, stream.notes.missed_slots) == (4, 4)
+    stream.has_ended(told.earlier(held=((0, 9),), next_seq=10, missed_slots=5))
+    assert (stream.missed_slots, stream.notes.missed_slots) == (5, 5)
+
+
 def test_frames_that_are_damaged_here_may_come_again_while_the_node_has_them(told: Told) -> None:
     told.connect(held=((0, 9),), next_seq=10)
     told.take(0, 4)
