@@ -254,7 +254,7 @@ class ServerStream:
         """
         if self.journal is not None:
             self.journal.sync()
-        notes = self.notes
+        notes = self._notes_to_keep
         if notes != self._notes_on_disk and self.folder.is_dir():
             notes.save(self.folder)
             self._notes_on_disk = notes
@@ -265,7 +265,7 @@ class ServerStream:
     @property
     def has_news(self) -> bool:
         """Is there anything to be synced or acknowledged?"""
-        unsaved = self.notes != self._notes_on_disk and self.journal is not None
+        unsaved = self._notes_to_keep != self._notes_on_disk and self.journal is not None
         return bool(self.unsynced or self.owed or unsaved or self._clock_unsynced)
 
     def disown(self, doubtful: Intervals, *, corrupt: bool = False) -> None:
@@ -315,6 +315,15 @@ class ServerStream:
         if self._guessed:
             self._guessed = False
             self._forgotten = self._forgotten - self.may_come
+
+    @property
+    def _notes_to_keep(self) -> StreamNotes:
+        """The notes, with what is damaged here now."""
+        lost = self.journal.lost.by_reason if self.journal is not None else {}
+        damaged = tuple(lost.get(CORRUPT, ()))
+        if damaged == self.notes.damaged:
+            return self.notes
+        return self.notes.model_copy(update={"damaged": damaged})
 
     def _log_clock(self, row: ClockOffset) -> None:
         self._clock_log.append(row)

@@ -66,15 +66,21 @@ class OpenedStream:
     def note_losses(self) -> None:
         """Write down what was found damaged: once it is cut off, nothing else says so.
 
-        A server's folder is left alone: the node may have these frames, and says what it lost.
+        On a server's folder they are not lost yet: the node may have these frames. Notes that
+        could not be read are replaced.
 
         Raises:
             StorageError: the disk is full or not writable.
         """
         notes = self.notes or StreamNotes(array_info=self.journal.info)
-        lost = self.lost.as_pairs()
-        if self.is_local and lost != Losses(notes.lost).as_pairs():
-            self.notes = notes.model_copy(update={"lost": lost})
+        if self.is_local:
+            found: dict[str, object] = {"lost": self.lost.as_pairs()}
+        else:
+            found = {"damaged": tuple(self.damaged)}
+        now = notes.model_copy(update=found)
+        is_broken = self.notes is None and (self.journal.folder / NOTES_FILE).exists()
+        if now != notes or is_broken:
+            self.notes = now
             self.notes.save(self.journal.folder)
 
     def disown_damaged(self, first: int, last: int) -> None:

@@ -80,7 +80,9 @@ class Journal:
             with suppress(FileFormatError):
                 notes = StreamNotes.load(folder)
                 if notes is not None:
-                    return cls(folder, notes.array_info)
+                    journal = cls(folder, notes.array_info)
+                    journal.lost.add(Intervals(notes.damaged) - journal.held, CORRUPT)
+                    return journal
             for path in sorted(folder.glob("*" + SUFFIX)):
                 schema, _ = read_header(path)
                 with suppress(FileFormatError):

@@ -48,6 +48,8 @@ class StreamNotes(BaseModel):
     sync_max_s: float = 0.0
     """The longest that frames waited for the disk."""
     lost: AsPairs = Field(default_factory=dict)
+    damaged: tuple[tuple[int, int], ...] = ()
+    """On a server: numbers that were here and cannot be read; the node may give them once more."""
 
     @property
     def has_ended(self) -> bool:

@@ -134,6 +134,8 @@ def verify_stream(folder: Path) -> StreamReport:
         report.held = report.held | segment.held
         report.unsynced = report.unsynced | segment.unsynced
     report.unsynced = report.unsynced - report.held
+    if report.notes is not None:
+        report.lost.add(Intervals(report.notes.damaged) - report.held, CORRUPT)
     for segment in segments:
         report.lost.add(segment.damaged - report.held, CORRUPT)
     _check_stream(report, segments, is_servers=(folder.parents[2] / "nodes").is_dir())

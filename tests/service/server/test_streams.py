@@ -290,6 +290,21 @@ def test_what_the_node_said_of_a_stream_outlives_the_server(told: Told) -> None:
     assert (present.next_seq, present.lost) == (None, {"evicted": ((0, 4),)})
 
 
+def test_what_was_damaged_here_is_known_after_a_restart_until_it_comes_again(told: Told) -> None:
+    told.connect(held=((0, 9),), next_seq=10)
+    told.take(0, 4)
+    told.take(5, 9)
+    told.node.present.disown(Intervals([(0, 4)]), corrupt=True)
+    told.synced()
+    told.restart()
+    assert told.node.streams[NEW].for_session(None).damaged == Intervals([(0, 4)])
+    told.connect(held=((0, 9),), next_seq=10)
+    told.take(0, 4)
+    told.synced()
+    told.restart()
+    assert not told.node.streams[NEW].for_session(None).damaged
+
+
 def test_slots_that_a_killed_node_has_forgotten_are_still_counted(told: Told) -> None:
     told.connect(held=((0, 9),), next_seq=10)
     stream = told.node.present

@@ -29,6 +29,7 @@ from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event, Ledger, Part, Session, SessionFolder
 from storage.verify.data import verdict_of, verify
+from storage.verify.journal import verify_stream
 from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
@@ -329,6 +330,10 @@ def test_what_is_damaged_on_a_server_may_come_again_until_it_is_given_up(
     shutil.copytree(data, again)
     (one,) = recover(data).sessions
     assert (one.outcome, one.problem) == ("waiting", "10 frames may still come from node bench")
+    assert verify_stream(folder).as_dict()["lost"] == {"corrupt": 10}
+    (one,) = recover(data, give_up=True).sessions  # they are cut off by now
+    assert one.ledger is not None
+    assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
     (one,) = recover(again, give_up=True).sessions
     assert one.ledger is not None
     assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
@@ -364,6 +369,13 @@ def test_a_stop_where_time_runs_back_fails_one_session_and_not_the_recovery(tmp_
     (one,) = recover(tmp_path).sessions
     assert one.outcome in ("failed", "waiting")
     assert one.problem
+
+
+def test_notes_of_a_servers_stream_that_cannot_be_read_are_replaced(tmp_path: Path) -> None:
+    folder = stream(servers(tmp_path), info_of(), (0, 99))
+    (folder / "stream.json").write_bytes(b"{")
+    assert "not a stream's notes" in recover(tmp_path).problems[0]
+    assert recover(tmp_path).is_nothing
 
 
 # --- streams of no session ------------------------------------------------------------------------
