@@ -65,7 +65,10 @@ def test_what_needs_no_heavy_library_loads_none(imports: str, absent: tuple[str,
 
 
 def test_ctrl_c_leaves_no_file_and_a_failing_exit_code(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from service.cli.main import main; main()", "simulate"]
+    # Tests that a shell starts in the background ignore Ctrl-C, and their children inherit that.
+    hears = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    code = f"{hears}; from service.cli.main import main; main()"
+    command = [sys.executable, "-c", code, "simulate"]
     arguments = ["--scene", "standing", "--seconds", "100000", "--no-estimates"]
     process = subprocess.Popen(
         command + arguments, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
