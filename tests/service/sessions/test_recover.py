@@ -6,126 +6,40 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from devices.errors import StorageError
-from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from service.sessions import recover as recover_module
-from service.sessions.recover import Recovered, Recovery, recover
+from service.sessions.recover import recover
 from service.sessions.sealing import seal
 from storage.clock.log import ClockOffset
 from storage.durable import locked
-from storage.intervals import Losses
 from storage.journal.in_flight import InFlight
-from storage.journal.journal import Journal
-from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
+from storage.journal.stream_notes import unsynced_tail_max
 from storage.sessions.file import SessionReader
-from storage.sessions.folder import Event, Ledger, Part, Session, SessionFolder
+from storage.sessions.folder import Event, Part, Session, SessionFolder
 from storage.verify.data import verdict_of, verify
-from storage.verify.journal import verify_stream
-from tests.builders.arrays import PERIOD_NS, UTC_NS, make_array
 from tests.builders.calibrations import make_calibration
-from tests.builders.frames import make_frames
+from tests.service.sessions.crashed import (
+    BOOT,
+    ID,
+    OTHER_BOOT,
+    TAIL,
+    info_of,
+    loaded,
+    outcomes,
+    recovered,
+    servers,
+    session,
+    state_of,
+    stream,
+    t_ns,
+)
 from tests.storage.faulty_disk import refusing
-
-ID = "20200101T000000Z-00000a"
-BOOT = "a" * 32
-OTHER_BOOT = "b" * 32
-LEAD = 400
-TAIL = unsynced_tail_max(500.0)
-
-Frames = Callable[..., FrameBatch]
-
-
-def info_of(boot_id: str = BOOT) -> ArrayInfo:
-    return make_array(boot_id=boot_id)
-
-
-def frames(first: int, last: int) -> FrameBatch:
-    """Unloaded for the lead, then ten counts, which are ten newtons; the last digit is noise."""
-    seq = np.arange(first, last + 1)
-    lead = seq < LEAD
-    return make_frames(
-        seq,
-        padc=(np.where(lead, 500, 490) + seq % 2)[:, None],
-        frame_status=np.where(lead, FrameStatus.LEAD, 0),
-    )
-
-
-def t_ns(seq: int) -> int:
-    return UTC_NS + PERIOD_NS * seq
-
-
-def stream(
-    data: Path, info: ArrayInfo, *runs: tuple[int, int], closed: bool = True, **notes: Any
-) -> Path:
-    folder = data / "journal" / info.node / info.boot_id
-    journal = Journal(folder, info)
-    for first, last in runs:
-        for begin in range(first, last + 1, 10):
-            journal.append(frames(begin, min(begin + 9, last)))
-    StreamNotes(array_info=info, **notes).save(folder)
-    journal.close()
-    if not closed:  # as a killed process leaves it
-        for path in folder.glob("*.idx"):
-            path.write_bytes(path.read_bytes()[:-48])
-    return folder
-
-
-def session(data: Path, session_id: str = ID, **changes: Any) -> Session:
-    content: dict[str, Any] = {
-        "id": session_id,
-        "name": "walk",
-        "node": "bench",
-        "state": "recording",
-        "started_t_ns": t_ns(0),
-        "parts": (Part(boot_id=BOOT, seq_first=0),),
-        "scene": "test",
-        "scene_content": {"name": "test"},
-        "subject": "leg 2",
-        "notes": "in mud",
-        "tags": ("wet",),
-        "events": (Event(id="e1", label="slip", t_ns=t_ns(500)),),
-    }
-    kept = Session(**content | changes)
-    SessionFolder(data / "sessions").save(kept)
-    return kept
-
-
-def loaded(data: Path, session_id: str = ID) -> Session:
-    return SessionFolder(data / "sessions").load(session_id)
-
-
-def recovered(data: Path, **how: Any) -> tuple[Recovered, Ledger]:
-    """The one session that is recovered, and what became of its frames."""
-    (one,) = recover(data, **how).sessions
-    assert one.ledger is not None
-    return one, one.ledger
-
-
-def state_of(data: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(data)): path.read_bytes()
-        for path in sorted(data.rglob("*"))
-        if path.is_file()
-    }
-
-
-def servers(data: Path) -> Path:
-    (data / "nodes" / "bench").mkdir(parents=True)
-    return data
-
-
-def outcomes(recovery: Recovery) -> list[str]:
-    return [one.outcome for one in recovery.sessions]
-
 
 # --- a node alone ---------------------------------------------------------------------------------
 
@@ -230,22 +144,6 @@ def test_several_parts_become_one_file(tmp_path: Path) -> None:
     assert verify(tmp_path).as_dict()["problems"] == []
 
 
-def test_frames_that_are_damaged_are_lost_and_the_others_kept(tmp_path: Path) -> None:
-    folder = stream(tmp_path, info_of(), (0, 99), next_seq=100)
-    (segment,) = folder.glob("*.arrows")
-    content = bytearray(segment.read_bytes())
-    content[len(content) // 2] ^= 1
-    segment.write_bytes(content)
-    session(tmp_path)
-    _, ledger = recovered(tmp_path)
-    assert ledger.parts[0].lost == {"corrupt": 10}
-    assert loaded(tmp_path).frames == 90
-    notes = StreamNotes.load(folder)
-    assert notes is not None
-    assert Losses(notes.lost).by_reason["corrupt"].count == 10
-    assert verdict_of(verify(tmp_path / "sessions" / ID)) == "lossy"
-
-
 def test_a_session_of_which_nothing_reached_the_disk_is_sealed_as_that(tmp_path: Path) -> None:
     session(tmp_path)
     one, ledger = recovered(tmp_path)
@@ -314,68 +212,6 @@ def test_a_stop_among_frames_that_are_lost_is_placed_by_the_rate(tmp_path: Path)
     one, ledger = recovered(tmp_path)
     assert one.session.parts[0].seq_last == 119
     assert ledger.parts[0].lost == {"evicted": 20}
-
-
-def test_what_is_damaged_on_a_server_may_come_again_until_it_is_given_up(
-    tmp_path: Path,
-) -> None:
-    data, again = tmp_path / "data", tmp_path / "again"
-    folder = stream(servers(data), info_of(), (0, 99))
-    (segment,) = folder.glob("*.arrows")
-    content = bytearray(segment.read_bytes())
-    content[len(content) // 2] ^= 1
-    segment.write_bytes(content)
-    parts = (Part(boot_id=BOOT, seq_first=0, seq_last=99),)
-    session(data, state="pending", stopped_t_ns=t_ns(99), parts=parts)
-    shutil.copytree(data, again)
-    (one,) = recover(data).sessions
-    assert (one.outcome, one.problem) == ("waiting", "10 frames may still come from node bench")
-    assert verify_stream(folder).as_dict()["lost"] == {"corrupt": 10}
-    (one,) = recover(data, give_up=True).sessions  # they are cut off by now
-    assert one.ledger is not None
-    assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
-    (one,) = recover(again, give_up=True).sessions
-    assert one.ledger is not None
-    assert (one.outcome, one.ledger.parts[0].lost) == ("sealed", {"corrupt": 10})
-
-
-def test_a_damaged_batch_at_the_stop_is_lost_and_the_others_tell_the_end(tmp_path: Path) -> None:
-    folder = stream(tmp_path, info_of(), (0, 99), next_seq=100)
-    (segment,) = folder.glob("*.arrows")
-    content = bytearray(segment.read_bytes())
-    content[len(content) // 2] ^= 1  # in the batch of frames 30 to 39
-    segment.write_bytes(content)
-    session(tmp_path, state="pending", stopped_t_ns=t_ns(35))
-    session(tmp_path, ID[:-1] + "b", state="pending", stopped_t_ns=t_ns(20))
-    here, other = recover(tmp_path).sessions
-    assert (here.outcome, other.outcome) == ("sealed", "sealed")
-    by_id = {one.session.id: one for one in (here, other)}
-    assert by_id[ID[:-1] + "b"].session.parts[0].seq_last == 20
-    ledger = by_id[ID].ledger
-    assert ledger is not None
-    assert ledger.parts[0].lost == {"corrupt": 6}
-    assert ledger.parts[0].seq_last == 35
-
-
-def test_a_stop_where_time_runs_back_fails_one_session_and_not_the_recovery(tmp_path: Path) -> None:
-    folder = stream(servers(tmp_path), info_of(), (0, 99))
-    journal = Journal.open(folder)
-    late = frames(100, 109)
-    back_ns = PERIOD_NS * 60
-    journal.append(replace(late, t_ns=late.t_ns - back_ns, t_mono_ns=late.t_mono_ns - back_ns))
-    journal.close()
-    clock = ClockOffset(boot_id=BOOT, t_mono_ns=0, server_minus_node_ns=0, uncertainty_ns=1)
-    session(tmp_path, state="pending", stopped_t_ns=t_ns(70), clock=(clock,))
-    (one,) = recover(tmp_path).sessions
-    assert one.outcome in ("failed", "waiting")
-    assert one.problem
-
-
-def test_notes_of_a_servers_stream_that_cannot_be_read_are_replaced(tmp_path: Path) -> None:
-    folder = stream(servers(tmp_path), info_of(), (0, 99))
-    (folder / "stream.json").write_bytes(b"{")
-    assert "not a stream's notes" in recover(tmp_path).problems[0]
-    assert recover(tmp_path).is_nothing
 
 
 # --- streams of no session ------------------------------------------------------------------------
