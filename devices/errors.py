@@ -20,6 +20,7 @@
      |    +-- ServoPacketError  (ValueError)   bytes that are no valid packet
      |    +-- ServoStatusError                 the servo answered with an error number
      +-- FileFormatError       (ValueError)    a file is not what it should be
+     |    +-- DamagedFileError                 a file is not what was written
      |    +-- DamagedFramesError               frames on disk are not those that were written
      +-- StorageError          (OSError)       a file cannot be written: disk full, read-only
      +-- CalibrationError      (ValueError)    a calibration is absent, unphysical or does not fit
@@ -201,6 +202,10 @@ class ServoStatusError(ServoError):
 
 class FileFormatError(FootTileError, ValueError):
     """A file is absent, unreadable, or not of the kind the command needs."""
+
+
+class DamagedFileError(FileFormatError):
+    """A file is not what was written: its hash is of other bytes, or it is no file at all."""
 
 
 class DamagedFramesError(FileFormatError):

@@ -1,19 +1,19 @@
 """Writing so that it stays written: whole files or none, synced, and errors a user can act on.
 
 Here also: the lock of a folder, since two processes that write in it would each undo what the other
-does, and JSON that carries a hash of its own text as its last key, so that an edit is seen.
+does, and setting aside what is damaged, since a file that cannot be trusted is still somebody's.
 """
 
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import os
 import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
@@ -192,30 +192,22 @@ def locked(
         os.close(descriptor)
 
 
-CHECK = "check"
-_END = re.compile(rb',\n "check": "([0-9a-f]{64})"\n\}\Z')
+ASIDE = ".damaged"
 
 
-def with_check(text: bytes) -> bytes:
-    """The object with its hash as the last key.
+def set_aside(path: Path) -> Path:
+    """Rename what is damaged, a file, folder or link, so that nobody reads it as what it was.
 
-    Args:
-        text: a JSON object with at least one key, and without this one.
+    Returns:
+        Where it is now: beside its place, with `.damaged` and a number behind its name.
+
+    Raises:
+        StorageError: it cannot be renamed; it is where it was then.
     """
-    body = text.rstrip().removesuffix(b"}").rstrip()
-    digits = hashlib.sha256(body).hexdigest()
-    return body + b',\n "check": "' + digits.encode() + b'"\n}'
-
-
-def without_check(text: bytes) -> bytes:
-    """The object without its hash; the same bytes if it carries none."""
-    end = _END.search(text)
-    return text if end is None else text[: end.start()] + b"\n}"
-
-
-def is_unchanged(text: bytes) -> bool | None:
-    """Does the text have the hash that it states? None if it states none."""
-    end = _END.search(text)
-    if end is None:
-        return None
-    return hashlib.sha256(text[: end.start()]).hexdigest().encode() == end[1]
+    with storage_errors(path, "Move it away by hand"):
+        taken = {each.name for each in path.parent.iterdir()}
+        free = (f"{path.name}{ASIDE}-{number}" for number in count(1))
+        aside = path.with_name(next(name for name in free if name not in taken))
+        path.rename(aside)
+        sync_folder(path.parent)
+    return aside

@@ -21,16 +21,10 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import FileFormatError, FootTileError, UnknownError, UsageError
+from storage.checked_json import read_checked, write_checked
 from storage.clock.log import ClockOffset
 from storage.clock.table import CLOCK_NAME, ClockTable, StreamFacts, read_clock
-from storage.durable import (
-    make_folder,
-    storage_errors,
-    sync_folder,
-    with_check,
-    without_check,
-    write_whole,
-)
+from storage.durable import make_folder, storage_errors, sync_folder, write_whole
 from storage.sessions.file import SessionReader
 
 EVENTS_NAME = "events.parquet"
@@ -240,7 +234,7 @@ class SessionFolder:
         with storage_errors(folder):
             make_folder(folder)
         text = session.model_dump_json(indent=1).encode()
-        write_whole(folder / "session.json", with_check(text))
+        write_checked(folder / "session.json", text)
 
     def load(self, session_id: str) -> Session:
         """Read `session.json`.
@@ -251,10 +245,10 @@ class SessionFolder:
         """
         path = self.path(session_id) / "session.json"
         try:
-            return Session.model_validate_json(without_check(path.read_bytes()))
+            return Session.model_validate_json(read_checked(path).text)
         except FileNotFoundError as error:
             raise UnknownError(f"no session {session_id!r}") from error
-        except (OSError, ValidationError) as error:
+        except ValidationError as error:
             raise FileFormatError(f"not a session: {error}", where=str(path)) from error
 
     def load_all(self) -> tuple[list[Session], dict[str, FootTileError]]:

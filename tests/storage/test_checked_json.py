@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Callable
+from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.durable import is_unchanged, with_check, without_check
+from devices.errors import DamagedFileError
+from storage.checked_json import (
+    is_unchanged,
+    read_checked,
+    with_check,
+    without_check,
+    write_checked,
+)
+from storage.durable import set_aside
 
 objects = st.dictionaries(
     st.text(max_size=5).filter(lambda key: key != "check"),
@@ -34,16 +46,96 @@ def test_every_flipped_bit_is_seen(content: dict[str, object], data: st.DataObje
     text = bytearray(with_check(json.dumps(content, indent=1).encode()))
     at = data.draw(st.integers(0, len(text) - 1))
     text[at] ^= 1 << data.draw(st.integers(0, 7))
-    if is_unchanged(bytes(text)) is True:
-        raise AssertionError(bytes(text))
-    if is_unchanged(bytes(text)) is None:  # its end is broken: either no JSON, or a key too many
-        try:
-            found = json.loads(bytes(text))
-        except ValueError:
-            return
-        assert set(found) - set(content)
+    assert is_unchanged(bytes(text)) is False
+
+
+@given(objects, st.data())
+def test_a_byte_less_or_more_is_seen(content: dict[str, object], data: st.DataObject) -> None:
+    whole = with_check(json.dumps(content, indent=1).encode())
+    at = data.draw(st.integers(0, len(whole) - 1))
+    assert is_unchanged(whole[:at] + whole[at + 1 :]) is False
+    more = data.draw(st.binary(min_size=1, max_size=2))
+    assert is_unchanged(whole[:at] + more + whole[at:]) is False
+
+
+@given(objects, st.data())
+def test_what_was_cut_is_damaged_or_no_json(
+    content: dict[str, object], data: st.DataObject
+) -> None:
+    whole = with_check(json.dumps(content, indent=1).encode())
+    cut = whole[: data.draw(st.integers(0, len(whole) - 1))]
+    if is_unchanged(cut) is not False:
+        with pytest.raises(ValueError, match=r"Expecting|Unterminated|Extra data|Invalid"):
+            json.loads(cut)
 
 
 def test_an_object_without_is_left_as_it_is() -> None:
     assert without_check(b'{"a": 1}') == b'{"a": 1}'
     assert is_unchanged(b'{"a": 1}') is None
+
+
+def test_a_file_is_written_with_its_hash_and_read_without(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    write_checked(path, b'{"a": 1}')
+    found = read_checked(path)
+    assert json.loads(found.text) == {"a": 1}
+    assert found.is_proven
+
+
+def test_a_file_of_an_older_version_is_read_and_called_unproven(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes(b'{"a": 1}')
+    found = read_checked(path)
+    assert json.loads(found.text) == {"a": 1}
+    assert not found.is_proven
+
+
+def test_a_missing_file_is_missing_and_not_damaged(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        read_checked(tmp_path / "a.json")
+
+
+def _empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+def _flip(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"1", b"3", 1))
+
+
+def _folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def _link(path: Path) -> None:
+    path.rename(path.with_name("elsewhere.json"))
+    path.symlink_to("elsewhere.json")
+
+
+def _dangling(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("nowhere.json")
+
+
+def _pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("damage", [_empty, _cut, _flip, _folder, _link, _dangling, _pipe])
+def test_what_is_not_the_file_that_was_written_is_damaged_and_can_be_set_aside(
+    tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    path = tmp_path / "a.json"
+    write_checked(path, b'{"a": 1}')
+    damage(path)
+    with pytest.raises(DamagedFileError, match=r"a\.json"):
+        read_checked(path)
+    assert set_aside(path).name == "a.json.damaged-1"
+    write_checked(path, b'{"a": 2}')
+    assert set_aside(path).name == "a.json.damaged-2"

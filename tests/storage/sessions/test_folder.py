@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.errors import FileFormatError, StorageError, UnknownError
+from devices.errors import DamagedFileError, FileFormatError, StorageError, UnknownError
+from storage.checked_json import without_check
 from storage.clock.log import ClockOffset
 from storage.sessions.folder import (
     Event,
@@ -206,7 +207,7 @@ def test_a_file_that_is_cut_off_anywhere_is_damaged(tmp_path: Path) -> None:
     content = path.read_bytes()
     for length in range(len(content)):
         path.write_bytes(content[:length])
-        with pytest.raises(FileFormatError, match="not a session") as caught:
+        with pytest.raises(FileFormatError) as caught:
             folder.load(ID)
         assert caught.value.where == str(path)
 
@@ -230,15 +231,19 @@ def test_what_is_not_a_session_is_refused_with_its_path(
     path = folder.path(ID) / "session.json"
     content = path.read_bytes()
     assert old in content
-    path.write_bytes(content.replace(old, new, 1))
+    path.write_bytes(without_check(content).replace(old, new, 1))
     with pytest.raises(FileFormatError, match="not a session") as caught:
+        folder.load(ID)
+    assert caught.value.where == str(path)
+    path.write_bytes(content.replace(old, new, 1))
+    with pytest.raises(DamagedFileError, match="changed") as caught:
         folder.load(ID)
     assert caught.value.where == str(path)
 
 
 def test_a_folder_in_place_of_the_file_is_damage_too(tmp_path: Path) -> None:
     (tmp_path / ID / "session.json").mkdir(parents=True)
-    with pytest.raises(FileFormatError, match="not a session"):
+    with pytest.raises(DamagedFileError, match="not a file"):
         SessionFolder(tmp_path).load(ID)
 
 

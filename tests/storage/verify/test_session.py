@@ -17,8 +17,8 @@ from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from service.sessions.sealing import seal
 from service.sessions.sources import Sources
+from storage.checked_json import with_check
 from storage.clock.log import ClockOffset
-from storage.durable import with_check
 from storage.intervals import Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes

@@ -1,0 +1,130 @@
+"""JSON files that prove themselves: the last key is a hash of all text before it.
+
+Every file of ours whose content can change a number, or what is asked of a node, is written and
+read here. Older versions wrote no hash: such a file is read and called unproven, and has one when
+it is next written. A file that had a hash and has none any more is damaged, not old.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+from devices.errors import DamagedFileError
+from storage.durable import write_whole
+
+CHECK = "check"
+_BEFORE, _AFTER = b',\n "check": "', b'"\n}'
+_END = re.compile(re.escape(_BEFORE) + rb"([0-9a-f]{64})" + re.escape(_AFTER) + rb"\Z")
+_TAIL_BYTES = len(_BEFORE) + 64 + len(_AFTER)
+_DIGITS_AT_END = re.compile(rb'"[0-9a-f]{64}"\s*\}\s*\Z')
+_BYTES_MAX = 64 << 20
+"""No file of ours is longer; what is, is not read into memory."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a file holds."""
+
+    text: bytes
+    """A JSON object, without its hash."""
+    is_proven: bool
+    """False: it states no hash, so it may have changed since an older version wrote it."""
+
+
+def write_checked(path: Path, text: bytes, *, mode: int = 0o666) -> None:
+    """Write a JSON object with its hash, whole or not at all.
+
+    Args:
+        path: the file; one that is there is replaced.
+        text: a JSON object with at least one key, and without "check".
+        mode: permissions, of which the umask takes its share.
+
+    Raises:
+        StorageError: the disk is full or not writable; nothing is left behind then.
+    """
+    write_whole(path, with_check(text), mode=mode)
+
+
+def read_checked(path: Path) -> Checked:
+    """Read a JSON object. Whether it has the keys that it should is for the caller to say.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DamagedFileError: its hash is of another text, or it is no file, or cannot be read.
+    """
+    try:
+        text = _bytes(path)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DamagedFileError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    return checked(text, where=str(path))
+
+
+def checked(text: bytes, *, where: str) -> Checked:
+    """The same for a text that was read already.
+
+    Raises:
+        DamagedFileError: its hash is of another text.
+    """
+    found = is_unchanged(text)
+    if found is False:
+        raise DamagedFileError(
+            "it was changed: its text is not what its hash is of",
+            where=where,
+            expected="the bytes as they were written",
+        )
+    if not text.strip():
+        raise DamagedFileError("it is empty", where=where, expected="a JSON object")
+    return Checked(without_check(text), is_proven=found is True)
+
+
+def _bytes(path: Path) -> bytes:
+    # A link may lead anywhere, and a pipe would be waited for.
+    if not stat.S_ISREG(path.lstat().st_mode):
+        raise DamagedFileError("it is not a file", where=str(path), expected="a JSON object")
+    with open(path, "rb", opener=_without_following) as file:
+        found = os.fstat(file.fileno())
+        if found.st_size > _BYTES_MAX:
+            raise DamagedFileError(
+                f"it has {found.st_size} bytes", where=str(path), expected=f"up to {_BYTES_MAX}"
+            )
+        return file.read()
+
+
+def _without_following(name: str, flags: int) -> int:
+    return os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
+
+
+def with_check(text: bytes) -> bytes:
+    """The object with its hash as the last key.
+
+    Args:
+        text: a JSON object with at least one key, and without this one.
+    """
+    body = text.rstrip().removesuffix(b"}").rstrip()
+    return body + _BEFORE + hashlib.sha256(body).hexdigest().encode() + _AFTER
+
+
+def without_check(text: bytes) -> bytes:
+    """The object without its hash; the same bytes if it carries none."""
+    end = _END.search(text)
+    return text if end is None else text[: end.start()] + b"\n}"
+
+
+def is_unchanged(text: bytes) -> bool | None:
+    """Does the text have the hash that it states? None if it never stated one."""
+    end = _END.search(text)
+    if end is None:
+        return False if _had_check(text) else None
+    return hashlib.sha256(text[: end.start()]).hexdigest().encode() == end[1]
+
+
+def _had_check(text: bytes) -> bool:
+    """Does it end like a text with a hash, of which a byte is another one, or missing, or more?"""
+    return b'"check":' in text[-2 * _TAIL_BYTES :] or _DIGITS_AT_END.search(text) is not None

@@ -1,0 +1,33 @@
+"""Every attack of the list, with few tries; with `--soak` as many as in docs/results/hostile.md."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+from tests.hostile.attack import ATTACKS, Attack
+
+SEED = 1
+
+for _path in sorted(Path(__file__).parent.glob("attack_*.py")):
+    importlib.import_module(f"tests.hostile.{_path.stem}")
+
+
+@pytest.mark.process
+@pytest.mark.real_time
+@pytest.mark.parametrize("attack", ATTACKS.values(), ids=list(ATTACKS))
+def test_an_attack_does_nothing_that_it_must_not(attack: Attack, tmp_path: Path) -> None:
+    outcome = attack.play(seed=SEED, is_soak=False, folder=tmp_path)
+    assert outcome.tries >= attack.tries
+    assert outcome.failures == []
+
+
+@pytest.mark.process
+@pytest.mark.soak
+@pytest.mark.parametrize("attack", ATTACKS.values(), ids=list(ATTACKS))
+def test_many_tries_of_it_do_not_either(attack: Attack, tmp_path: Path) -> None:
+    outcome = attack.play(seed=SEED, is_soak=True, folder=tmp_path)
+    assert outcome.tries >= attack.soak_tries
+    assert outcome.failures == []
