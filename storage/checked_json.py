@@ -57,13 +57,7 @@ def read_checked(path: Path) -> Checked:
         FileNotFoundError: there is none.
         DamagedFileError: its hash is of another text, or it is no file, or cannot be read.
     """
-    try:
-        text = _bytes(path)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise DamagedFileError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    return checked(text, where=str(path))
+    return checked(bytes_of(path), where=str(path))
 
 
 def checked(text: bytes, *, where: str) -> Checked:
@@ -82,6 +76,23 @@ def checked(text: bytes, *, where: str) -> Checked:
     if not text.strip():
         raise DamagedFileError("it is empty", where=where, expected="a JSON object")
     return Checked(without_check(text), is_proven=found is True)
+
+
+def bytes_of(path: Path) -> bytes:
+    """What is in a file of ours, whatever it is.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DamagedFileError: it is no file, or cannot be read.
+    """
+    try:
+        return _bytes(path)
+    except FileNotFoundError:
+        raise
+    except DamagedFileError:
+        raise
+    except OSError as error:
+        raise DamagedFileError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
 
 def _bytes(path: Path) -> bytes:

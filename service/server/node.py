@@ -22,7 +22,8 @@ from service.server.live_estimates import LiveEstimates
 from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
 from service.sessions.pipeline import Columns
-from service.sessions.tares import RecordedTare, TareHistory
+from service.sessions.tare_file import RecordedTare
+from service.sessions.tares import TareHistory
 from storage.clock.log import ClockOffset
 from storage.durable import make_folder, storage_errors, write_whole
 from storage.intervals import NO_END, NODE_RESTARTED, Intervals, with_open_ends
@@ -303,9 +304,7 @@ class ServerNode:
             self.storage_problem = str(error)
 
     def _estimates(self) -> tuple[LiveEstimates, TareKeeper]:
-        in_force = self.tares.in_force(self.info)
-        tare = in_force.tare if in_force is not None else None
-        live = LiveEstimates(self.info, self.hello.calibration, tare)
+        live = LiveEstimates(self.info, self.hello.calibration, self.tares.to_use(self.info))
         automatic = self.hello.scene.get("auto_tare", True) is not False
         return live, TareKeeper(self.info, live, self.tares, automatic=automatic)
 
