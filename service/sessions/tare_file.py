@@ -18,8 +18,8 @@ from typing import Any
 from devices.errors import DamagedFileError
 from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare
-from storage.checked_json import bytes_of, checked, write_checked
-from storage.durable import ASIDE
+from storage.checked_json import checked, write_checked
+from storage.durable import ASIDE, read_whole
 
 REASONS = {
     "lead": "unloaded lead of the emulation",
@@ -86,7 +86,7 @@ def chips_of(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
 def read_tares(path: Path) -> TaresFound:
     """Whatever can be proven in a file, and a `LostTares` wherever something else was."""
     try:
-        text = bytes_of(path)
+        text = read_whole(path)
     except FileNotFoundError:
         return _missing(path)
     except DamagedFileError as error:
