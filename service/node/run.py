@@ -94,6 +94,8 @@ class RunningNode:
             emulated=options.rig.emulated,
             report=report,
         )
+        for problem in journal.problems:
+            report(problem)
         self._health = Health()
         self._present: NodeStream | None = None
         self._messages: asyncio.Queue[Message] = asyncio.Queue()
@@ -202,7 +204,11 @@ class RunningNode:
         return Status(
             missed_slots=self._present_stream().missed_slots,
             backlog_frames=backlog_frames,
-            troubles=(*self._health.troubles, *self._journal.troubles),
+            troubles=(
+                *self._health.troubles,
+                *self._journal.troubles,
+                *self._journal.problems,
+            ),
             counts={serial: dict(counts) for serial, counts in self._health.counts.items()},
         )
 

@@ -32,8 +32,11 @@ class Trash:
         found, unreadable = self.folder.load_all()
         for session_id, error in unreadable.items():
             log.warning("session %s in the trash is left out: %s", session_id, error)
-        self.has_unreadable = bool(unreadable)
-        """Is there one that cannot be read?"""
+        self.problems = [
+            f"session {session_id} in the trash is left out: {error}"
+            for session_id, error in unreadable.items()
+        ]
+        """Those that cannot be read, and why, in words."""
         self._sessions = {session.id: session for session in found}
 
     def __contains__(self, session_id: str) -> bool:
@@ -114,7 +117,10 @@ class SessionBook:
         found, unreadable = folder.load_all()
         for session_id, error in unreadable.items():
             log.warning("session %s is left out: %s", session_id, error)
-        self.has_unreadable = bool(unreadable) or trash.has_unreadable
+        said = [f"session {name} is left out: {error}" for name, error in unreadable.items()]
+        self.problems = said + trash.problems
+        """Sessions that cannot be read, and why, in words."""
+        self.has_unreadable = bool(self.problems)
         """Is a session unreadable? Then it is not known which frames it needs."""
         self._sessions = {session.id: session for session in found}
 

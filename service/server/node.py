@@ -13,6 +13,7 @@ from pathlib import Path
 
 from devices.errors import (
     FileFormatError,
+    FootTileError,
     StateError,
     StorageError,
 )
@@ -24,8 +25,9 @@ from service.server.tare_keeper import TareKeeper
 from service.sessions.pipeline import Columns
 from service.sessions.tare_file import RecordedTare
 from service.sessions.tares import TareHistory
+from storage.checked_json import write_checked
 from storage.clock.log import ClockOffset
-from storage.durable import make_folder, storage_errors, write_whole
+from storage.durable import make_folder, storage_errors
 from storage.intervals import NO_END, NODE_RESTARTED, Intervals, with_open_ends
 from storage.journal.journal import RING_NS, Journal
 from storage.wire import decode
@@ -34,6 +36,7 @@ log = logging.getLogger("foottile.nodes")
 
 _RATE_OVER_NS = 1_000_000_000
 BOOT_ID = re.compile(r"[0-9a-f]{32}")
+HELLO_FILE = "hello.json"
 
 Estimated = tuple[FrameBatch, Columns]
 
@@ -71,15 +74,26 @@ class ServerNode:
         self._folder = folder
         self._journals_folder = journals
         self._pace: deque[tuple[int, int]] = deque()
+        self._found: list[str] = []
         for path in sorted(journals.glob("*")):
             if BOOT_ID.fullmatch(path.name):
                 try:
-                    self.streams[path.name] = ServerStream.open(path)
-                except FileFormatError as error:
-                    log.warning("a journal is left out: %s", error)
+                    self.streams[path.name] = stream = ServerStream.open(path)
+                    self._found += stream.problems
+                except FootTileError as error:
+                    self._found.append(f"a journal is left out: {error}")
+        if self.tares.problem is not None:
+            self._found.append(self.tares.problem)
+        for text in self._found:
+            log.warning("node %s: %s", self.name, text)
         self.present = self._stream_of(self.info)
         """The stream that it takes now."""
         self.live, self.tare_keeper = self._estimates()
+
+    @property
+    def problems(self) -> list[str]:
+        """What was found damaged of what is kept of it, and what became of it, in words."""
+        return [f"node {self.name}: {text}" for text in self._found]
 
     @property
     def info(self) -> ArrayInfo:
@@ -287,7 +301,7 @@ class ServerNode:
         """
         with storage_errors(self._folder):
             make_folder(self._folder)
-        write_whole(self._folder / "hello.json", self.hello.model_dump_json().encode())
+        write_checked(self._folder / HELLO_FILE, self.hello.model_dump_json().encode())
 
     def _stream_of(self, info: ArrayInfo) -> ServerStream:
         if info.boot_id not in self.streams:

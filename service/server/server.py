@@ -10,7 +10,7 @@ import uuid
 from contextlib import ExitStack
 from pathlib import Path
 
-from devices.errors import FootTileError, StorageError
+from devices.errors import DamagedFileError, FootTileError, StorageError
 from service.link import Close, Wanted
 from service.server.book import SessionBook, Trash, destroy
 from service.server.live import Hub
@@ -24,6 +24,8 @@ from service.server_clock import utc_ns
 from storage.durable import (
     locked,
     make_folder,
+    put_aside,
+    read_whole,
     remove_stale_temporaries,
     storage_errors,
     write_whole,
@@ -98,7 +100,7 @@ class Server:
         try:
             remove_stale_temporaries(data)
             self.check_storage()
-            self.id = _id_of(data)
+            self.id, self._problems = _id_of(data)
             """Name of this data folder: a node keeps what this server needs apart from others."""
             self.hub = Hub()
             self.nodes = ServerNodes(data)
@@ -155,6 +157,11 @@ class Server:
         """
         # As much as some seconds of frames: on a full disk an empty file can still be written.
         write_whole(self.data / ".writable", bytes(_PROBE_BYTES))
+
+    @property
+    def problems(self) -> list[str]:
+        """What was found damaged in the data folder, and what became of it, in words."""
+        return self._problems + self.nodes.problems + self.sessions.problems
 
     async def empty_trash(self) -> tuple[int, int]:
         """Delete what is in the trash for good; return the number of sessions and of bytes.
@@ -245,11 +252,20 @@ class Server:
             )
 
 
-def _id_of(data: Path) -> str:
-    path = data / "server_id"
-    with storage_errors(path):
-        kept = path.read_text("utf-8", "replace").strip() if path.exists() else ""
-    if not _SERVER_ID.fullmatch(kept):
+def _id_of(data: Path) -> tuple[str, list[str]]:
+    """The folder's name, a new one if there is none, and what was found damaged."""
+    path, problems = data / "server_id", []
+    try:
+        kept = read_whole(path).decode("utf-8", "replace").strip()
+        if not _SERVER_ID.fullmatch(kept):
+            raise DamagedFileError("it is no name of a data folder", where=str(path))  # noqa: TRY301
+    except FileNotFoundError:
+        kept = ""
+    except DamagedFileError as error:
+        kept = ""
+        problems.append(f"{put_aside(path, error)}, and nodes get to know this server anew")
+        log.warning("%s", problems[-1])
+    if not kept:
         kept = uuid.uuid4().hex
         write_whole(path, kept.encode() + b"\n")
-    return kept
+    return kept, problems

@@ -10,7 +10,7 @@ from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
-from devices.errors import FileFormatError, StorageError
+from devices.errors import StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from service.link import ClockRow, EarlierStream, Hello, PairsByReason
 from service.sessions.ends import SessionStream, around_in
@@ -52,6 +52,8 @@ class ServerStream:
         """Frames appended to the journal since the last sync."""
         self.owed = Intervals()
         """Frames to be acknowledged once the journal is synced."""
+        self.problems: list[str] = []
+        """What was found damaged when it was opened, and what became of it, in words."""
         self._first_seq: int | None = None
         self._forgotten = Intervals()
         self._guessed = False
@@ -71,11 +73,11 @@ class ServerStream:
         journal = Journal.open(folder)
         stream = cls(folder, journal.info)
         stream.journal = journal
-        with suppress(FileFormatError):  # the node says it again
-            notes = StreamNotes.load(folder)
-            if notes is not None:
-                stream.notes = stream._notes_on_disk = notes
-                stream.missed_slots = notes.missed_slots
+        stream.problems = list(journal.problems)
+        notes = StreamNotes.load_whole(folder, stream.problems)  # without, the node says it again
+        if notes is not None:
+            stream.notes = stream._notes_on_disk = notes
+            stream.missed_slots = notes.missed_slots
         with suppress(StorageError):
             stream.clock_rows.extend(stream.all_clock_rows())
         newest = journal.held.last

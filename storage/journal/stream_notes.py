@@ -9,7 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
-from storage.durable import write_whole
+from storage.checked_json import read_checked, write_checked
+from storage.durable import put_aside
 from storage.intervals import AsPairs
 
 NOTES_FILE = "stream.json"
@@ -62,7 +63,7 @@ class StreamNotes(BaseModel):
         Raises:
             StorageError: the disk is full or not writable.
         """
-        write_whole(folder / NOTES_FILE, self.model_dump_json(indent=1).encode())
+        write_checked(folder / NOTES_FILE, self.model_dump_json(indent=1).encode())
 
     @classmethod
     def load(cls, folder: Path) -> StreamNotes | None:
@@ -73,8 +74,25 @@ class StreamNotes(BaseModel):
         """
         path = folder / NOTES_FILE
         try:
-            return cls.model_validate_json(path.read_bytes())
+            return cls.model_validate_json(read_checked(path).text)
         except FileNotFoundError:
             return None
-        except (OSError, ValidationError) as error:
-            raise FileFormatError(f"not a stream's notes: {error}", where=str(path)) from error
+        except ValidationError as error:
+            # A field that is not known here is not dropped in silence: it may bound what is lost.
+            newer = [e["loc"][0] for e in error.errors() if e["type"] == "extra_forbidden"]
+            what = f"of another version, with {newer[0]!r}" if newer else f"not a stream's: {error}"
+            raise FileFormatError(f"notes that are {what}", where=str(path)) from error
+
+    @classmethod
+    def load_whole(cls, folder: Path, problems: list[str]) -> StreamNotes | None:
+        """The same, and what cannot be read is set aside.
+
+        Args:
+            folder: the stream's own.
+            problems: told what was found damaged and what became of it.
+        """
+        try:
+            return cls.load(folder)
+        except FileFormatError as error:
+            problems.append(put_aside(folder / NOTES_FILE, error))
+            return None

@@ -83,6 +83,7 @@ def _hello(server: Server, node: str | None) -> dict[str, object]:
         "protocol": PROTOCOL,
         "software": SOFTWARE,
         "t_ns": utc_ns(),
+        "problems": server.problems,
         "nodes": [
             NodeView.of(known, recorder).model_dump(mode="json")
             for known in server.nodes
