@@ -13,7 +13,7 @@ import httpx
 
 from devices.errors import LinkError, StateError, UsageError
 from storage.durable import storage_errors, sync_folder, write_whole
-from storage.sessions.content_hash import sha256_of
+from storage.file_hash import hashes_of, sha256_of
 from storage.sessions.folder import FRAMES_NAME
 
 API = "/api/v1"
@@ -149,6 +149,13 @@ class Client:
             raise self._refused(answer)
         if not answer.content.startswith(_PARQUET):
             return  # an older server, which knows no format but JSON here
+        hashes = hashes_of(answer.content)
+        if hashes is not None and hashes[0] != hashes[1]:
+            raise LinkError(
+                f"{path.name} has not the hash that it states",
+                where=self.server,
+                remedy="Run the same command again; if it stays so, the server's file is damaged",
+            )
         write_whole(path, answer.content)
 
     def _get(self, path: str, query: dict[str, str] | None = None) -> dict[str, Any]:

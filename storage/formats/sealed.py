@@ -4,26 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from devices.errors import FileFormatError, UsageError
 from devices.frames import FRAME_COLUMNS
-from storage.clock.table import CLOCK_NAME, ClockTable
 from storage.formats.export import ClockName, Format, export
-from storage.formats.marks import TIMES, Marks, place
+from storage.formats.marks import TIMES, Mark, Marks, place
 from storage.formats.slice import Slice
 from storage.schema import KNOWN
+from storage.sessions.beside import clock_beside
 from storage.sessions.file import SessionReader
-from storage.sessions.folder import Event, clock_beside
+from storage.sessions.folder import Event
 
 
 def marks_of(reader: SessionReader, events: Sequence[Event], part: Slice) -> Marks:
-    """Where events stand in a sealed file; at no frame if no clock table lies beside it.
+    """Where events stand in a sealed file; at no frame if no sound clock table lies beside it.
 
     Raises:
-        FileFormatError: the file or its clock table is damaged.
+        FileFormatError: the file is damaged.
     """
     if not events:
         return Marks(())
-    has_clock = reader.path.with_name(CLOCK_NAME).is_file()
-    clock = clock_beside(reader) if has_clock else ClockTable({}, (), ())
+    try:
+        clock = clock_beside(reader)
+    except (UsageError, FileFormatError) as error:  # the frames are worth more than the marks
+        return Marks([Mark(event, left_out=error.what) for event in events])
     names = (*TIMES, "part") if reader.has("part") else TIMES
     return place(events, reader.columns(*names), clock, part)
 

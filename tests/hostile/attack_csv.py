@@ -139,4 +139,4 @@ def _wrong_number(cell: str, number: float | None) -> bool:
         return cell != ""
     if isinstance(number, int):
         return int(cell) != number
-    return np.float32(cell) != np.float32(number)
+    return bool(np.float32(cell) != np.float32(number))

@@ -22,12 +22,12 @@ from service.api.routes.access import ServerState, present, problems
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from service.version import SOFTWARE
-from storage.clock.table import CLOCK_NAME
+from storage.clock.file import CLOCK_NAME
+from storage.file_hash import sha256_of
 from storage.formats.export import MEDIA_TYPES, ClockName, Format, export
 from storage.formats.marks import TIMES, Marks, place
 from storage.formats.sealed import export_file, marks_of
 from storage.formats.slice import SECONDS_MAX, Slice
-from storage.sessions.content_hash import sha256_of
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import FRAMES_NAME, Session
 

@@ -12,7 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from service.api.routes.access import ServerState, problems, stored_table
 from service.server.views import EventView, Page, SessionView
 from storage.formats.export import MEDIA_TYPES
-from storage.sessions.folder import EVENTS_NAME, Ledger
+from storage.sessions.beside import EVENTS_NAME
+from storage.sessions.folder import Ledger
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 

@@ -137,9 +137,8 @@ def export_command(
     from storage.formats.export import CLOCKS, FORMATS
     from storage.formats.sealed import export_file, marks_of
     from storage.formats.slice import Slice
-    from storage.sessions.events import events_beside
+    from storage.sessions.beside import EVENTS_NAME, read_events
     from storage.sessions.file import SessionReader
-    from storage.sessions.folder import EVENTS_NAME
 
     if to not in FORMATS:
         raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))
@@ -151,21 +150,22 @@ def export_command(
     names = tuple(name.strip() for name in (columns or "").split(",") if name.strip())
     part = Slice(start_s, end_s, names)
     with SessionReader(source) as reader, progress(f"writing {path.name}"):
-        events = events_beside(source) if marks is not False else None
-        if marks and events is None:
+        beside = source.with_name(EVENTS_NAME)
+        stored = read_events(beside) if marks is not False and beside.is_file() else None
+        if marks and stored is None:
             raise UsageError(
                 f"there is no {EVENTS_NAME} beside {source.name}, so nothing is known of marks",
                 where=str(source.parent),
                 expected="a session's folder as a server sealed it or `foottile pull` fetched it",
             )
-        placed = None if events is None else marks_of(reader, events, part)
+        placed = None if stored is None else marks_of(reader, stored.events, part)
         with whole_file(path) as file:
             for chunk in export_file(reader, chosen, part, clock=clock, marks=placed):
                 file.write(chunk)
     say(f"{path}: {path.stat().st_size} bytes")
     for mark in placed.left_out if placed is not None else ():
         remark(f"mark {mark.event.label!r} is not in it: {mark.left_out}")
-    if marks is None and events is None and "session" in reader.notes:
+    if marks is None and stored is None and "session" in reader.notes:
         remark(f"without marks: there is no {EVENTS_NAME} beside {source.name}")
 
 

@@ -13,8 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from devices.errors import StorageError
 from service.client import Client
-from storage.sessions.events import read_events
+from storage.sessions.beside import read_events, write_events
 from storage.sessions.folder import Session
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
@@ -180,23 +181,20 @@ def test_a_label_that_is_no_text_is_refused(session: Recording, label: str) -> N
 def test_a_mark_that_is_sent_again_after_a_full_disk_is_in_the_table_too(
     session: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import service.server.book as book
-    from devices.errors import StorageError
-
-    real, full = book.write_events, [True]
+    full = [True]
 
     def write(changed: Session, folder: Path) -> None:
         if full[0]:
             raise StorageError("cannot be written: no space", where=str(folder))
-        real(changed, folder)
+        write_events(changed, folder)
 
-    monkeypatch.setattr(book, "write_events", write)
+    monkeypatch.setattr("service.server.book.write_events", write)
     body = {"label": "a stone", "id": "0123456789ab"}
     assert session.running.http.post(f"{session.url}/events", json=body).status_code == 507
     full[0] = False
     assert session.running.http.post(f"{session.url}/events", json=body).status_code == 201
-    table = read_events(session.folder / "events.parquet")
-    assert [event.label for event in table] == ["a stone"]
+    stored = read_events(session.folder / "events.parquet")
+    assert [event.label for event in stored.events] == ["a stone"]
 
 
 def test_the_table_of_events_is_given_as_it_is_stored(session: Recording, node: FakeNode) -> None:
@@ -275,7 +273,7 @@ def test_marks_without_a_clock_table_are_at_no_frame_and_that_is_said(
 ) -> None:
     (pulled / "clock.parquet").unlink()
     assert export(monkeypatch, pulled, "--format", "csv", "--out", tmp_path / "out.csv") == 0
-    assert "'a stone' is not in it: no frame's time is known" in capsys.readouterr().err
+    assert "'a stone' is not in it: there is no clock.parquet" in capsys.readouterr().err
 
 
 def test_a_damaged_table_of_events_is_an_error_and_marks_can_be_left_out(
