@@ -12,9 +12,9 @@ from typing import Any, Self
 import httpx
 
 from devices.errors import LinkError, StateError, UsageError
-from storage.clock.table import CLOCK_NAME
+from storage.clock.file import CLOCK_NAME
 from storage.durable import storage_errors, sync_folder, write_whole
-from storage.sessions.content_hash import sha256_of
+from storage.file_hash import sha256_of
 from storage.sessions.folder import FRAMES_NAME
 
 API = "/api/v1"

@@ -14,7 +14,8 @@ from pathlib import Path
 from devices.errors import UnknownError
 from service.server_clock import utc_ns
 from storage.durable import storage_errors
-from storage.sessions.folder import DOOMED_PREFIX, Event, Session, SessionFolder, write_events
+from storage.sessions.beside import write_events
+from storage.sessions.folder import DOOMED_PREFIX, Event, Session, SessionFolder
 
 
 class Trash:

@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import storage_errors, sync_folder, temporary_of
+from storage.file_hash import write_file_hash
 from storage.schema import (
     ARRAY_INFO_KEY,
     FRAMES,
@@ -31,13 +32,7 @@ from storage.schema import (
     flat_columns,
     from_flat,
 )
-from storage.sessions.content_hash import (
-    CONTENT_HASH_KEY,
-    CONTENT_KEY,
-    ContentDigest,
-    content_hash,
-    write_file_hash,
-)
+from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, ContentDigest, content_hash
 
 FORMAT_KEY = b"foottile.format"
 FORMAT = b"2"

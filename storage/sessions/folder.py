@@ -2,8 +2,6 @@
 
 Each has a folder `<sessions>/<id>/` with `session.json`, replaced whole at every change, and, once
 it is sealed, `frames.parquet`, `events.parquet` and `clock.parquet`.
-
-`events.parquet` is what people marked.
 """
 
 from __future__ import annotations
@@ -16,72 +14,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from devices.errors import FileFormatError, FootTileError, UnknownError, UsageError
+from devices.errors import (
+    FileFormatError,
+    FootTileError,
+    UnknownError,
+)
 from storage.checked_json import read_checked, write_checked
 from storage.clock.log import ClockOffset
-from storage.clock.table import CLOCK_NAME, ClockTable, StreamFacts, read_clock
-from storage.durable import make_folder, storage_errors, sync_folder, write_whole
-from storage.sessions.file import SessionReader
-
-EVENTS_NAME = "events.parquet"
-
-
-def write_events(session: Session, folder: Path) -> None:
-    """Write `events.parquet` into the session's folder, in place of the one that is there.
-
-    Raises:
-        StorageError: the disk is full or not writable.
-    """
-    events = session.events
-    columns = {
-        "id": pa.array([event.id for event in events], pa.string()),
-        "label": pa.array([event.label for event in events], pa.string()),
-        "t_ns": pa.array([event.t_ns for event in events], pa.int64()),
-    }
-    sink = pa.BufferOutputStream()
-    pq.write_table(pa.table(columns), sink, compression="zstd")
-    write_whole(folder / EVENTS_NAME, sink.getvalue().to_pybytes())
-
-
-def clock_beside(reader: SessionReader) -> ClockTable:
-    """The clock table that lies beside a sealed session's frames.
-
-    Raises:
-        UsageError: there is none.
-        FileFormatError: it is damaged, or the session's notes are.
-    """
-    path = reader.path.with_name(CLOCK_NAME)
-    if not path.is_file():
-        raise UsageError(
-            f"there is no {CLOCK_NAME} beside {reader.path.name}, so the server's time is unknown",
-            where=str(reader.path.parent),
-            expected="a session's folder as a server sealed it",
-            remedy="Leave the clock at `node`, or fetch the session's folder whole",
-        )
-    rows, facts = read_clock(path)
-    info = reader.info
-    facts.setdefault(info.boot_id, StreamFacts(info.boot_id, info.utc_offset_ns, info.clock_set))
-    parts = _parts(reader)
-    streams = [facts.get(boot_id, StreamFacts(boot_id)) for boot_id in dict.fromkeys(parts)]
-    return ClockTable(rows, streams, parts, where=str(path))
-
-
-def _parts(reader: SessionReader) -> list[str]:
-    """Streams by number of part; a file that was never recorded has one part."""
-    session = reader.notes.get("session")
-    if session is None:
-        return [reader.info.boot_id]
-    try:
-        return [str(part["boot_id"]) for part in session["parts"]]
-    except (TypeError, KeyError) as error:
-        raise FileFormatError(
-            "its notes do not say which streams it is of", where=str(reader.path)
-        ) from error
-
+from storage.durable import make_folder, storage_errors, sync_folder
 
 FRAMES_NAME = "frames.parquet"
 DOOMED_PREFIX = ".deleted-"

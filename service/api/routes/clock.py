@@ -11,10 +11,12 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.errors import StateError
 from service.api.routes.access import ServerState, present, problems
-from storage.clock.table import CLOCK_NAME, ClockSummary
+from storage.clock.file import CLOCK_NAME
+from storage.clock.table import ClockSummary
 from storage.formats.export import MEDIA_TYPES
+from storage.sessions.beside import clock_beside
 from storage.sessions.file import SessionReader
-from storage.sessions.folder import FRAMES_NAME, Session, clock_beside
+from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 

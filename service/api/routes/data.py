@@ -24,12 +24,13 @@ from service.api.routes.access import ServerState, present, problems
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from service.version import SOFTWARE
-from storage.clock.table import CLOCK_NAME
+from storage.clock.file import CLOCK_NAME
+from storage.file_hash import sha256_of
 from storage.formats.export import MEDIA_TYPES, ClockName, Format, Slice, export
 from storage.schema import KNOWN
-from storage.sessions.content_hash import sha256_of
+from storage.sessions.beside import clock_beside
 from storage.sessions.file import SessionReader
-from storage.sessions.folder import FRAMES_NAME, Session, clock_beside
+from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])
 

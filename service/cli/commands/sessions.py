@@ -127,8 +127,8 @@ def export_command(
     from storage.durable import whole_file
     from storage.formats.export import CLOCKS, FORMATS, Slice, export
     from storage.schema import FRAMES, KNOWN
+    from storage.sessions.beside import clock_beside
     from storage.sessions.file import SessionReader
-    from storage.sessions.folder import clock_beside
 
     if to not in FORMATS:
         raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))
