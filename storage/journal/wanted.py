@@ -44,7 +44,7 @@ class ServerWants(BaseModel):
 class _File(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    servers: dict[str, ServerWants] = Field(default_factory=dict)
+    servers: dict[str, ServerWants]
 
 
 class Wanted:

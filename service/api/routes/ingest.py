@@ -87,6 +87,7 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
     try:
         node = server.nodes.greet(hello)
         node.attach(hello, utc_ns())
+        server.recorder.know(node)
         server.settling.follow(node)
     except (LinkError, StorageError) as error:
         code = Close.TRY_LATER if isinstance(error, StorageError) else Close.BAD_HELLO
