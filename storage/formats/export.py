@@ -21,7 +21,7 @@ from devices.errors import UsageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
 from storage.schema import ARRAY_INFO_KEY, FRAMES, KNOWN, SERVER_TIME, Array, flat_columns
-from storage.sessions.file import NOTES_KEY, parquet_options
+from storage.sessions.file import EXPORT_KEY, NOTES_KEY, parquet_options
 
 Format = Literal["parquet", "arrow", "csv"]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -69,6 +69,7 @@ def export(
     to: Format,
     part: Slice,
     clock: ClockTable | None = None,
+    source: Mapping[str, object] | None = None,
 ) -> Iterator[bytes]:
     """A session's frames as bytes of a file.
 
@@ -79,6 +80,7 @@ def export(
         to: format.
         part: rows and columns.
         clock: adds `t_server_ns` and its bound, and how they were found to the notes; None: not.
+        source: which session it is of, and its hashes; for the metadata.
 
     Yields:
         Chunks of the file. There is a header even if no frame is in the slice.
@@ -89,7 +91,9 @@ def export(
     if clock is not None:
         pieces = _with_server_time(pieces, clock)
         notes = {**notes, "clock": clock.summary().model_dump(mode="json")}
-    tables = _tables(pieces, info, notes, part)
+    chosen = {"start_s": part.start_s, "end_s": part.end_s, "columns": list(part.columns)}
+    made_from = {**(source or {}), **chosen, "clock": "node" if clock is None else "server"}
+    tables = _tables(pieces, info, notes, part, made_from)
     first = next(tables, None)
     if first is None:
         raise UsageError("the session has no frames")
@@ -106,11 +110,16 @@ def export(
 
 
 def _tables(
-    pieces: Pieces, info: ArrayInfo, notes: Mapping[str, object], part: Slice
+    pieces: Pieces,
+    info: ArrayInfo,
+    notes: Mapping[str, object],
+    part: Slice,
+    made_from: Mapping[str, object],
 ) -> Iterator[pa.Table]:
     metadata: dict[bytes | str, bytes | str] = {
         ARRAY_INFO_KEY: info.model_dump_json().encode(),
         NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
+        EXPORT_KEY: json.dumps(made_from).encode(),
     }
     begin_t_ns: int | None = None
     for frames, extra in pieces:

@@ -214,7 +214,8 @@ def _chunks(session: Session, query: DataQuery, server: Server) -> Iterator[byte
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
-        return export(SessionFrames(sources), sources.info, {}, query.format, query.slice, clock)
+        pieces, source = SessionFrames(sources), {"session": session.id, "state": session.state}
+        return export(pieces, sources.info, {}, query.format, query.slice, clock, source)
     return _chunks_of_file(server.sessions.folder.path(session.id) / FRAMES_NAME, query)
 
 
@@ -223,7 +224,8 @@ def _chunks_of_file(path: Path, query: DataQuery) -> Iterator[bytes]:
         extra = [name for name in KNOWN if name not in FRAME_COLUMNS and reader.has(name)]
         clock = clock_beside(reader) if query.clock == "server" else None
         pieces = reader.batches(*extra)
-        yield from export(pieces, reader.info, reader.notes, query.format, query.slice, clock)
+        notes, source = reader.notes, reader.identity
+        yield from export(pieces, reader.info, notes, query.format, query.slice, clock, source)
 
 
 def _matches(request: Request, tag: str) -> bool:

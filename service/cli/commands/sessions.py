@@ -148,6 +148,7 @@ def export_command(
             chosen,
             Slice(start_s, end_s, names),
             clock_beside(reader) if clock == "server" else None,
+            reader.identity,
         )
         with whole_file(path) as file, progress(f"writing {path.name}"):
             for chunk in chunks:
