@@ -146,8 +146,12 @@ SERVER_TIME = (
 )
 """What a clock table makes of `t_ns` when a session is read; never in a sealed file."""
 
+MARKS = (Column("event", pa.string(), "1", "what people marked at this frame"),)
+"""Placed when a session is read (`storage.formats.marks`); never in a sealed file."""
+
 KNOWN = {
-    column.name: column for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL, *SERVER_TIME)
+    column.name: column
+    for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL, *SERVER_TIME, *MARKS)
 }
 
 

@@ -288,21 +288,26 @@ class SessionReader:
         Raises:
             FileFormatError: a column is missing, of another type, or damaged.
         """
+        for values in self.columns(*(column.name for column in FRAMES), *extra):
+            yield FrameBatch(**{column.name: values.pop(column.name) for column in FRAMES}), values
+
+    def columns(self, *wanted: str) -> Iterator[dict[str, Array]]:
+        """Some columns only, of `storage.schema.KNOWN`, a row group at a time.
+
+        Raises:
+            FileFormatError: as for `batches`.
+        """
         tiles = len(self.info.tiles)
-        wanted = [*(column.name for column in FRAMES), *extra]
         names = [flat for name in wanted for flat in KNOWN[name].flat_names(tiles)]
         for group in range(self._file.num_row_groups):
             try:
                 table = self._file.read_row_group(group, columns=names)
-                values: dict[str, Any] = {
-                    name: from_flat(KNOWN[name], table, tiles) for name in wanted
-                }
-                frames = FrameBatch(**{column.name: values.pop(column.name) for column in FRAMES})
+                values = {name: from_flat(KNOWN[name], table, tiles) for name in wanted}
             except (KeyError, ValueError, OSError, pa.ArrowException) as error:
                 raise FileFormatError(
                     f"row group {group} cannot be read: {error}", where=str(self.path)
                 ) from error
-            yield frames, values
+            yield values
 
     def frames(self) -> FrameBatch:
         """All frames at once.
