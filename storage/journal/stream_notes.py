@@ -72,11 +72,22 @@ class StreamNotes(BaseModel):
         Raises:
             FileFormatError: it is damaged.
         """
+        notes, _ = cls.load_checked(folder)
+        return notes
+
+    @classmethod
+    def load_checked(cls, folder: Path) -> tuple[StreamNotes | None, bool]:
+        """Read it, and say whether it proves itself; an older version's does not.
+
+        Raises:
+            FileFormatError: it is damaged.
+        """
         path = folder / NOTES_FILE
         try:
-            return cls.model_validate_json(read_checked(path).text)
+            read = read_checked(path)
+            return cls.model_validate_json(read.text), read.is_proven
         except FileNotFoundError:
-            return None
+            return None, True
         except ValidationError as error:
             # A field that is not known here is not dropped in silence: it may bound what is lost.
             newer = [e["loc"][0] for e in error.errors() if e["type"] == "extra_forbidden"]
@@ -85,7 +96,7 @@ class StreamNotes(BaseModel):
 
     @classmethod
     def load_whole(cls, folder: Path, problems: list[str]) -> StreamNotes | None:
-        """The same, and what cannot be read is set aside.
+        """As `load`, and what cannot be read is set aside.
 
         Args:
             folder: the stream's own.
