@@ -7,6 +7,7 @@ import logging
 import re
 import time
 import uuid
+import zlib
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -40,7 +41,7 @@ TICK_S = 0.2
 _SLOW_TICK_S = 1.0
 _PRUNE_EVERY_S = 30.0
 _PROBE_BYTES = 64 << 10
-_SERVER_ID = re.compile(r"[0-9a-f]{32}")
+_SERVER_ID = re.compile(r"([0-9a-f]{32})(?: ([0-9a-f]{8}))?")
 
 
 class Link:
@@ -256,16 +257,21 @@ def _id_of(data: Path) -> tuple[str, list[str]]:
     """The folder's name, a new one if there is none, and what was found damaged."""
     path, problems = data / "server_id", []
     try:
-        kept = read_whole(path).decode("utf-8", "replace").strip()
-        if not _SERVER_ID.fullmatch(kept):
+        found = _SERVER_ID.fullmatch(read_whole(path).decode("utf-8", "replace").strip())
+        kept, check = found.groups() if found is not None else ("", None)
+        if not kept or check not in (None, _check_of(kept)):
             raise DamagedFileError("it is no name of a data folder", where=str(path))  # noqa: TRY301
     except FileNotFoundError:
-        kept = ""
+        kept, check = "", None
     except DamagedFileError as error:
-        kept = ""
+        kept, check = "", None
         problems.append(f"{put_aside(path, error)}, and nodes get to know this server anew")
         log.warning("%s", problems[-1])
-    if not kept:
-        kept = uuid.uuid4().hex
-        write_whole(path, kept.encode() + b"\n")
+    if check is None:  # none there, or an older version's
+        kept = kept or uuid.uuid4().hex
+        write_whole(path, f"{kept} {_check_of(kept)}\n".encode())
     return kept, problems
+
+
+def _check_of(server_id: str) -> str:
+    return f"{zlib.crc32(server_id.encode()):08x}"

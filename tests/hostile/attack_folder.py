@@ -155,7 +155,7 @@ def _may_change(path: Path, whole: Served) -> set[str]:
 _SAID = ("hello.json", "tares.json", "stream.json", "session.json", "server_id")
 
 
-@attack("every file of a server's data folder, damaged in every way", tries=120, soak_tries=5_000)
+@attack("every file of a server's data folder, damaged in every way", tries=80, soak_tries=5_000)
 def folder_of_a_server(play: Play) -> Outcome:
     """One file of a data folder is damaged, then a server is started on it.
 
