@@ -15,6 +15,7 @@ from pathlib import Path
 from platformdirs import user_cache_path
 
 from devices.errors import CalibrationError, needs_extra
+from devices.inputs import read_text
 from devices.scene.file import Scene, build_scene, load_scene
 from service.estimation.calibration import PRESETS, Calibration
 from service.rig.emulated import EmulatedFoot
@@ -69,8 +70,8 @@ def read_calibration(path: Path) -> Calibration:
         CalibrationError: there is none, or it is not one.
     """
     try:
-        text = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_text(path)
+    except (OSError, ValueError) as error:
         raise CalibrationError(
             f"no calibration {str(path)!r}: {error}",
             expected=f"a file, {BENCH!r}, or a preset: {', '.join(PRESETS)}",

@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
+from devices.inputs import check_file
 from storage.durable import storage_errors, sync_folder, temporary_of
 from storage.file_hash import write_file_hash
 from storage.schema import (
@@ -196,6 +197,7 @@ class SessionReader:
         """
         self.path = path
         try:
+            check_file(path)
             self._file = pq.ParquetFile(path, page_checksum_verification=True)
         except (OSError, ValueError, pa.ArrowException) as error:
             raise FileFormatError(
