@@ -48,8 +48,12 @@ BYTES_MAX = 64 << 20
 """No file that is read at once is longer; what is, is not read into memory."""
 
 
-def read_whole(path: Path) -> bytes:
+def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
     """Read a file of ours that is small.
+
+    Args:
+        path: the file itself: links are not followed, and pipes not waited for.
+        bytes_max: a longer one is none of ours.
 
     Raises:
         FileNotFoundError: there is none.
@@ -61,9 +65,9 @@ def read_whole(path: Path) -> bytes:
             raise DamagedFileError("it is not a file", where=str(path))
         with open(path, "rb", opener=_without_following) as file:
             size = os.fstat(file.fileno()).st_size
-            if size > BYTES_MAX:
+            if size > bytes_max:
                 raise DamagedFileError(
-                    f"it has {size} bytes", where=str(path), expected=f"up to {BYTES_MAX}"
+                    f"it has {size} bytes", where=str(path), expected=f"up to {bytes_max}"
                 )
             return file.read()
     except FileNotFoundError:

@@ -29,7 +29,7 @@ from storage.durable import make_folder, storage_errors, sync_folder
 
 FRAMES_NAME = "frames.parquet"
 DOOMED_PREFIX = ".deleted-"
-_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
+SESSION_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
 
 State = Literal["recording", "pending", "sealing", "sealed"]
 
@@ -164,7 +164,7 @@ class SessionFolder:
         Raises:
             UnknownError: the id has not the form of one, so it can not leave the folder either.
         """
-        if not _ID.fullmatch(session_id):
+        if not SESSION_ID.fullmatch(session_id):
             raise UnknownError(f"no session {session_id[:80]!r}")
         return self._folder / session_id
 
@@ -251,5 +251,7 @@ class SessionFolder:
     def ids(self) -> Iterator[str]:
         """Ids of all sessions, newest first."""
         if self._folder.is_dir():
-            names = [path.name for path in self._folder.iterdir() if _ID.fullmatch(path.name)]
+            names = [
+                path.name for path in self._folder.iterdir() if SESSION_ID.fullmatch(path.name)
+            ]
             yield from sorted(names, reverse=True)

@@ -242,7 +242,7 @@ def test_a_pulled_session_is_exported_with_the_servers_time_and_a_lone_file_is_n
     out = tmp_path / "out.parquet"
     options = ("--format", "parquet", "--clock", "server", "--out", out)
     assert export(monkeypatch, folder, *options) == 0
-    served = session.data(clock="server").content
+    served = session.data(clock="server", marks="true").content
     assert pq.read_table(out).equals(pq.read_table(io.BytesIO(served)))
     out.unlink()
     lone = tmp_path / "lone.parquet"
