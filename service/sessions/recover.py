@@ -9,12 +9,13 @@ killed at any time: what was written is whole, and a second run comes to the sam
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from devices.errors import DamagedFileError, DamagedFramesError, FootTileError
+from devices.errors import DamagedFileError, DamagedFramesError, FootTileError, StorageError
 from service.sessions.begin import begun
 from service.sessions.ends import SessionStream, at_stop, broken_off, open_tail
 from service.sessions.recover_streams import OpenedStream, hello_of, open_streams
@@ -137,7 +138,8 @@ def _complete(
     own = {part.boot_id: opened.get((session.node, part.boot_id)) for part in session.parts}
     for stream in own.values():
         if stream is not None:
-            session = session.with_clock(ClockLog(stream.journal.folder).rows())
+            with suppress(StorageError):  # its frames are worth more than its clock
+                session = session.with_clock(ClockLog(stream.journal.folder).rows())
     is_local, give_up = _is_local(data), give_up or session.given_up
     session = _with_ends(session, own, is_local=is_local, give_up=give_up)
     if any(part.seq_last is None for part in session.parts):

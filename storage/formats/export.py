@@ -30,7 +30,7 @@ from storage.schema import (
     Array,
     flat_columns,
 )
-from storage.sessions.file import NOTES_KEY, parquet_options
+from storage.sessions.file import EXPORT_KEY, NOTES_KEY, parquet_options
 
 Format = Literal["parquet", "arrow", "csv"]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -59,6 +59,7 @@ def export(
     part: Slice,
     clock: ClockTable | None = None,
     marks: Marks | None = None,
+    source: Mapping[str, object] | None = None,
 ) -> Iterator[bytes]:
     """A session's frames as bytes of a file.
 
@@ -70,6 +71,7 @@ def export(
         part: rows and columns.
         clock: adds `t_server_ns` and its bound, and how they were found to the notes; None: not.
         marks: adds `event`, and what became of each mark to the notes; None: not.
+        source: which session it is of, and its hashes; for the metadata.
 
     Yields:
         Chunks of the file. There is a header even if no frame is in the slice, as in a gap.
@@ -84,7 +86,14 @@ def export(
     if marks is not None:
         pieces = marks.added(pieces)
         notes = {**notes, "marks": [mark.as_dict() for mark in marks.all]}
-    tables = _tables(pieces, info, notes, part)
+    chosen = {"start_s": part.start_s, "end_s": part.end_s, "columns": list(part.columns)}
+    made_of = {**(source or {}), **chosen, "clock": "node" if clock is None else "server"}
+    metadata: dict[bytes | str, bytes | str] = {
+        ARRAY_INFO_KEY: info.model_dump_json().encode(),
+        NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
+        EXPORT_KEY: json.dumps(made_of).encode(),
+    }
+    tables = _tables(pieces, info, metadata, part)
     first = next(tables, None)
     if first is None:
         raise UsageError("the session has no frames")
@@ -100,12 +109,8 @@ def export(
 
 
 def _tables(
-    pieces: Pieces, info: ArrayInfo, notes: Mapping[str, object], part: Slice
+    pieces: Pieces, info: ArrayInfo, metadata: dict[bytes | str, bytes | str], part: Slice
 ) -> Iterator[pa.Table]:
-    metadata: dict[bytes | str, bytes | str] = {
-        ARRAY_INFO_KEY: info.model_dump_json().encode(),
-        NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
-    }
     begin_t_ns: int | None = None
     end_t_ns = 0
     header: pa.Table | None = None

@@ -42,4 +42,13 @@ def export_file(
     """
     extra = [name for name in KNOWN if name not in FRAME_COLUMNS and reader.has(name)]
     table = clock_beside(reader) if clock == "server" else None
-    yield from export(reader.batches(*extra), reader.info, reader.notes, to, part, table, marks)
+    yield from export(
+        reader.batches(*extra),
+        reader.info,
+        reader.notes,
+        to,
+        part,
+        table,
+        marks,
+        source=reader.identity,
+    )

@@ -23,7 +23,7 @@ from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.inputs import check_file
 from storage.durable import storage_errors, sync_folder, temporary_of
-from storage.file_hash import write_file_hash
+from storage.file_hash import FILE_HASH_KEY, write_file_hash
 from storage.schema import (
     ARRAY_INFO_KEY,
     FRAMES,
@@ -40,6 +40,8 @@ FORMAT = b"2"
 FORMAT_WITHOUT_HASH = b"1"
 """Files of older versions: the same, without any hash of their own. They are read, not written."""
 NOTES_KEY = b"foottile.notes"
+EXPORT_KEY = b"foottile.export"
+"""Only in what was made from a session: of which one, and what of it."""
 
 ROW_GROUP_NS = 60_000_000_000
 
@@ -199,11 +201,11 @@ class SessionReader:
         try:
             check_file(path)
             self._file = pq.ParquetFile(path, page_checksum_verification=True)
-        except (OSError, ValueError, pa.ArrowException) as error:
+            schema = self._file.schema_arrow
+        except Exception as error:  # damaged bytes may cause any error
             raise FileFormatError(
                 f"cannot be read as Parquet: {error}", where=str(path), expected="a sealed session"
             ) from error
-        schema = self._file.schema_arrow
         metadata = schema.metadata or {}
         version = metadata.get(FORMAT_KEY)
         if version not in (FORMAT, FORMAT_WITHOUT_HASH):
@@ -255,6 +257,17 @@ class SessionReader:
                 raise FileFormatError(
                     f"row group {group} cannot be read: {error}", where=str(self.path)
                 ) from error
+
+    @property
+    def identity(self) -> dict[str, object]:
+        """Which session it is, for what is made from it: id, content hash, stated file hash."""
+        said = self._file.metadata.metadata or {}
+        session = self.notes.get("session")
+        return {
+            "session": session.get("id") if isinstance(session, dict) else None,
+            "content_sha256": self.content_sha256,
+            "file_sha256": said.get(FILE_HASH_KEY, b"").decode("ascii", "replace") or None,
+        }
 
     def close(self) -> None:
         """Close the file."""

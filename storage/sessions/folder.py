@@ -10,6 +10,7 @@ import re
 import secrets
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from devices.errors import (
     FileFormatError,
     FootTileError,
+    StorageError,
     UnknownError,
 )
 from storage.checked_json import read_checked, write_checked
@@ -27,7 +29,7 @@ from storage.durable import make_folder, storage_errors, sync_folder
 
 FRAMES_NAME = "frames.parquet"
 DOOMED_PREFIX = ".deleted-"
-_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
+SESSION_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
 
 State = Literal["recording", "pending", "sealing", "sealed"]
 
@@ -162,7 +164,7 @@ class SessionFolder:
         Raises:
             UnknownError: the id has not the form of one, so it can not leave the folder either.
         """
-        if not _ID.fullmatch(session_id):
+        if not SESSION_ID.fullmatch(session_id):
             raise UnknownError(f"no session {session_id[:80]!r}")
         return self._folder / session_id
 
@@ -173,10 +175,17 @@ class SessionFolder:
             StorageError: the disk is full or not writable; the old one is still there then.
         """
         folder = self.path(session.id)
+        is_new = not folder.exists()
         with storage_errors(folder):
             make_folder(folder)
         text = session.model_dump_json(indent=1).encode()
-        write_checked(folder / "session.json", text)
+        try:
+            write_checked(folder / "session.json", text)
+        except StorageError:
+            if is_new:  # a full disk still takes an empty folder, which is no session
+                with suppress(OSError):
+                    folder.rmdir()
+            raise
 
     def load(self, session_id: str) -> Session:
         """Read `session.json`.
@@ -242,5 +251,7 @@ class SessionFolder:
     def ids(self) -> Iterator[str]:
         """Ids of all sessions, newest first."""
         if self._folder.is_dir():
-            names = [path.name for path in self._folder.iterdir() if _ID.fullmatch(path.name)]
+            names = [
+                path.name for path in self._folder.iterdir() if SESSION_ID.fullmatch(path.name)
+            ]
             yield from sorted(names, reverse=True)

@@ -79,8 +79,6 @@ def verify_file(path: Path) -> FileReport:
             raise
         report.problems.append(error.what)
     except Exception as error:  # damaged bytes may cause any error
-        if not report.problems:
-            raise
         report.problems.append(f"it cannot be read: {error}")
     else:
         _check_ledger(report)

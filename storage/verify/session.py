@@ -69,7 +69,13 @@ class SessionReport:
         if self.problems:
             ledger = ledger.model_copy(update={"complete": False})
         content = ledger.model_dump(mode="json")
-        return {**content, "id": self.id, "problems": self.problems, "sha256": self.sha256}
+        return {
+            **content,
+            "id": self.id,
+            "problems": self.problems,
+            "sha256": self.sha256,
+            "unproven": self.unproven,
+        }
 
 
 def verify_lone_file(path: Path) -> SessionReport:

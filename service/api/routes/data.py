@@ -251,7 +251,8 @@ def _chunks(
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
-        yield from export(SessionFrames(sources), sources.info, {}, to, part, clock, marks)
+        pieces, source = SessionFrames(sources), {"session": session.id, "state": session.state}
+        yield from export(pieces, sources.info, {}, to, part, clock, marks, source)
         return
     with SessionReader(server.sessions.folder.path(session.id) / FRAMES_NAME) as reader:
         yield from export_file(reader, to, part, clock=query.clock, marks=marks)
