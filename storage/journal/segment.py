@@ -7,6 +7,7 @@ the index was never promised to a server or a session. An index that is missing 
 
 from __future__ import annotations
 
+import errno
 import os
 import zlib
 from contextlib import suppress
@@ -93,12 +94,13 @@ class Segment:
         return found[np.argsort(found["seq_first"], kind="stable")]
 
     def disown(self, doubtful: Intervals) -> None:
-        """Stop holding batches within these numbers.
-
-        Raises:
-            OSError: the index cannot be read.
-        """
-        for record in self.records():
+        """Stop holding batches within these numbers."""
+        try:
+            records = self.records()
+        except OSError:  # gone, or no descriptor is left: what is doubtful is whole batches anyway
+            self.held = self.held - doubtful
+            return
+        for record in records:
             batch = Intervals([numbers(record)])
             if not (batch - doubtful):
                 self.held = self.held - batch
@@ -180,6 +182,10 @@ class SegmentWriter:
         try:
             os.fsync(self._data.fileno())
             os.fsync(self._index.fileno())
+            # A file that was moved or deleted takes what is written, too, and keeps it for nobody.
+            there, ours = os.stat(self.segment.path), os.fstat(self._data.fileno())
+            if (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino):
+                raise FileNotFoundError(errno.ENOENT, "another file is in its place")
         except OSError:
             self.has_news = True
             raise
@@ -221,7 +227,7 @@ class SegmentWriter:
 def unread_of(path: Path) -> Path:
     """A free name beside a segment for what of it could not be read."""
     taken = {each.name for each in path.parent.iterdir()}
-    names = (f"{path.stem}{f'.{n}' if n else ''}{UNREAD_SUFFIX}" for n in count())
+    names = (f"{path.stem}{f'.{n}' if n > 1 else ''}{UNREAD_SUFFIX}" for n in count(1))
     return path.with_name(next(name for name in names if name not in taken))
 
 

@@ -91,8 +91,8 @@ class StreamNotes(BaseModel):
         except ValidationError as error:
             # A field that is not known here is not dropped in silence: it may bound what is lost.
             newer = [e["loc"][0] for e in error.errors() if e["type"] == "extra_forbidden"]
-            what = f"of another version, with {newer[0]!r}" if newer else f"not a stream's: {error}"
-            raise FileFormatError(f"notes that are {what}", where=str(path)) from error
+            other = f" of another version, with {newer[0]!r}" if newer else f": {error}"
+            raise FileFormatError(f"not a stream's notes{other}", where=str(path)) from error
 
     @classmethod
     def load_whole(cls, folder: Path, problems: list[str]) -> StreamNotes | None:

@@ -1,0 +1,157 @@
+"""The server's data folder: its lock, its id, and whether it is still the one under its name."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import re
+import threading
+import uuid
+import zlib
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+from devices.errors import DamagedFileError, FolderGoneError
+from storage.durable import (
+    is_held,
+    locked,
+    make_folder,
+    put_aside,
+    read_whole,
+    set_aside,
+    storage_errors,
+    write_whole,
+)
+
+log = logging.getLogger("foottile.server")
+
+_ID_NAME = "server_id"
+_PROBE_NAME = ".writable"
+_ID = re.compile(r"([0-9a-f]{32})(?: ([0-9a-f]{8}))?")
+"""The id and its CRC-32, which older versions did not write."""
+_PROBE_BYTES = 64 << 10
+
+
+class DataFolder:
+    """Held by one server until it is closed.
+
+    A folder that was moved or unmounted is waited for: when it is back, which its id proves, it is
+    used again. Meanwhile nothing is written under its name.
+
+    Args:
+        path: made if absent.
+
+    Raises:
+        StorageError: it cannot be written, or another server has it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._checking = threading.Lock()
+        with storage_errors(path, "Choose another folder with --data"):
+            make_folder(path)
+        self._lock = self._locked()
+        self.problems: list[str] = []
+        """What was found damaged of what is kept here, and what became of it, in words."""
+        try:
+            if (path / _PROBE_NAME).is_dir():
+                set_aside(path / _PROBE_NAME)
+            self.id = self._known_id() or self._new_id(uuid.uuid4().hex)
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def check(self) -> None:
+        """Whether it is there; from any thread.
+
+        Raises:
+            FolderGoneError: it is not, and what is in its place.
+            StorageError: it is back, but another server has it.
+        """
+        with self._checking:
+            if is_held(self.path):
+                return
+            found: str | None = None
+            with suppress(DamagedFileError):
+                found, _ = self._kept_id()
+            if found == self.id:  # mounted anew, or a copy in its place
+                lock = self._locked()
+                self._lock.close()
+                self._lock = lock
+                return
+            place = (
+                "there is nothing" if not self.path.is_dir() else "there is an empty mount point"
+            )
+            if found is not None:
+                place = "there is the data folder of another server"
+            elif self.path.is_dir() and any(self.path.iterdir()):
+                place = "there is another folder"
+            raise FolderGoneError(
+                "the data folder was moved, deleted or unmounted, and nothing is kept: "
+                f"{place} in its place",
+                where=str(self.path),
+                remedy="Move it back or mount it: the server then goes on by itself, and nodes "
+                "send again what is missing",
+                errno=errno.ENOENT,
+            )
+
+    def check_writable(self) -> None:
+        """Whether it is there, and something can be written.
+
+        Raises:
+            FolderGoneError: it is not there.
+            StorageError: it cannot be written.
+        """
+        self.check()
+        # As much as some seconds of frames: on a full disk an empty file can still be written.
+        write_whole(self.path / _PROBE_NAME, bytes(_PROBE_BYTES))
+
+    def close(self) -> None:
+        """Let another server have it."""
+        self._lock.close()
+
+    def _locked(self) -> ExitStack:
+        stack = ExitStack()
+        stack.enter_context(
+            locked(
+                self.path,
+                refusal="another foottile server uses this data folder",
+                remedy="Stop it, or choose another folder with --data",
+            )
+        )
+        return stack
+
+    def _known_id(self) -> str | None:
+        """The id, written anew if it states no checksum; None if there is none, or not any more."""
+        try:
+            kept, is_proven = self._kept_id()
+        except DamagedFileError as error:
+            problem = put_aside(self.path / _ID_NAME, error)
+            self.problems.append(f"{problem}; nodes get to know this server anew")
+            log.warning("%s", self.problems[-1])
+            return None
+        return kept if kept is None or is_proven else self._new_id(kept)
+
+    def _kept_id(self) -> tuple[str | None, bool]:
+        """The id, and whether it proves itself.
+
+        Raises:
+            DamagedFileError: it is not what was written.
+        """
+        path = self.path / _ID_NAME
+        try:
+            text = read_whole(path).decode("ascii", "replace").strip()
+        except FileNotFoundError:
+            return None, False
+        found = _ID.fullmatch(text)
+        if found is None or found[2] not in (None, _check_of(found[1])):
+            raise DamagedFileError("it is not the id that was written", where=str(path))
+        return found[1], found[2] is not None
+
+    def _new_id(self, made: str) -> str:
+        write_whole(self.path / _ID_NAME, f"{made} {_check_of(made)}\n".encode())
+        return made
+
+
+def _check_of(made: str) -> str:
+    return f"{zlib.crc32(made.encode()):08x}"
