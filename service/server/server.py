@@ -7,8 +7,10 @@ import logging
 import re
 import time
 import uuid
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
@@ -111,6 +113,8 @@ class Server:
             self._lock.close()
             raise
         self.links: dict[str, Link] = {}
+        self._failing: dict[str, str] = {}
+        """What has failed in the last tick, and how."""
 
     async def run(self) -> None:
         """Sync, acknowledge, settle, prune and tell, until cancelled."""
@@ -118,21 +122,20 @@ class Server:
         while True:
             await asyncio.sleep(TICK_S)
             now_s = time.monotonic()
-            try:
-                await asyncio.gather(*(self._sync(node) for node in self.nodes))
+            await asyncio.gather(*(self._sync(node) for node in list(self.nodes)))
+            with self._alone("sessions"):
                 self.settling.settle()
-                self._tell_wanted()
-                if now_s >= slow_s:
-                    slow_s = now_s + _SLOW_TICK_S
+            for link in list(self.links.values()):
+                self._tell_wanted(link)
+            if now_s >= slow_s:
+                slow_s = now_s + _SLOW_TICK_S
+                with self._alone("heartbeat"):
                     self._heartbeat()
-                if now_s >= prune_s:
-                    prune_s = now_s + _PRUNE_EVERY_S
-                    for node in self.nodes:
+            if now_s >= prune_s:
+                prune_s = now_s + _PRUNE_EVERY_S
+                for node in list(self.nodes):
+                    with self._alone(f"node {node.name}, deleting what nobody needs"):
                         node.prune(self.recorder.needed(node.name))
-            except FootTileError as error:
-                log.warning("%s", error)
-            except Exception:
-                log.exception("this is a bug; the server goes on")
 
     async def close(self) -> None:
         """End the links and wait for what is being sealed."""
@@ -165,16 +168,37 @@ class Server:
         doomed = self.sessions.trash.doom()
         return len(doomed), await asyncio.to_thread(destroy, doomed)
 
+    def node_as_json(self, node: ServerNode) -> dict[str, Any] | None:
+        """How a node is, for screens; None if that cannot be said, which is said in the log."""
+        with self._alone(f"node {node.name}, as screens see it"):
+            return NodeView.of(node, self.recorder).model_dump(mode="json")
+        return None
+
     def tell_node(self, node: ServerNode) -> None:
         """Tell every screen how a node is."""
-        view = NodeView.of(node, self.recorder).model_dump(mode="json")
-        self.hub.notice({"type": "node", "node": view})
+        if (view := self.node_as_json(node)) is not None:
+            self.hub.notice({"type": "node", "node": view})
 
-    def _tell_wanted(self) -> None:
-        """Tell nodes what sessions need, where that has changed."""
-        for link in self.links.values():
+    def _tell_wanted(self, link: Link) -> None:
+        """Tell a node what sessions need, if that has changed."""
+        with self._alone(f"node {link.node.name}, what sessions need of it"):
             if link.wanted is not None and self.recorder.wanted(link.node.name) != link.wanted:
                 link.news.set()
+
+    @contextmanager
+    def _alone(self, what: str) -> Iterator[None]:
+        """Whatever fails here ends nothing else; it is said when it begins, not at every tick."""
+        try:
+            yield
+        except Exception as error:
+            if self._failing.get(what) != str(error):
+                self._failing[what] = str(error)
+                if isinstance(error, FootTileError):
+                    log.warning("%s: %s", what, error)
+                else:
+                    log.exception("%s: this is a bug; the server goes on", what)
+        else:
+            self._failing.pop(what, None)
 
     def _ask_again(self, node: ServerNode) -> None:
         link = self.links.get(node.name)
@@ -211,11 +235,12 @@ class Server:
 
     async def _sync(self, node: ServerNode) -> None:
         """Sync a node's journals to disk, then acknowledge the frames that were in them before."""
-        if node.storage_problem is not None:  # perhaps not even a journal could be begun
-            await self._try_again(node)
-            return
-        streams = [stream for stream in node.streams.values() if stream.has_news]
-        await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
+        with self._alone(f"node {node.name}, bringing its frames to the disk"):
+            if node.storage_problem is not None:  # perhaps not even a journal could be begun
+                await self._try_again(node)
+                return
+            streams = [stream for stream in node.streams.values() if stream.has_news]
+            await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
 
     async def _sync_stream(self, node: ServerNode, stream: ServerStream) -> None:
         unsynced, stream.unsynced = stream.unsynced, Intervals()
