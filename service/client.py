@@ -12,13 +12,13 @@ from typing import Any, Self
 import httpx
 
 from devices.errors import LinkError, StateError, UsageError
-from storage.clock.table import CLOCK_NAME
 from storage.durable import storage_errors, sync_folder, write_whole
-from storage.sessions.content_hash import sha256_of
+from storage.file_hash import hashes_of, sha256_of
 from storage.sessions.folder import FRAMES_NAME
 
 API = "/api/v1"
 _CHUNK = 1 << 20
+_PARQUET = b"PAR1"
 
 
 class Client:
@@ -96,7 +96,8 @@ class Client:
         ledger = self._get(f"/sessions/{session_id}/ledger")
         for name, content in (("session", session), ("events", events), ("ledger", ledger)):
             write_whole(folder / f"{name}.json", json.dumps(content, indent=1).encode())
-        self._pull_clock(session_id, folder / CLOCK_NAME)
+        for name in ("events", "clock"):
+            self._pull_table(f"/sessions/{session_id}/{name}", folder / f"{name}.parquet")
         return {**session, "path": str(path), "resumed_bytes": resumed}
 
     def _download(self, session: dict[str, Any], path: Path) -> int:
@@ -140,12 +141,21 @@ class Client:
             sync_folder(path.parent)
         return resumed
 
-    def _pull_clock(self, session_id: str, path: Path) -> None:
-        answer = self._answer(f"/sessions/{session_id}/clock", {"format": "parquet"})
+    def _pull_table(self, url: str, path: Path) -> None:
+        answer = self._answer(url, {"format": "parquet"})
         if answer.status_code == HTTPStatus.NOT_FOUND:
-            return  # taken away, or a server that knows no clocks yet
+            return  # taken away, or an older server that has none
         if answer.is_error:
             raise self._refused(answer)
+        if not answer.content.startswith(_PARQUET):
+            return  # an older server, which knows no format but JSON here
+        hashes = hashes_of(answer.content)
+        if hashes is not None and hashes[0] != hashes[1]:
+            raise LinkError(
+                f"{path.name} has not the hash that it states",
+                where=self.server,
+                remedy="Run the same command again; if it stays so, the server's file is damaged",
+            )
         write_whole(path, answer.content)
 
     def _get(self, path: str, query: dict[str, str] | None = None) -> dict[str, Any]:

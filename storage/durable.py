@@ -1,7 +1,8 @@
 """Writing so that it stays written: whole files or none, synced, and errors a user can act on.
 
-Here also: the lock of a folder, since two processes that write in it would each undo what the other
-does, and setting aside what is damaged, since a file that cannot be trusted is still somebody's.
+Here also: reading such files without following links or waiting for pipes; the lock of a folder,
+since two processes that write in it would each undo what the other does; and setting aside what is
+damaged, since a file that cannot be trusted is still somebody's.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import fcntl
 import os
 import re
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -17,7 +19,7 @@ from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
-from devices.errors import StorageError
+from devices.errors import DamagedFileError, StorageError
 
 _TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp")
 _OLDER_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
@@ -39,6 +41,42 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
     """
     with whole_file(path, mode=mode) as file:
         file.write(content)
+
+
+BYTES_MAX = 64 << 20
+"""No file that is read at once is longer; what is, is not read into memory."""
+
+
+def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
+    """Read a file of ours that is small.
+
+    Args:
+        path: the file itself: links are not followed, and pipes not waited for.
+        bytes_max: a longer one is none of ours.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DamagedFileError: it is no file, too long for one of ours, or cannot be read.
+    """
+    try:
+        # A link may lead anywhere, and a pipe would be waited for.
+        if not stat.S_ISREG(path.lstat().st_mode):
+            raise DamagedFileError("it is not a file", where=str(path))
+        with open(path, "rb", opener=_without_following) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > bytes_max:
+                raise DamagedFileError(
+                    f"it has {size} bytes", where=str(path), expected=f"up to {bytes_max}"
+                )
+            return file.read()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DamagedFileError(f"cannot be read: {error.strerror}", where=str(path)) from error
+
+
+def _without_following(name: str, flags: int) -> int:
+    return os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 @contextmanager

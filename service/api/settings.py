@@ -19,10 +19,11 @@ from pydantic_settings import (
 )
 
 from devices.errors import UsageError
+from service.api.doors import Bounds
 
 
-class Settings(BaseSettings):
-    """What a server is told."""
+class Settings(Bounds, BaseSettings):
+    """What a server is told; the bounds of connections are in `service.api.doors`."""
 
     model_config = SettingsConfigDict(env_prefix="FOOTTILE_", extra="forbid", frozen=True)
 

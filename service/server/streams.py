@@ -6,6 +6,7 @@ knows why frames are missing and where a stream ended. `sync` writes it.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +21,8 @@ from storage.intervals import CORRUPT, NO_END, REFUSED, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import wire_schema
+
+log = logging.getLogger("foottile.streams")
 
 CLOCK_ROWS = 128
 """Clock measurements that are kept in memory for a pre-roll; the log has all of them."""
@@ -80,7 +83,10 @@ class ServerStream:
                 stream.missed_slots = notes.missed_slots
                 stream._refused = Intervals(notes.lost.get(REFUSED, ()))
         with suppress(StorageError):
-            stream.clock_rows.extend(stream.all_clock_rows())
+            lines = stream._clock_log.lines()
+            stream.clock_rows.extend(lines.rows)
+            if lines.damaged:
+                log.warning("%s: %d damaged clock rows are left out", folder, lines.damaged)
         newest = journal.held.last
         if newest is not None:
             stream._first_seq = next(iter(journal.held))[0]

@@ -53,8 +53,10 @@ def demo_command(
     import uvloop
     from platformdirs import user_data_path
 
+    from service.api.doors import raise_open_files
     from service.rig.rig import RigOptions
 
+    raise_open_files()
     the_scene = scene_with(scene, bus=None, servo=None)
     check_emulated(the_scene)
     # The node finds it in the cache.
