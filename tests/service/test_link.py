@@ -94,8 +94,8 @@ def test_a_message_is_json_and_comes_back() -> None:
     assert json.loads(say(ACK))["seq_last"] == 199
     for message in FROM_NODE:
         assert understood(FromNode, heard(say(message))) == message
-    for message in FROM_SERVER:
-        assert understood(FromServer, heard(say(message))) == message
+    for answer in FROM_SERVER:
+        assert understood(FromServer, heard(say(answer))) == answer
 
 
 @settings(deadline=None, max_examples=1500)
