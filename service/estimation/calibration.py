@@ -20,6 +20,12 @@ from devices.facts import Count, Label, Text, Word
 from service.estimation.effects import CalibrationPart, Effects, NotNegative, Number
 
 ANY_SERIAL = "*"
+UNPROVEN = ", unproven"
+"""Behind the name of one that was written or edited by hand, wherever it is reported."""
+EDITED = (
+    "It was edited by hand or damaged: calibrate again; or, if the edit is meant, delete its lines "
+    '"id" and "check": then it is used, and called unproven'
+)
 LOOP_OPENS_N = 1.0
 CURVE_OPENS_N = 0.2
 """Forces at which a loop, and what a cubic misses of a curve, have opened by half: at zero load
@@ -154,7 +160,7 @@ class Calibration(CalibrationPart):
 
     @classmethod
     def from_json(cls, text: str, *, where: str) -> Calibration:
-        """Read a calibration file.
+        """Read a calibration file. One without an id was written or edited by hand.
 
         Raises:
             CalibrationError: not JSON, a field is missing or unknown, or the id does not match.
@@ -175,11 +181,14 @@ class Calibration(CalibrationPart):
                 where=where,
                 expected="a file written by `foottile calibrate`",
             ) from error
+        if stated_id is None:
+            name = calibration.name.removesuffix(UNPROVEN) + UNPROVEN
+            return calibration.model_copy(update={"name": name})
         if stated_id != calibration.id:
             raise CalibrationError(
                 f"its id says {stated_id}, its content is {calibration.id}",
                 where=where,
-                remedy="It was edited by hand or damaged: calibrate again",
+                remedy=EDITED,
             )
         return calibration
 

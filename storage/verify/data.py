@@ -23,7 +23,7 @@ from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID
 from storage.verify.exported import ExportReport, verify_export
 from storage.verify.journal import StreamReport, verify_stream
-from storage.verify.others import verify_others
+from storage.verify.others import Others, check_json, verify_others
 from storage.verify.segment import SegmentReport, verify_segment
 from storage.verify.session import SessionReport, verify_lone_file, verify_session
 
@@ -78,7 +78,7 @@ Report = FolderReport | SessionReport | StreamReport | SegmentReport | ExportRep
 
 
 def verify(path: Path, *, data: Path | None = None) -> Report:
-    """Prove what is there, whatever it is: session, sealed file, journal, segment, data folder.
+    """Prove what is there: session, sealed file, journal, segment, data folder, JSON of ours.
 
     Args:
         path: a folder or a file.
@@ -94,6 +94,10 @@ def verify(path: Path, *, data: Path | None = None) -> Report:
             return verify_session(path.parent, data=data)
         if path.name == NOTES_FILE:
             return verify_stream(path.absolute().parent)
+        if path.suffix == ".json":
+            others = Others()
+            check_json(path, path.name, others)
+            return FolderReport(path, problems=others.problems, unproven=others.unproven)
         return verify_export(path) or verify_lone_file(path)
     if not path.exists():
         raise FileFormatError("no such file or folder", where=str(path))
@@ -103,6 +107,8 @@ def verify(path: Path, *, data: Path | None = None) -> Report:
         return verify_session(path, data=data)
     if (path / NOTES_FILE).exists() or any(path.glob("*" + SUFFIX)):
         return verify_stream(path.absolute())
+    if any(path.glob("*.json")):
+        return verify_folder(path)
     raise FileFormatError(
         "nothing that foottile wrote is in it",
         where=str(path),

@@ -14,9 +14,6 @@ from devices.errors import DamagedFileError
 from storage.checked_json import read_checked
 from storage.durable import ASIDE
 
-_PLACES = ("nodes", "journal")
-"""Of streams and sessions others look at everything."""
-
 
 @dataclass
 class Others:
@@ -54,7 +51,7 @@ def verify_others(data: Path, proven: set[Path]) -> Others:
             if ASIDE in name:
                 found.set_aside.append(_name(path, data))
             elif name.endswith(".json") and not name.startswith(".") and not is_proven:
-                _check(path, _name(path, data), found)
+                check_json(path, _name(path, data), found)
         # A folder that was set aside, or that has the name of a file, is not looked into.
         folders[:] = [name for name in folders if ASIDE not in name and not name.endswith(".json")]
         if is_proven:
@@ -62,7 +59,8 @@ def verify_others(data: Path, proven: set[Path]) -> Others:
     return found
 
 
-def _check(path: Path, name: str, found: Others) -> None:
+def check_json(path: Path, name: str, found: Others) -> None:
+    """Prove one JSON file, and note under this name what is wrong with it."""
     try:
         if not read_checked(path).is_proven:
             found.unproven.append(f"{name}: it states no hash of itself")

@@ -31,7 +31,7 @@ def verify_command(
     target: Annotated[
         str,
         typer.Argument(
-            help="Session (folder, or id in --data), sealed file, journal, or data folder."
+            help="Session (folder, or id in --data), data folder, a file of them, calibration."
         ),
     ],
     data: Annotated[
