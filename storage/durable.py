@@ -7,6 +7,7 @@ damaged, since a file that cannot be trusted is still somebody's.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
@@ -19,7 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
-from devices.errors import DamagedFileError, StorageError
+from devices.errors import DamagedFileError, FolderGoneError, StorageError
 
 _TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp")
 _OLDER_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
@@ -87,6 +88,7 @@ def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[BinaryIO]:
         StorageError: the disk is full or not writable; nothing is left behind then.
     """
     temporary = temporary_of(path)
+    check_held(path)
     try:
         with storage_errors(path):
             with open(temporary, "wb", opener=partial(os.open, mode=mode)) as file:
@@ -156,7 +158,9 @@ def make_folder(folder: Path) -> None:
 
     Raises:
         OSError: it cannot be made.
+        FolderGoneError: it would be in a folder whose lock we hold, and that one is gone.
     """
+    check_held(folder)
     missing = [folder]
     while not missing[-1].parent.is_dir():
         missing.append(missing[-1].parent)
@@ -224,10 +228,48 @@ def locked(
     except BlockingIOError as error:
         os.close(descriptor)
         raise StorageError(refusal, where=str(folder), remedy=remedy) from error
+    if not is_shared:
+        _held[folder] = descriptor
     try:
         yield
     finally:
+        if _held.get(folder) == descriptor:
+            del _held[folder]
         os.close(descriptor)
+
+
+_held: dict[Path, int] = {}
+"""Folders whose lock this process holds alone, and the locks' descriptors."""
+
+
+def is_held(folder: Path) -> bool:
+    """Is the folder under this name the one whose lock we hold?
+
+    It is not if it was moved, deleted or unmounted meanwhile: files that are open then still take
+    what is written, and nobody will find it there.
+    """
+    try:
+        there = os.stat(folder / LOCK_NAME)
+    except OSError:
+        return False
+    ours = os.fstat(_held[folder])
+    return (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
+
+
+def check_held(path: Path) -> None:
+    """Nothing is written where a folder was whose lock we hold: not into an empty mount point.
+
+    Raises:
+        FolderGoneError: `path` is in such a folder, and that one is not there any more.
+    """
+    for folder in list(_held):
+        if path.is_relative_to(folder) and not is_held(folder):
+            raise FolderGoneError(
+                "this is not the folder that was opened: it was moved, deleted or unmounted",
+                where=str(folder),
+                remedy="Move it back or mount it: it is then used again by itself",
+                errno=errno.ENOENT,
+            )
 
 
 ASIDE = ".damaged"

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import time
-import uuid
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
 from service.server.book import SessionBook, Trash, destroy
+from service.server.data_folder import DataFolder
 from service.server.live import Hub
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
@@ -23,13 +22,7 @@ from service.server.settling import Settling
 from service.server.streams import ServerStream
 from service.server.views import NodeView, SessionView
 from service.server_clock import utc_ns
-from storage.durable import (
-    locked,
-    make_folder,
-    remove_stale_temporaries,
-    storage_errors,
-    write_whole,
-)
+from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
 from storage.sessions.folder import Session, SessionFolder
 
@@ -39,8 +32,7 @@ TICK_S = 0.2
 """How often frames are synced and acknowledged: a server that is killed has not promised more."""
 _SLOW_TICK_S = 1.0
 _PRUNE_EVERY_S = 30.0
-_PROBE_BYTES = 64 << 10
-_SERVER_ID = re.compile(r"[0-9a-f]{32}")
+_SAY_AGAIN_S = 60.0
 
 
 class Link:
@@ -87,21 +79,14 @@ class Server:
 
     def __init__(self, data: Path) -> None:
         self.data = data
-        with storage_errors(data, "Choose another folder with --data"):
-            make_folder(data)
-        self._lock = ExitStack()
-        self._lock.enter_context(
-            locked(
-                data,
-                refusal="another foottile server uses this data folder",
-                remedy="Stop it, or choose another folder with --data",
-            )
-        )
+        self.folder = DataFolder(data)
+        self.id = self.folder.id
+        """Name of this data folder: a node keeps what this server needs apart from others."""
+        self._unkept: set[str] = set()
+        """Nodes of which was said that nothing is kept."""
         try:
             remove_stale_temporaries(data)
             self.check_storage()
-            self.id = _id_of(data)
-            """Name of this data folder: a node keeps what this server needs apart from others."""
             self.hub = Hub()
             self.nodes = ServerNodes(data)
             self.sessions = SessionBook(
@@ -110,11 +95,11 @@ class Server:
             self.settling = Settling(self.sessions, self.nodes, self._ask_again)
             self.recorder = Recorder(self.sessions, self.nodes, self.settling)
         except FootTileError:
-            self._lock.close()
+            self.folder.close()
             raise
         self.links: dict[str, Link] = {}
-        self._failing: dict[str, str] = {}
-        """What has failed in the last tick, and how."""
+        self._failing: dict[str, tuple[str, float]] = {}
+        """What has failed in the last tick, how, and when that was said."""
 
     async def run(self) -> None:
         """Sync, acknowledge, settle, prune and tell, until cancelled."""
@@ -123,6 +108,12 @@ class Server:
             await asyncio.sleep(TICK_S)
             now_s = time.monotonic()
             await asyncio.gather(*(self._sync(node) for node in list(self.nodes)))
+            folder_is_there = False
+            with self._alone("data folder"):
+                await self._check_folder()
+                folder_is_there = True
+            if not folder_is_there:
+                continue
             with self._alone("sessions"):
                 self.settling.settle()
             for link in list(self.links.values()):
@@ -137,6 +128,23 @@ class Server:
                     with self._alone(f"node {node.name}, deleting what nobody needs"):
                         node.prune(self.recorder.needed(node.name))
 
+    async def _check_folder(self) -> None:
+        """While the folder is away nothing is settled or deleted, and every node says so.
+
+        Raises:
+            StorageError: it is away.
+        """
+        try:
+            self.folder.check()
+        except StorageError as error:
+            for node in self.nodes:
+                if self._cannot_keep(node, error):
+                    for stream in node.streams.values():
+                        stream.let_go()
+                        with suppress(StorageError):
+                            await asyncio.to_thread(stream.sync)
+            raise
+
     async def close(self) -> None:
         """End the links and wait for what is being sealed."""
         for link in list(self.links.values()):
@@ -148,16 +156,16 @@ class Server:
                     stream.close()
                 except StorageError as error:
                     log.warning("%s", error)
-        self._lock.close()
+        self.folder.close()
 
     def check_storage(self) -> None:
         """Whether something can be written.
 
         Raises:
+            FolderGoneError: the data folder is not there.
             StorageError: it cannot.
         """
-        # As much as some seconds of frames: on a full disk an empty file can still be written.
-        write_whole(self.data / ".writable", bytes(_PROBE_BYTES))
+        self.folder.check_writable()
 
     async def empty_trash(self) -> tuple[int, int]:
         """Delete what is in the trash for good; return the number of sessions and of bytes.
@@ -191,9 +199,10 @@ class Server:
         try:
             yield
         except Exception as error:
-            if self._failing.get(what) != str(error):
-                self._failing[what] = str(error)
-                if isinstance(error, FootTileError):
+            before, said_s = self._failing.get(what, ("", 0.0))
+            if str(error) != before or time.monotonic() - said_s > _SAY_AGAIN_S:
+                self._failing[what] = (str(error), time.monotonic())
+                if isinstance(error, FootTileError | OSError):
                     log.warning("%s: %s", what, error)
                 else:
                     log.exception("%s: this is a bug; the server goes on", what)
@@ -247,8 +256,9 @@ class Server:
         owed, stream.owed = stream.owed, Intervals()
         try:
             await asyncio.to_thread(stream.sync)
+            self.folder.check()
         except StorageError as error:
-            node.storage_problem = str(error)
+            self._cannot_keep(node, error)
             # The kernel may forget what it could not write: the node has to send it again.
             stream.disown(stream.unsynced | unsynced)
             stream.unsynced, stream.owed = Intervals(), Intervals()
@@ -263,18 +273,25 @@ class Server:
             await asyncio.to_thread(self.check_storage)
         except StorageError:
             return
+        log.warning("node %s: the server can write again", node.name)
         node.storage_problem = None
+        self._unkept.discard(node.name)
+        self.tell_node(node)
         if node.name in self.links:
             self.links[node.name].end(
                 Close.RESTART, "the server can write again; send what it lacks"
             )
 
+    def _cannot_keep(self, node: ServerNode, error: StorageError) -> bool:
+        """What a node sends is not kept: say it once, here and on every screen.
 
-def _id_of(data: Path) -> str:
-    path = data / "server_id"
-    with storage_errors(path):
-        kept = path.read_text("utf-8", "replace").strip() if path.exists() else ""
-    if not _SERVER_ID.fullmatch(kept):
-        kept = uuid.uuid4().hex
-        write_whole(path, kept.encode() + b"\n")
-    return kept
+        Returns:
+            Whether it is news.
+        """
+        is_news = node.name not in self._unkept
+        node.storage_problem = str(error)
+        if is_news:
+            self._unkept.add(node.name)
+            log.warning("node %s: nothing of it is kept: %s", node.name, error)
+            self.tell_node(node)
+        return is_news

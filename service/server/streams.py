@@ -322,9 +322,19 @@ class ServerStream:
         Raises:
             StorageError: the disk refused.
         """
-        self.sync()
-        if self.journal is not None:
-            self.journal.close()
+        try:
+            self.sync()
+        finally:
+            if self.journal is not None:
+                self.journal.close()
+
+    def let_go(self) -> None:
+        """The disk is not there: what was not synced is not held, and open files are to be closed.
+
+        The next `sync` closes them.
+        """
+        self.disown(self.unsynced)
+        self.unsynced, self.owed = Intervals(), Intervals()
 
     def delete(self) -> None:
         """Delete the journal."""

@@ -17,7 +17,13 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from devices.errors import DamagedFileError, StorageError
-from storage.durable import make_folder, read_whole, storage_errors, sync_folder
+from storage.durable import (
+    check_held,
+    make_folder,
+    read_whole,
+    storage_errors,
+    sync_folder,
+)
 
 NAME = "clock.jsonl"
 _BYTES_MAX = 1 << 30
@@ -57,6 +63,7 @@ class ClockLog:
         Raises:
             StorageError: the disk is full or not writable. Earlier rows are untouched.
         """
+        check_held(self.path)
         with storage_errors(self.path):
             if not self.path.parent.is_dir():
                 make_folder(self.path.parent)

@@ -10,6 +10,7 @@ import re
 import secrets
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from devices.errors import (
     FileFormatError,
     FootTileError,
+    StorageError,
     UnknownError,
 )
 from storage.checked_json import read_checked, write_checked
@@ -173,10 +175,17 @@ class SessionFolder:
             StorageError: the disk is full or not writable; the old one is still there then.
         """
         folder = self.path(session.id)
+        is_new = not folder.exists()
         with storage_errors(folder):
             make_folder(folder)
         text = session.model_dump_json(indent=1).encode()
-        write_checked(folder / "session.json", text)
+        try:
+            write_checked(folder / "session.json", text)
+        except StorageError:
+            if is_new:  # a full disk still takes an empty folder, which is no session
+                with suppress(OSError):
+                    folder.rmdir()
+            raise
 
     def load(self, session_id: str) -> Session:
         """Read `session.json`.
