@@ -99,7 +99,7 @@ class FootTileError(Exception):
         if self.expected:
             text += f"; expected {self.expected}"
         if self.remedy:
-            text += f". {self.remedy}"
+            text += f"{'' if text.endswith(('.', '?', '!')) else '.'} {self.remedy}"
         return text
 
     def __reduce__(self) -> tuple[object, ...]:

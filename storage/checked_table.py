@@ -55,12 +55,20 @@ def read_table(path: Path) -> CheckedTable:
         FileNotFoundError: there is none.
         DamagedFileError: its hash is of other bytes, or it is no table, or cannot be read.
     """
-    content = read_whole(path)
+    return table_of(read_whole(path), where=str(path))
+
+
+def table_of(content: bytes, *, where: str) -> CheckedTable:
+    """The same for a file's content.
+
+    Raises:
+        DamagedFileError: its hash is of other bytes, or it is no table.
+    """
     hashes = hashes_of(content)
     if hashes is not None and hashes[0] != hashes[1]:
         raise DamagedFileError(
             "it was changed: its bytes are not those that its hash is of",
-            where=str(path),
+            where=where,
             expected="the bytes as they were written",
         )
     try:
@@ -70,8 +78,8 @@ def read_table(path: Path) -> CheckedTable:
             said = table.schema.metadata or {}
     except Exception as error:  # damaged bytes may cause any error
         raise DamagedFileError(
-            f"cannot be read as a table: {' '.join(str(error).split())[:300]}", where=str(path)
+            f"cannot be read as a table: {' '.join(str(error).split())[:300]}", where=where
         ) from error
     if hashes is None and FORMAT_KEY in said:
-        raise DamagedFileError("it was changed: its hash is gone", where=str(path))
+        raise DamagedFileError("it was changed: its hash is gone", where=where)
     return CheckedTable(table, is_proven=hashes is not None)

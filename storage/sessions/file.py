@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
+from devices.inputs import check_file
 from storage.durable import storage_errors, sync_folder, temporary_of
 from storage.file_hash import FILE_HASH_KEY, write_file_hash
 from storage.schema import (
@@ -198,6 +199,7 @@ class SessionReader:
         """
         self.path = path
         try:
+            check_file(path)
             self._file = pq.ParquetFile(path, page_checksum_verification=True)
             schema = self._file.schema_arrow
         except Exception as error:  # damaged bytes may cause any error

@@ -75,6 +75,7 @@ def _as_dict(recovery: Recovery) -> dict[str, Any]:
         "removed": [str(path) for path in recovery.removed],
         "cut_bytes": recovery.cut,
         "mended": recovery.mended,
+        "restored": recovery.restored,
         "problems": recovery.problems,
     }
 
@@ -86,6 +87,8 @@ def _tell(recovery: Recovery) -> None:
         say(f"{len(recovery.removed)} half-written files were removed")
     for session_id in recovery.mended:
         say(f"session {session_id}: events.parquet was written again")
+    for session_id in recovery.restored:
+        say(f"session {session_id}: session.json was made again from the files beside it")
     for found in recovery.sessions:
         say(f"session {found.session.id} ({found.session.name}): {_outcome(found)}")
         if found.problem:

@@ -13,6 +13,7 @@ from service.cli.options import (
     data_folder,
     output_path,
     print_json,
+    printable,
     progress,
     remark,
     say,
@@ -68,7 +69,7 @@ def sessions_command(
         assumed = ", scale assumed" if session["absolute_scale"] == "assumed" else ""
         table.add_row(
             session["id"],
-            escape(session["name"]),
+            escape(printable(session["name"])),
             session["node"],
             f"{session['duration_s']:.1f}",
             str(session["frames"]),

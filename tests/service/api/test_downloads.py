@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import shutil
 from base64 import b64encode
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,8 +18,9 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
-from devices.errors import LinkError, StateError
+from devices.errors import LinkError, StateError, UsageError
 from service.client import Client
+from storage.verify.data import verdict_of, verify
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
@@ -323,6 +325,39 @@ def test_the_client_pulls_a_session_whole(sealed: Sealed, tmp_path: Path) -> Non
         }
         again = client.pull(sealed.id, tmp_path / "out")
         assert again["path"] == pulled["path"]
+
+
+def test_what_is_pulled_proves_itself_file_by_file(sealed: Sealed, tmp_path: Path) -> None:
+    with Client(sealed.running.url) as client:
+        client.pull(sealed.id, tmp_path)
+        folder = tmp_path / sealed.id
+        report = verify(folder)
+        assert (verdict_of(report), report.as_dict()["unproven"]) == ("complete", [])
+        for path in sorted(folder.iterdir()):
+            whole = path.read_bytes()
+            path.write_bytes(whole[:40] + bytes([whole[40] ^ 1]) + whole[41:])
+            assert path.name in " ".join(verify(folder).as_dict()["problems"])
+            path.write_bytes(whole)
+        (folder / "session.json").write_bytes(b"{")
+        client.pull(sealed.id, tmp_path)
+        assert (folder / "session.json.damaged-1").read_bytes() == b"{"
+        assert verdict_of(verify(folder)) == "complete"
+
+
+def test_nothing_is_pulled_into_a_servers_data_folder(sealed: Sealed, tmp_path: Path) -> None:
+    folder = sealed.session.folder
+    before = (folder / "session.json").read_bytes()
+    with Client(sealed.running.url) as client:
+        for out in (folder.parent, folder.parent.parent, folder):
+            with pytest.raises(UsageError, match="this is a data folder"):
+                client.pull(sealed.id, out)
+        copied = tmp_path / "copied"
+        shutil.copytree(folder.parent, copied)  # without the lock, but still not ours
+        with pytest.raises(UsageError, match=r"not one that `foottile pull` wrote"):
+            client.pull(sealed.id, copied)
+    assert (folder / "session.json").read_bytes() == before
+    assert (copied / sealed.id / "session.json").read_bytes() == before
+    assert not (folder.parent.parent / sealed.id).exists()
 
 
 @pytest.mark.parametrize("have", [1, 1000, None])
