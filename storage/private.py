@@ -13,9 +13,9 @@ from storage.durable import LOCK_NAME, make_folder, storage_errors
 def keep_private(folder: Path) -> None:
     """What this process writes from now on is for its user, whatever the umask was.
 
-    A folder that is made here, that is empty, or that is ours and every user could read, is closed to
-    others. One that its owner has opened to its group, and to it only, stays so, and what is written
-    is the group's to read.
+    A folder that is made here, or is empty, or is ours and every user could read it, is closed to
+    others. One that its owner has opened to its group, and to it only, stays so, and what is
+    written is the group's to read.
 
     Args:
         folder: where it will write; made if absent.
