@@ -48,7 +48,7 @@ class StartSession(_Body):
 
     node: str = Field(examples=["demo"])
     name: Name = Field(examples=["mud, third trial"])
-    pre_roll_s: Annotated[float, Field(ge=0, le=600, allow_inf_nan=False)] = Field(
+    pre_roll_s: Annotated[float, Field(ge=0, le=600, allow_inf_nan=False, strict=True)] = Field(
         default=0.0, description="Begin so much earlier, as far as the server still has it."
     )
     subject: Name | None = None
@@ -69,7 +69,7 @@ class MarkEvent(_Body):
     """An event."""
 
     label: Name = Field(examples=["stepped on a stone"])
-    t_ns: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
+    t_ns: Annotated[int, Field(ge=0, lt=2**63, strict=True)] | None = Field(
         default=None, description="Server's UTC; left out: now."
     )
     id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")] | None = Field(

@@ -39,12 +39,14 @@ def recover_command(
     """
     from service.sessions.recover import recover
     from storage.durable import locked
+    from storage.private import keep_private
 
     if not any((folder / name).is_dir() for name in ("journal", "sessions")):
         raise UsageError(
             f"no data folder {str(folder)!r}",
             expected="a folder with `journal` and `sessions`, of a server or a node",
         )
+    keep_private(folder)
     with locked(folder), progress("opening journals") as tell:
         recovery = recover(folder, streams=streams, give_up=give_up, tell=tell)
     if as_json:
