@@ -24,6 +24,8 @@ from storage.durable import put_aside, read_whole, storage_errors, write_whole
 
 log = logging.getLogger("foottile.serve")
 
+KEPT_IN = "token"
+"""File of the data folder with the token that was made."""
 _BACKLOG = 128
 _GRACE_S = 3
 _UNREAD_MS = 60_000
@@ -87,7 +89,7 @@ def token_for(host: str, given: str | None, data: Path) -> str | None:
     """
     if given or is_loopback(host):
         return given or None
-    path = data / "token"
+    path = data / KEPT_IN
     try:
         kept = read_whole(path).decode("ascii", "replace").strip()
         if not _TOKEN.fullmatch(kept):
