@@ -26,6 +26,8 @@ _DRAIN_S = 3.0
 """A node that is stopped waits no longer for the server."""
 _AWAY_LOOKS = 50
 """After this many looks without a link, a second in all, it waits no longer."""
+_PROBLEMS_MAX, _PROBLEM_LENGTH = 20, 400
+"""What a server is told of what was found damaged; all of it was said here."""
 _TROUBLES_S = 0.5
 """Between two looks at the disk's troubles."""
 
@@ -207,7 +209,7 @@ class RunningNode:
             troubles=(
                 *self._health.troubles,
                 *self._journal.troubles,
-                *self._journal.problems,
+                *(problem[:_PROBLEM_LENGTH] for problem in self._journal.problems[:_PROBLEMS_MAX]),
             ),
             counts={serial: dict(counts) for serial, counts in self._health.counts.items()},
         )

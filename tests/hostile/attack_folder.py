@@ -160,7 +160,7 @@ def _may_change(path: Path, whole: Served) -> set[str]:
 _SAID = ("hello.json", "tares.json", "stream.json", "session.json", "server_id")
 
 
-@attack("every file of a server's data folder, damaged in every way", tries=80, soak_tries=5_000)
+@attack("every file of a server's data folder, damaged in every way", tries=40, soak_tries=4_000)
 def folder_of_a_server(play: Play) -> Outcome:
     """One file of a data folder is damaged, then a server is started on it.
 
@@ -228,7 +228,7 @@ _NUMBERS = ("gauge_kpa", "force_n", "force_sigma_n", "grf_n", "grf_sigma_n", "co
 Numbers = Mapping[str, np.ndarray]
 
 
-@attack("a bit flipped in tares.json", tries=40, soak_tries=2_600)
+@attack("a bit flipped in tares.json", tries=24, soak_tries=2_600)
 def flipped_tares(play: Play) -> Outcome:
     """A bit is flipped at every byte in turn; then forces are computed live, and a session sealed.
 
@@ -331,7 +331,7 @@ def node_folder(folder: Path) -> Path:
     return folder
 
 
-@attack("every file of a node's folder, damaged in every way", tries=80, soak_tries=3_000)
+@attack("every file of a node's folder, damaged in every way", tries=30, soak_tries=2_000)
 def folder_of_a_node(play: Play) -> Outcome:
     """One file of a node's state is damaged, then its journal is opened, goes on and is tidied.
 
