@@ -48,6 +48,8 @@ async def ingest(socket: WebSocket, server: Server) -> None:
         link = await _greet(socket, server, offered)
         await _serve(socket, server, link)
     except HangUp as end:
+        if link is not None:  # first: a peer that is not there takes its time to be closed
+            _leave(server, link)
         await _close(socket, end)
     except (WebSocketDisconnect, RuntimeError):  # it went away, perhaps while we were sending
         pass
@@ -141,8 +143,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
         said = _parse(message, Close.MALFORMED)
         match said:
             case Probe(id=number):
-                answer = Probe(id=number, server_t_ns=utc_ns())
-                await socket.send_text(say(answer))
+                await _answer(socket, Probe(id=number, server_t_ns=utc_ns()))
             case FramesOf(boot_id=boot_id):
                 if boot_id not in node.order:
                     raise HangUp(Close.MALFORMED, f"stream {boot_id[:80]!r} was not announced")
@@ -162,6 +163,14 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
                     raise HangUp(Close.MALFORMED, f"lost: {error}") from error
             case Hello():
                 raise HangUp(Close.MALFORMED, "hello was said before")
+
+
+async def _answer(socket: WebSocket, probe: Probe) -> None:
+    try:
+        async with asyncio.timeout(SILENCE_S):
+            await socket.send_text(say(probe))
+    except TimeoutError as error:  # else nobody would notice that nothing is heard either
+        raise HangUp(Close.SILENT, f"nothing was read for {SILENCE_S:g} s") from error
 
 
 async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
