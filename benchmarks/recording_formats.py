@@ -18,7 +18,8 @@ import pyarrow.parquet as pq
 from recording_data import Recording, batches
 
 from devices.frames import FrameBatch
-from storage.formats.export import Slice, export
+from storage.formats.export import export
+from storage.formats.slice import Slice
 from storage.journal.journal import Journal
 from storage.schema import FRAMES, flat_columns, wire_schema
 from storage.sessions.file import ROW_GROUP_NS, SessionReader, SessionWriter

@@ -90,9 +90,10 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     from service.offline.calibrations import find_calibration
     from service.sessions.sealing import seal
     from service.sessions.sources import Sources
+    from storage.file_hash import write_file_hash
     from storage.journal.journal import Journal
     from storage.sessions import file as session_file
-    from storage.sessions.content_hash import ContentDigest, write_file_hash
+    from storage.sessions.content_hash import ContentDigest
     from storage.sessions.folder import Part, Session, SessionFolder
     from storage.sessions.ledger import StreamState, ledger_of
 

@@ -13,8 +13,8 @@ from service.estimation.calibration import Calibration, paper_eq2_shape
 from service.offline.calibrations import find_calibration
 from service.sessions.frames import SessionFrames
 from service.sessions.sources import Sources
+from storage.file_hash import sha256_of
 from storage.journal.journal import Journal
-from storage.sessions.content_hash import sha256_of
 from storage.sessions.file import SessionWriter, parquet_options
 from storage.sessions.folder import Part, Session
 

@@ -23,6 +23,7 @@
      |    +-- DamagedFileError                 a file is not what was written
      |    +-- DamagedFramesError               frames on disk are not those that were written
      +-- StorageError          (OSError)       a file cannot be written: disk full, read-only
+     |    +-- FolderGoneError                  the folder that it writes to is not there any more
      +-- CalibrationError      (ValueError)    a calibration is absent, unphysical or does not fit
      +-- TareError             (ValueError)    no interval to tare on
      +-- LinkError             (ConnectionError) node, server or client cannot talk to each other
@@ -98,7 +99,7 @@ class FootTileError(Exception):
         if self.expected:
             text += f"; expected {self.expected}"
         if self.remedy:
-            text += f". {self.remedy}"
+            text += f"{'' if text.endswith(('.', '?', '!')) else '.'} {self.remedy}"
         return text
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -223,6 +224,10 @@ class DamagedFramesError(FileFormatError):
 
 class StorageError(_SystemError):
     """A file cannot be written: the disk is full, read-only, or gone; `errno` is the system's."""
+
+
+class FolderGoneError(StorageError):
+    """A folder was moved, deleted or unmounted under the process that writes in it."""
 
 
 class CalibrationError(FootTileError, ValueError):

@@ -11,14 +11,48 @@ from typing import Any, Self
 
 import httpx
 
-from devices.errors import LinkError, StateError, UsageError
-from storage.clock.table import CLOCK_NAME
-from storage.durable import storage_errors, sync_folder, write_whole
-from storage.sessions.content_hash import sha256_of
+from devices.errors import DamagedFileError, LinkError, StateError, UsageError
+from storage.checked_json import read_checked, write_checked
+from storage.checked_table import table_of
+from storage.durable import LOCK_NAME, set_aside, storage_errors, sync_folder, write_whole
+from storage.file_hash import sha256_of
+from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME
 
 API = "/api/v1"
 _CHUNK = 1 << 20
+_PARQUET = b"PAR1"
+
+
+def refuse_data_folder(folder: Path) -> None:
+    """Refuse to write where a server or node keeps this session, or others.
+
+    What was pulled before is written again; its `session.json` is set aside if it is damaged.
+
+    Args:
+        folder: of one session, perhaps not there yet.
+
+    Raises:
+        UsageError: it is theirs.
+        StorageError: what is damaged cannot be set aside.
+    """
+    remedy = "Choose a folder of your own with --out"
+    for place in (folder.resolve(), *folder.resolve().parents[:4]):
+        has_data = (place / "sessions").is_dir() or (place / "journal").is_dir()
+        if has_data and (place / LOCK_NAME).exists():
+            what = "this is a data folder, whose files are its server's or node's"
+            raise UsageError(what, where=str(place), remedy=remedy)
+    path = folder / SESSION_NAME
+    try:
+        content = json.loads(read_checked(path).text)
+    except FileNotFoundError:
+        return
+    except ValueError:  # a DamagedFileError is one
+        set_aside(path)
+        return
+    if not isinstance(content, dict) or "complete" not in content:
+        what = f"its {SESSION_NAME} is not one that `foottile pull` wrote"
+        raise UsageError(what, where=str(folder), remedy=remedy)
 
 
 class Client:
@@ -71,6 +105,7 @@ class Client:
         Raises:
             LinkError: the server does not answer, the download broke off, or its hash is wrong.
             StateError: the session is not sealed.
+            UsageError: that is a folder in which a server or node keeps its sessions.
             StorageError: it cannot be written.
         """
         if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
@@ -86,6 +121,7 @@ class Client:
                 remedy="Stop it first, or wait until it is sealed",
             )
         folder = out / session_id
+        refuse_data_folder(folder)
         with storage_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
         path = folder / FRAMES_NAME
@@ -95,8 +131,9 @@ class Client:
         events = self._get(f"/sessions/{session_id}/events")
         ledger = self._get(f"/sessions/{session_id}/ledger")
         for name, content in (("session", session), ("events", events), ("ledger", ledger)):
-            write_whole(folder / f"{name}.json", json.dumps(content, indent=1).encode())
-        self._pull_clock(session_id, folder / CLOCK_NAME)
+            write_checked(folder / f"{name}.json", json.dumps(content, indent=1).encode())
+        for name in ("events", "clock"):
+            self._pull_table(f"/sessions/{session_id}/{name}", folder / f"{name}.parquet")
         return {**session, "path": str(path), "resumed_bytes": resumed}
 
     def _download(self, session: dict[str, Any], path: Path) -> int:
@@ -140,12 +177,22 @@ class Client:
             sync_folder(path.parent)
         return resumed
 
-    def _pull_clock(self, session_id: str, path: Path) -> None:
-        answer = self._answer(f"/sessions/{session_id}/clock", {"format": "parquet"})
+    def _pull_table(self, url: str, path: Path) -> None:
+        answer = self._answer(url, {"format": "parquet"})
         if answer.status_code == HTTPStatus.NOT_FOUND:
-            return  # taken away, or a server that knows no clocks yet
+            return  # taken away, or an older server that has none
         if answer.is_error:
             raise self._refused(answer)
+        if not answer.content.startswith(_PARQUET):
+            return  # an older server, which knows no format but JSON here
+        try:
+            table_of(answer.content, where=path.name)
+        except DamagedFileError as error:
+            raise LinkError(
+                str(error),
+                where=self.server,
+                remedy="Run the same command again; if it stays so, the server's file is damaged",
+            ) from error
         write_whole(path, answer.content)
 
     def _get(self, path: str, query: dict[str, str] | None = None) -> dict[str, Any]:

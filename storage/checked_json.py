@@ -8,22 +8,18 @@ it is next written. A file that had a hash and has none any more is damaged, not
 from __future__ import annotations
 
 import hashlib
-import os
 import re
-import stat
 from dataclasses import dataclass
 from pathlib import Path
 
 from devices.errors import DamagedFileError
-from storage.durable import write_whole
+from storage.durable import read_whole, write_whole
 
 CHECK = "check"
 _BEFORE, _AFTER = b',\n "check": "', b'"\n}'
 _END = re.compile(re.escape(_BEFORE) + rb"([0-9a-f]{64})" + re.escape(_AFTER) + rb"\Z")
 _TAIL_BYTES = len(_BEFORE) + 64 + len(_AFTER)
 _DIGITS_AT_END = re.compile(rb'"[0-9a-f]{64}"\s*\}\s*\Z')
-_BYTES_MAX = 64 << 20
-"""No file of ours is longer; what is, is not read into memory."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +53,7 @@ def read_checked(path: Path) -> Checked:
         FileNotFoundError: there is none.
         DamagedFileError: its hash is of another text, or it is no file, or cannot be read.
     """
-    try:
-        text = _bytes(path)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise DamagedFileError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    return checked(text, where=str(path))
+    return checked(read_whole(path), where=str(path))
 
 
 def checked(text: bytes, *, where: str) -> Checked:
@@ -82,23 +72,6 @@ def checked(text: bytes, *, where: str) -> Checked:
     if not text.strip():
         raise DamagedFileError("it is empty", where=where, expected="a JSON object")
     return Checked(without_check(text), is_proven=found is True)
-
-
-def _bytes(path: Path) -> bytes:
-    # A link may lead anywhere, and a pipe would be waited for.
-    if not stat.S_ISREG(path.lstat().st_mode):
-        raise DamagedFileError("it is not a file", where=str(path), expected="a JSON object")
-    with open(path, "rb", opener=_without_following) as file:
-        found = os.fstat(file.fileno())
-        if found.st_size > _BYTES_MAX:
-            raise DamagedFileError(
-                f"it has {found.st_size} bytes", where=str(path), expected=f"up to {_BYTES_MAX}"
-            )
-        return file.read()
-
-
-def _without_following(name: str, flags: int) -> int:
-    return os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 def with_check(text: bytes) -> bytes:

@@ -1,15 +1,18 @@
 """Writing so that it stays written: whole files or none, synced, and errors a user can act on.
 
-Here also: the lock of a folder, since two processes that write in it would each undo what the other
-does, and setting aside what is damaged, since a file that cannot be trusted is still somebody's.
+Here also: reading such files without following links or waiting for pipes; the lock of a folder,
+since two processes that write in it would each undo what the other does; and setting aside what is
+damaged, since a file that cannot be trusted is still somebody's.
 """
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -17,7 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
-from devices.errors import StorageError
+from devices.errors import DamagedFileError, FolderGoneError, StorageError
 
 _TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp")
 _OLDER_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
@@ -41,6 +44,42 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
         file.write(content)
 
 
+BYTES_MAX = 64 << 20
+"""No file that is read at once is longer; what is, is not read into memory."""
+
+
+def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
+    """Read a file of ours that is small.
+
+    Args:
+        path: the file itself: links are not followed, and pipes not waited for.
+        bytes_max: a longer one is none of ours.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DamagedFileError: it is no file, too long for one of ours, or cannot be read.
+    """
+    try:
+        # A link may lead anywhere, and a pipe would be waited for.
+        if not stat.S_ISREG(path.lstat().st_mode):
+            raise DamagedFileError("it is not a file", where=str(path))
+        with open(path, "rb", opener=_without_following) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > bytes_max:
+                raise DamagedFileError(
+                    f"it has {size} bytes", where=str(path), expected=f"up to {bytes_max}"
+                )
+            return file.read()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DamagedFileError(f"cannot be read: {error.strerror}", where=str(path)) from error
+
+
+def _without_following(name: str, flags: int) -> int:
+    return os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
+
+
 @contextmanager
 def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[BinaryIO]:
     """A file to write that takes its place, whole and on the disk, when the block ends well.
@@ -49,6 +88,7 @@ def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[BinaryIO]:
         StorageError: the disk is full or not writable; nothing is left behind then.
     """
     temporary = temporary_of(path)
+    check_held(path)
     try:
         with storage_errors(path):
             with open(temporary, "wb", opener=partial(os.open, mode=mode)) as file:
@@ -118,7 +158,9 @@ def make_folder(folder: Path) -> None:
 
     Raises:
         OSError: it cannot be made.
+        FolderGoneError: it would be in a folder whose lock we hold, and that one is gone.
     """
+    check_held(folder)
     missing = [folder]
     while not missing[-1].parent.is_dir():
         missing.append(missing[-1].parent)
@@ -186,10 +228,48 @@ def locked(
     except BlockingIOError as error:
         os.close(descriptor)
         raise StorageError(refusal, where=str(folder), remedy=remedy) from error
+    if not is_shared:
+        _held[folder] = descriptor
     try:
         yield
     finally:
+        if _held.get(folder) == descriptor:
+            del _held[folder]
         os.close(descriptor)
+
+
+_held: dict[Path, int] = {}
+"""Folders whose lock this process holds alone, and the locks' descriptors."""
+
+
+def is_held(folder: Path) -> bool:
+    """Is the folder under this name the one whose lock we hold?
+
+    It is not if it was moved, deleted or unmounted meanwhile: files that are open then still take
+    what is written, and nobody will find it there.
+    """
+    try:
+        there = os.stat(folder / LOCK_NAME)
+    except OSError:
+        return False
+    ours = os.fstat(_held[folder])
+    return (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
+
+
+def check_held(path: Path) -> None:
+    """Nothing is written where a folder was whose lock we hold: not into an empty mount point.
+
+    Raises:
+        FolderGoneError: `path` is in such a folder, and that one is not there any more.
+    """
+    for folder in list(_held):
+        if path.is_relative_to(folder) and not is_held(folder):
+            raise FolderGoneError(
+                "this is not the folder that was opened: it was moved, deleted or unmounted",
+                where=str(folder),
+                remedy="Move it back or mount it: it is then used again by itself",
+                errno=errno.ENOENT,
+            )
 
 
 ASIDE = ".damaged"

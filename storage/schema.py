@@ -8,6 +8,7 @@ of both, the array's description in the schema metadata.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from devices.errors import FileFormatError
+from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import (
     FRAME_COLUMNS,
     NO_SERVO_AGE,
@@ -27,6 +28,8 @@ from devices.frames import (
 )
 
 ARRAY_INFO_KEY = b"foottile.array_info"
+ARRAY_HASH_KEY = b"foottile.array_info_sha256"
+"""In a journal's segments, whose header has no other checksum."""
 
 Array = npt.NDArray[Any]
 """A numpy column; which type it has is said by the column table, not by the checker."""
@@ -143,8 +146,12 @@ SERVER_TIME = (
 )
 """What a clock table makes of `t_ns` when a session is read; never in a sealed file."""
 
+MARKS = (Column("event", pa.string(), "1", "what people marked at this frame"),)
+"""Placed when a session is read (`storage.formats.marks`); never in a sealed file."""
+
 KNOWN = {
-    column.name: column for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL, *SERVER_TIME)
+    column.name: column
+    for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL, *SERVER_TIME, *MARKS)
 }
 
 
@@ -153,7 +160,7 @@ KNOWN = {
 
 def wire_schema(info: ArrayInfo) -> pa.Schema:
     """Arrow schema of a stream of frames of this array."""
-    tiles = len(info.tiles)
+    tiles, text = len(info.tiles), info.model_dump_json().encode()
     return pa.schema(
         [
             column.field(
@@ -165,8 +172,17 @@ def wire_schema(info: ArrayInfo) -> pa.Schema:
             )
             for column in FRAMES
         ],
-        metadata={ARRAY_INFO_KEY: info.model_dump_json().encode()},
+        metadata={ARRAY_INFO_KEY: text, ARRAY_HASH_KEY: _digits(text)},
     )
+
+
+def older_wire_schema(info: ArrayInfo) -> pa.Schema:
+    """The same as older versions wrote it, without hash."""
+    return wire_schema(info).with_metadata({ARRAY_INFO_KEY: info.model_dump_json().encode()})
+
+
+def _digits(text: bytes) -> bytes:
+    return hashlib.sha256(text).hexdigest().encode()
 
 
 def to_record_batch(batch: FrameBatch, schema: pa.Schema) -> pa.RecordBatch:
@@ -210,14 +226,20 @@ def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
     """The description of the array that a schema carries.
 
     Raises:
-        FileFormatError: it carries none, or one of another version.
+        FileFormatError: it carries none, one of another version, or one that was changed.
     """
-    text = (schema.metadata or {}).get(ARRAY_INFO_KEY)
+    said = schema.metadata or {}
+    text = said.get(ARRAY_INFO_KEY)
     if text is None:
         raise FileFormatError(
             "no description of the tile array in it",
             where=where,
             expected="a file written by foottile",
+        )
+    if said.get(ARRAY_HASH_KEY, _digits(text)) != _digits(text):
+        raise DamagedFileError(
+            "its description of the tile array was changed: it is not what its hash is of",
+            where=where,
         )
     try:
         return ArrayInfo.model_validate_json(text)

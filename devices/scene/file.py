@@ -19,6 +19,7 @@ from typing import Annotated, Self
 from pydantic import Field, ValidationError, model_validator
 
 from devices.errors import SceneError
+from devices.inputs import read_text
 from devices.scene.emulated import EmulationScene, FaultScene, GroundScene, MudGround, NoGround
 from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
 from devices.scene.quantities import NotNegative, Section
@@ -91,8 +92,8 @@ def load_scene(name_or_path: str) -> Scene:
         text = (folder / f"{name_or_path}.toml").read_text("utf-8")
         return parse_scene(text, where=f"scene {name_or_path}")
     try:
-        text = Path(name_or_path).read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_text(Path(name_or_path))
+    except (OSError, ValueError) as error:
         raise SceneError(
             f"no scene {name_or_path!r}: {error}",
             expected=f"one of {', '.join(builtin_scenes())}, or the path of a scene file",

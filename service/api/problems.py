@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
 from devices.errors import (
+    FolderGoneError,
     FootTileError,
     StateError,
     StorageError,
@@ -29,6 +30,7 @@ _STATUS: tuple[tuple[type[FootTileError], HTTPStatus], ...] = (
     (UnknownError, HTTPStatus.NOT_FOUND),
     (StateError, HTTPStatus.CONFLICT),
     (TareError, HTTPStatus.CONFLICT),
+    (FolderGoneError, HTTPStatus.SERVICE_UNAVAILABLE),
     (StorageError, HTTPStatus.INSUFFICIENT_STORAGE),
     (UsageError, HTTPStatus.UNPROCESSABLE_ENTITY),
 )

@@ -14,13 +14,18 @@ import uvicorn
 from fastapi import FastAPI
 
 from devices.errors import LinkError
+from service.api.doors import Bounds, Doors, open_files_max
 from service.api.guard import is_loopback
+from service.api.protocols import DoorsConfig, Http, WebSocket, accept
 from service.estimation.warm import warm_up
 from service.link import MESSAGE_BYTES_MAX
 from storage.durable import storage_errors, write_whole
 
 _BACKLOG = 128
 _GRACE_S = 3
+_UNREAD_MS = 60_000
+"""A connection whose other end takes nothing of what is sent for so long is closed by the kernel:
+no time-out of ours sees how much of a download has arrived."""
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -38,6 +43,8 @@ def listen(host: str, port: int) -> socket.socket:
         raise LinkError(f"cannot listen on {host}: {error}") from error
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # those that come to it inherit this
+            listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
         listening.bind(address)
         listening.listen(_BACKLOG)
     except OSError as error:
@@ -88,23 +95,29 @@ def token_for(host: str, given: str | None, data: Path) -> str | None:
 
 
 @asynccontextmanager
-async def serving(app: FastAPI, listening: socket.socket) -> AsyncIterator[None]:
+async def serving(
+    app: FastAPI, listening: socket.socket, bounds: Bounds | None = None
+) -> AsyncIterator[None]:
     """Serve while the block runs; on a new machine the models are compiled before, in seconds."""
     await asyncio.to_thread(warm_up)
-    config = uvicorn.Config(
+    bounds = bounds if bounds is not None else Bounds()
+    config = DoorsConfig(
         app,
         log_level="warning",
         access_log=False,
         server_header=False,
-        ws="websockets-sansio",  # the fastest that is kept up (performance.md)
+        http=Http,
+        ws=WebSocket,  # on websockets' sans-I/O, the fastest that is kept up (performance.md)
         ws_max_size=MESSAGE_BYTES_MAX,
         ws_per_message_deflate=False,
         ws_ping_interval=20.0,
         ws_ping_timeout=20.0,
+        timeout_keep_alive=bounds.idle_timeout_s,  # type: ignore[arg-type]  # it takes fractions
         timeout_graceful_shutdown=_GRACE_S,
     )
+    config.doors = Doors(bounds, open_files_max())
     logging.getLogger("uvicorn.error").addFilter(_is_news)
-    server = _UvicornWithoutSignals(config)
+    server = _Uvicorn(config)
     task = asyncio.create_task(server.serve([listening]))
     try:
         while not server.started and not task.done():
@@ -117,13 +130,39 @@ async def serving(app: FastAPI, listening: socket.socket) -> AsyncIterator[None]
         await task
 
 
-def _is_news(record: logging.LogRecord) -> bool:
+_NO_NEWS = (
     # We refuse a handshake with an HTTP answer that says why; uvicorn takes that for a mistake.
-    return "without completing handshake" not in record.getMessage()
+    "without completing handshake",
+    # It is told to the one who sent it; a log that others can fill is no log.
+    "Invalid HTTP request received",
+    "Unsupported upgrade request",
+)
 
 
-class _UvicornWithoutSignals(uvicorn.Server):
-    """Leaves signals to its caller."""
+def _is_news(record: logging.LogRecord) -> bool:
+    return not any(text in record.getMessage() for text in _NO_NEWS)
+
+
+class _Uvicorn(uvicorn.Server):
+    """Leaves signals to its caller, and takes connections in through the doors."""
+
+    config: DoorsConfig
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets=[])
+        self._accepting = [
+            asyncio.create_task(accept(each, self._protocol, self.config.doors))
+            for each in sockets or ()
+        ]
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        for task in self._accepting:
+            task.cancel()
+        await asyncio.gather(*self._accepting, return_exceptions=True)
+        await super().shutdown(sockets)
+
+    def _protocol(self) -> asyncio.Protocol:
+        return Http(self.config, self.server_state, self.lifespan.state)
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:

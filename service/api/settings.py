@@ -19,10 +19,12 @@ from pydantic_settings import (
 )
 
 from devices.errors import UsageError
+from devices.inputs import TEXT_BYTES_MAX, check_file
+from service.api.doors import Bounds
 
 
-class Settings(BaseSettings):
-    """What a server is told."""
+class Settings(Bounds, BaseSettings):
+    """What a server is told; the bounds of connections are in `service.api.doors`."""
 
     model_config = SettingsConfigDict(env_prefix="FOOTTILE_", extra="forbid", frozen=True)
 
@@ -45,8 +47,11 @@ def load_settings(config: Path | None, **given: object) -> Settings:
     Raises:
         UsageError: the file is not readable, a name is unknown, or a value is wrong.
     """
-    if config is not None and not config.is_file():
-        raise UsageError(f"no settings file {str(config)!r}")
+    if config is not None:
+        try:
+            check_file(config, bytes_max=TEXT_BYTES_MAX)
+        except (OSError, ValueError) as error:
+            raise UsageError(f"no settings file {str(config)!r}: {error}") from error
 
     where = "" if config is None else str(config)
     chosen = {name: value for name, value in given.items() if value is not None}

@@ -21,6 +21,7 @@ from service.cli.commands.serve import serve_command
 from service.cli.commands.sessions import export_command, pull_command, sessions_command
 from service.cli.commands.simulate import simulate_command
 from service.cli.commands.verify import verify_command
+from service.cli.options import printable, with_finite_numbers
 from service.version import SOFTWARE
 
 _TYPER_INTERRUPTED = 130
@@ -38,7 +39,7 @@ for command in (
     *(simulate_command, estimate_command, calibrate_command, domes_command, verify_command),
     *(recover_command, doctor_command, bench_command),
 ):
-    app.command(command.__name__.removesuffix("_command"))(command)
+    app.command(command.__name__.removesuffix("_command"))(with_finite_numbers(command))
 
 
 def _print_version(wanted: bool) -> None:
@@ -66,11 +67,11 @@ def main() -> None:
     try:
         app()
     except FootTileError as error:
-        sys.stderr.write(f"foottile: {error}\n")
+        sys.stderr.write(f"foottile: {printable(str(error))}\n")
         sys.exit(error.exit_code)
     except SystemExit as end:
         # typer's code for Ctrl-C; ours are 0 to 3, and what was not finished has failed.
         sys.exit(1 if end.code == _TYPER_INTERRUPTED else end.code)
     except OSError as error:
-        sys.stderr.write(f"foottile: {error}\n")
+        sys.stderr.write(f"foottile: {printable(str(error))}\n")
         sys.exit(1)

@@ -29,6 +29,10 @@ from devices.scene.hardware import EMULATED
 if TYPE_CHECKING:
     from service.rig.emulated import EmulatedFoot
 
+SEED_MAX = 2**63 - 1
+SECONDS_MAX = NUMBER_MAX = 1e9
+"""Thirty years; and more than any metre, newton or factor can be."""
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -57,8 +61,8 @@ def pair(text: str | None, option: str) -> tuple[float, float] | None:
         first, second = (float(part) for part in text.split(","))
     except ValueError:
         first = second = math.nan
-    if not (math.isfinite(first) and math.isfinite(second)):
-        raise UsageError(f"{option} {text!r} is no pair of numbers", expected="A,B")
+    if not (abs(first) < NUMBER_MAX and abs(second) < NUMBER_MAX):
+        raise UsageError(f"{option} {text!r} is no pair of sensible numbers", expected="A,B")
     return first, second
 
 
@@ -76,17 +80,22 @@ def output_path(path: Path, *inputs: Path) -> Path:
         UsageError: its folder is missing or not writable, it is no regular file, or one of the
             inputs, which would be lost.
     """
-    target = path.resolve()
+    target = _resolved(path)
     folder = target.parent
     if not folder.is_dir():
         raise UsageError(f"no folder {str(folder)!r} to write {path.name} in", remedy="Make it")
-    if (target.exists() and not target.is_file()) or not os.access(folder, os.W_OK):
+    is_file = target.is_file() or not os.path.lexists(target)  # a link in a circle is there, too
+    if not (is_file and os.access(folder, os.W_OK)):
         raise UsageError(f"{str(path)!r} cannot be written")
-    if any(target == given.resolve() for given in inputs):
+    if any(target == _resolved(given) for given in inputs):
         raise UsageError(
             f"{str(path)!r} is an input and would be lost", remedy="Write to another file"
         )
     return target
+
+
+def _resolved(path: Path) -> Path:
+    return Path(os.path.realpath(path))  # unlike Path.resolve, whatever links there are
 
 
 def plain(value: Any) -> Any:
@@ -130,6 +139,12 @@ def progress(message: str) -> Iterator[Callable[[str], None]]:
         yield status.update
 
 
+def printable(text: str) -> str:
+    """Text of files and other people as one line that a terminal shows and does not obey."""
+    line = " ".join(text.split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
 def say(message: str) -> None:
     """A line of the result on stdout, as it is."""
     stdout.print(message, highlight=False, soft_wrap=True, markup=False)
@@ -156,8 +171,10 @@ class FootOptions:
         str, typer.Option(help="Axes of the load that become x and y: xy, yx, -yx, ...")
     ] = "xy"
     lead_s: Annotated[float, typer.Option(help="Seconds without load first: the tare.")] = 1.0
-    seed: Annotated[int, typer.Option(min=0, help="Draws noise and ground, not the parts.")] = 0
-    parts_seed: Annotated[int, typer.Option(min=0, help="Draws other parts.")] = 0
+    seed: Annotated[
+        int, typer.Option(min=0, max=SEED_MAX, help="Draws noise and ground, not the parts.")
+    ] = 0
+    parts_seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Draws other parts.")] = 0
 
     def foot(self, scene: Scene) -> EmulatedFoot:
         """What they ask for, in a scene.
@@ -175,7 +192,7 @@ class FootOptions:
             ("--cop-scale", self.cop_scale, None),
             ("--lead-s", self.lead_s, -1e-9),
         ):
-            if not abs(value) < 1e9 or (least is not None and value <= least):
+            if not abs(value) < NUMBER_MAX or (least is not None and value <= least):
                 raise UsageError(f"{option} {value:g}", expected="a sensible positive number")
         if self.load is not None and scene.array.bus != EMULATED:
             raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
@@ -214,6 +231,21 @@ def with_foot_options(command: Callable[..., None]) -> Callable[..., None]:
     # What typer reads of a function.
     run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+def with_finite_numbers(command: Callable[..., None]) -> Callable[..., None]:
+    """A command that refuses NaN and infinity in any of its options: no option means them."""
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        for name, value in given.items():
+            if isinstance(value, float) and not math.isfinite(value):
+                raise UsageError(
+                    f"--{name.replace('_', '-')} {value:g}", expected="a finite number"
+                )
+        command(**given)
+
     return run
 
 

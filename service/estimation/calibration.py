@@ -19,6 +19,12 @@ from devices.errors import CalibrationError
 from service.estimation.effects import CalibrationPart, Effects
 
 ANY_SERIAL = "*"
+UNPROVEN = ", unproven"
+"""Behind the name of one that was written or edited by hand, wherever it is reported."""
+EDITED = (
+    "It was edited by hand or damaged: calibrate again; or, if the edit is meant, delete its lines "
+    '"id" and "check": then it is used, and called unproven'
+)
 LOOP_OPENS_N = 1.0
 CURVE_OPENS_N = 0.2
 """Forces at which a loop, and what a cubic misses of a curve, have opened by half: at zero load
@@ -148,7 +154,7 @@ class Calibration(CalibrationPart):
 
     @classmethod
     def from_json(cls, text: str, *, where: str) -> Calibration:
-        """Read a calibration file.
+        """Read a calibration file. One without an id was written or edited by hand.
 
         Raises:
             CalibrationError: not JSON, a field is missing or unknown, or the id does not match.
@@ -169,11 +175,14 @@ class Calibration(CalibrationPart):
                 where=where,
                 expected="a file written by `foottile calibrate`",
             ) from error
+        if stated_id is None:
+            name = calibration.name.removesuffix(UNPROVEN) + UNPROVEN
+            return calibration.model_copy(update={"name": name})
         if stated_id != calibration.id:
             raise CalibrationError(
                 f"its id says {stated_id}, its content is {calibration.id}",
                 where=where,
-                remedy="It was edited by hand or damaged: calibrate again",
+                remedy=EDITED,
             )
         return calibration
 

@@ -8,21 +8,26 @@ parts seed and version, and would be the same if it were made again.
 from __future__ import annotations
 
 import hashlib
+import os
+import re
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from devices.errors import CalibrationError, needs_extra
+from devices.errors import CalibrationError, DamagedFileError, StorageError, needs_extra
 from devices.scene.file import Scene, build_scene, load_scene
-from service.estimation.calibration import PRESETS, Calibration
+from service.estimation.calibration import EDITED, PRESETS, UNPROVEN, Calibration
 from service.rig.emulated import EmulatedFoot
 from service.version import SOFTWARE
-from storage.durable import write_whole
+from storage.checked_json import read_checked, write_checked
+from storage.durable import make_folder, set_aside
 
 BENCH = "bench"
 BENCH_REFERENCE = "emulated mill, 12 bit over 100 N"
+
+_LAST_COMMA = re.compile(rb",\s*\}\s*\Z")
 
 Progress = Callable[[str], None]
 
@@ -63,19 +68,35 @@ def find_calibration(
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read a calibration file.
+    """Read a calibration file, which may have been written by hand: then its name says so.
 
     Raises:
-        CalibrationError: there is none, or it is not one.
+        CalibrationError: there is none, it is not one, or not what its hashes are of.
     """
     try:
-        text = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_checked(path.resolve()).text  # a user may keep links to it
+    except FileNotFoundError as error:
         raise CalibrationError(
-            f"no calibration {str(path)!r}: {error}",
+            f"no calibration {str(path)!r}",
             expected=f"a file, {BENCH!r}, or a preset: {', '.join(PRESETS)}",
         ) from error
-    return Calibration.from_json(text, where=str(path))
+    except (DamagedFileError, OSError, RuntimeError) as error:  # these two: links in a circle
+        what = error.what if isinstance(error, DamagedFileError) else str(error)
+        raise CalibrationError(
+            f"not a calibration: {what}", where=str(path), remedy=EDITED
+        ) from error
+    # Who deletes the last line, as the error says, leaves the comma before it.
+    text = _LAST_COMMA.sub(b"\n}", text)
+    return Calibration.from_json(text.decode("utf-8", "replace"), where=str(path))
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Write a calibration file.
+
+    Raises:
+        StorageError: the disk is full or not writable; nothing is left behind then.
+    """
+    write_checked(path, calibration.to_json().encode())
 
 
 def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) -> Calibration:
@@ -83,11 +104,8 @@ def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) 
     # Another version or another bench is another result.
     made_by = hashlib.sha256(f"{SOFTWARE}/{parts_seed}/{scene.model_dump_json()}".encode())
     kept = folder / f"{serial}-{made_by.hexdigest()[:16]}.json"
-    if kept.exists():
-        try:
-            return read_calibration(kept)
-        except CalibrationError:
-            kept.unlink(missing_ok=True)  # a damaged cache is no calibration, and no reason to fail
+    if (calibration := _kept_in(kept, serial, progress)) is not None:
+        return calibration
     # Here, because only the emulated bench needs the physics.
     with needs_extra("server", "the emulated bench"):
         from service.offline.calibrate import calibrate_recordings, read_recordings
@@ -101,9 +119,31 @@ def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) 
         calibration = calibrate_recordings(
             read_recordings([recording]), name=f"{BENCH}-{serial}", reference=BENCH_REFERENCE
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(kept, calibration.to_json().encode())
+    try:
+        make_folder(folder)
+        write_calibration(kept, calibration)
+    except OSError as error:  # it is what it is without a cache
+        progress(f"the calibration of {serial} is not kept: {error}")
     return calibration
+
+
+def _kept_in(kept: Path, serial: str, progress: Progress) -> Calibration | None:
+    """What is in the cache; None if nothing is, or nothing that proves itself: that is said."""
+    if not os.path.lexists(kept):
+        return None
+    try:
+        calibration = read_calibration(kept)
+        calibration.of(serial)
+        what = "it states no hash" if calibration.name.endswith(UNPROVEN) else ""
+    except CalibrationError as error:
+        what = error.what
+    if not what:
+        return calibration
+    try:
+        progress(f"{kept} is left out ({what}), and set aside as {set_aside(kept).name}")
+    except StorageError as error:
+        progress(f"{kept} is left out ({what}): {error}")
+    return None
 
 
 def bench_scene(serial: str) -> Scene:

@@ -14,7 +14,8 @@ from pathlib import Path
 from devices.errors import UnknownError
 from service.server_clock import utc_ns
 from storage.durable import storage_errors
-from storage.sessions.folder import DOOMED_PREFIX, Event, Session, SessionFolder, write_events
+from storage.sessions.beside import write_events
+from storage.sessions.folder import DOOMED_PREFIX, Event, Session, SessionFolder
 
 
 class Trash:
@@ -174,15 +175,14 @@ class SessionBook:
             StorageError: it cannot be written down.
         """
         session = self.get(session_id)
-        for known in session.events:
-            if known.id == event_id:
-                return known
-        event = Event(
-            id=event_id or uuid.uuid4().hex[:12],
-            label=label,
-            t_ns=utc_ns() if t_ns is None else t_ns,
-        )
-        session = self.keep(session.model_copy(update={"events": (*session.events, event)}))
+        event = next((known for known in session.events if known.id == event_id), None)
+        if event is None:
+            event = Event(
+                id=event_id or uuid.uuid4().hex[:12],
+                label=label,
+                t_ns=utc_ns() if t_ns is None else t_ns,
+            )
+            session = self.keep(session.model_copy(update={"events": (*session.events, event)}))
         if session.state == "sealed":
             write_events(session, self.folder.path(session_id))
         return event

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import time
-import uuid
-from contextlib import ExitStack
+from contextlib import suppress
 from pathlib import Path
 
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
 from service.server.book import SessionBook, Trash, destroy
+from service.server.data_folder import DataFolder
 from service.server.live import Hub
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
@@ -21,13 +20,7 @@ from service.server.settling import Settling
 from service.server.streams import ServerStream
 from service.server.views import NodeView, SessionView
 from service.server_clock import utc_ns
-from storage.durable import (
-    locked,
-    make_folder,
-    remove_stale_temporaries,
-    storage_errors,
-    write_whole,
-)
+from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
 from storage.sessions.folder import Session, SessionFolder
 
@@ -37,8 +30,7 @@ TICK_S = 0.2
 """How often frames are synced and acknowledged: a server that is killed has not promised more."""
 _SLOW_TICK_S = 1.0
 _PRUNE_EVERY_S = 30.0
-_PROBE_BYTES = 64 << 10
-_SERVER_ID = re.compile(r"[0-9a-f]{32}")
+_SAY_AGAIN_S = 60.0
 
 
 class Link:
@@ -85,21 +77,15 @@ class Server:
 
     def __init__(self, data: Path) -> None:
         self.data = data
-        with storage_errors(data, "Choose another folder with --data"):
-            make_folder(data)
-        self._lock = ExitStack()
-        self._lock.enter_context(
-            locked(
-                data,
-                refusal="another foottile server uses this data folder",
-                remedy="Stop it, or choose another folder with --data",
-            )
-        )
+        self.folder = DataFolder(data)
+        self.id = self.folder.id
+        """Name of this data folder: a node keeps what this server needs apart from others."""
+        self._said: tuple[str, float] = ("", 0.0)
+        self._unkept: set[str] = set()
+        """Nodes of which was said that nothing is kept."""
         try:
             remove_stale_temporaries(data)
             self.check_storage()
-            self.id = _id_of(data)
-            """Name of this data folder: a node keeps what this server needs apart from others."""
             self.hub = Hub()
             self.nodes = ServerNodes(data)
             self.sessions = SessionBook(
@@ -108,7 +94,7 @@ class Server:
             self.settling = Settling(self.sessions, self.nodes, self._ask_again)
             self.recorder = Recorder(self.sessions, self.nodes, self.settling)
         except FootTileError:
-            self._lock.close()
+            self.folder.close()
             raise
         self.links: dict[str, Link] = {}
 
@@ -120,6 +106,7 @@ class Server:
             now_s = time.monotonic()
             try:
                 await asyncio.gather(*(self._sync(node) for node in self.nodes))
+                await self._check_folder()
                 self.settling.settle()
                 self._tell_wanted()
                 if now_s >= slow_s:
@@ -129,10 +116,34 @@ class Server:
                     prune_s = now_s + _PRUNE_EVERY_S
                     for node in self.nodes:
                         node.prune(self.recorder.needed(node.name))
-            except FootTileError as error:
-                log.warning("%s", error)
-            except Exception:
-                log.exception("this is a bug; the server goes on")
+            except (FootTileError, OSError) as error:
+                self._say(str(error))
+            except Exception as error:
+                self._say(f"this is a bug; the server goes on: {error!r}", error)
+
+    async def _check_folder(self) -> None:
+        """While the folder is away nothing is settled or deleted, and every node says so.
+
+        Raises:
+            StorageError: it is away.
+        """
+        try:
+            self.folder.check()
+        except StorageError as error:
+            for node in self.nodes:
+                if self._cannot_keep(node, error):
+                    for stream in node.streams.values():
+                        stream.let_go()
+                        with suppress(StorageError):
+                            await asyncio.to_thread(stream.sync)
+            raise
+
+    def _say(self, text: str, bug: Exception | None = None) -> None:
+        """Log what is wrong, once: five times a second it would fill the log."""
+        before, said_s = self._said
+        if text != before or time.monotonic() - said_s > _SAY_AGAIN_S:
+            self._said = (text, time.monotonic())
+            log.log(logging.WARNING if bug is None else logging.ERROR, "%s", text, exc_info=bug)
 
     async def close(self) -> None:
         """End the links and wait for what is being sealed."""
@@ -145,16 +156,16 @@ class Server:
                     stream.close()
                 except StorageError as error:
                     log.warning("%s", error)
-        self._lock.close()
+        self.folder.close()
 
     def check_storage(self) -> None:
         """Whether something can be written.
 
         Raises:
+            FolderGoneError: the data folder is not there.
             StorageError: it cannot.
         """
-        # As much as some seconds of frames: on a full disk an empty file can still be written.
-        write_whole(self.data / ".writable", bytes(_PROBE_BYTES))
+        self.folder.check_writable()
 
     async def empty_trash(self) -> tuple[int, int]:
         """Delete what is in the trash for good; return the number of sessions and of bytes.
@@ -222,8 +233,9 @@ class Server:
         owed, stream.owed = stream.owed, Intervals()
         try:
             await asyncio.to_thread(stream.sync)
+            self.folder.check()
         except StorageError as error:
-            node.storage_problem = str(error)
+            self._cannot_keep(node, error)
             # The kernel may forget what it could not write: the node has to send it again.
             stream.disown(stream.unsynced | unsynced)
             stream.unsynced, stream.owed = Intervals(), Intervals()
@@ -238,18 +250,25 @@ class Server:
             await asyncio.to_thread(self.check_storage)
         except StorageError:
             return
+        log.warning("node %s: the server can write again", node.name)
         node.storage_problem = None
+        self._unkept.discard(node.name)
+        self.tell_node(node)
         if node.name in self.links:
             self.links[node.name].end(
                 Close.RESTART, "the server can write again; send what it lacks"
             )
 
+    def _cannot_keep(self, node: ServerNode, error: StorageError) -> bool:
+        """What a node sends is not kept: say it once, here and on every screen.
 
-def _id_of(data: Path) -> str:
-    path = data / "server_id"
-    with storage_errors(path):
-        kept = path.read_text("utf-8", "replace").strip() if path.exists() else ""
-    if not _SERVER_ID.fullmatch(kept):
-        kept = uuid.uuid4().hex
-        write_whole(path, kept.encode() + b"\n")
-    return kept
+        Returns:
+            Whether it is news.
+        """
+        is_news = node.name not in self._unkept
+        node.storage_problem = str(error)
+        if is_news:
+            self._unkept.add(node.name)
+            log.warning("node %s: nothing of it is kept: %s", node.name, error)
+            self.tell_node(node)
+        return is_news

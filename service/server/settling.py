@@ -20,7 +20,8 @@ from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.sessions.sealing import seal
 from storage.intervals import Intervals
-from storage.sessions.folder import Session, write_events
+from storage.sessions.beside import write_events
+from storage.sessions.folder import Session
 
 log = logging.getLogger("foottile.settling")
 

@@ -6,6 +6,7 @@ knows why frames are missing and where a stream ended. `sync` writes it.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
@@ -19,6 +20,8 @@ from storage.intervals import CORRUPT, NO_END, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import wire_schema
+
+log = logging.getLogger("foottile.streams")
 
 CLOCK_ROWS = 128
 """Clock measurements that are kept in memory for a pre-roll; the log has all of them."""
@@ -77,7 +80,10 @@ class ServerStream:
                 stream.notes = stream._notes_on_disk = notes
                 stream.missed_slots = notes.missed_slots
         with suppress(StorageError):
-            stream.clock_rows.extend(stream.all_clock_rows())
+            lines = stream._clock_log.lines()
+            stream.clock_rows.extend(lines.rows)
+            if lines.damaged:
+                log.warning("%s: %d damaged clock rows are left out", folder, lines.damaged)
         newest = journal.held.last
         if newest is not None:
             stream._first_seq = next(iter(journal.held))[0]
@@ -291,9 +297,19 @@ class ServerStream:
         Raises:
             StorageError: the disk refused.
         """
-        self.sync()
-        if self.journal is not None:
-            self.journal.close()
+        try:
+            self.sync()
+        finally:
+            if self.journal is not None:
+                self.journal.close()
+
+    def let_go(self) -> None:
+        """The disk is not there: what was not synced is not held, and open files are to be closed.
+
+        The next `sync` closes them.
+        """
+        self.disown(self.unsynced)
+        self.unsynced, self.owed = Intervals(), Intervals()
 
     def delete(self) -> None:
         """Delete the journal."""

@@ -271,6 +271,7 @@ class SessionView(View):
     tail_frames_max: int = Field(
         description="How many more there may have been where a node's power failed."
     )
+    marks: int = Field(description="Events that were marked in it.")
     bytes: int | None = Field(description="Size of the sealed file.")
     sha256: str | None = Field(description="Hash of the sealed file.")
     parts: list[Part] = Field(description="Intervals of streams, ends included.")
@@ -287,12 +288,13 @@ class SessionView(View):
         """Of a session as it is now."""
         ledger = recorder.ledger_of(session)
         made = {"frames", "pending_frames", "lost", "tail_frames_max", "duration_s", "problem"}
-        content = session.model_dump(include=set(cls.model_fields) - made)
+        content = session.model_dump(include=set(cls.model_fields) - made - {"marks"})
         return cls(
             **content | {"complete": "lossy" if ledger.lossy else ledger.complete},
             frames=ledger.recorded,
             pending_frames=ledger.pending,
             lost=ledger.lost,
+            marks=len(session.events),
             tail_frames_max=ledger.unsynced_tail_max,
             problem=recorder.problem_of(session),
             duration_s=recorder.duration_s(session, ledger.recorded),

@@ -38,14 +38,14 @@ class SessionFrames:
     def __iter__(self) -> Iterator[tuple[FrameBatch, Columns]]:
         if self._sources.calibration is None:
             self._without_estimates(self._sources.problem)
-            yield from self._raw()
+            yield from self.raw()
             return
         try:
             pieces = self._estimated()
             first = next(pieces, None)
         except FootTileError as error:  # no tare, a calibration of other tiles, no estimator
             self._without_estimates(error)
-            yield from self._raw()
+            yield from self.raw()
             return
         if first is not None:
             yield first
@@ -60,7 +60,7 @@ class SessionFrames:
             sources.calibration, sources.info.models, OFFLINE_LAG_MS, tares=sources.tares
         )
         stream = EstimateStream(sources.info, options)
-        for frames, columns in stream.run(self._raw()):
+        for frames, columns in stream.run(self.raw()):
             if not self.notes and stream.plan is not None:
                 self.notes = notes_of(stream.plan, sources.tares)
             yield frames, columns
@@ -75,7 +75,8 @@ class SessionFrames:
         if tares:
             self.notes["tares"] = [tare.as_dict() for tare in tares]
 
-    def _raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
+    def raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
+        """Frames with the column `part` only."""
         for number, part in enumerate(self._sources.session.parts):
             journal = self._sources.journals.get(part.boot_id)
             if journal is None:

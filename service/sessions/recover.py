@@ -9,15 +9,13 @@ killed at any time: what was written is whole, and a second run comes to the sam
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
-from devices.errors import DamagedFramesError, FootTileError
+from devices.errors import DamagedFileError, DamagedFramesError, FootTileError, StorageError
 from service.sessions.begin import begun
 from service.sessions.ends import SessionStream, at_stop, broken_off, open_tail
 from service.sessions.recover_streams import OpenedStream, hello_of, open_streams
@@ -25,19 +23,12 @@ from service.sessions.sealing import seal
 from service.sessions.sources import sources_of
 from service.sessions.tares import TareHistory
 from storage.clock.log import ClockLog
-from storage.durable import remove_stale_temporaries
+from storage.durable import remove_stale_temporaries, set_aside
 from storage.intervals import NO_END, Intervals
 from storage.journal.node_journal import settle_left_over
 from storage.journal.segment import UNREAD_SUFFIX
-from storage.sessions.folder import (
-    EVENTS_NAME,
-    Ledger,
-    Part,
-    Session,
-    SessionFolder,
-    new_session_id,
-    write_events,
-)
+from storage.sessions.beside import EVENTS_NAME, read_events, write_events
+from storage.sessions.folder import Ledger, Part, Session, SessionFolder, new_session_id
 from storage.sessions.ledger import ledger_of, numbers_of, states_of
 from storage.verify.session import verify_session
 
@@ -114,11 +105,11 @@ def recover(
     recovery = Recovery()
     sessions = SessionFolder(data / "sessions")
     recovery.removed += remove_stale_temporaries(data)
-    set_aside = _set_aside(data)
+    before = _unread(data)
     if _is_local(data):
         settle_left_over(data)  # a killed node leaves its frames in flight in a file
     opened, recovery.problems = open_streams(data, tell, is_local=_is_local(data))
-    for path in sorted(_set_aside(data) - set_aside):
+    for path in sorted(_unread(data) - before):
         name = f"{path.parent.parent.name}/{path.parent.name}"
         recovery.cut[name] = recovery.cut.get(name, 0) + path.stat().st_size
     known, unreadable = sessions.load_all()
@@ -147,7 +138,8 @@ def _complete(
     own = {part.boot_id: opened.get((session.node, part.boot_id)) for part in session.parts}
     for stream in own.values():
         if stream is not None:
-            session = session.with_clock(ClockLog(stream.journal.folder).rows())
+            with suppress(StorageError):  # its frames are worth more than its clock
+                session = session.with_clock(ClockLog(stream.journal.folder).rows())
     is_local, give_up = _is_local(data), give_up or session.given_up
     session = _with_ends(session, own, is_local=is_local, give_up=give_up)
     if any(part.seq_last is None for part in session.parts):
@@ -269,22 +261,21 @@ def _of_no_session(
     return found
 
 
-def _set_aside(data: Path) -> set[Path]:
+def _unread(data: Path) -> set[Path]:
     """Files with what followed the last whole batch of a segment."""
     return set(data.glob("journal/*/*/*" + UNREAD_SUFFIX))
 
 
 def _mend_events(session: Session, folder: Path) -> bool:
     """Write `events.parquet` again if it differs from `session.json`, which is written first."""
-    wanted = [event.model_dump() for event in session.events]
     try:
-        with pq.ParquetFile(folder / EVENTS_NAME) as file:
-            if file.read().to_pylist() == wanted:
-                return False
+        stored = read_events(folder / EVENTS_NAME)
+        if stored.events == session.events and stored.is_proven:
+            return False
     except FileNotFoundError:
         if not session.frames:
             return False
-    except (OSError, ValueError, pa.ArrowException):
-        pass
+    except DamagedFileError:
+        set_aside(folder / EVENTS_NAME)
     write_events(session, folder)
     return True

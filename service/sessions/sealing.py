@@ -7,10 +7,11 @@ from pathlib import Path
 from devices.errors import FileFormatError
 from service.sessions.frames import SessionFrames
 from service.sessions.sources import Sources
-from storage.clock.table import CLOCK_NAME, write_clock
-from storage.sessions.content_hash import sha256_of
+from storage.clock.file import CLOCK_NAME, write_clock
+from storage.file_hash import sha256_of
+from storage.sessions.beside import write_events
 from storage.sessions.file import SessionWriter
-from storage.sessions.folder import FRAMES_NAME, Ledger, Session, write_events
+from storage.sessions.folder import FRAMES_NAME, Ledger, Session
 
 
 def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:

@@ -1,7 +1,8 @@
 """The measurements of one stream's clock as they come: `clock.jsonl` in its journal folder.
 
-One JSON object a line, each with a CRC-32 of its own. A line is only ever appended: a torn last one
-is closed before the next, and a line that is not to the letter what was written is skipped.
+One JSON object a line, each with a CRC-32 of its own. A line is only ever appended, and a torn last
+one is cut off before the next. A line that is not to the letter what was written is left out: every
+row only narrows the bounds of the offset, so without it they are wider, and still right.
 """
 
 from __future__ import annotations
@@ -10,14 +11,38 @@ import json
 import os
 import zlib
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from devices.errors import StorageError
-from storage.durable import make_folder, storage_errors, sync_folder
+from devices.errors import DamagedFileError, StorageError
+from storage.durable import (
+    check_held,
+    make_folder,
+    read_whole,
+    storage_errors,
+    sync_folder,
+)
 
 NAME = "clock.jsonl"
+_BYTES_MAX = 1 << 30
+"""A stream of two years."""
+
+
+@dataclass(frozen=True)
+class ClockLines:
+    """What a log holds.
+
+    Attributes:
+        rows: of the lines that are whole, in the order they came.
+        damaged: how many other lines there are.
+        is_torn: does the last one lack its end, as after a power cut, or while it is written?
+    """
+
+    rows: tuple[ClockOffset, ...] = ()
+    damaged: int = 0
+    is_torn: bool = False
 
 
 class ClockLog:
@@ -38,15 +63,18 @@ class ClockLog:
         Raises:
             StorageError: the disk is full or not writable. Earlier rows are untouched.
         """
+        check_held(self.path)
         with storage_errors(self.path):
             if not self.path.parent.is_dir():
                 make_folder(self.path.parent)
             descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
             try:
                 end = os.fstat(descriptor).st_size
-                torn = end > 0 and os.pread(descriptor, 1, end - 1) != b"\n"
+                if end > 0 and os.pread(descriptor, 1, end - 1) != b"\n":
+                    end = os.pread(descriptor, end, 0).rfind(b"\n") + 1
+                    os.ftruncate(descriptor, end)
                 try:
-                    _write(descriptor, b"\n" * torn + _line(row))
+                    _write(descriptor, _line(row))
                 except OSError:
                     with suppress(OSError):
                         os.ftruncate(descriptor, end)
@@ -77,14 +105,24 @@ class ClockLog:
         Raises:
             StorageError: it is there and cannot be read.
         """
+        return self.lines().rows
+
+    def lines(self) -> ClockLines:
+        """The same, and what else is in it.
+
+        Raises:
+            StorageError: it is there and cannot be read.
+        """
         try:
-            content = self.path.read_bytes()
+            content = read_whole(self.path, bytes_max=_BYTES_MAX)
         except FileNotFoundError:
-            return ()
-        except OSError as error:
-            raise StorageError(f"cannot be read: {error}", where=str(self.path)) from error
-        read = (_row(line) for line in content.split(b"\n"))
-        return tuple(row for row in read if row is not None)
+            return ClockLines()
+        except DamagedFileError as error:
+            raise StorageError(error.what, where=error.where) from error
+        *lines, rest = content.split(b"\n")
+        read = [_row(line) for line in lines]
+        rows = tuple(row for row in read if row is not None)
+        return ClockLines(rows, damaged=len(read) - len(rows), is_torn=bool(rest))
 
 
 def _line(row: ClockOffset) -> bytes:

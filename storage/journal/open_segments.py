@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from devices.errors import StorageError
-from storage.durable import storage_errors, sync_folder
+from storage.durable import check_held, storage_errors, sync_folder
 from storage.journal.segment import SUFFIX, SegmentWriter
 from storage.wire import EncodedBatch
 
@@ -107,6 +107,7 @@ class OpenSegments:
         while path.exists():
             path = self._folder / f"{seq_first:020d}-{taken}{SUFFIX}"
             taken += 1
+        check_held(path)
         with storage_errors(path):
             writer = SegmentWriter(path, self._header)
         with self._lock:

@@ -7,6 +7,7 @@ the index was never promised to a server or a session. An index that is missing 
 
 from __future__ import annotations
 
+import errno
 import os
 import zlib
 from contextlib import suppress
@@ -92,12 +93,13 @@ class Segment:
         return found[np.argsort(found["seq_first"], kind="stable")]
 
     def disown(self, doubtful: Intervals) -> None:
-        """Stop holding batches within these numbers.
-
-        Raises:
-            OSError: the index cannot be read.
-        """
-        for record in self.records():
+        """Stop holding batches within these numbers."""
+        try:
+            records = self.records()
+        except OSError:  # gone, or no descriptor is left: what is doubtful is whole batches anyway
+            self.held = self.held - doubtful
+            return
+        for record in records:
             batch = Intervals([numbers(record)])
             if not (batch - doubtful):
                 self.held = self.held - batch
@@ -179,6 +181,10 @@ class SegmentWriter:
         try:
             os.fsync(self._data.fileno())
             os.fsync(self._index.fileno())
+            # A file that was moved or deleted takes what is written, too, and keeps it for nobody.
+            there, ours = os.stat(self.segment.path), os.fstat(self._data.fileno())
+            if (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino):
+                raise FileNotFoundError(errno.ENOENT, "another file is in its place")
         except OSError:
             self.has_news = True
             raise

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
-from storage.durable import write_whole
+from storage.checked_json import read_checked, write_checked
 from storage.intervals import AsPairs
 
 NOTES_FILE = "stream.json"
@@ -62,7 +62,7 @@ class StreamNotes(BaseModel):
         Raises:
             StorageError: the disk is full or not writable.
         """
-        write_whole(folder / NOTES_FILE, self.model_dump_json(indent=1).encode())
+        write_checked(folder / NOTES_FILE, self.model_dump_json(indent=1).encode())
 
     @classmethod
     def load(cls, folder: Path) -> StreamNotes | None:
@@ -71,10 +71,21 @@ class StreamNotes(BaseModel):
         Raises:
             FileFormatError: it is damaged.
         """
+        notes, _ = cls.load_checked(folder)
+        return notes
+
+    @classmethod
+    def load_checked(cls, folder: Path) -> tuple[StreamNotes | None, bool]:
+        """Read it, and say whether it proves itself; an older version's does not.
+
+        Raises:
+            FileFormatError: it is damaged.
+        """
         path = folder / NOTES_FILE
         try:
-            return cls.model_validate_json(path.read_bytes())
+            read = read_checked(path)
+            return cls.model_validate_json(read.text), read.is_proven
         except FileNotFoundError:
-            return None
-        except (OSError, ValidationError) as error:
+            return None, True
+        except ValidationError as error:
             raise FileFormatError(f"not a stream's notes: {error}", where=str(path)) from error

@@ -9,10 +9,15 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from storage.checked_json import is_unchanged, without_check
+from devices.errors import DamagedFileError
+from storage.checked_json import is_unchanged, read_checked, without_check
+from storage.durable import read_whole
 from storage.sessions.folder import Ledger, Part, Session
 
 SESSION_NAME = "session.json"
+LEDGER_NAME = "ledger.json"
+PULLED_EVENTS_NAME = "events.json"
+"""`foottile pull` writes these two."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ def claims_in(
         try:
             return claims_of(Session.model_validate_json(body))
         except ValidationError:
-            return _pulled(folder, json.loads(body))
+            return _pulled(folder, json.loads(body), problems, unproven)
     except (ValueError, KeyError, TypeError) as error:
         problems.append(f"{SESSION_NAME} is not readable: {first_line(error)}")
         return None
@@ -66,19 +71,35 @@ def claims_of(session: Session) -> Claims:
     return Claims(session.model_dump(mode="json"), session.parts, session.ledger, session)
 
 
-def _pulled(folder: Path, content: dict[str, Any]) -> Claims:
-    """What `foottile pull` left: the API's view of the session, and its ledger in a file."""
-    text = bytes_of(folder / "ledger.json")
+def _pulled(
+    folder: Path, content: dict[str, Any], problems: list[str], unproven: list[str]
+) -> Claims:
+    """What `foottile pull` left: the API's view of the session, and beside it events and ledger."""
+    text = _beside(folder / LEDGER_NAME, problems, unproven)
+    _beside(folder / PULLED_EVENTS_NAME, problems, unproven)
     parts = tuple(Part.model_validate(part) for part in content["parts"])
     ledger = Ledger.model_validate_json(text) if text is not None else None
     return Claims({**content, "id": content["id"]}, parts, ledger, None)
 
 
+def _beside(path: Path, problems: list[str], unproven: list[str]) -> bytes | None:
+    try:
+        read = read_checked(path)
+    except FileNotFoundError:
+        return None
+    except DamagedFileError as error:
+        problems.append(f"{path.name}: {error.what}")
+        return None
+    if not read.is_proven:
+        unproven.append(f"{path.name}: it states no hash of itself")
+    return read.text
+
+
 def bytes_of(path: Path) -> bytes | None:
     """A file's content; None if there is none, or it cannot be read."""
     try:
-        return path.read_bytes()
-    except OSError:
+        return read_whole(path)
+    except (OSError, DamagedFileError):
         return None
 
 

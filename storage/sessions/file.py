@@ -21,7 +21,9 @@ import pyarrow.parquet as pq
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
+from devices.inputs import check_file
 from storage.durable import storage_errors, sync_folder, temporary_of
+from storage.file_hash import FILE_HASH_KEY, write_file_hash
 from storage.schema import (
     ARRAY_INFO_KEY,
     FRAMES,
@@ -31,19 +33,15 @@ from storage.schema import (
     flat_columns,
     from_flat,
 )
-from storage.sessions.content_hash import (
-    CONTENT_HASH_KEY,
-    CONTENT_KEY,
-    ContentDigest,
-    content_hash,
-    write_file_hash,
-)
+from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, ContentDigest, content_hash
 
 FORMAT_KEY = b"foottile.format"
 FORMAT = b"2"
 FORMAT_WITHOUT_HASH = b"1"
 """Files of older versions: the same, without any hash of their own. They are read, not written."""
 NOTES_KEY = b"foottile.notes"
+EXPORT_KEY = b"foottile.export"
+"""Only in what was made from a session: of which one, and what of it."""
 
 ROW_GROUP_NS = 60_000_000_000
 
@@ -201,12 +199,13 @@ class SessionReader:
         """
         self.path = path
         try:
+            check_file(path)
             self._file = pq.ParquetFile(path, page_checksum_verification=True)
-        except (OSError, ValueError, pa.ArrowException) as error:
+            schema = self._file.schema_arrow
+        except Exception as error:  # damaged bytes may cause any error
             raise FileFormatError(
                 f"cannot be read as Parquet: {error}", where=str(path), expected="a sealed session"
             ) from error
-        schema = self._file.schema_arrow
         metadata = schema.metadata or {}
         version = metadata.get(FORMAT_KEY)
         if version not in (FORMAT, FORMAT_WITHOUT_HASH):
@@ -259,6 +258,17 @@ class SessionReader:
                     f"row group {group} cannot be read: {error}", where=str(self.path)
                 ) from error
 
+    @property
+    def identity(self) -> dict[str, object]:
+        """Which session it is, for what is made from it: id, content hash, stated file hash."""
+        said = self._file.metadata.metadata or {}
+        session = self.notes.get("session")
+        return {
+            "session": session.get("id") if isinstance(session, dict) else None,
+            "content_sha256": self.content_sha256,
+            "file_sha256": said.get(FILE_HASH_KEY, b"").decode("ascii", "replace") or None,
+        }
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -280,21 +290,26 @@ class SessionReader:
         Raises:
             FileFormatError: a column is missing, of another type, or damaged.
         """
+        for values in self.columns(*(column.name for column in FRAMES), *extra):
+            yield FrameBatch(**{column.name: values.pop(column.name) for column in FRAMES}), values
+
+    def columns(self, *wanted: str) -> Iterator[dict[str, Array]]:
+        """Some columns only, of `storage.schema.KNOWN`, a row group at a time.
+
+        Raises:
+            FileFormatError: as for `batches`.
+        """
         tiles = len(self.info.tiles)
-        wanted = [*(column.name for column in FRAMES), *extra]
         names = [flat for name in wanted for flat in KNOWN[name].flat_names(tiles)]
         for group in range(self._file.num_row_groups):
             try:
                 table = self._file.read_row_group(group, columns=names)
-                values: dict[str, Any] = {
-                    name: from_flat(KNOWN[name], table, tiles) for name in wanted
-                }
-                frames = FrameBatch(**{column.name: values.pop(column.name) for column in FRAMES})
+                values = {name: from_flat(KNOWN[name], table, tiles) for name in wanted}
             except (KeyError, ValueError, OSError, pa.ArrowException) as error:
                 raise FileFormatError(
                     f"row group {group} cannot be read: {error}", where=str(self.path)
                 ) from error
-            yield frames, values
+            yield values
 
     def frames(self) -> FrameBatch:
         """All frames at once.

@@ -2,8 +2,6 @@
 
 Each has a folder `<sessions>/<id>/` with `session.json`, replaced whole at every change, and, once
 it is sealed, `frames.parquet`, `events.parquet` and `clock.parquet`.
-
-`events.parquet` is what people marked.
 """
 
 from __future__ import annotations
@@ -12,80 +10,26 @@ import re
 import secrets
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from devices.errors import FileFormatError, FootTileError, UnknownError, UsageError
+from devices.errors import (
+    FileFormatError,
+    FootTileError,
+    StorageError,
+    UnknownError,
+)
 from storage.checked_json import read_checked, write_checked
 from storage.clock.log import ClockOffset
-from storage.clock.table import CLOCK_NAME, ClockTable, StreamFacts, read_clock
-from storage.durable import make_folder, storage_errors, sync_folder, write_whole
-from storage.sessions.file import SessionReader
-
-EVENTS_NAME = "events.parquet"
-
-
-def write_events(session: Session, folder: Path) -> None:
-    """Write `events.parquet` into the session's folder, in place of the one that is there.
-
-    Raises:
-        StorageError: the disk is full or not writable.
-    """
-    events = session.events
-    columns = {
-        "id": pa.array([event.id for event in events], pa.string()),
-        "label": pa.array([event.label for event in events], pa.string()),
-        "t_ns": pa.array([event.t_ns for event in events], pa.int64()),
-    }
-    sink = pa.BufferOutputStream()
-    pq.write_table(pa.table(columns), sink, compression="zstd")
-    write_whole(folder / EVENTS_NAME, sink.getvalue().to_pybytes())
-
-
-def clock_beside(reader: SessionReader) -> ClockTable:
-    """The clock table that lies beside a sealed session's frames.
-
-    Raises:
-        UsageError: there is none.
-        FileFormatError: it is damaged, or the session's notes are.
-    """
-    path = reader.path.with_name(CLOCK_NAME)
-    if not path.is_file():
-        raise UsageError(
-            f"there is no {CLOCK_NAME} beside {reader.path.name}, so the server's time is unknown",
-            where=str(reader.path.parent),
-            expected="a session's folder as a server sealed it",
-            remedy="Leave the clock at `node`, or fetch the session's folder whole",
-        )
-    rows, facts = read_clock(path)
-    info = reader.info
-    facts.setdefault(info.boot_id, StreamFacts(info.boot_id, info.utc_offset_ns, info.clock_set))
-    parts = _parts(reader)
-    streams = [facts.get(boot_id, StreamFacts(boot_id)) for boot_id in dict.fromkeys(parts)]
-    return ClockTable(rows, streams, parts, where=str(path))
-
-
-def _parts(reader: SessionReader) -> list[str]:
-    """Streams by number of part; a file that was never recorded has one part."""
-    session = reader.notes.get("session")
-    if session is None:
-        return [reader.info.boot_id]
-    try:
-        return [str(part["boot_id"]) for part in session["parts"]]
-    except (TypeError, KeyError) as error:
-        raise FileFormatError(
-            "its notes do not say which streams it is of", where=str(reader.path)
-        ) from error
-
+from storage.durable import make_folder, storage_errors, sync_folder
 
 FRAMES_NAME = "frames.parquet"
 DOOMED_PREFIX = ".deleted-"
-_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
+SESSION_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
 
 State = Literal["recording", "pending", "sealing", "sealed"]
 
@@ -220,7 +164,7 @@ class SessionFolder:
         Raises:
             UnknownError: the id has not the form of one, so it can not leave the folder either.
         """
-        if not _ID.fullmatch(session_id):
+        if not SESSION_ID.fullmatch(session_id):
             raise UnknownError(f"no session {session_id[:80]!r}")
         return self._folder / session_id
 
@@ -231,10 +175,17 @@ class SessionFolder:
             StorageError: the disk is full or not writable; the old one is still there then.
         """
         folder = self.path(session.id)
+        is_new = not folder.exists()
         with storage_errors(folder):
             make_folder(folder)
         text = session.model_dump_json(indent=1).encode()
-        write_checked(folder / "session.json", text)
+        try:
+            write_checked(folder / "session.json", text)
+        except StorageError:
+            if is_new:  # a full disk still takes an empty folder, which is no session
+                with suppress(OSError):
+                    folder.rmdir()
+            raise
 
     def load(self, session_id: str) -> Session:
         """Read `session.json`.
@@ -300,5 +251,7 @@ class SessionFolder:
     def ids(self) -> Iterator[str]:
         """Ids of all sessions, newest first."""
         if self._folder.is_dir():
-            names = [path.name for path in self._folder.iterdir() if _ID.fullmatch(path.name)]
+            names = [
+                path.name for path in self._folder.iterdir() if SESSION_ID.fullmatch(path.name)
+            ]
             yield from sorted(names, reverse=True)

@@ -5,22 +5,31 @@ Nothing is written, no lock is taken; a server or node may run beside it.
 
 from __future__ import annotations
 
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, FootTileError
+from storage.durable import ASIDE
 from storage.journal.segment import SUFFIX
 from storage.journal.segment_format import INDEX_SUFFIX
 from storage.journal.stream_notes import NOTES_FILE
 from storage.sessions.claims import SESSION_NAME
-from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.folder import FRAMES_NAME, SESSION_ID
+from storage.verify.exported import ExportReport, verify_export
 from storage.verify.journal import StreamReport, verify_stream
+from storage.verify.others import Others, check_json, verify_others
 from storage.verify.segment import SegmentReport, verify_segment
 from storage.verify.session import SessionReport, verify_lone_file, verify_session
 
-Verdict = Literal["complete", "lossy", "pending", "damaged"]
+Verdict = Literal["complete", "lossy", "pending", "damaged", "export"]
+
+_STREAM_NAME = re.compile(r"[0-9a-f]{32}")
 
 
 @dataclass
@@ -32,12 +41,16 @@ class FolderReport:
         sessions: of its sessions, including those in the trash.
         streams: of its journals.
         problems: what is wrong beside these.
+        unproven: what else states no hash of itself.
+        set_aside: what was found damaged before: it counts no more, and waits for a person.
     """
 
     path: Path
     sessions: list[SessionReport] = field(default_factory=list)
     streams: list[StreamReport] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    unproven: list[str] = field(default_factory=list)
+    set_aside: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON has it (docs/formats.md)."""
@@ -47,18 +60,25 @@ class FolderReport:
             *(f"session {s.id or s.path.name}: {said}" for s in sessions for said in s.problems),
             *(f"journal {j.node}/{j.boot_id}: {said}" for j in streams for said in j.problems),
         ]
+        unproven = [
+            *self.unproven,
+            *(f"session {s.id or s.path.name}: {said}" for s in sessions for said in s.unproven),
+            *(f"journal {j.node}/{j.boot_id}: {said}" for j in streams for said in j.unproven),
+        ]
         return {
             "sessions": [session.as_dict() for session in sessions],
             "journals": [stream.as_dict() for stream in streams],
             "problems": everything,
+            "unproven": unproven,
+            "set_aside": self.set_aside,
         }
 
 
-Report = FolderReport | SessionReport | StreamReport | SegmentReport
+Report = FolderReport | SessionReport | StreamReport | SegmentReport | ExportReport
 
 
 def verify(path: Path, *, data: Path | None = None) -> Report:
-    """Prove what is there, whatever it is: session, sealed file, journal, segment, data folder.
+    """Prove what is there: session, sealed file, journal, segment, data folder, JSON of ours.
 
     Args:
         path: a folder or a file.
@@ -74,7 +94,11 @@ def verify(path: Path, *, data: Path | None = None) -> Report:
             return verify_session(path.parent, data=data)
         if path.name == NOTES_FILE:
             return verify_stream(path.absolute().parent)
-        return verify_lone_file(path)
+        if path.suffix == ".json":
+            others = Others()
+            check_json(path, path.name, others)
+            return FolderReport(path, problems=others.problems, unproven=others.unproven)
+        return verify_export(path) or verify_lone_file(path)
     if not path.exists():
         raise FileFormatError("no such file or folder", where=str(path))
     if (path / "sessions").is_dir() or (path / "journal").is_dir():
@@ -83,6 +107,8 @@ def verify(path: Path, *, data: Path | None = None) -> Report:
         return verify_session(path, data=data)
     if (path / NOTES_FILE).exists() or any(path.glob("*" + SUFFIX)):
         return verify_stream(path.absolute())
+    if any(path.glob("*.json")):
+        return verify_folder(path)
     raise FileFormatError(
         "nothing that foottile wrote is in it",
         where=str(path),
@@ -96,23 +122,56 @@ def verify_folder(path: Path) -> FolderReport:
     Raises:
         FileFormatError: it cannot be read.
     """
+    data = path.absolute()
     report = FolderReport(path)
     known = cache(verify_stream)
-    for folder in sorted(path.absolute().glob("journal/*/*")):
-        if folder.is_dir() and (report_of := _if_there(folder, known)) is not None:
-            report.streams.append(report_of)
+    proven: set[Path] = set()
+    for folder in _folders(data, "journal/*", _STREAM_NAME, report):
+        proven.add(folder)
+        with _told(report, folder, data):
+            report.streams.append(known(folder))
     for place in ("sessions", "trash"):
-        for folder in _session_folders(path / place):
-            try:
-                session = verify_session(folder, data=path.absolute(), streams=known)
-            except FileFormatError:
-                if folder.exists():
-                    raise
-                continue  # deleted meanwhile
-            if session.id not in (None, folder.name):
-                session.problems.append(f"it lies in the folder of {folder.name}")
-            report.sessions.append(session)
+        for folder in _folders(data, place, SESSION_ID, report):
+            proven.add(folder)
+            with _told(report, folder, data):
+                # The folder of a session that was never written down is empty.
+                if any(not inside.name.startswith(".") for inside in folder.iterdir()):
+                    session = verify_session(folder, data=data, streams=known)
+                    if session.id not in (None, folder.name):
+                        session.problems.append(f"it lies in the folder of {folder.name}")
+                    report.sessions.append(session)
+    others = verify_others(data, proven)
+    report.problems += others.problems
+    report.unproven, report.set_aside = others.unproven, others.set_aside
     return report
+
+
+def _folders(
+    data: Path, places: str, form: re.Pattern[str], report: FolderReport
+) -> Iterator[Path]:
+    """Folders with a name of this form; what has such a name and is none is a problem."""
+    for path in sorted(data.glob(f"{places}/*")):
+        if ASIDE in path.name or not form.fullmatch(path.name):
+            continue
+        with _told(report, path, data):
+            if path.is_dir():
+                yield path
+            else:
+                report.problems.append(f"{path.relative_to(data)}: it is not a folder")
+
+
+@contextmanager
+def _told(report: FolderReport, path: Path, data: Path) -> Iterator[None]:
+    """Note what cannot be read, and go on with the rest; what was deleted meanwhile is no damage.
+
+    Damaged bytes may cause any error, and none may hide what is wrong elsewhere.
+    """
+    try:
+        yield
+    except Exception as error:
+        if os.path.lexists(path):
+            what = error.what if isinstance(error, FootTileError) else f"cannot be read: {error}"
+            report.problems.append(f"{path.relative_to(data)}: {what}")
 
 
 def verdict_of(report: Report) -> Verdict:
@@ -129,6 +188,8 @@ def verdict_of(report: Report) -> Verdict:
         return next((verdict for verdict in order if verdict in verdicts), "complete")
     if report.problems:
         return "damaged"
+    if isinstance(report, ExportReport):
+        return "export"
     if not isinstance(report, SessionReport) or report.in_trash:
         return "complete"
     if report.ledger is None or any(part.pending for part in report.ledger.parts):
@@ -136,24 +197,3 @@ def verdict_of(report: Report) -> Verdict:
     if report.ledger.lossy:
         return "lossy"
     return "complete" if report.ledger.complete else "pending"
-
-
-def _session_folders(place: Path) -> list[Path]:
-    if not place.is_dir():
-        return []
-    # The folder of a session that was never written down is empty.
-    return sorted(
-        path
-        for path in place.iterdir()
-        if path.is_dir() and any(not inside.name.startswith(".") for inside in path.iterdir())
-    )
-
-
-def _if_there(folder: Path, known: Any) -> StreamReport | None:
-    try:
-        report: StreamReport = known(folder)
-    except FileFormatError:
-        if folder.exists():
-            raise
-        return None
-    return report

@@ -13,8 +13,9 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import FileFormatError
+from storage.file_hash import file_hashes
 from storage.intervals import AsPairs, Intervals, Losses, union
-from storage.sessions.content_hash import ContentDigest, file_hashes
+from storage.sessions.content_hash import ContentDigest
 from storage.sessions.file import FORMAT_WITHOUT_HASH, SessionReader
 from storage.sessions.folder import Ledger, Part, PartLedger
 from storage.sessions.frame_order import PartFrames
@@ -78,8 +79,6 @@ def verify_file(path: Path) -> FileReport:
             raise
         report.problems.append(error.what)
     except Exception as error:  # damaged bytes may cause any error
-        if not report.problems:
-            raise
         report.problems.append(f"it cannot be read: {error}")
     else:
         _check_ledger(report)

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo
+from storage.clock.log import NAME as CLOCK_LOG
+from storage.clock.log import ClockLog
 from storage.intervals import CORRUPT, Intervals, Losses
 from storage.journal.segment import SUFFIX, UNREAD_SUFFIX
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD
@@ -34,6 +36,7 @@ class StreamReport:
         segments: how many there are.
         problems: what is wrong.
         remarks: what a person should know, and is no damage.
+        unproven: what these files cannot show.
     """
 
     node: str
@@ -46,6 +49,7 @@ class StreamReport:
     segments: int = 0
     problems: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    unproven: list[str] = field(default_factory=list)
 
     def state(self, may_come: Intervals) -> StreamState:
         """The stream as sessions know it.
@@ -94,6 +98,7 @@ class StreamReport:
             "next_seq": self.notes.next_seq if self.notes is not None else None,
             "unsynced_tail_max": self.notes.unsynced_tail_max if self.notes is not None else 0,
             "problems": self.problems,
+            "unproven": self.unproven,
         }
 
 
@@ -108,16 +113,20 @@ def verify_stream(folder: Path) -> StreamReport:
     """
     report = StreamReport(folder.parent.name, folder.name)
     try:
-        report.notes = StreamNotes.load(folder)
+        report.notes, is_proven = StreamNotes.load_checked(folder)
+        if not is_proven:
+            report.unproven.append(f"{NOTES_FILE}: it states no hash of itself")
     except FileFormatError as error:
         report.problems.append(f"{NOTES_FILE}: {error.what}")
     if report.notes is not None:
         report.info, report.lost = report.notes.array_info, Losses(report.notes.lost)
     else:
         report.remarks.append(f"no {NOTES_FILE}: nothing says where the stream ended")
+    _check_clock(report, folder)
     segments = _segments(folder)
     for path in _names(folder, INDEX_SUFFIX):
-        if not path.with_suffix(SUFFIX).exists() and bytes_of(path):
+        # An empty one is what a power cut leaves.
+        if not path.with_suffix(SUFFIX).exists() and bytes_of(path) != b"":
             report.problems.append(f"{path.name}: the segment of this index is missing")
     for path in _names(folder, UNREAD_SUFFIX):
         report.remarks.append(f"{path.name}: bytes that were no whole batch after a crash")
@@ -171,6 +180,21 @@ def _check_stream(report: StreamReport, segments: list[SegmentReport], *, is_ser
             "ended, and it was not closed"
             for segment in open_ones
         ]
+
+
+def _check_clock(report: StreamReport, folder: Path) -> None:
+    try:
+        lines = ClockLog(folder).lines()
+    except StorageError as error:
+        report.problems.append(f"{CLOCK_LOG}: {error.what}")
+        return
+    if lines.damaged:
+        report.problems.append(
+            f"{CLOCK_LOG}: {lines.damaged} lines are not what was written: they are left out, and "
+            "the bounds of the server's time are wider"
+        )
+    if lines.is_torn:
+        report.remarks.append(f"{CLOCK_LOG}: its last line has no end, as after a crash")
 
 
 def _segments(folder: Path) -> list[SegmentReport]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from devices.errors import FileFormatError
+from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
 from storage.intervals import Intervals
 from storage.journal.segment_format import (
@@ -32,7 +32,7 @@ from storage.journal.segment_format import (
     read_header,
     read_index,
 )
-from storage.schema import array_info, wire_schema
+from storage.schema import array_info, older_wire_schema, wire_schema
 from storage.wire import decode
 
 
@@ -84,10 +84,16 @@ def verify_segment(path: Path) -> SegmentReport:
         FileFormatError: there is no such file.
     """
     report = SegmentReport(path)
+    for each in (path, path.with_suffix(INDEX_SUFFIX)):
+        if os.path.lexists(each) and (each.is_symlink() or not each.is_file()):
+            report.problems.append(f"{each.name} is not a file")
+            return report
     try:
         _verify(path, report)
-    except OSError as error:  # not there, or deleted meanwhile
+    except FileNotFoundError as error:  # or deleted meanwhile
         raise FileFormatError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    except Exception as error:  # damaged bytes may cause any error
+        report.problems.append(f"it cannot be read: {error}")
     return report
 
 
@@ -208,9 +214,11 @@ def _schema_of(path: Path, report: SegmentReport) -> tuple[pa.Schema | None, int
         return None, 0
     try:
         report.info = array_info(schema, where=str(path))
-    except FileFormatError:
+    except FileFormatError as error:
+        if isinstance(error, DamagedFileError):
+            report.problems.append(error.what)
         return None, 0
-    expected = wire_schema(report.info)
-    if not schema.equals(expected, check_metadata=True):
+    expected, older = wire_schema(report.info), older_wire_schema(report.info)
+    if not any(schema.equals(one, check_metadata=True) for one in (expected, older)):
         report.problems.append("its columns are not those of a stream of frames")
     return expected, length

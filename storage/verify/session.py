@@ -9,27 +9,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import pyarrow as pa
-import pyarrow.parquet as pq
-from pydantic import TypeAdapter, ValidationError
+from typing import Any, TypeVar
 
 from devices.errors import FileFormatError
-from storage.clock.table import CLOCK_NAME
+from storage.clock.file import CLOCK_NAME, StoredClock, read_clock
+from storage.file_hash import sha256_of
 from storage.intervals import NO_END, Intervals
-from storage.sessions.claims import SESSION_NAME, Claims, bytes_of, claims_in, claims_of, first_line
-from storage.sessions.content_hash import file_hashes, sha256_of
-from storage.sessions.folder import EVENTS_NAME, FRAMES_NAME, Event, Ledger, Session
+from storage.sessions.beside import EVENTS_NAME, StoredEvents, read_events
+from storage.sessions.claims import SESSION_NAME, Claims, bytes_of, claims_in, claims_of
+from storage.sessions.folder import FRAMES_NAME, Event, Ledger, Session
 from storage.sessions.ledger import ledger_of, states_of
 from storage.verify.file import FileReport, ledger_problems, verify_file
 from storage.verify.journal import StreamReport, verify_stream
 
 _TRIES = 3
 _SAME_S = 1e-6
-_CLOCK_COLUMNS = ("boot_id", "t_mono_ns", "server_minus_node_ns", "uncertainty_ns")
 
 Streams = Callable[[Path], StreamReport]
+_Stored = TypeVar("_Stored", StoredEvents, StoredClock)
 
 
 @dataclass
@@ -72,7 +69,13 @@ class SessionReport:
         if self.problems:
             ledger = ledger.model_copy(update={"complete": False})
         content = ledger.model_dump(mode="json")
-        return {**content, "id": self.id, "problems": self.problems, "sha256": self.sha256}
+        return {
+            **content,
+            "id": self.id,
+            "problems": self.problems,
+            "sha256": self.sha256,
+            "unproven": self.unproven,
+        }
 
 
 def verify_lone_file(path: Path) -> SessionReport:
@@ -173,9 +176,9 @@ def _check_sealed(report: SessionReport, folder: Path, said: Claims) -> None:
             problems.append(f"the ledgers of {SESSION_NAME} and {FRAMES_NAME} are not the same")
     if file.session and file.session.get("parts") != [p.model_dump() for p in said.parts]:
         problems.append(f"{SESSION_NAME} and {FRAMES_NAME} are not of the same parts")
-    if said.whole is not None:
-        _check_events(problems, folder / EVENTS_NAME, said.whole.events)
-        _check_clock(problems, folder / CLOCK_NAME, said.whole)
+    whole = said.whole
+    _check_events(report, folder / EVENTS_NAME, whole.events if whole is not None else None)
+    _check_clock(report, folder / CLOCK_NAME, whole)
 
 
 def _compare(problems: list[str], content: dict[str, Any], file: FileReport, size: int) -> None:
@@ -220,43 +223,44 @@ def _add_file(report: SessionReport, folder: Path) -> FileReport:
     return file
 
 
-def _check_events(problems: list[str], path: Path, events: tuple[Event, ...]) -> None:
-    table = _small_table(problems, path)
-    if table is None:
+def _check_events(report: SessionReport, path: Path, events: tuple[Event, ...] | None) -> None:
+    """Prove the table of events.
+
+    Args:
+        report: takes what is found.
+        path: of the table.
+        events: that it should have; None: that is not known, and it may be missing.
+    """
+    stored = _stored(report, path, read_events, may_lack=events is None)
+    if stored is not None and events is not None and stored.events != events:
+        report.problems.append(f"{path.name} has other events than {SESSION_NAME}")
+
+
+def _check_clock(report: SessionReport, path: Path, session: Session | None) -> None:
+    """Prove the clock table in the same way."""
+    stored = _stored(report, path, read_clock, may_lack=session is None)
+    if stored is None or session is None:
         return
+    by_stream = sorted(session.clock, key=lambda row: row.boot_id)
+    if by_stream and sorted(stored.offsets, key=lambda row: row.boot_id) != by_stream:
+        report.problems.append(f"{path.name} has other rows than {SESSION_NAME}")
+
+
+def _stored(
+    report: SessionReport, path: Path, read: Callable[[Path], _Stored], *, may_lack: bool
+) -> _Stored | None:
     try:
-        found = TypeAdapter(tuple[Event, ...]).validate_python(table.to_pylist())
-    except ValidationError as error:
-        problems.append(f"{path.name} is not readable: {first_line(error)}")
-        return
-    if found != events:
-        problems.append(f"{path.name} has other events than {SESSION_NAME}")
-
-
-def _check_clock(problems: list[str], path: Path, session: Session) -> None:
-    table = _small_table(problems, path)
-    if table is None:
-        return
-    if missing := set(_CLOCK_COLUMNS) - set(table.column_names):
-        problems.append(f"{path.name} lacks {', '.join(sorted(missing))}")
-        return
-    said = [row.model_dump(include=set(_CLOCK_COLUMNS)) for row in session.clock]
-    if said and table.select(list(_CLOCK_COLUMNS)).to_pylist() != said:
-        problems.append(f"{path.name} has other rows than {SESSION_NAME}")
-
-
-def _small_table(problems: list[str], path: Path) -> pa.Table | None:
-    try:
-        hashes = file_hashes(path)
-        if hashes is not None and hashes[0] != hashes[1]:
-            problems.append(f"{path.name}: its bytes are not those that were written")
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            return file.read()
+        stored = read(path)
     except FileNotFoundError:
-        problems.append(f"{path.name} is missing")
-    except (OSError, ValueError, pa.ArrowException) as error:
-        problems.append(f"{path.name} is not readable: {first_line(error)}")
-    return None
+        if not may_lack:
+            report.problems.append(f"{path.name} is missing")
+        return None
+    except FileFormatError as error:
+        report.problems.append(f"{path.name}: {error.what}")
+        return None
+    if not stored.is_proven:
+        report.unproven.append(f"{path.name}: an older foottile wrote it, without a hash")
+    return stored
 
 
 def _count(report: SessionReport, data: Path, session: Session, streams: Streams) -> None:

@@ -49,6 +49,7 @@ def test_the_text_is_made_of_the_facts(kind: type[FootTileError]) -> None:
     assert str(error) == "tile T02: it broke; expected a whole one. Mend it"
     assert str(kind("it broke")) == "it broke"
     assert str(kind("it broke", remedy="Mend it")) == "it broke. Mend it"
+    assert str(kind("did it break?", remedy="Mend it")) == "did it break? Mend it"
 
 
 def travelled(error: FootTileError) -> FootTileError:

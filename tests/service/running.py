@@ -18,6 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from devices.frames import FrameBatch
 from service.api.app import make_app
+from service.api.doors import Bounds
 from service.api.serve import listen, serving, urls_of
 from service.link import SUBPROTOCOL
 from service.server.server import Server
@@ -37,13 +38,21 @@ def assert_refused(answer: httpx.Response, status: int, *words: str) -> None:
 class Running:
     """A server in a thread with an event loop of its own."""
 
-    def __init__(self, data: Path, *, token: str | None = None, hosts: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        data: Path,
+        *,
+        token: str | None = None,
+        hosts: Sequence[str] = (),
+        bounds: Bounds | None = None,
+    ) -> None:
         self.data = data
         self.server: Server
         self.http: httpx.Client
         self.port = 0
         self._token = token
         self._hosts = tuple(hosts)
+        self._bounds = bounds
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop
         self._stop: asyncio.Event
@@ -160,7 +169,7 @@ class Running:
         with listen("127.0.0.1", self.port) as listening:
             self.server = Server(self.data)
             app = make_app(self.server, hosts=self._hosts, token=self._token)
-            async with serving(app, listening):
+            async with serving(app, listening, self._bounds):
                 self.port = int(urls_of(listening, "127.0.0.1")[-1].rsplit(":", 1)[1])
                 ready.set()
                 await self._stop.wait()

@@ -21,6 +21,7 @@ from storage.schema import (
     ESTIMATES,
     FRAMES,
     KNOWN,
+    MARKS,
     MILL,
     SERVER_TIME,
     TRUTH,
@@ -174,7 +175,7 @@ def test_every_column_on_disk_says_its_unit() -> None:
     for column in (*ESTIMATES, *TRUTH):
         shape = (3, 2) if column.per_tile else (3,)
         values[column.name] = np.zeros(shape, dtype=column.type.to_pandas_dtype())
-    for column in MILL:
+    for column in (*MILL, *MARKS):
         values[column.name] = np.array(["a", "b", "c"])
     values["part"] = np.zeros(3, dtype=np.uint16)
     for column in SERVER_TIME:

@@ -222,3 +222,22 @@ def test_a_phone_has_room_for_several_recordings_and_all_buttons(
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         for button in ("#tare", "#record", "#stop", "#mark"):
             expect(page.locator(button)).to_be_in_viewport()
+
+
+def test_a_session_shows_how_many_marks_it_has_and_its_downloads_have_them(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    session = scripted.recorded("walk")
+    page = open_page(scripted.url)
+    marks = row_of(page, session).locator(".c-marks")
+    expect(marks).to_have_text("0")
+    t_ns = int(session.column("t_ns")[3])
+    body = {"label": "a stone", "t_ns": t_ns}
+    assert scripted.running.http.post(f"{session.url}/events", json=body).status_code == 201
+    expect(marks).to_have_text("1")
+    for kind in ("parquet", "arrow", "csv"):
+        with page.expect_download() as download:
+            row_of(page, session).locator(f'[data-part="{kind}"]').click()
+        content = Path(download.value.path()).read_bytes()
+        assert content == session.data(format=kind, marks="true").content
+        assert b"a stone" in content

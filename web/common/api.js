@@ -94,4 +94,6 @@ export const restoreSession = (session) => call("POST", `/trash/${id(session)}/r
 export const emptyTrash = () => call("DELETE", "/trash");
 export const listSessions = (cursor) =>
   call("GET", `/sessions?limit=20${cursor ? `&cursor=${id(cursor)}` : ""}`);
-export const dataAddress = (session, format) => `${PREFIX}/sessions/${id(session)}/data?format=${format}`;
+/** Of a download, with marks if there are any; Parquet without them is the sealed file itself. */
+export const dataAddress = (session, format) =>
+  `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marks ? "&marks=true" : ""}`;

@@ -115,6 +115,7 @@ export class Sessions {
       cell("c-start", "Started", localTime(new Date(session.started_t_ns / 1e6))),
       cell("c-duration", "Duration", duration(session.duration_s)),
       cell("c-frames", "Frames", Number.isFinite(session.frames) ? session.frames.toLocaleString("en-GB") : "–"),
+      cell("c-marks", "Marks", Number.isFinite(session.marks) ? String(session.marks) : "–"),
       cell("c-size", "Size", bytes(session.bytes)),
       state,
       downloads(session),
@@ -161,7 +162,7 @@ export class Sessions {
 
 function head() {
   const row = el("div", { cls: "head", role: "row" });
-  for (const text of ["Name", "Started", "Duration", "Frames", "Size", "State", "Download", ""]) row.append(el("span", { role: "columnheader", text }));
+  for (const text of ["Name", "Started", "Duration", "Frames", "Marks", "Size", "State", "Download", ""]) row.append(el("span", { role: "columnheader", text }));
   return row;
 }
 
@@ -170,7 +171,7 @@ function downloads(session) {
   for (const [format, text] of [["parquet", "Parquet"], ["arrow", "Arrow"], ["csv", "CSV"]]) {
     if (format === "parquet" && session.state !== "sealed") continue; // it exists only once sealed
     box.append(el("a", {
-      href: api.dataAddress(session.id, format), download: "", text, "data-part": format,
+      href: api.dataAddress(session, format), download: "", text, "data-part": format,
       "aria-label": `Download ${session.name} as ${text}`,
     }));
   }

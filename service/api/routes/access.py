@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
+from fastapi.responses import FileResponse
 
-from devices.errors import UnknownError
+from devices.errors import StateError, UnknownError
 from service.api.problems import MEDIA_TYPE, Problem
 from service.server.server import Server
+from storage.formats.export import MEDIA_TYPES
+from storage.sessions.folder import Session
 
 _SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}
 
@@ -31,6 +34,23 @@ def present(path: Path) -> Path:
     if not path.is_file():
         raise UnknownError(f"the file {path.name} has been taken away", where=str(path))
     return path
+
+
+def stored_table(session: Session, path: Path) -> FileResponse:
+    """A table that lies beside a session's frames, as it is.
+
+    Raises:
+        StateError: it is written when the session is sealed.
+        UnknownError: it has been taken away.
+    """
+    if session.sha256 is None:
+        raise StateError(
+            f"session {session.id} is {session.state}, and {path.name} is not written yet",
+            remedy="Stop it, or ask for format=json",
+        )
+    return FileResponse(
+        present(path), media_type=MEDIA_TYPES["parquet"], filename=f"{session.id}.{path.name}"
+    )
 
 
 def _server(request: Request) -> Server:

@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Literal
 
 from fastapi import APIRouter, Response
-from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 
-from devices.errors import StateError
-from service.api.routes.access import ServerState, present, problems
-from storage.clock.table import CLOCK_NAME, ClockSummary
+from service.api.routes.access import ServerState, present, problems, stored_table
+from storage.clock.file import CLOCK_NAME
+from storage.clock.table import ClockSummary
 from storage.formats.export import MEDIA_TYPES
+from storage.sessions.beside import clock_beside
 from storage.sessions.file import SessionReader
-from storage.sessions.folder import FRAMES_NAME, Session, clock_beside
+from storage.sessions.folder import FRAMES_NAME
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
@@ -45,20 +45,11 @@ async def clock(
     """
     session = server.sessions.get(session_id)
     if format == "parquet":
-        return _table(session, server.sessions.folder.path(session_id) / CLOCK_NAME)
+        return stored_table(session, server.sessions.folder.path(session_id) / CLOCK_NAME)
     if session.sha256 is None:
         table = server.recorder.sources(session_id).clock_table()
         return await run_in_threadpool(table.summary)
     return await run_in_threadpool(_sealed, server.sessions.folder.path(session_id) / FRAMES_NAME)
-
-
-def _table(session: Session, path: Path) -> FileResponse:
-    if session.sha256 is None:
-        raise StateError(
-            f"session {session.id} is {session.state}, and its clock table is not written yet",
-            remedy="Stop it, or ask for format=json",
-        )
-    return FileResponse(present(path), media_type=_PARQUET, filename=f"{session.id}.{path.name}")
 
 
 def _sealed(path: Path) -> ClockSummary:

@@ -7,7 +7,6 @@ import re
 from base64 import b64encode
 from collections.abc import AsyncIterator, Iterator
 from http import HTTPStatus
-from pathlib import Path
 from typing import Annotated
 
 import pyarrow as pa
@@ -18,18 +17,19 @@ from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from starlette.datastructures import MutableHeaders
 
 from devices.errors import StateError, UnknownError, UsageError
-from devices.frames import FRAME_COLUMNS
 from service.api.problems import problem
 from service.api.routes.access import ServerState, present, problems
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from service.version import SOFTWARE
-from storage.clock.table import CLOCK_NAME
-from storage.formats.export import MEDIA_TYPES, ClockName, Format, Slice, export
-from storage.schema import KNOWN
-from storage.sessions.content_hash import sha256_of
+from storage.clock.file import CLOCK_NAME
+from storage.file_hash import sha256_of
+from storage.formats.export import MEDIA_TYPES, ClockName, Format, export
+from storage.formats.marks import TIMES, Marks, place
+from storage.formats.sealed import export_file, marks_of
+from storage.formats.slice import SECONDS_MAX, Slice
 from storage.sessions.file import SessionReader
-from storage.sessions.folder import FRAMES_NAME, Session, clock_beside
+from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])
 
@@ -44,10 +44,10 @@ class DataQuery(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Format = "parquet"
-    start_s: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = Field(
+    start_s: Annotated[float, Field(ge=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
         default=None, description="Seconds after the first frame."
     )
-    end_s: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)] | None = Field(
+    end_s: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
         default=None, description="Up to, not including, so many seconds after the first frame."
     )
     columns: str | None = Field(
@@ -61,6 +61,18 @@ class DataQuery(BaseModel):
         "bound `t_server_uncertainty_ns`; null where the clocks were not compared.",
     )
 
+    marks: bool | None = Field(
+        default=None,
+        description="Adds `event`: what people marked, at the frame nearest in time; null "
+        "elsewhere. Left out: true for Arrow and CSV, false for Parquet, which is then the sealed "
+        "file.",
+    )
+
+    @property
+    def has_marks(self) -> bool:
+        """Are marks wanted?"""
+        return self.format != "parquet" if self.marks is None else self.marks
+
     @property
     def slice(self) -> Slice:
         """Rows and columns."""
@@ -72,12 +84,14 @@ class DataQuery(BaseModel):
         """The same for queries that ask for the same."""
         part = self.slice
         columns = ",".join(part.columns)
-        return f"{self.format}|{part.start_s}|{part.end_s}|{columns}|{self.clock}"
+        rows = f"{part.start_s}|{part.end_s}"
+        return f"{self.format}|{rows}|{columns}|{self.clock}|{self.has_marks}"
 
     @property
     def is_stored(self) -> bool:
         """Is it the sealed file as it is?"""
-        return self.format == "parquet" and self.slice.is_all and self.clock == "node"
+        is_plain = self.clock == "node" and not self.has_marks
+        return self.format == "parquet" and self.slice.is_all and is_plain
 
 
 @router.head("/{session_id}/data", include_in_schema=False)
@@ -97,7 +111,7 @@ class DataQuery(BaseModel):
             _404="No such session, or nothing was recorded.",
             _409="Parquet is there only when the session is sealed.",
             _416="The range is outside the file.",
-            _422="No such format or column.",
+            _422="No such format or column, or a slice that holds no time of the session.",
         ),
     },
 )
@@ -109,10 +123,10 @@ async def data(
 ) -> Response:
     """A session as Parquet, Arrow or CSV.
 
-    Parquet without slice, columns or server's clock is the stored file: with ranges, a strong ETag
-    that is its SHA-256, and a digest. Everything else is made on request and streamed; while a
-    session is recorded it is what there is so far. `Foottile-Complete` says whether frames are
-    missing.
+    Parquet without slice, columns, server's clock or marks is the stored file: with ranges, a
+    strong ETag that is its SHA-256, and a digest. Everything else is made on request and streamed;
+    while a session is recorded it is what there is so far. `Foottile-Complete` says whether frames
+    are missing, `Foottile-Marks` how many marks are in it and how many could not be placed.
     """
     session = server.sessions.get(session_id)
     ledger = server.recorder.ledger(session_id)
@@ -169,22 +183,29 @@ def _stored(
 async def _made(
     session: Session, query: DataQuery, request: Request, server: Server, headers: dict[str, str]
 ) -> Response:
-    clocks = ""
-    if query.clock == "server":
-        clocks = await run_in_threadpool(_clocks_hash, session, server)
+    beside = ""
+    if query.clock == "server" or query.has_marks:  # marks are placed by the clocks
+        beside = await run_in_threadpool(_clocks_hash, session, server)
+    if query.has_marks:
+        beside += "".join(event.model_dump_json() for event in session.events)
     if session.sha256 is not None:
         weak, content = "", f"{session.sha256}|{pa.__version__}"
     else:
         recorded = server.recorder.ledger(session.id).recorded
         weak, content = "W/", f"{session.id}|{session.state}|{recorded}"
-    about = f"{content}|{query.canonical}|{clocks}|{SOFTWARE}"
+    about = f"{content}|{query.canonical}|{beside}|{SOFTWARE}"
     tag = hashlib.sha256(about.encode()).hexdigest()
     headers |= {"ETag": f'{weak}"{tag}"'}
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
     if _matches(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     headers["Content-Disposition"] = f'attachment; filename="{session.id}.{query.format}"'
-    chunks = _chunks(session, query, server)
+    marks = None
+    if query.has_marks:
+        marks = await run_in_threadpool(_marks, session, query, server)
+        left_out = len(marks.left_out)
+        headers["Foottile-Marks"] = f"placed={len(marks.all) - left_out}, left-out={left_out}"
+    chunks = _chunks(session, query, server, marks)
     # The first chunk now: what is wrong with the query is then an answer, not a broken download.
     first = await run_in_threadpool(next, chunks, None)
     if first is None:
@@ -209,20 +230,32 @@ def _clocks_hash(session: Session, server: Server) -> str:
     return hashlib.sha256(repr(session.clock).encode()).hexdigest()
 
 
-def _chunks(session: Session, query: DataQuery, server: Server) -> Iterator[bytes]:
+def _marks(session: Session, query: DataQuery, server: Server) -> Marks:
+    if session.sha256 is not None:
+        with SessionReader(server.sessions.folder.path(session.id) / FRAMES_NAME) as reader:
+            return marks_of(reader, session.events, query.slice)
+    if not session.events:
+        return Marks(())
+    sources = server.recorder.sources(session.id)
+    times = (
+        {name: getattr(frames, name) for name in TIMES} | {"part": columns["part"]}
+        for frames, columns in SessionFrames(sources).raw()
+    )
+    return place(session.events, times, sources.clock_table(), query.slice)
+
+
+def _chunks(
+    session: Session, query: DataQuery, server: Server, marks: Marks | None
+) -> Iterator[bytes]:
+    to, part = query.format, query.slice
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
-        return export(SessionFrames(sources), sources.info, {}, query.format, query.slice, clock)
-    return _chunks_of_file(server.sessions.folder.path(session.id) / FRAMES_NAME, query)
-
-
-def _chunks_of_file(path: Path, query: DataQuery) -> Iterator[bytes]:
-    with SessionReader(path) as reader:
-        extra = [name for name in KNOWN if name not in FRAME_COLUMNS and reader.has(name)]
-        clock = clock_beside(reader) if query.clock == "server" else None
-        pieces = reader.batches(*extra)
-        yield from export(pieces, reader.info, reader.notes, query.format, query.slice, clock)
+        pieces, source = SessionFrames(sources), {"session": session.id, "state": session.state}
+        yield from export(pieces, sources.info, {}, to, part, clock, marks, source)
+        return
+    with SessionReader(server.sessions.folder.path(session.id) / FRAMES_NAME) as reader:
+        yield from export_file(reader, to, part, clock=query.clock, marks=marks)
 
 
 def _matches(request: Request, tag: str) -> bool:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 from http import HTTPStatus
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from service.api.routes.access import ServerState, problems
+from service.api.routes.access import ServerState, problems, stored_table
 from service.server.views import EventView, Page, SessionView
+from storage.formats.export import MEDIA_TYPES
+from storage.sessions.beside import EVENTS_NAME
 from storage.sessions.folder import Ledger
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
@@ -193,10 +195,32 @@ async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventVi
     return EventView(**event.model_dump())
 
 
-@router.get("/{session_id}/events", operation_id="listEvents", summary="Events", responses=_UNKNOWN)
-async def events(session_id: str, server: ServerState) -> Page[EventView]:
-    """In order of time."""
-    marked = sorted(server.sessions.get(session_id).events, key=lambda event: event.t_ns)
+@router.get(
+    "/{session_id}/events",
+    operation_id="listEvents",
+    summary="Events",
+    response_model=Page[EventView],
+    responses={
+        200: {
+            "description": "The list, or the stored table.",
+            "content": {MEDIA_TYPES["parquet"]: {}},
+        },
+        **problems(
+            _404="No such session, or its table has been taken away.",
+            _409="The table is written when the session is sealed.",
+        ),
+    },
+)
+async def events(
+    session_id: str,
+    server: ServerState,
+    format: Literal["json", "parquet"] = "json",  # noqa: A002
+) -> Page[EventView] | Response:
+    """In order of time; `format=parquet` is `events.parquet`, as it lies beside the frames."""
+    session = server.sessions.get(session_id)
+    if format == "parquet":
+        return stored_table(session, server.sessions.folder.path(session_id) / EVENTS_NAME)
+    marked = sorted(session.events, key=lambda event: event.t_ns)
     return Page(items=[EventView(**event.model_dump()) for event in marked])
 
 

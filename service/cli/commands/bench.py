@@ -26,6 +26,9 @@ FRAMES, QUICK_FRAMES = 1_000_000, 100_000
 LIVE_FRAMES, QUICK_LIVE_FRAMES = 10_000, 2_000
 SECONDS_MAX = 1000.0
 """A draw is held in memory: at 500 frames/s and four tiles this is about 100 MB."""
+FRAMES_MAX = 10_000_000
+DRAWS_MAX = 100_000
+JOBS_MAX = 1024
 REPETITIONS, QUICK_REPETITIONS = 5, 3
 
 
@@ -46,17 +49,21 @@ def bench_command(
     ] = False,
     draws: Annotated[
         int | None,
-        typer.Option(min=1, help=f"Draws of tiles, calibration and noise; default {DRAWS}."),
+        typer.Option(
+            min=1, max=DRAWS_MAX, help=f"Draws of tiles, calibration and noise; default {DRAWS}."
+        ),
     ] = None,
     seconds: Annotated[
         float | None,
         typer.Option(help="Length of a draw; default: the scene's, or 20 if it has no end."),
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(min=1, help=f"Frames timed offline; default {FRAMES}.")
+        int | None,
+        typer.Option(min=1, max=FRAMES_MAX, help=f"Frames timed offline; default {FRAMES}."),
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Draws at the same time; default: one per core.")
+        int | None,
+        typer.Option(min=1, max=JOBS_MAX, help="Draws at the same time; default: one per core."),
     ] = None,
     whole_only: Annotated[
         bool, typer.Option("--whole-only", help="Only the scenes' whole ladders, for many draws.")

@@ -39,6 +39,7 @@ def calibrate_command(
     """
     from service.cli.calibration_report import calibration_json, calibration_tables
     from service.offline.calibrate import calibrate_recordings, read_recordings
+    from service.offline.calibrations import write_calibration
     from storage.durable import write_whole
 
     path = output_path(out, *recordings)
@@ -54,7 +55,7 @@ def calibrate_command(
                 calibration,
                 {serial: [one.indentation for one in each] for serial, each in pressed.items()},
             )
-    write_whole(path, calibration.to_json().encode())
+    write_calibration(path, calibration)
     if plot_path is not None and png is not None:
         write_whole(plot_path, png)
     if as_json:

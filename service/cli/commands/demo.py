@@ -15,6 +15,7 @@ from devices.errors import FootTileError, needs_extra
 from service.cli.commands.node import calibration_of
 from service.cli.commands.serve import PREPARING, announce
 from service.cli.options import (
+    SECONDS_MAX,
     FootOptions,
     check_emulated,
     remark,
@@ -42,7 +43,8 @@ def demo_command(
         Path | None, typer.Option(help="Folder for sessions; default: one for demos.")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="End after so long; default: at Ctrl-C.")
+        float | None,
+        typer.Option(min=0.0, max=SECONDS_MAX, help="End after so long; default: at Ctrl-C."),
     ] = None,
 ) -> None:
     """Run a server and an emulated node, and show where the live page is.
@@ -53,8 +55,10 @@ def demo_command(
     import uvloop
     from platformdirs import user_data_path
 
+    from service.api.doors import raise_open_files
     from service.rig.rig import RigOptions
 
+    raise_open_files()
     the_scene = scene_with(scene, bus=None, servo=None)
     check_emulated(the_scene)
     # The node finds it in the cache.

@@ -56,7 +56,9 @@ def doctor_command(
     the_scene = load_scene(scene) if scene is not None else None
     name = bus or (the_scene.array.bus if the_scene is not None else None)
     if name is None:
-        raise UsageError("which bus?", remedy="Add --bus /dev/i2c-1, --bus emulated, or --scene")
+        raise UsageError(
+            "no bus is named", remedy="Add --bus /dev/i2c-1, --bus emulated, or --scene"
+        )
     if name == EMULATED and the_scene is None:
         the_scene = load_scene(_EMULATED_SCENE)
     with ExitStack() as stack, progress(f"examining {name}"):

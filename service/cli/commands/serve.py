@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,10 @@ from service.cli.options import remark, say, stop_on_signals
 
 if TYPE_CHECKING:
     from service.api.settings import Settings
+
+
+def _bound(text: str) -> Any:
+    return typer.Option(help=text, rich_help_panel="Bounds for those without a key")
 
 
 @needs_extra("server", "`foottile serve`")
@@ -26,6 +30,19 @@ def serve_command(
         list[str] | None,
         typer.Option(help="Name under which the server is reached; may be given several times."),
     ] = None,
+    max_connections: Annotated[int | None, _bound("Requests and screens at once; 512.")] = None,
+    max_connections_per_address: Annotated[
+        int | None, _bound("The same from one address, as all phones of a hotspot are; 256.")
+    ] = None,
+    max_nodes: Annotated[int | None, _bound("Nodes at once; 32.")] = None,
+    max_header_bytes: Annotated[int | None, _bound("Longest headers of a request; 32768.")] = None,
+    header_timeout_s: Annotated[
+        float | None, _bound("A request's headers have to come within; 10.")
+    ] = None,
+    body_timeout_s: Annotated[float | None, _bound("Its body has to come within; 20.")] = None,
+    idle_timeout_s: Annotated[
+        float | None, _bound("A connection may wait so long for its next request; 30.")
+    ] = None,
 ) -> None:
     """Take in nodes, estimate, show live, record, and give sessions away over HTTP.
 
@@ -35,11 +52,24 @@ def serve_command(
     """
     import uvloop
 
+    from service.api.doors import raise_open_files
     from service.api.settings import load_settings
 
     settings = load_settings(
-        config, host=host, port=port, data=data, allow_host=tuple(allow_host or ()) or None
+        config,
+        host=host,
+        port=port,
+        data=data,
+        allow_host=tuple(allow_host or ()) or None,
+        max_connections=max_connections,
+        max_connections_per_address=max_connections_per_address,
+        max_nodes=max_nodes,
+        max_header_bytes=max_header_bytes,
+        header_timeout_s=header_timeout_s,
+        body_timeout_s=body_timeout_s,
+        idle_timeout_s=idle_timeout_s,
     )
+    raise_open_files()
     uvloop.run(_serve(settings))
 
 
@@ -54,7 +84,7 @@ async def _serve(settings: Settings) -> None:
         token = token_for(settings.host, settings.token, settings.data)
         app = make_app(server, hosts=settings.allow_host, token=token)
         remark(PREPARING)
-        async with serving(app, listening):
+        async with serving(app, listening, settings):
             announce(urls_of(listening, settings.host), settings.data, token)
             await stop.wait()
 

@@ -13,6 +13,7 @@ from service.cli.options import (
     data_folder,
     output_path,
     print_json,
+    printable,
     progress,
     remark,
     say,
@@ -55,8 +56,8 @@ def sessions_command(
         print_json({"items": found})
         return
     table = Table(box=None, pad_edge=False)
-    for heading in ("session", "name", "node", "s", "frames", "state"):
-        right = heading in ("s", "frames")
+    for heading in ("session", "name", "node", "s", "frames", "marks", "state"):
+        right = heading in ("s", "frames", "marks")
         table.add_column(
             heading,
             justify="right" if right else "left",
@@ -68,10 +69,11 @@ def sessions_command(
         assumed = ", scale assumed" if session["absolute_scale"] == "assumed" else ""
         table.add_row(
             session["id"],
-            escape(session["name"]),
+            escape(printable(session["name"])),
             session["node"],
             f"{session['duration_s']:.1f}",
             str(session["frames"]),
+            str(session.get("marks", "")),
             session["state"] + lossy + assumed,
         )
     stdout.print(table)
@@ -122,13 +124,22 @@ def export_command(
     clock: Annotated[
         str, typer.Option(help="node, or server: adds t_server_ns and t_server_uncertainty_ns.")
     ] = "node",
+    marks: Annotated[
+        bool | None,
+        typer.Option(
+            "--marks/--no-marks",
+            help="Add the column event: what people marked, at the frame nearest in time; default: "
+            "if there are events beside the frames.",
+        ),
+    ] = None,
 ) -> None:
     """Write a sealed session, or a slice of it, in another format."""
     from storage.durable import whole_file
-    from storage.formats.export import CLOCKS, FORMATS, Slice, export
-    from storage.schema import FRAMES, KNOWN
+    from storage.formats.export import CLOCKS, FORMATS
+    from storage.formats.sealed import export_file, marks_of
+    from storage.formats.slice import Slice
+    from storage.sessions.beside import EVENTS_NAME, read_events
     from storage.sessions.file import SessionReader
-    from storage.sessions.folder import clock_beside
 
     if to not in FORMATS:
         raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))
@@ -138,21 +149,25 @@ def export_command(
     source = _sealed_file(session, data)
     path = output_path(out, source)
     names = tuple(name.strip() for name in (columns or "").split(",") if name.strip())
-    frame_names = {column.name for column in FRAMES}
-    with SessionReader(source) as reader:
-        extra = [name for name in KNOWN if name not in frame_names and reader.has(name)]
-        chunks = export(
-            reader.batches(*extra),
-            reader.info,
-            reader.notes,
-            chosen,
-            Slice(start_s, end_s, names),
-            clock_beside(reader) if clock == "server" else None,
-        )
-        with whole_file(path) as file, progress(f"writing {path.name}"):
-            for chunk in chunks:
+    part = Slice(start_s, end_s, names)
+    with SessionReader(source) as reader, progress(f"writing {path.name}"):
+        beside = source.with_name(EVENTS_NAME)
+        stored = read_events(beside) if marks is not False and beside.is_file() else None
+        if marks and stored is None:
+            raise UsageError(
+                f"there is no {EVENTS_NAME} beside {source.name}, so nothing is known of marks",
+                where=str(source.parent),
+                expected="a session's folder as a server sealed it or `foottile pull` fetched it",
+            )
+        placed = None if stored is None else marks_of(reader, stored.events, part)
+        with whole_file(path) as file:
+            for chunk in export_file(reader, chosen, part, clock=clock, marks=placed):
                 file.write(chunk)
     say(f"{path}: {path.stat().st_size} bytes")
+    for mark in placed.left_out if placed is not None else ():
+        remark(f"mark {mark.event.label!r} is not in it: {mark.left_out}")
+    if marks is None and stored is None and "session" in reader.notes:
+        remark(f"without marks: there is no {EVENTS_NAME} beside {source.name}")
 
 
 def _in_folder(data: Path) -> list[dict[str, Any]]:
@@ -167,7 +182,7 @@ def _in_folder(data: Path) -> list[dict[str, Any]]:
         ledger = session.ledger
         content = session.model_dump(mode="json", exclude=_LONG)
         complete = False if ledger is None else "lossy" if ledger.lossy else ledger.complete
-        found.append({**content, "complete": complete})
+        found.append({**content, "complete": complete, "marks": len(session.events)})
     return found
 
 

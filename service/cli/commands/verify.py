@@ -13,15 +13,17 @@ from service.cli.options import JsonOption, data_folder, print_json, progress, r
 if TYPE_CHECKING:
     from storage.sessions.folder import Ledger
     from storage.verify.data import Report, Verdict
+    from storage.verify.exported import ExportReport
     from storage.verify.journal import StreamReport
     from storage.verify.session import SessionReport
 
-_EXIT = {"complete": 0, "lossy": 3, "pending": 3, "damaged": 1}
+_EXIT = {"complete": 0, "lossy": 3, "pending": 3, "damaged": 1, "export": 4}
 _SENTENCE = {
     "complete": "Everything is whole and complete.",
     "lossy": "Everything is whole, but some frames are lost for good: they are counted above.",
     "pending": "Everything is whole, but not every session is sealed yet.",
     "damaged": "Something is damaged: do not trust what is named above.",
+    "export": "An export: it proves nothing; the session that it was made from does.",
 }
 
 
@@ -29,7 +31,7 @@ def verify_command(
     target: Annotated[
         str,
         typer.Argument(
-            help="Session (folder, or id in --data), sealed file, journal, or data folder."
+            help="Session (folder, or id in --data), data folder, a file of them, calibration."
         ),
     ],
     data: Annotated[
@@ -41,7 +43,8 @@ def verify_command(
     """Prove sessions and journals from their files alone: checksums, hashes, order and ledger.
 
     Nothing is written, and a server may run meanwhile. Exit codes: 0 everything is whole and
-    complete, 1 something is damaged, 2 wrong usage, 3 whole, but lossy or not yet sealed.
+    complete, 1 something is damaged, 2 wrong usage, 3 whole, but lossy or not yet sealed, 4 an
+    export, which proves nothing: verify the session that it says it was made from.
     """
     from storage.verify.data import verdict_of, verify
 
@@ -75,30 +78,36 @@ def _path_of(target: str, data: Path | None) -> Path:
 
 def _tell(report: Report, *, is_part: bool = False) -> None:
     from storage.verify.data import FolderReport
+    from storage.verify.exported import ExportReport
     from storage.verify.segment import SegmentReport
     from storage.verify.session import SessionReport
 
     remarks: list[str] = []
+    unproven: list[str] = []
     if isinstance(report, FolderReport):
         parts: list[Report] = [*report.sessions, *report.streams]
         for part in parts:
             _tell(part, is_part=True)
+        unproven = report.as_dict()["unproven"]
+        remarks = [f"{name}: set aside, it counts no more" for name in report.set_aside]
     elif isinstance(report, SessionReport):
         say(_session_line(report))
+        unproven = report.unproven
+    elif isinstance(report, ExportReport):
+        say(_export_line(report))
     elif isinstance(report, SegmentReport):
         closed = "closed" if report.is_closed else "not closed"
         say(f"segment {report.path.name}: {report.held.count} frames, {closed}")
         remarks = report.remarks
     else:
         say(_stream_line(report))
-        remarks = report.remarks
+        remarks, unproven = report.remarks, report.unproven
     for problem in report.problems:
         say(f"  damaged: {problem}")
     for text in remarks:
         say(f"  {text}")
-    if isinstance(report, SessionReport) and not is_part:
-        for what in report.unproven:
-            remark(f"not proven: {what}")
+    for what in () if is_part else unproven:
+        remark(f"not proven: {what}")
 
 
 def _session_line(report: SessionReport) -> str:
@@ -108,6 +117,12 @@ def _session_line(report: SessionReport) -> str:
     said = "in the trash" if report.in_trash and verdict != "damaged" else verdict
     name = f" ({report.name})" if report.name else ""
     return f"session {report.id or report.path.name}{name}: {said}, {_counts(report.ledger)}"
+
+
+def _export_line(report: ExportReport) -> str:
+    source = {name: value for name, value in report.source.items() if value not in (None, [])}
+    said = ", ".join(f"{name} {value}" for name, value in source.items())
+    return f"export {report.path.name} ({report.format}): {said or 'it does not say of what'}"
 
 
 def _counts(ledger: Ledger | None) -> str:

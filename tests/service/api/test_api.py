@@ -196,7 +196,7 @@ def test_every_operation_is_described(tmp_path: Path) -> None:
     try:
         schema = make_app(server).openapi()
     finally:
-        server._lock.close()
+        server.folder.close()
     ids = []
     for path, operations in schema["paths"].items():
         for method, operation in operations.items():

@@ -18,6 +18,7 @@ import pytest
 
 from service.cli.main import main
 from service.client import Client
+from storage.checked_table import write_table
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
@@ -116,8 +117,11 @@ def test_the_tag_of_a_download_depends_on_the_clock(running: Running, node: Fake
     assert running.http.get(url, params=query, headers=seen).status_code == 304
     path = session.folder / "clock.parquet"
     table = pq.read_table(path)
-    pq.write_table(table.slice(0, 1), path)
+    write_table(path, table.slice(0, 1))
     assert running.http.get(url, params=query, headers=seen).status_code == 200
+    pq.write_table(table, path)  # by another program: its hash is gone
+    refused = running.http.get(url, params=query, headers=seen)
+    assert (refused.status_code, "its hash is gone" in refused.json()["detail"]) == (500, True)
     answer = running.http.get(url, params={"clock": "mine"})
     assert answer.status_code == 422
 
@@ -238,7 +242,7 @@ def test_a_pulled_session_is_exported_with_the_servers_time_and_a_lone_file_is_n
     out = tmp_path / "out.parquet"
     options = ("--format", "parquet", "--clock", "server", "--out", out)
     assert export(monkeypatch, folder, *options) == 0
-    served = session.data(clock="server").content
+    served = session.data(clock="server", marks="true").content
     assert pq.read_table(out).equals(pq.read_table(io.BytesIO(served)))
     out.unlink()
     lone = tmp_path / "lone.parquet"
@@ -277,7 +281,7 @@ def test_numbers_that_no_clock_has_are_refused_and_the_raw_data_stays(
     path = session.folder / "clock.parquet"
     table = pq.read_table(path)
     offsets = pa.array([2**63 - 1] * len(table), pa.int64())
-    pq.write_table(table.set_column(2, table.schema.field(2), offsets), path)
+    write_table(path, table.set_column(2, table.schema.field(2), offsets))
     assert session.data(format="csv").status_code == 200
     answer = running.http.get(f"{session.url}/data?clock=server")
     assert_refused(answer, 500, "server_minus_node_ns")

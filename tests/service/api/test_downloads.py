@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import shutil
 from base64 import b64encode
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,8 +18,9 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
-from devices.errors import LinkError, StateError
+from devices.errors import LinkError, StateError, UsageError
 from service.client import Client
+from storage.verify.data import verdict_of, verify
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
@@ -210,18 +212,20 @@ def test_a_slice_has_the_rows_and_columns_asked_for(sealed: Sealed, to: str) -> 
 def test_another_format_of_the_whole_has_the_same_values(sealed: Sealed, to: str) -> None:
     whole = pq.read_table(io.BytesIO(sealed.content))
     found = table_of(sealed.made(format=to), to)
-    assert sorted(found.column_names) == sorted(whole.column_names)
+    assert sorted(found.column_names) == sorted([*whole.column_names, "event"])
     for name in ("seq", "t_ns", "padc_0", "part", "force_n_1", "grf_n"):
         np.testing.assert_allclose(
             found[name].to_numpy(), whole[name].to_numpy(), rtol=1e-6, err_msg=name
         )
 
 
-def test_an_empty_slice_has_a_header_and_no_rows(sealed: Sealed) -> None:
+def test_a_slice_that_begins_after_the_end_or_ends_before_it_begins_is_refused(
+    sealed: Sealed,
+) -> None:
     for to in ("parquet", "arrow", "csv"):
-        found = table_of(sealed.made(format=to, start_s=100, columns="seq,t_ns"), to)
-        assert found.column_names == ["seq", "t_ns"]
-        assert found.num_rows == 0
+        assert_refused(sealed.made(format=to, start_s=100), 422, "starts at 100 s", "ends at")
+        assert_refused(sealed.made(format=to, start_s=2, end_s=1), 422, "ends at 1 s")
+    assert_refused(sealed.made(sealed.recording, format="csv", start_s=100), 422, "starts at")
 
 
 def test_queries_that_ask_for_different_data_have_different_tags(sealed: Sealed) -> None:
@@ -315,11 +319,45 @@ def test_the_client_pulls_a_session_whole(sealed: Sealed, tmp_path: Path) -> Non
             "frames.parquet",
             "session.json",
             "events.json",
+            "events.parquet",
             "ledger.json",
             "clock.parquet",
         }
         again = client.pull(sealed.id, tmp_path / "out")
         assert again["path"] == pulled["path"]
+
+
+def test_what_is_pulled_proves_itself_file_by_file(sealed: Sealed, tmp_path: Path) -> None:
+    with Client(sealed.running.url) as client:
+        client.pull(sealed.id, tmp_path)
+        folder = tmp_path / sealed.id
+        report = verify(folder)
+        assert (verdict_of(report), report.as_dict()["unproven"]) == ("complete", [])
+        for path in sorted(folder.iterdir()):
+            whole = path.read_bytes()
+            path.write_bytes(whole[:40] + bytes([whole[40] ^ 1]) + whole[41:])
+            assert path.name in " ".join(verify(folder).as_dict()["problems"])
+            path.write_bytes(whole)
+        (folder / "session.json").write_bytes(b"{")
+        client.pull(sealed.id, tmp_path)
+        assert (folder / "session.json.damaged-1").read_bytes() == b"{"
+        assert verdict_of(verify(folder)) == "complete"
+
+
+def test_nothing_is_pulled_into_a_servers_data_folder(sealed: Sealed, tmp_path: Path) -> None:
+    folder = sealed.session.folder
+    before = (folder / "session.json").read_bytes()
+    with Client(sealed.running.url) as client:
+        for out in (folder.parent, folder.parent.parent, folder):
+            with pytest.raises(UsageError, match="this is a data folder"):
+                client.pull(sealed.id, out)
+        copied = tmp_path / "copied"
+        shutil.copytree(folder.parent, copied)  # without the lock, but still not ours
+        with pytest.raises(UsageError, match=r"not one that `foottile pull` wrote"):
+            client.pull(sealed.id, copied)
+    assert (folder / "session.json").read_bytes() == before
+    assert (copied / sealed.id / "session.json").read_bytes() == before
+    assert not (folder.parent.parent / sealed.id).exists()
 
 
 @pytest.mark.parametrize("have", [1, 1000, None])

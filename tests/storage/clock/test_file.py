@@ -12,10 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError, UsageError
+from storage.clock.file import read_clock, write_clock
 from storage.clock.log import ClockOffset
-from storage.clock.table import StreamFacts, read_clock, write_clock
+from storage.clock.table import StreamFacts
+from storage.sessions.beside import clock_beside
 from storage.sessions.file import SessionReader, SessionWriter
-from storage.sessions.folder import clock_beside
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 
@@ -38,17 +39,20 @@ def test_the_file_gives_back_rows_and_facts(tmp_path: Path) -> None:
     rows = [*measured("one", 3), *measured("two", 2)]
     facts = [StreamFacts("one", 5, True), StreamFacts("two"), StreamFacts("three", -7, False)]
     write_clock(tmp_path / "clock.parquet", rows, facts)
-    read, said = read_clock(tmp_path / "clock.parquet")
+    stored = read_clock(tmp_path / "clock.parquet")
+    read = stored.rows
+    assert stored.is_proven
+    assert stored.offsets == tuple(rows)
     assert {name: len(own) for name, own in read.items()} == {"one": 3, "two": 2}
     assert read["one"].offset_ns.tolist() == [row.server_minus_node_ns for row in rows[:3]]
-    assert list(said.values()) == facts
+    assert list(stored.facts.values()) == facts
 
 
 def test_a_table_without_rows_is_one(tmp_path: Path) -> None:
     write_clock(tmp_path / "clock.parquet", [], [StreamFacts("one", 5, False)])
-    rows, facts = read_clock(tmp_path / "clock.parquet")
-    assert rows == {}
-    assert facts["one"].clock_set is False
+    stored = read_clock(tmp_path / "clock.parquet")
+    assert stored.rows == {}
+    assert stored.facts["one"].clock_set is False
 
 
 def numbers(**changed: pa.Array[Any]) -> dict[str, pa.Array[Any]]:

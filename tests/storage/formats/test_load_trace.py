@@ -348,3 +348,40 @@ def test_a_parquet_column_that_is_no_number_is_refused_by_name(
 def test_a_load_that_is_mostly_negative_is_refused_as_upside_down(read: Read, content: str) -> None:
     # Pressed as it is, it would be clipped to no load at all without a word.
     refused(read, content, "negative", "Change its sign")
+
+
+# --- size -----------------------------------------------------------------------------------------
+
+
+def test_a_small_file_with_very_many_rows_is_refused_before_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "trace.parquet"
+    table = pa.table({"time_s": np.zeros(4_000_000), "fz_n": np.zeros(4_000_000)})
+    with pq.ParquetWriter(path, table.schema, compression="zstd") as file:
+        for _ in range(4):
+            file.write_table(table)
+    assert path.stat().st_size < 1_000_000
+
+    def read_anyway(*_: object, **__: object) -> None:
+        pytest.fail("it is read")
+
+    monkeypatch.setattr(pq.ParquetFile, "read", read_anyway)
+    with pytest.raises(LoadTraceError, match=r"16000000 rows of 2 columns"):
+        read_load_trace(path)
+
+
+def test_a_text_that_is_too_long_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "trace.csv"
+    with path.open("wb") as file:
+        file.truncate(300 << 20)  # a hole: it takes no room
+    with pytest.raises(LoadTraceError, match="314572800 bytes"):
+        read_load_trace(path)
+
+
+def test_columns_that_are_no_load_are_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "trace.csv"
+    path.write_text('time_s,Fz_N,cop_x_m,cop_y_m,note\n0,1,0,0,"a\nb"\n1,2,0,0,=1+1\n')
+    trace = read_load_trace(path)
+    assert trace.fz_n is not None
+    assert trace.fz_n.tolist() == [1.0, 2.0]

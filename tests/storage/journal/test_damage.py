@@ -258,6 +258,8 @@ def test_a_segment_that_is_gone_is_an_error_that_names_it(tmp_path: Path) -> Non
     path.unlink()
     with pytest.raises(StorageError, match=path.name):
         list(journal.read(0, 9))
+    with pytest.raises(StorageError, match=path.name):
+        journal.close()  # what was written to it is nowhere
 
 
 @pytest.mark.parametrize("record", [0, 1, 2])

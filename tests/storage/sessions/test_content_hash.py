@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
-from storage.sessions.content_hash import file_hashes, write_file_hash
+from storage.file_hash import file_hashes, write_file_hash
 from storage.sessions.file import SessionReader, SessionWriter
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames

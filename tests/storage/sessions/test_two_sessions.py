@@ -11,7 +11,8 @@ import pytest
 
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import Slice, export
+from storage.formats.export import export
+from storage.formats.slice import Slice
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 

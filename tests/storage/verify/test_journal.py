@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
+from storage.checked_json import without_check
+from storage.clock.log import ClockLog, ClockOffset
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.segment import SegmentWriter
-from storage.journal.segment_format import INDEX_SUFFIX, RECORD
+from storage.journal.segment_format import INDEX_SUFFIX, RECORD, read_header
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
-from storage.schema import wire_schema
+from storage.schema import array_info, older_wire_schema, wire_schema
 from storage.verify.journal import verify_stream
 from storage.verify.segment import verify_segment
 from storage.wire import EncodedBatch, encode
@@ -274,3 +277,82 @@ def test_what_a_disk_refused_once_and_was_written_again_is_no_disorder(tmp_path:
     report = verify_stream(folder)
     assert report.problems == []
     assert list(report.held) == [(0, 59)]
+
+
+# --- beside the segments --------------------------------------------------------------------------
+
+
+def with_clock(folder: Path) -> Path:
+    log = ClockLog(folder)
+    for second in range(4):
+        log.append(
+            ClockOffset(
+                boot_id=BOOT,
+                t_mono_ns=second * 10**9,
+                server_minus_node_ns=second,
+                uncertainty_ns=500,
+            )
+        )
+    return log.path
+
+
+def test_a_damaged_clock_row_is_said_and_a_torn_last_one_is_no_damage(tmp_path: Path) -> None:
+    path = with_clock(stream(tmp_path))
+    whole = path.read_bytes()
+    assert problems(path.parent) == ""
+    for at in range(0, len(whole) - 1, 11):
+        damaged = bytearray(whole)
+        damaged[at] ^= 4
+        path.write_bytes(damaged)
+        assert "clock.jsonl" in problems(path.parent)
+    path.write_bytes(whole[:-20])
+    report = verify_stream(path.parent)
+    assert (report.problems, "clock.jsonl" in report.remarks[-1]) == ([], True)
+    ClockLog(path.parent).append(ClockLog(path.parent).rows()[0])  # which cuts the torn one off
+    assert verify_stream(path.parent).remarks == []
+
+
+def test_no_flip_in_a_streams_notes_is_read_and_older_ones_are_unproven(tmp_path: Path) -> None:
+    folder = stream(tmp_path, next_seq=40)
+    path = folder / NOTES_FILE
+    whole = path.read_bytes()
+    for at in range(len(whole)):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << at % 8
+        path.write_bytes(damaged)
+        with pytest.raises(FileFormatError):
+            StreamNotes.load(folder)
+    assert NOTES_FILE in problems(folder)
+    path.write_bytes(without_check(whole))
+    report = verify_stream(folder)
+    assert (report.problems, NOTES_FILE in report.unproven[0]) == ([], True)
+
+
+def test_no_flip_in_a_segments_header_gives_another_array(tmp_path: Path) -> None:
+    folder = stream(tmp_path)
+    (folder / NOTES_FILE).unlink()  # so that only the segment says which array it is of
+    path = segment_of(folder)
+    whole = path.read_bytes()
+    _, header_bytes = read_header(path)
+    for at in range(0, header_bytes, 3):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << at % 8
+        path.write_bytes(damaged)
+        schema, _ = read_header(path)
+        with suppress(FileFormatError):
+            same = schema is None or array_info(schema, where="") == array()
+            assert same, f"flipped at {at}"
+            continue
+        assert problems(folder) != ""
+
+
+def test_segments_of_older_versions_without_a_hash_are_read(tmp_path: Path) -> None:
+    info = array()
+    writer = SegmentWriter(
+        tmp_path / f"{0:020}.arrows", older_wire_schema(info).serialize().to_pybytes()
+    )
+    batch = frames(0, 4)
+    writer.append(EncodedBatch.of(batch, encode(batch, wire_schema(info))))
+    writer.close()
+    report = verify_segment(tmp_path / f"{0:020}.arrows")
+    assert (report.problems, report.held.count, report.info) == ([], 5, info)

@@ -126,7 +126,7 @@ def test_a_whole_session_is_proven_and_nothing_is_touched(tmp_path: Path) -> Non
     content = report.as_dict()
     assert set(content) == {
         *("complete", "lossy", "parts", "missed_slots"),
-        *("id", "problems", "sha256"),
+        *("id", "problems", "sha256", "unproven"),
     }
     assert (content["complete"], content["lossy"], content["id"]) == (False, True, ID)
     assert content["parts"][0] == {
@@ -406,7 +406,7 @@ def test_a_data_folder_is_all_of_its_sessions_and_journals(tmp_path: Path) -> No
     report = verify(tmp_path)
     assert verdict_of(report) == "lossy"
     content = report.as_dict()
-    assert set(content) == {"sessions", "journals", "problems"}
+    assert set(content) == {"sessions", "journals", "problems", "unproven", "set_aside"}
     assert [one["id"] for one in content["sessions"]] == [ID, OTHER_ID]
     assert [one["frames"] for one in content["journals"]] == [56, 20]
     assert content["problems"] == []

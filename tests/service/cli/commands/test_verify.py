@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
+from storage.checked_json import write_checked
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.file import SessionReader, SessionWriter
@@ -80,7 +84,7 @@ def test_json_of_one_session_is_its_ledger(run: Run, data: Path) -> None:
             name: one[name] for name in ("lossy", "parts", "missed_slots")
         }
     folder = json.loads(run("verify", data, "--json").out)
-    assert list(folder) == ["sessions", "journals", "problems"]
+    assert list(folder) == ["sessions", "journals", "problems", "unproven", "set_aside"]
     assert folder["sessions"][0]["id"] == ID
     assert folder["journals"][0]["held"] == [[0, 99]]
 
@@ -176,3 +180,121 @@ def test_estimates_of_frames_out_of_order_are_refused(run: Run, data: Path, tmp_
     found = run("estimate", mixed, "--out", out, "--calibration", "paper-eq2-shape")
     found.fails(1, "out of order: part 0: frame 0 follows frame 59")
     assert not out.exists()
+
+
+@pytest.mark.parametrize("to", ["parquet", "arrow", "csv"])
+def test_an_export_says_what_it_is_of_and_proves_nothing(
+    run: Run, data: Path, tmp_path: Path, to: str
+) -> None:
+    run("recover", data)
+    out = tmp_path / f"slice.{to}"
+    run("export", ID, "--data", data, "--out", out, "--format", to, "--start-s", "0.1")
+    found = run("verify", out)
+    assert found.code == 4
+    assert found.out.splitlines()[-1].startswith("An export: it proves nothing")
+    assert "damaged" not in found.out
+    said = json.loads(run("verify", out, "--json").out)
+    assert (said["export"], said["proves"], said["problems"]) == (to, [], [])
+    if to != "csv":  # which has no place for it
+        assert f"session {ID}" in found.out
+        sealed = data / "sessions" / ID / "frames.parquet"
+        with SessionReader(sealed) as reader:
+            assert said["source"]["content_sha256"] == reader.content_sha256
+        assert (said["source"]["start_s"], said["source"]["clock"]) == (0.1, "node")
+        out.write_bytes(out.read_bytes()[:-200])
+        assert run("verify", out).code == 1
+
+
+def test_an_export_in_the_place_of_a_sealed_file_is_damage(run: Run, data: Path) -> None:
+    run("recover", data)
+    sealed = data / "sessions" / ID / "frames.parquet"
+    out = data / "export.parquet"
+    run("export", ID, "--data", data, "--out", out, "--format", "parquet")
+    out.replace(sealed)
+    assert run("verify", sealed.parent).code == 1
+
+
+def test_what_simulate_and_estimate_write_is_proven(run: Run, tmp_path: Path) -> None:
+    raw, estimated = tmp_path / "raw.parquet", tmp_path / "estimated.parquet"
+    run("simulate", "--scene", "standing", "--seconds", "2", "--out", raw)
+    calibrated = ("--calibration", "paper-eq2-shape")
+    run("estimate", raw, "--out", estimated, *calibrated)
+    for path in (raw, estimated):
+        found = run("verify", path)
+        assert (found.code, "damaged" in found.out) == (0, False)
+        assert "it is of no recorded session" in found.err
+
+
+def test_every_other_file_of_a_data_folder_is_looked_at(run: Run, data: Path) -> None:
+    run("recover", data)
+    node = data / "nodes" / "bench"
+    node.mkdir(parents=True)
+    write_checked(node / "tares.json", b'{"tares": []}')
+    (node / "hello.json").write_text('{"older": 1}')
+    (node / "tares.json.damaged-1").write_text("x")
+    found = run("verify", data)
+    assert found.code == 0
+    assert "not proven: nodes/bench/hello.json" in found.err
+    assert "nodes/bench/tares.json.damaged-1: set aside" in found.out
+    content = bytearray((node / "tares.json").read_bytes())
+    content[5] ^= 1
+    (node / "tares.json").write_bytes(content)
+    found = run("verify", data)
+    assert (found.code, "damaged: nodes/bench/tares.json" in found.out) == (1, True)
+
+
+def _a_folder(path: Path) -> None:
+    path.mkdir()
+
+
+def _a_link_to_nothing(path: Path) -> None:
+    path.symlink_to("nowhere")
+
+
+def _a_link_to_itself(path: Path) -> None:
+    path.symlink_to(path.name)
+
+
+def _a_pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def _nothing_in_it(path: Path) -> None:
+    path.touch()
+
+
+@pytest.mark.parametrize(
+    "replaced_by", [_a_folder, _a_link_to_nothing, _a_link_to_itself, _a_pipe, _nothing_in_it]
+)
+def test_verify_names_whatever_stands_in_the_place_of_a_file(
+    run: Run, data: Path, replaced_by: Callable[[Path], None]
+) -> None:
+    run("recover", data)
+    (data / "nodes" / "bench").mkdir(parents=True)
+    write_checked(data / "nodes" / "bench" / "hello.json", b'{"older": 1}')
+    paths = [path for path in data.rglob("*") if path.is_file() and path.name != ".lock"]
+    assert len(paths) == 8
+    for path in paths:
+        aside = path.rename(data.parent / "aside")
+        replaced_by(path)
+        found = run("verify", data)
+        assert path.name in found.out or path.stem in found.out, path
+        # An index that is lost with the power is no damage: what it lacks was never promised.
+        assert (found.code == 1) is not (path.suffix == ".idx" and replaced_by is _nothing_in_it)
+        if path.is_dir() and not path.is_symlink():
+            path.rmdir()
+        else:
+            path.unlink()
+        aside.rename(path)
+    assert run("verify", data).code == 0
+
+
+def test_verify_goes_on_behind_a_folder_that_is_none(run: Run, data: Path) -> None:
+    begun(data, OTHER_ID, last=99)
+    run("recover", data)
+    shutil.rmtree(data / "sessions" / ID)
+    (data / "sessions" / ID).write_text("no folder")
+    (data / "journal" / "bench" / ("b" * 32)).symlink_to("nowhere")
+    found = json.loads(run("verify", data, "--json").out)
+    assert [one["id"] for one in found["sessions"]] == [OTHER_ID]
+    assert len(found["problems"]) == 2

@@ -1,0 +1,251 @@
+"""uvicorn's protocols with the bounds that it lacks, and how connections are taken in.
+
+uvicorn bounds neither the size of headers nor the time they take, and counts connections only when
+their headers are there. Its protocol classes are made to be replaced (`http=`, `ws=`), so what is
+missing is added to them here; parsing and answering stay uvicorn's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import Any
+
+import uvicorn
+from starlette.types import Receive, Scope, Send
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.http11 import Request
+
+from service.api.doors import Doors
+from service.api.problems import problem
+from service.link import INGEST_PATH, SUBPROTOCOL, Close
+
+_SAID_ON_LIVE_BYTES_MAX = 4096
+_UNREAD_BYTES_MAX = 1 << 20
+"""What may wait for one who goes on asking and does not read."""
+_STARVED = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
+_STARVED_PAUSE_S = 0.1
+_FULL_PAUSE_S = 0.01
+_RETRY_AFTER_S = 5
+_TOO_MANY = "There are too many connections; try again in some seconds"
+
+
+class DoorsConfig(uvicorn.Config):
+    """uvicorn's configuration, and the doors that its protocols ask."""
+
+    doors: Doors
+
+
+class Http(HttpToolsProtocol):
+    """HTTP whose headers and bodies come in time and in bounds, or not at all."""
+
+    config: DoorsConfig
+    _timer: asyncio.TimerHandle | None = None
+    _in_head = False
+    _fed_bytes = 0
+    """Since the request began: one endless header reaches no callback before it ends."""
+    _head_bytes = 0
+    _is_too_long = False
+    _is_upgraded = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """It waits now."""
+        super().connection_made(transport)
+        self.config.doors.come(transport, self.client[0] if self.client else "")
+        self._expect(self.config.doors.bounds.header_timeout_s)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """It has gone."""
+        self._expect(None)
+        self.config.doors.go(self.transport)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Parse, unless it is more than headers may be."""
+        super().data_received(data)
+        if self.transport.is_closing() or self._is_upgraded:
+            return
+        if self._in_head:
+            self._fed_bytes += len(data)
+            if self._fed_bytes > 2 * self.config.doors.bounds.max_header_bytes:
+                self._is_too_long = True
+                self.send_400_response("")
+        elif self._timer is None and not self._is_asked:
+            self._expect(self.config.doors.bounds.header_timeout_s)  # empty lines, as it seems
+
+    def on_message_begin(self) -> None:
+        """A request begins."""
+        super().on_message_begin()
+        self._in_head, self._fed_bytes, self._head_bytes = True, 0, 0
+        if self._timer is None:
+            self._expect(self.config.doors.bounds.header_timeout_s)
+
+    def on_url(self, url: bytes) -> None:
+        """A piece of the request line."""
+        self._count(len(url))
+        super().on_url(url)
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """A header."""
+        self._count(len(name) + len(value) + 4)
+        super().on_header(name, value)
+
+    def on_headers_complete(self) -> None:
+        """It asks for something: is there room?"""
+        self._in_head = False
+        self._expect(None)
+        if not (self.parser.should_upgrade() and self._should_upgrade()):
+            if not self.config.doors.admit(self.transport):
+                self.app = refuse
+            self._expect(self.config.doors.bounds.body_timeout_s)
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """The body is there."""
+        self._expect(None)
+        super().on_message_complete()
+
+    def on_response_complete(self) -> None:
+        """It waits again, unless it has asked for more already."""
+        is_last = not self.pipeline
+        super().on_response_complete()
+        if is_last:
+            self.config.doors.rest(self.transport)
+
+    def handle_websocket_upgrade(self) -> None:
+        """It is the websocket's from here on."""
+        self._is_upgraded = True
+        super().handle_websocket_upgrade()
+
+    def send_400_response(self, msg: str) -> None:
+        """Say what was wrong with it as a problem, and close."""
+        if self._is_too_long:
+            what = f"Headers of more than {self.config.doors.bounds.max_header_bytes} bytes"
+            self._end(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, what)
+        else:
+            self._end(HTTPStatus.BAD_REQUEST, "This is not HTTP/1.1")
+
+    @property
+    def _is_asked(self) -> bool:
+        """Is a request not answered yet?"""
+        cycle: RequestResponseCycle | None = self.cycle  # None before the first one
+        return cycle is not None and not cycle.response_complete
+
+    def _count(self, more: int) -> None:
+        self._head_bytes += more
+        if self._head_bytes > self.config.doors.bounds.max_header_bytes:
+            self._is_too_long = True
+            raise ValueError("headers are too long")  # the parser gives up, and 400 is ours above
+
+    def _expect(self, within_s: float | None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        late = self._too_late
+        self._timer = self.loop.call_later(within_s, late) if within_s is not None else None
+
+    def _too_late(self) -> None:
+        self._timer = None
+        if self._in_head or self._is_asked:
+            self._end(HTTPStatus.REQUEST_TIMEOUT, "The request did not come in time")
+        else:
+            self.transport.close()
+
+    def _end(self, status: HTTPStatus, detail: str) -> None:
+        if self.transport.is_closing():
+            return
+        if not (self._is_asked and self.cycle.response_started):
+            answer = problem("", status, detail, {"connection": "close"})
+            head = [f"HTTP/1.1 {status.value} {status.phrase}".encode()]
+            head += [name + b": " + value for name, value in answer.raw_headers]
+            self.transport.write(b"\r\n".join([*head, b"", bytes(answer.body)]))
+        self.transport.close()
+
+
+class WebSocket(WebSocketsSansIOProtocol):
+    """A websocket with a place: a node's once it has spoken, else that of a screen."""
+
+    config: DoorsConfig
+    _is_node = False
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """It has gone."""
+        self.config.doors.go(self.transport)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Take in frames; each ping is answered, so one that does not read must not go on."""
+        if self.transport.get_write_buffer_size() > _UNREAD_BYTES_MAX:
+            self.transport.abort()
+        else:
+            super().data_received(data)
+
+    def handle_connect(self, event: Request) -> None:
+        """Is there room?"""
+        doors = self.config.doors
+        self._is_node = event.path.partition("?")[0] == INGEST_PATH
+        if not self._is_node:
+            self.conn.max_message_size = _SAID_ON_LIVE_BYTES_MAX
+        if doors.nodes_are_full if self._is_node else not doors.admit(self.transport):
+            self.app = refuse
+        super().handle_connect(event)
+
+    def send_receive_event_to_app(self) -> None:
+        """A message; the first one of a node gets it its place."""
+        if self._is_node:
+            self.config.doors.admit_node(self.transport)
+        super().send_receive_event_to_app()
+
+    async def run_asgi(self) -> None:
+        """Serve it; then it only has to go, which one that does not read does not do by itself."""
+        await super().run_asgi()
+        self.config.doors.rest(self.transport)
+
+
+async def refuse(scope: Scope, receive: Receive, send: Send) -> None:
+    """Say that there is no room, in the way of the one who asks."""
+    if scope["type"] == "websocket":
+        chosen = SUBPROTOCOL if SUBPROTOCOL in scope["subprotocols"] else None
+        await receive()
+        await send({"type": "websocket.accept", "subprotocol": chosen})
+        await send({"type": "websocket.close", "code": Close.TRY_LATER, "reason": _TOO_MANY})
+        return
+    headers = {"connection": "close", "retry-after": str(_RETRY_AFTER_S)}
+    answer = problem(scope["path"], HTTPStatus.SERVICE_UNAVAILABLE, _TOO_MANY, headers)
+    await answer(scope, receive, send)
+
+
+async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors) -> None:
+    """Take in connections until cancelled, one after the other.
+
+    An event loop's own server takes in all that are there before it tells of one, and, out of
+    descriptors, closes whoever comes: nodes as well.
+
+    Args:
+        listening: the socket they come to.
+        make: a protocol for each.
+        doors: counts them.
+    """
+    loop = asyncio.get_running_loop()
+    listening.setblocking(False)
+    while True:
+        if doors.is_full:
+            doors.turn_out()
+            await asyncio.sleep(_FULL_PAUSE_S)
+            continue
+        try:
+            connection, _ = await loop.sock_accept(listening)
+        except OSError as error:
+            if error.errno in _STARVED:
+                doors.say("starved", f"no connection can be taken in for now: {error}")
+                doors.turn_out()
+                await asyncio.sleep(_STARVED_PAUSE_S)
+            continue  # or it has gone already
+        try:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            await loop.connect_accepted_socket(make, connection)
+        except OSError:
+            connection.close()

@@ -1,0 +1,85 @@
+"""Small Parquet tables that prove themselves: events and clocks beside a session's frames.
+
+The hash of their bytes is in the footer (`storage.file_hash`), and every page has a checksum. Older
+versions wrote neither: such a table is read and called unproven, and has both when it is next
+written.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from devices.errors import DamagedFileError
+from storage.durable import read_whole, write_whole
+from storage.file_hash import FILE_HASH_KEY, NO_HASH, hashes_of, put_hash
+
+FORMAT_KEY = b"foottile.format"
+"""In the schema's metadata: what has it, and no hash, is damaged, not old."""
+_FORMAT = b"2"
+
+
+@dataclass(frozen=True)
+class CheckedTable:
+    """What a file holds."""
+
+    table: pa.Table
+    is_proven: bool
+    """False: it states no hash, so it may have changed since an older version wrote it."""
+
+
+def write_table(path: Path, table: pa.Table) -> None:
+    """Write a table with its hash, whole or not at all.
+
+    Raises:
+        StorageError: the disk is full or not writable; nothing is left behind then.
+    """
+    said = {**(table.schema.metadata or {}), FORMAT_KEY: _FORMAT}
+    table = table.replace_schema_metadata(said)
+    sink = io.BytesIO()
+    with pq.ParquetWriter(sink, table.schema, compression="zstd", write_page_checksum=True) as file:
+        file.write_table(table)
+        file.add_key_value_metadata({FILE_HASH_KEY.decode(): NO_HASH.decode()})
+    put_hash(sink, where=str(path))
+    write_whole(path, sink.getvalue())
+
+
+def read_table(path: Path) -> CheckedTable:
+    """Read a table. Whether it has the columns that it should is for the caller to say.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DamagedFileError: its hash is of other bytes, or it is no table, or cannot be read.
+    """
+    return table_of(read_whole(path), where=str(path))
+
+
+def table_of(content: bytes, *, where: str) -> CheckedTable:
+    """The same for a file's content.
+
+    Raises:
+        DamagedFileError: its hash is of other bytes, or it is no table.
+    """
+    hashes = hashes_of(content)
+    if hashes is not None and hashes[0] != hashes[1]:
+        raise DamagedFileError(
+            "it was changed: its bytes are not those that its hash is of",
+            where=where,
+            expected="the bytes as they were written",
+        )
+    try:
+        with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True) as file:
+            table = file.read()
+            table.validate(full=True)
+            said = table.schema.metadata or {}
+    except Exception as error:  # damaged bytes may cause any error
+        raise DamagedFileError(
+            f"cannot be read as a table: {' '.join(str(error).split())[:300]}", where=where
+        ) from error
+    if hashes is None and FORMAT_KEY in said:
+        raise DamagedFileError("it was changed: its hash is gone", where=where)
+    return CheckedTable(table, is_proven=hashes is not None)

@@ -1,0 +1,110 @@
+"""The load in a session of ours, sealed or exported, as the columns of a load trace.
+
+What was pressed is taken if the file knows it (`true_*`, of an emulation), else what was estimated;
+forces of tiles (`force_n_0`, ...) before their sum with its centre of pressure (`grf_n`). A bare
+reference tile bears nothing and has no column. Rows at the beginning and at the end of which a
+number is not known, as before the tare or the servo's first answer, are left out; one in between is
+for the reader of the trace to refuse.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from devices.errors import FileFormatError, LoadTraceError
+from storage.schema import array_info
+
+Columns = dict[str, "pa.ChunkedArray[pa.Scalar[pa.DataType]]"]
+
+SESSION_COLUMN = re.compile(
+    r"t_ns|(true_)?(force_n_\d+|grf_n|cop_[xy]_m|angle_rad)",
+)
+"""A pattern of the columns that are needed."""
+
+_TOTAL = ("grf_n", "cop_x_m", "cop_y_m")
+
+
+def is_session(names: Iterable[str]) -> bool:
+    """Are these a session's columns, and no load trace's?"""
+    return "t_ns" in names and "time_s" not in names
+
+
+def as_load(columns: Columns, schema: pa.Schema, *, where: str) -> Columns:
+    """`time_s` and `cell1_n, ...` or `fz_n, cop_x_m, cop_y_m`, with `angle_rad` if it is known.
+
+    Args:
+        columns: of a session; those that `SESSION_COLUMN` names.
+        schema: of its file, which may describe the array.
+        where: for errors.
+
+    Raises:
+        LoadTraceError: it has no load in its columns, or `t_ns` are no instants.
+    """
+    found: Columns = {}
+    for stem in ("true_", ""):
+        if cells := _cells(columns, schema, stem, where=where):
+            found = {f"cell{i + 1}_n": column for i, column in enumerate(cells)}
+        elif all(stem + name in columns for name in _TOTAL):
+            names = ("fz_n", *_TOTAL[1:])
+            found = {name: columns[stem + old] for name, old in zip(names, _TOTAL, strict=True)}
+        if found:
+            break
+    if not found:
+        raise LoadTraceError(
+            f"it is a session without any load in its columns ({', '.join(columns)})",
+            where=where,
+            expected="force_n_0, force_n_1, ..., or grf_n with cop_x_m and cop_y_m",
+            remedy="Estimate it first, with `foottile estimate`",
+        )
+    for name in ("true_angle_rad", "angle_rad"):
+        if name in columns and columns[name].null_count < len(columns[name]):
+            found["angle_rad"] = columns[name]
+            break
+    if not pa.types.is_integer(columns["t_ns"].type) or columns["t_ns"].null_count:
+        raise LoadTraceError("t_ns are no instants", where=where, expected="nanoseconds")
+    t_ns = columns["t_ns"].to_numpy()
+    found["time_s"] = pa.chunked_array([(t_ns - t_ns[:1]) * 1e-9])
+    # Where nothing presses there is no centre of pressure, and none is needed.
+    needed = [column for name, column in found.items() if not name.startswith("cop_")]
+    rows = np.flatnonzero(~np.any([pc.is_null(c, nan_is_null=True) for c in needed], axis=0))
+    if not len(rows):
+        raise LoadTraceError("no row of it has a load", where=where)
+    begin, end = int(rows[0]), int(rows[-1]) + 1
+    return {name: column.slice(begin, end - begin) for name, column in found.items()}
+
+
+def _cells(
+    columns: Columns, schema: pa.Schema, stem: str, *, where: str
+) -> list[pa.ChunkedArray[pa.Scalar[pa.DataType]]]:
+    """Forces of the tiles that bear load, in their order."""
+    numbers = sorted(
+        int(match[1]) for name in columns if (match := re.fullmatch(rf"{stem}force_n_(\d+)", name))
+    )
+    if numbers != list(range(len(numbers))):
+        raise LoadTraceError(
+            f"forces of tiles {', '.join(map(str, numbers))} only",
+            where=where,
+            expected=f"{stem}force_n of all tiles",
+        )
+    bare = _bare(schema)
+    cells = []
+    for i in numbers:
+        estimated = columns.get(f"force_n_{i}")
+        is_empty = estimated is not None and estimated.null_count == len(estimated)
+        if not (is_empty if bare is None else i in bare):
+            cells.append(columns[f"{stem}force_n_{i}"])
+    return cells
+
+
+def _bare(schema: pa.Schema) -> set[int] | None:
+    """Numbers of the bare tiles; None if the file does not describe the array, as CSV."""
+    try:
+        tiles = array_info(schema, where="").tiles
+    except FileFormatError:
+        return None
+    return {i for i, tile in enumerate(tiles) if tile.reference}

@@ -1,0 +1,119 @@
+"""An export, recognised: it says which session it was made from, and proves nothing itself."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from storage.schema import ARRAY_INFO_KEY, KNOWN
+from storage.sessions.content_hash import CONTENT_KEY
+from storage.sessions.file import EXPORT_KEY, FORMAT_KEY
+
+_HEADER_MAX = 1 << 20
+_TILE_NUMBER = re.compile(r"_[0-9]+$")
+
+
+@dataclass
+class ExportReport:
+    """What an export says of itself.
+
+    Attributes:
+        path: the file.
+        format: of the file.
+        source: session, hashes of its file, and what was chosen of it; empty if it does not say.
+        problems: what is wrong with it; none: it can be read to its end.
+    """
+
+    path: Path
+    format: str
+    source: dict[str, Any] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has it (docs/formats.md)."""
+        return {
+            "export": self.format,
+            "source": self.source,
+            "proves": [],
+            "problems": self.problems,
+        }
+
+
+def verify_export(path: Path) -> ExportReport | None:
+    """Read an export to its end.
+
+    Returns:
+        None if it is none: a sealed session, something else, or too damaged to tell.
+    """
+    with path.open("rb") as file:
+        begin = file.read(4)
+    if begin == b"PAR1":
+        return _parquet(path)
+    if begin == b"\xff\xff\xff\xff":
+        return _arrow(path)
+    return _csv(path)
+
+
+def _parquet(path: Path) -> ExportReport | None:
+    try:
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        said, footer = file.schema_arrow.metadata or {}, file.metadata.metadata or {}
+    except Exception:  # damaged bytes may cause any error
+        return None
+    with file:
+        # Those of older versions say so by what they lack: they are not sealed.
+        is_older = ARRAY_INFO_KEY in said and FORMAT_KEY not in said and CONTENT_KEY not in footer
+        if EXPORT_KEY not in said and not is_older:
+            return None
+        report = ExportReport(path, "parquet", _source(said))
+        try:
+            for group in range(file.num_row_groups):
+                file.read_row_group(group)
+        except Exception as error:  # damaged bytes may cause any error
+            report.problems.append(f"it cannot be read: {error}")
+    return report
+
+
+def _arrow(path: Path) -> ExportReport | None:
+    try:
+        with pa.OSFile(str(path), "r") as file, pa.ipc.open_stream(file) as stream:
+            said = stream.schema.metadata or {}
+            if EXPORT_KEY not in said and ARRAY_INFO_KEY not in said:
+                return None
+            report = ExportReport(path, "arrow", _source(said))
+            try:
+                for batch in stream:
+                    batch.validate()
+            except Exception as error:  # damaged bytes may cause any error
+                report.problems.append(f"it cannot be read: {error}")
+    except Exception:  # the same
+        return None
+    return report
+
+
+def _csv(path: Path) -> ExportReport | None:
+    with path.open("rb") as file:
+        first = file.readline(_HEADER_MAX)
+    try:
+        (names,) = csv.reader([first.decode("utf-8").rstrip("\r\n")])
+    except (UnicodeDecodeError, ValueError, csv.Error):
+        return None
+    is_ours = bool(names) and all(
+        name in KNOWN or _TILE_NUMBER.sub("", name) in KNOWN for name in names
+    )
+    return ExportReport(path, "csv") if is_ours else None
+
+
+def _source(said: dict[bytes, bytes]) -> dict[str, Any]:
+    try:
+        source = json.loads(said.get(EXPORT_KEY, b"{}"))
+    except ValueError:
+        return {}
+    return source if isinstance(source, dict) else {}

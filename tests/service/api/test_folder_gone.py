@@ -1,0 +1,193 @@
+"""A data folder that goes away under a running server: nothing is promised that is not in it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from devices.errors import FolderGoneError, StorageError
+from service.server.data_folder import DataFolder
+from storage.durable import LOCK_NAME
+from storage.intervals import Intervals
+from tests.builders.frames import assert_same_bits
+from tests.service.fake_node import FakeNode, Play
+from tests.service.running import Running, assert_refused, closed
+from tests.waiting import until
+
+
+def files_in(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def nothing(data: Path) -> None:
+    """In the place of the folder."""
+
+
+def an_empty_folder(data: Path) -> None:
+    data.mkdir()
+
+
+def a_foreign_folder(data: Path) -> None:
+    data.mkdir()
+    (data / "thesis.tex").touch()
+
+
+def another_servers(data: Path) -> None:
+    other = data.with_name("other")
+    DataFolder(other).close()
+    other.rename(data)
+
+
+@pytest.mark.parametrize(
+    ("put", "said"),
+    [
+        (nothing, "there is nothing in its place"),
+        (an_empty_folder, "an empty mount point"),
+        (a_foreign_folder, "another folder"),
+        (another_servers, "another server"),
+    ],
+)
+def test_while_the_folder_is_away_nothing_is_promised_or_written_in_its_place(
+    running: Running, tared: FakeNode, put: Callable[[Path], None], said: str
+) -> None:
+    node, data = tared, running.data
+    away = data.with_name("away")
+    data.rename(away)
+    put(data)
+    found = files_in(data) if data.exists() else None
+    sent = node.send(30, 20.0)
+    until(lambda: said in (running.node()["storage_problem"] or ""))
+    assert_refused(running.http.get("/ready"), 503, said)
+    assert_refused(running.http.post("/sessions", json={"node": "bench", "name": "x"}), 503)
+    node.socket.send('{"type":"probe","id":1}')
+    node.receive("probe")
+    assert node.acked == Intervals([(0, 69)])
+    assert running.node()["last_seq"] >= 90  # the picture goes on
+    assert (files_in(data) if data.exists() else None) == found
+    if data.exists():
+        shutil.rmtree(data)
+    away.rename(data)
+    assert closed(node.socket)[0] == 1012
+    until(lambda: not running.node()["connected"])
+    node.connect()
+    node.send_again(sent)
+    node.send(10, 20.0)
+    node.acknowledged(node.seq - 1)
+    assert running.node()["storage_problem"] is None
+    assert running.http.get("/ready").status_code == 200
+    assert_same_bits(running.held(node.boot_id), node.all_sent())
+
+
+def test_a_recording_is_complete_although_the_folder_was_away_in_the_middle(
+    running: Running, tared: FakeNode
+) -> None:
+    node = tared
+    recording = node.record()
+    node.deliver(50, 20.0)
+    away = running.data.with_name("away")
+    running.data.rename(away)
+    sent = node.send(50, 20.0)
+    until(lambda: running.node()["storage_problem"])
+    away.rename(running.data)
+    assert closed(node.socket)[0] == 1012
+    until(lambda: not running.node()["connected"])
+    node.connect()
+    node.send_again(sent)
+    node.acknowledged(int(sent.seq[-1]))
+    sealed = node.finish(recording)
+    assert sealed["complete"] is True
+    assert sealed["lost"] == {}
+    running.restart()
+    assert running.session(recording.id).now()["complete"] is True
+
+
+def test_frames_whose_own_file_was_deleted_are_not_acknowledged(
+    running: Running, tared: FakeNode
+) -> None:
+    shutil.rmtree(running.data / "journal" / "bench")
+    tared.send(30, 20.0)
+    until(lambda: running.node()["storage_problem"])
+    tared.socket.send('{"type":"probe","id":1}')
+    tared.receive("probe")
+    assert tared.acked == Intervals([(0, 69)])
+
+
+def test_a_folder_that_was_deleted_is_not_made_again(running: Running, tared: FakeNode) -> None:
+    shutil.rmtree(running.data)
+    with Play(tared, 20.0):
+        until(lambda: running.node()["storage_problem"])
+        assert_refused(running.http.get("/ready"), 503, "nothing in its place")
+    assert not running.data.exists()
+    assert tared.acked == Intervals([(0, 69)])
+
+
+def test_a_copy_with_the_same_id_is_the_folder(running: Running, tared: FakeNode) -> None:
+    # As it is when a disk is mounted anew: other inodes, the same content.
+    away = running.data.with_name("away")
+    running.data.rename(away)
+    until(lambda: running.node()["storage_problem"])
+    shutil.copytree(away, running.data)
+    until(lambda: running.http.get("/ready").status_code == 200)
+    assert closed(tared.socket)[0] == 1012
+    until(lambda: not running.node()["connected"])
+    tared.connect()
+    tared.send(30, 20.0)
+    tared.acknowledged(int(tared.sent[-1].seq[-1]))
+    assert files_in(running.data) > files_in(away) - {".writable"}
+    assert_same_bits(running.held(tared.boot_id), tared.all_sent())
+
+
+def test_a_copy_that_another_server_has_is_not_taken_from_it(tmp_path: Path) -> None:
+    data, away = tmp_path / "data", tmp_path / "away"
+    folder = DataFolder(data)
+    data.rename(away)
+    shutil.copytree(away, data)
+    # The lock is the kernel's: another descriptor of this process is as good as another process.
+    with (data / LOCK_NAME).open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(StorageError, match="another foottile server"):
+            folder.check()
+    folder.check()
+    folder.close()
+
+
+def test_the_log_says_it_once(
+    running: Running, tared: FakeNode, caplog: pytest.LogCaptureFixture
+) -> None:
+    running.data.rename(running.data.with_name("away"))
+    with Play(tared, 20.0):
+        until(lambda: running.node()["storage_problem"])
+        time.sleep(0.5)  # some twenty ticks
+    said = [record for record in caplog.records if "moved, deleted" in record.getMessage()]
+    assert 1 <= len(said) <= 3
+    assert not [record for record in caplog.records if record.exc_info]
+    running.data.with_name("away").rename(running.data)
+
+
+@pytest.fixture
+def mounted(tmp_path: Path) -> Iterator[Path]:
+    """A folder with a disk of its own."""
+    point = tmp_path / "mount"
+    point.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64m", "foottile-test", str(point)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("only root may mount, and not in every container")
+    yield point
+    subprocess.run(["umount", "-l", str(point)], capture_output=True)
+
+
+def test_a_disk_that_is_unmounted_takes_nothing_and_its_mount_point_neither(mounted: Path) -> None:
+    data = mounted / "data"
+    folder = DataFolder(data)
+    assert subprocess.run(["umount", "-l", str(mounted)]).returncode == 0
+    with pytest.raises(FolderGoneError, match="nothing in its place"):
+        folder.check_writable()
+    assert list(mounted.iterdir()) == []
+    folder.close()

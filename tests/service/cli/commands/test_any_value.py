@@ -1,0 +1,235 @@
+"""Every option of every command with values that nobody means: a sentence and a code, no more.
+
+Commands and options are found, not listed: one that is added without a place here fails a test.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
+
+import pytest
+
+from service.cli.main import app
+from service.cli.options import FootOptions
+from tests.service.cli.outcome import Outcome, Run
+
+NUMBERS = ("nan", "inf", "-inf", "-1", "1e308", str(10**30))
+NOT_FINITE = {"nan", "inf", "-inf"}
+
+SHORT = (
+    "simulate",
+    "--scene",
+    "standing",
+    "--seconds",
+    0.2,
+    "--no-estimates",
+    "--out",
+    "x.parquet",
+)
+COMMANDS: dict[str, tuple[object, ...]] = {
+    "bench": ("--out", "bench", "--scene", "gone.toml"),
+    "calibrate": ("s.parquet", "--out", "cal.json"),
+    "demo": ("--scene", "gone.toml"),
+    "doctor": ("--bus", "emulated"),
+    "domes": (),
+    "estimate": ("s.parquet", "--out", "x.parquet", "--calibration", "paper-eq2-shape"),
+    "export": ("s.parquet", "--format", "csv", "--out", "x.csv"),
+    "node": ("--scene", "gone.toml"),
+    "pull": ("20200101T000000Z-000000", "--out", "x", "--server", "http://127.0.0.1:1"),
+    "recover": (".",),
+    "serve": ("--host", "192.0.2.1"),  # no address of this machine: it ends at once
+    "sessions": ("--data", "."),
+    "simulate": SHORT[1:],
+    "verify": ("s.parquet",),
+}
+"""For each command, arguments with which it ends within a moment."""
+
+
+def kinds(annotation: Any) -> Iterator[Any]:
+    """The types an option may have, without what typer is told beside them."""
+    if get_origin(annotation) in (Union, UnionType, list):
+        for part in get_args(annotation):
+            yield from kinds(part)
+    elif hasattr(annotation, "__metadata__"):
+        yield from kinds(annotation.__origin__)
+    else:
+        yield annotation
+
+
+def options(*wanted: type) -> list[tuple[str, str]]:
+    """Command and option, of these types."""
+    of_foot = set(inspect.signature(FootOptions).parameters)
+    found = []
+    for command in app.registered_commands:
+        assert command.name is not None
+        assert command.callback is not None
+        for name, parameter in inspect.signature(
+            command.callback, eval_str=True
+        ).parameters.items():
+            # An emulated foot is refused by one function, whoever asks for it.
+            if command.name != "simulate" and name in of_foot:
+                continue
+            if set(kinds(parameter.annotation)) & set(wanted):
+                found.append((command.name, name))
+    return found
+
+
+def test_every_command_has_its_place_here() -> None:
+    assert {command.name for command in app.registered_commands} == set(COMMANDS)
+
+
+@pytest.fixture(scope="module")
+def sealed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The bytes of a short session, made when it is first asked for."""
+    return {}
+
+
+@pytest.fixture
+def run_short(run: Run, tmp_path: Path, sealed: dict[str, bytes]) -> Run:
+    """Runs a command in a folder with a short session, `s.parquet`."""
+    if not sealed:
+        assert run(*SHORT).code == 0
+        sealed["s"] = (tmp_path / "x.parquet").read_bytes()
+        (tmp_path / "x.parquet").unlink()
+    (tmp_path / "s.parquet").write_bytes(sealed["s"])
+    return run
+
+
+def check(outcome: Outcome, *codes: int) -> None:
+    assert outcome.code in codes, outcome.err
+    assert "Traceback" not in outcome.err
+    if outcome.code in (1, 2):
+        last = outcome.err.strip().splitlines()[-1]
+        assert last.startswith(("foottile: ", "Error: ")), outcome.err
+        assert len(last) < 1000
+        assert last.isprintable()
+
+
+@pytest.mark.parametrize(("command", "name"), options(int, float))
+def test_a_number_that_nobody_means_is_refused_in_a_sentence(
+    run_short: Run, command: str, name: str
+) -> None:
+    option = f"--{name.replace('_', '-')}"
+    for value in NUMBERS:
+        outcome = run_short(command, *COMMANDS[command], f"{option}={value}")
+        check(outcome, *((2,) if value in NOT_FINITE else (0, 1, 2, 3)))
+
+
+@pytest.mark.parametrize("pair", ["nan,nan", "inf,0", "0,-inf", "1e308,1e308", "-1e308,1e308", "1"])
+def test_a_pair_of_numbers_that_nobody_means_is_refused_in_a_sentence(
+    run_short: Run, pair: str
+) -> None:
+    check(run_short("estimate", *COMMANDS["estimate"], f"--tare-s={pair}"), 1, 2)
+    (Path.cwd() / "load.csv").write_text("time_s,fz_n,cop_x_m,cop_y_m\n0,9,0,0\n1,9,0,0\n")
+    check(run_short(*SHORT, "--load", "load.csv", f"--cop-offset-m={pair}"), 0, 1, 2)
+
+
+# --- files and folders ----------------------------------------------------------------------------
+
+
+def listening(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+
+
+def truncated(path: Path, size: int) -> None:
+    with path.open("wb") as file:
+        file.truncate(size)
+
+
+PLACES: dict[str, Callable[[Path], object]] = {
+    "missing": lambda path: None,
+    "folder": Path.mkdir,
+    "zeros": lambda path: path.symlink_to("/dev/zero"),
+    "nothing": lambda path: path.symlink_to("/dev/null"),
+    "pipe": os.mkfifo,
+    "socket": listening,
+    "loop": lambda path: path.symlink_to(path),
+    "empty": lambda path: path.write_bytes(b""),
+    "junk": lambda path: path.write_bytes(bytes(range(256)) * 40),
+    "hole": lambda path: truncated(path, 1 << 40),
+    "no Parquet": lambda path: path.write_bytes(b"PAR1" + b"\xff" * 40 + b"PAR1"),
+}
+FOLDERS = {"folder", "missing"}
+"""What may stand where a folder is asked for."""
+FILES = {"missing", "empty", "junk", "hole", "no Parquet"}
+"""What may be written over."""
+
+
+READ: dict[tuple[str, str], tuple[object, ...]] = {
+    ("bench", "scene"): ("--out", "bench", "--scene", "{}"),
+    ("calibrate", "recordings"): ("{}", "--out", "cal.json"),
+    ("demo", "scene"): ("--scene", "{}"),
+    ("doctor", "scene"): ("--scene", "{}"),
+    ("estimate", "session"): ("{}", "--out", "x.parquet"),
+    ("estimate", "calibration"): ("s.parquet", "--out", "x.parquet", "--calibration", "{}"),
+    ("estimate", "scene"): (*COMMANDS["estimate"], "--scene", "{}"),
+    ("export", "session"): ("{}", "--format", "csv", "--out", "x.csv"),
+    ("node", "scene"): ("--scene", "{}"),
+    ("serve", "config"): ("--host", "192.0.2.1", "--config", "{}"),
+    ("simulate", "scene"): ("--scene", "{}", "--seconds", 1),
+    ("simulate", "load"): ("--scene", "standing", "--load", "{}"),
+    ("verify", "target"): ("{}",),
+}
+WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
+    ("calibrate", "out"): ("s.parquet", "--out", "{}"),
+    ("calibrate", "plot"): ("s.parquet", "--out", "cal.json", "--plot", "{}"),
+    ("estimate", "out"): ("s.parquet", "--out", "{}", "--calibration", "paper-eq2-shape"),
+    ("export", "out"): ("s.parquet", "--format", "csv", "--out", "{}"),
+    ("simulate", "out"): (*SHORT[1:-1], "{}"),
+}
+IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
+    ("bench", "out"): ("--out", "{}", "--scene", "standing", "--seconds", 0.01),
+    ("demo", "data"): ("--port", 0, "--data", "{}"),
+    ("export", "data"): ("20200101T000000Z-000000", "--format=csv", "--out=x.csv", "--data", "{}"),
+    ("node", "journal"): ("--scene", "standing", "--record", "a", "--journal", "{}"),
+    ("pull", "out"): ("20200101T000000Z-000000", "--server=http://127.0.0.1:1", "--out", "{}"),
+    ("recover", "folder"): ("{}",),
+    ("serve", "data"): ("--port", 0, "--data", "{}"),
+    ("sessions", "data"): ("--data", "{}"),
+    ("verify", "data"): ("20200101T000000Z-000000", "--data", "{}"),
+}
+
+
+def test_every_path_has_its_place_here() -> None:
+    known = {*READ, *WRITTEN, *IN_FOLDERS}
+    assert set(options(Path)) <= known
+    assert known <= set(options(Path, str))
+
+
+def given(arguments: tuple[object, ...], name: str) -> list[object]:
+    return [name if argument == "{}" else argument for argument in arguments]
+
+
+@pytest.mark.parametrize(("command", "option"), READ)
+def test_what_is_no_file_of_the_kind_is_refused_in_a_sentence(
+    run_short: Run, tmp_path: Path, command: str, option: str
+) -> None:
+    for name, make in PLACES.items():
+        make(tmp_path / name)
+        check(run_short(command, *given(READ[command, option], name)), 1, 2)
+    assert not (tmp_path / "x.parquet").exists()
+
+
+@pytest.mark.parametrize(("command", "option"), WRITTEN)
+def test_what_cannot_be_written_over_is_refused_before_anything_takes_time(
+    run_short: Run, tmp_path: Path, command: str, option: str
+) -> None:
+    for name in PLACES.keys() - FILES:
+        PLACES[name](tmp_path / name)
+        check(run_short(command, *given(WRITTEN[command, option], name)), 2)
+
+
+@pytest.mark.parametrize(("command", "option"), IN_FOLDERS)
+def test_what_is_no_folder_is_refused_in_a_sentence(
+    run_short: Run, tmp_path: Path, command: str, option: str
+) -> None:
+    for name in PLACES.keys() - FOLDERS:
+        PLACES[name](tmp_path / name)
+        check(run_short(command, *given(IN_FOLDERS[command, option], name)), 1, 2)

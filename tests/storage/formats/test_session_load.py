@@ -1,0 +1,129 @@
+"""Sessions of ours as recorded loads: sealed or exported, what was pressed is pressed again."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from devices.emulation.ground.load_trace import LoadTrace
+from devices.errors import LoadTraceError
+from storage.formats.export import FORMATS, Format, export
+from storage.formats.load_trace import read_load_trace
+from storage.formats.slice import Slice
+from storage.schema import Array
+from storage.sessions.file import SessionWriter
+from tests.builders.arrays import PERIOD_NS, make_array, make_tile
+from tests.builders.frames import make_frames
+
+ROWS = 20
+ARRAY = make_array([make_tile(0), make_tile(1, reference=True), make_tile(2)])
+RNG = np.random.default_rng(3)
+ESTIMATE_N = RNG.uniform(1.0, 20.0, (ROWS, 3)).astype(np.float32).astype(np.float64)
+ESTIMATE_N[:, 1] = np.nan
+TRUE_N = np.where(np.isnan(ESTIMATE_N), 0.0, ESTIMATE_N + 1.0)
+
+ESTIMATES = {
+    "force_n": ESTIMATE_N,
+    "grf_n": np.nansum(ESTIMATE_N, axis=1),
+    "cop_x_m": np.where(np.arange(ROWS) % 4, 0.01, np.nan),
+    "cop_y_m": np.full(ROWS, -0.01),
+    "angle_rad": np.where(np.arange(ROWS) < 2, np.nan, 0.1),  # before the servo's first answer
+}
+TRUTH = {
+    "true_force_n": TRUE_N,
+    "true_grf_n": TRUE_N.sum(axis=1),
+    "true_cop_x_m": np.full(ROWS, 0.02),
+    "true_cop_y_m": np.full(ROWS, 0.03),
+    "true_angle_rad": np.full(ROWS, 0.2),
+}
+
+
+def written(path: Path, columns: dict[str, Array]) -> Path:
+    with SessionWriter(path, ARRAY, {}) as file:
+        file.append(make_frames(ROWS, 3), columns)
+    return path
+
+
+def exported(folder: Path, to: Format, columns: dict[str, Array], *names: str) -> Path:
+    path = folder / f"out.{to}"
+    pieces = [(make_frames(ROWS, 3), columns)]
+    path.write_bytes(b"".join(export(pieces, ARRAY, {}, to, Slice(columns=names))))
+    return path
+
+
+def cells(trace: LoadTrace) -> Array:
+    assert trace.cells_n is not None
+    return trace.cells_n
+
+
+def test_a_sealed_session_presses_what_it_estimated_on_the_tiles_that_bear_load(
+    tmp_path: Path,
+) -> None:
+    trace = read_load_trace(written(tmp_path / "s.parquet", ESTIMATES))
+    np.testing.assert_array_equal(cells(trace), ESTIMATE_N[2:, [0, 2]])  # from the first angle on
+    np.testing.assert_allclose(trace.time_s, np.arange(2, ROWS) * PERIOD_NS * 1e-9, rtol=1e-12)
+    assert trace.angle_rad is not None
+    np.testing.assert_allclose(trace.angle_rad, 0.1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("to", ["parquet", "csv"])
+def test_what_was_really_pressed_goes_before_what_was_estimated(tmp_path: Path, to: Format) -> None:
+    trace = read_load_trace(exported(tmp_path, to, ESTIMATES | TRUTH))
+    np.testing.assert_allclose(cells(trace), TRUE_N[:, [0, 2]], rtol=1e-15)
+    assert trace.angle_rad is not None
+    np.testing.assert_allclose(trace.angle_rad, 0.2)
+    assert len(trace.time_s) == ROWS
+
+
+def test_every_export_that_is_a_table_is_read_again(tmp_path: Path) -> None:
+    for to in FORMATS:
+        path = exported(tmp_path, to, ESTIMATES)
+        if to == "arrow":
+            with pytest.raises(LoadTraceError, match=r"CSV file in UTF-8 .* or a Parquet file"):
+                read_load_trace(path)
+        else:
+            np.testing.assert_allclose(cells(read_load_trace(path)), ESTIMATE_N[2:, [0, 2]], 1e-6)
+
+
+@pytest.mark.parametrize("to", ["parquet", "csv"])
+def test_a_sum_with_its_centre_of_pressure_is_a_load_too(tmp_path: Path, to: Format) -> None:
+    names = ("t_ns", "grf_n", "cop_x_m", "cop_y_m")
+    trace = read_load_trace(exported(tmp_path, to, ESTIMATES, *names))
+    assert trace.cells_n is None
+    assert trace.fz_n is not None
+    assert trace.cop_m is not None
+    np.testing.assert_allclose(trace.fz_n, ESTIMATES["grf_n"], rtol=1e-6)
+    np.testing.assert_array_equal(np.isnan(trace.cop_m[:, 0]), np.arange(ROWS) % 4 == 0)
+
+
+def test_rows_without_forces_are_left_out_at_the_ends_and_refused_in_between(
+    tmp_path: Path,
+) -> None:
+    columns = {"force_n": ESTIMATE_N.copy()}
+    columns["force_n"][:3, 0] = np.nan
+    columns["force_n"][-2:, 2] = np.nan
+    trace = read_load_trace(written(tmp_path / "s.parquet", columns))
+    np.testing.assert_array_equal(cells(trace), ESTIMATE_N[3:-2, [0, 2]])
+    columns["force_n"][10, 0] = np.nan
+    with pytest.raises(LoadTraceError, match=r"cell1_n is nan at row 8"):
+        read_load_trace(written(tmp_path / "s.parquet", columns))
+
+
+def test_raw_frames_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(LoadTraceError, match=re.escape("Estimate it first")):
+        read_load_trace(written(tmp_path / "s.parquet", {}))
+
+
+def test_a_session_in_which_nothing_is_known_is_refused(tmp_path: Path) -> None:
+    nothing = {"force_n": np.full((ROWS, 3), np.nan)}
+    with pytest.raises(LoadTraceError, match="no row of it has a load"):
+        read_load_trace(written(tmp_path / "s.parquet", nothing))
+
+
+def test_forces_of_some_tiles_only_are_refused(tmp_path: Path) -> None:
+    path = exported(tmp_path, "csv", ESTIMATES, "t_ns", "force_n_2")
+    with pytest.raises(LoadTraceError, match=re.escape("forces of tiles 2 only")):
+        read_load_trace(path)
