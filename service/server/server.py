@@ -18,7 +18,7 @@ from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
 from service.server.settling import Settling
 from service.server.streams import ServerStream
-from service.server.views import NodeView, SessionView
+from service.server.views import Counted, NodeView, SessionView
 from service.server_clock import utc_ns
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
@@ -97,6 +97,8 @@ class Server:
             self.folder.close()
             raise
         self.links: dict[str, Link] = {}
+        self._counts: dict[str, Counted] = {}
+        """What screens were told last, by session."""
 
     async def run(self) -> None:
         """Sync, acknowledge, settle, prune and tell, until cancelled."""
@@ -109,6 +111,7 @@ class Server:
                 await self._check_folder()
                 self.settling.settle()
                 self._tell_wanted()
+                self._tell_counts()
                 if now_s >= slow_s:
                     slow_s = now_s + _SLOW_TICK_S
                     self._heartbeat()
@@ -186,6 +189,16 @@ class Server:
         for link in self.links.values():
             if link.wanted is not None and self.recorder.wanted(link.node.name) != link.wanted:
                 link.news.set()
+
+    def _tell_counts(self) -> None:
+        """Tell screens how far unsealed sessions are, where that has changed: by the ledger."""
+        counts: dict[str, Counted] = {}
+        for session in self.sessions if self.hub.subscribers else ():
+            if session.state in ("recording", "pending"):
+                counted = counts[session.id] = Counted.of(session, self.recorder)
+                if counted != self._counts.get(session.id):
+                    self.hub.count(session.node, {session.id: counted.model_dump()})
+        self._counts = counts
 
     def _ask_again(self, node: ServerNode) -> None:
         link = self.links.get(node.name)
