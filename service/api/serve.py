@@ -21,6 +21,8 @@ from service.estimation.warm import warm_up
 from service.link import MESSAGE_BYTES_MAX
 from storage.durable import storage_errors, write_whole
 
+KEPT_IN = "token"
+"""File of the data folder with the token that was made."""
 _BACKLOG = 128
 _GRACE_S = 3
 _UNREAD_MS = 60_000
@@ -84,7 +86,7 @@ def token_for(host: str, given: str | None, data: Path) -> str | None:
     """
     if given or is_loopback(host):
         return given or None
-    path = data / "token"
+    path = data / KEPT_IN
     with storage_errors(path):
         kept = path.read_text().strip() if path.exists() else ""
         if not kept:
