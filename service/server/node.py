@@ -23,6 +23,7 @@ from service.link import BOOT_ID, Hello, StreamNumbers
 from service.server.live_estimates import LiveEstimates
 from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
+from service.server_clock import utc_ns
 from service.sessions.pipeline import Columns
 from service.sessions.tare_file import RecordedTare
 from service.sessions.tares import TareHistory
@@ -36,6 +37,7 @@ from storage.wire import decode
 log = logging.getLogger("foottile.nodes")
 
 _RATE_OVER_NS = 1_000_000_000
+_JITTER = 1.02
 IS_BOOT_ID = re.compile(BOOT_ID)
 HELLO_FILE = "hello.json"
 
@@ -153,13 +155,20 @@ class ServerNode:
 
     @property
     def rate_hz(self) -> float | None:
-        """Frames a second over the last second, by the node's clock."""
+        """Frames a second over the last second, by the node's clock; 0 if none came in it."""
         if len(self._pace) < 2:  # a rate needs two instants
             return None
+        if self.present.last_seen_t_ns is None or (
+            utc_ns() - self.present.last_seen_t_ns > 2 * _RATE_OVER_NS
+        ):
+            return 0.0
         (first_ns, first_seq), (last_ns, last_seq) = self._pace[0], self._pace[-1]
-        return (
-            (last_seq - first_seq) / ((last_ns - first_ns) * 1e-9) if last_ns > first_ns else None
-        )
+        if last_ns <= first_ns:
+            return None
+        rate_hz = (last_seq - first_seq) / ((last_ns - first_ns) * 1e-9)
+        # The nominal rate is what bus and node can do: more in one second is its jitter.
+        nominal_hz = self.info.nominal_rate_hz
+        return nominal_hz if nominal_hz < rate_hz < _JITTER * nominal_hz else rate_hz
 
     def attach(self, hello: Hello, now_t_ns: int) -> None:
         """The node has connected, and said which frames it has.
