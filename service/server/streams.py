@@ -56,6 +56,8 @@ class ServerStream:
         """Frames appended to the journal since the last sync."""
         self.owed = Intervals()
         """Frames to be acknowledged once the journal is synced."""
+        self.problems: list[str] = []
+        """What was found damaged when it was opened, and what became of it, in words."""
         self._first_seq: int | None = None
         self._refused = Intervals()
         self._forgotten = Intervals()
@@ -76,12 +78,12 @@ class ServerStream:
         journal = Journal.open(folder)
         stream = cls(folder, journal.info)
         stream.journal = journal
-        with suppress(FileFormatError):  # the node says it again
-            notes = StreamNotes.load(folder)
-            if notes is not None:
-                stream.notes = stream._notes_on_disk = notes
-                stream.missed_slots = notes.missed_slots
-                stream._refused = Intervals(notes.lost.get(REFUSED, ()))
+        stream.problems = list(journal.problems)
+        notes = StreamNotes.load_whole(folder, stream.problems)  # without, the node says it again
+        if notes is not None:
+            stream.notes = stream._notes_on_disk = notes
+            stream.missed_slots = notes.missed_slots
+            stream._refused = Intervals(notes.lost.get(REFUSED, ()))
         with suppress(StorageError):
             lines = stream._clock_log.lines()
             stream.clock_rows.extend(lines.rows)
