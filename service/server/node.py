@@ -246,10 +246,9 @@ class ServerNode:
         try:
             frames = decode(payload, stream.schema)
             stream.check(frames)
+            stream.take(frames, payload, now_t_ns)
         except FileFormatError as error:
             raise LinkError(f"node {self.name!r}: {error}") from error
-        try:
-            stream.take(frames, payload, now_t_ns)
         except StorageError as error:  # the live picture goes on; nothing is acknowledged
             self.storage_problem = str(error)
         first, last = int(frames.seq[0]), int(frames.seq[-1])
@@ -324,10 +323,10 @@ class ServerNode:
         """Frames whose estimates are due; a bug there costs this node its estimates, no more."""
         try:
             due = list(self.live.feed(frames))
-            self._look_for_tare()
         except Exception as error:
             self._go_without_estimates(error)
             return [(frames, {})]
+        self._look_for_tare()
         return due
 
     def _go_without_estimates(self, error: Exception) -> None:
@@ -345,6 +344,8 @@ class ServerNode:
             self.tare_keeper.look(self.journal, to_come)
         except StorageError as error:  # not in force then; tried again once it can be kept
             self.storage_problem = str(error)
+        except Exception as error:
+            self._go_without_estimates(error)
 
     def _estimate_anew(self) -> None:
         self._has_failed = False

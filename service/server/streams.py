@@ -232,8 +232,11 @@ class ServerStream:
         self._said(said.lost, next_seq=said.next_seq + beyond, unsynced_tail_max=tail)
 
     def is_gone(self) -> None:
-        """The node has not mentioned it: nothing more will come of it."""
+        """The node has not mentioned it: nothing more will come of it, and no file stays open."""
         self.node_has = Intervals()
+        with suppress(StorageError):  # said when it is synced
+            if self.journal is not None:
+                self.journal.close()
 
     def note_losses(self, lost: PairsByReason) -> None:
         """Note all frames of this stream that the node has lost so far."""
@@ -245,6 +248,7 @@ class ServerStream:
 
         Raises:
             FileFormatError: they break a rule that `verify` asks for as well.
+            StorageError: what stands beside them cannot be read.
         """
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         end = self.notes.next_seq

@@ -99,8 +99,13 @@ class Journal:
         return sum(segment.size_bytes for segment in self._segments)
 
     def misplaced(self, frames: FrameBatch) -> str:
-        """Why frames cannot stand among those that are held, in words; empty if they can."""
-        return self._instants.misplaced(frames, self.held)
+        """Why frames cannot stand among those that are held, in words; empty if they can.
+
+        Raises:
+            StorageError: an index cannot be read.
+        """
+        with storage_errors(self.folder):
+            return self._instants.misplaced(frames, self.held)
 
     def append(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
         """Hold the frames of `batch` that are not held yet; return their numbers.
