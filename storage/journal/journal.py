@@ -60,10 +60,14 @@ class Journal:
             make_folder(folder)
             self._set_aside_no_files()
             for path in sorted(folder.glob("*" + SUFFIX)):
+                index = path.with_suffix(INDEX_SUFFIX)
+                has_records = index.exists() and index.stat().st_size > 0
                 segment, damaged = recover(path, self._schema)
                 self.lost.add(damaged, CORRUPT)
                 if segment is not None:
                     self._take_in(segment)
+                elif has_records:  # else it was just begun when its process was killed
+                    self.problems.append(f"{path}: no frame in it is proven by its index")
             for path in folder.glob("*" + INDEX_SUFFIX):
                 # A power cut may take the name of a segment and leave that of its index. Nothing in
                 # it was promised then; but a person may have deleted it, so the index is set aside.

@@ -252,9 +252,12 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
         batches = batches_in(index)
         was_closed = is_closed(index) and len(batches) == len(index) - 1 and end_of(batches) == size
     good = []
+    read: dict[int, EncodedBatch | None] = {}
     with path.open("rb") as file:
         for record in index:
-            found = record if was_closed else _checked(file.fileno(), path, record, end, schema)
+            if not was_closed and not is_whole(record) and end not in read:
+                read[end] = next(messages_from(path, end, schema), None)
+            found = record if was_closed else _checked(file.fileno(), record, end, read.get(end))
             if found is None and is_whole(record):
                 doubtful.add(*numbers(record))
             elif found is not None:
@@ -302,12 +305,11 @@ def _write_index(path: Path, records: Records) -> None:
     write_whole(path.with_suffix(INDEX_SUFFIX), content)
 
 
-def _checked(descriptor: int, path: Path, record: Any, end: int, schema: pa.Schema) -> Any | None:
+def _checked(descriptor: int, record: Any, end: int, message: EncodedBatch | None) -> Any | None:
     """The record if the batch's bytes agree with it; mended if only the record was damaged."""
     if is_whole(record):
         is_right = not record["count"] or payload_of(descriptor, record) is not None
         return record if is_right else None
-    message = next(messages_from(path, end, schema), None)
     if message is None or zlib.crc32(message.payload) != record["crc32"]:
         return None
     return record_of(message, end)[0]
