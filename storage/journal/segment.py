@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -19,8 +20,8 @@ from typing import Any, BinaryIO
 import numpy as np
 import pyarrow as pa
 
-from devices.errors import StorageError
-from storage.durable import write_whole
+from devices.errors import DamagedFileError, StorageError
+from storage.durable import put_aside, write_whole
 from storage.intervals import Intervals
 from storage.journal.segment_format import (
     INDEX_SUFFIX,
@@ -222,6 +223,21 @@ class SegmentWriter:
         """Close the files as they are."""
         self._data.close()
         self._index.close()
+
+
+def set_aside_no_files(folder: Path) -> list[str]:
+    """Set aside what has the name of a segment or index and is none, or may not be read.
+
+    Returns:
+        What was found, and what became of it, in words.
+    """
+    problems = []
+    for path in sorted((*folder.glob("*" + SUFFIX), *folder.glob("*" + INDEX_SUFFIX))):
+        is_file = stat.S_ISREG(path.lstat().st_mode)
+        if not is_file or not os.access(path, os.R_OK):
+            what = "it cannot be read" if is_file else "it is not a file"
+            problems.append(put_aside(path, DamagedFileError(what, where=str(path))))
+    return problems
 
 
 def unread_of(path: Path) -> Path:
