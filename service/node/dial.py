@@ -121,7 +121,10 @@ class BackOff:
         self._wait_s = 0.0
 
     def succeeded(self) -> None:
-        """A server has welcomed the node."""
+        """A server has acknowledged frames.
+
+        A welcome alone is none: whoever is let go for what it sends would come back at once.
+        """
         self._bounds, self._wait_s = BACK_OFF_S, 0.0
 
     def failed(self, error: Exception) -> None:

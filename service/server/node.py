@@ -13,11 +13,12 @@ from pathlib import Path
 
 from devices.errors import (
     FileFormatError,
+    LinkError,
     StateError,
     StorageError,
 )
 from devices.frames import ArrayInfo, FrameBatch
-from service.link import Hello, StreamNumbers
+from service.link import BOOT_ID, Hello, StreamNumbers
 from service.server.live_estimates import LiveEstimates
 from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
@@ -32,7 +33,7 @@ from storage.wire import decode
 log = logging.getLogger("foottile.nodes")
 
 _RATE_OVER_NS = 1_000_000_000
-BOOT_ID = re.compile(r"[0-9a-f]{32}")
+IS_BOOT_ID = re.compile(BOOT_ID)
 
 Estimated = tuple[FrameBatch, Columns]
 
@@ -71,14 +72,17 @@ class ServerNode:
         self._journals_folder = journals
         self._pace: deque[tuple[int, int]] = deque()
         for path in sorted(journals.glob("*")):
-            if BOOT_ID.fullmatch(path.name):
+            if IS_BOOT_ID.fullmatch(path.name):
                 try:
                     self.streams[path.name] = ServerStream.open(path)
                 except FileFormatError as error:
                     log.warning("a journal is left out: %s", error)
         self.present = self._stream_of(self.info)
         """The stream that it takes now."""
-        self.live, self.tare_keeper = self._estimates()
+        self.live: LiveEstimates
+        self.tare_keeper: TareKeeper
+        self._has_failed = False
+        self._estimate_anew()
 
     @property
     def info(self) -> ArrayInfo:
@@ -156,10 +160,12 @@ class ServerNode:
         known = (self.hello.array_info, self.hello.calibration)
         self.hello = hello
         self.has_spoken, self.greeted_t_ns = True, now_t_ns
-        for stream in self.streams.values():
+        for stream in list(self.streams.values()):
             stream.owed = Intervals()
             if stream.boot_id not in self.order and not hello.has_more:
                 stream.is_gone()
+                if stream.journal is None:  # nothing of it ever came
+                    del self.streams[stream.boot_id]
         for earlier in hello.earlier:
             self._stream_of(earlier.array_info).has_ended(earlier)
         self.present = self._stream_of(hello.array_info)
@@ -168,8 +174,8 @@ class ServerNode:
         for name in self.order:
             stream = self.streams[name]
             stream.owed = stream.held & stream.may_come
-        if known != (hello.array_info, hello.calibration):
-            self.live, self.tare_keeper = self._estimates()
+        if known != (hello.array_info, hello.calibration) or self._has_failed:
+            self._estimate_anew()
         try:
             self.keep()
         except StorageError as error:  # the picture goes on; what is sent is not acknowledged
@@ -211,14 +217,13 @@ class ServerNode:
             First and last number of the message, and the frames whose estimates are now due.
 
         Raises:
-            FileFormatError: it is not a message of this stream's frames.
+            LinkError: it is not a message of this stream's frames, or they break a rule of theirs.
         """
-        frames = decode(payload, stream.schema)
-        if (frames.t_ns - frames.t_mono_ns != stream.info.utc_offset_ns).any():
-            raise FileFormatError(
-                f"frames {frames.seq[0]} to {frames.seq[-1]} are not t_mono_ns plus the offset",
-                expected=f"t_ns - t_mono_ns = {stream.info.utc_offset_ns}, as announced in hello",
-            )
+        try:
+            frames = decode(payload, stream.schema)
+            stream.check(frames)
+        except FileFormatError as error:
+            raise LinkError(f"node {self.name!r}: {error}") from error
         try:
             stream.take(frames, payload, now_t_ns)
         except StorageError as error:  # the live picture goes on; nothing is acknowledged
@@ -236,9 +241,7 @@ class ServerNode:
         self._pace.append((int(frames.t_mono_ns[-1]), last))
         while self._pace[-1][0] - self._pace[0][0] > _RATE_OVER_NS and len(self._pace) > 2:
             self._pace.popleft()
-        due = list(self.live.feed(frames))
-        self._look_for_tare()
-        return first, last, due
+        return first, last, self._estimated(frames)
 
     def take_tare(self, reason: str = "") -> RecordedTare:
         """Tare from an unloaded interval of the last seconds, and put it in force.
@@ -293,6 +296,23 @@ class ServerNode:
             self.streams[info.boot_id] = ServerStream(self._journals_folder / info.boot_id, info)
         return self.streams[info.boot_id]
 
+    def _estimated(self, frames: FrameBatch) -> list[Estimated]:
+        """Frames whose estimates are due; a bug there costs this node its estimates, no more."""
+        try:
+            due = list(self.live.feed(frames))
+            self._look_for_tare()
+        except Exception as error:
+            self._go_without_estimates(error)
+            return [(frames, {})]
+        return due
+
+    def _go_without_estimates(self, error: Exception) -> None:
+        log.exception("node %s: this is a bug; it goes on without estimates", self.name)
+        self._has_failed = True
+        self.live = LiveEstimates(self.info, None, None)
+        self.live.calibration_problem = f"the estimator failed, until it connects again: {error!r}"
+        self.tare_keeper = TareKeeper(self.info, self.live, self.tares, automatic=False)
+
     def _look_for_tare(self) -> None:
         if self.storage_problem is not None:  # it could not be kept
             return
@@ -302,12 +322,17 @@ class ServerNode:
         except StorageError as error:  # not in force then; tried again once it can be kept
             self.storage_problem = str(error)
 
-    def _estimates(self) -> tuple[LiveEstimates, TareKeeper]:
+    def _estimate_anew(self) -> None:
         in_force = self.tares.in_force(self.info)
         tare = in_force.tare if in_force is not None else None
-        live = LiveEstimates(self.info, self.hello.calibration, tare)
+        self._has_failed = False
+        try:
+            self.live = LiveEstimates(self.info, self.hello.calibration, tare)
+        except Exception as error:
+            self._go_without_estimates(error)
+            return
         automatic = self.hello.scene.get("auto_tare", True) is not False
-        return live, TareKeeper(self.info, live, self.tares, automatic=automatic)
+        self.tare_keeper = TareKeeper(self.info, self.live, self.tares, automatic=automatic)
 
 
 def _joined(numbers: list[tuple[int, int]]) -> list[tuple[int, int]]:

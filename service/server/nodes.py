@@ -16,12 +16,13 @@ from devices.errors import (
     LinkError,
     UnknownError,
 )
-from service.link import PROTOCOL, Hello, Pairs
-from service.server.node import BOOT_ID, ServerNode
-from storage.intervals import Intervals
+from service.link import PROTOCOL, Hello
+from service.server.node import IS_BOOT_ID, ServerNode
 
 log = logging.getLogger("foottile.nodes")
 
+_NODES_MAX = 1000
+"""Whoever says ever new names fills neither memory nor disk."""
 _NODE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 
 
@@ -82,6 +83,11 @@ class ServerNodes:
         info = hello.array_info
         _check(hello)
         if info.node not in self._nodes:
+            if len(self._nodes) >= _NODES_MAX:
+                raise LinkError(
+                    f"this server knows {len(self._nodes)} nodes already",
+                    remedy="Delete the folders in nodes/ of those that are gone, and start it anew",
+                )
             try:
                 self._nodes[info.node] = self._make(hello)
             except FootTileError as error:
@@ -93,6 +99,10 @@ class ServerNodes:
                 raise LinkError(f"stream {said.boot_id} was announced with another array")
         return node
 
+    def forget(self, name: str) -> None:
+        """A node that said hello for the first time, and could not be taken in after all."""
+        self._nodes.pop(name, None)
+
     def _make(self, hello: Hello) -> ServerNode:
         name = hello.array_info.node
         return ServerNode(self._data / "nodes" / name, self._data / "journal" / name, hello)
@@ -101,7 +111,7 @@ class ServerNodes:
 def _check(hello: Hello) -> None:
     streams = [hello.array_info, *(each.array_info for each in hello.earlier)]
     for info in streams:
-        if not _NODE_NAME.fullmatch(info.node) or not BOOT_ID.fullmatch(info.boot_id):
+        if not _NODE_NAME.fullmatch(info.node) or not IS_BOOT_ID.fullmatch(info.boot_id):
             raise LinkError(
                 f"node {info.node[:80]!r} with boot_id {info.boot_id[:80]!r}",
                 expected="a name of letters, digits, '.', '_' and '-', and 32 hex digits",
@@ -112,17 +122,6 @@ def _check(hello: Hello) -> None:
             raise LinkError(f"an earlier stream of node {hello.array_info.node!r} is {info.node!r}")
     if len({info.boot_id for info in streams}) < len(streams):
         raise LinkError(f"node {hello.array_info.node!r} names a stream twice")
-    try:
-        for pairs in _all_pairs(hello):
-            Intervals(pairs)
-    except ValueError as error:
-        raise LinkError(f"node {hello.array_info.node!r}: {error}") from error
-
-
-def _all_pairs(hello: Hello) -> Iterator[Pairs]:
-    for held, lost in ((hello.held, hello.lost), *((e.held, e.lost) for e in hello.earlier)):
-        yield held
-        yield from lost.values()
 
 
 def _protocol_of(content: bytes) -> object:

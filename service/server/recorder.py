@@ -29,6 +29,8 @@ from storage.sessions.ledger import numbers_of
 log = logging.getLogger("foottile.recorder")
 
 BEHIND_S = 2.0
+CLOCK_ROW_OFF_NS = 60_000_000_000
+"""Eight probes may take 40 s on a link that hardly carries anything."""
 
 
 class Recorder:
@@ -165,11 +167,21 @@ class Recorder:
         book.changed(book.get(session_id))
         return book.get(session_id)
 
-    def note_clock(self, node: ServerNode, row: ClockRow) -> None:
+    def note_clock(self, node: ServerNode, row: ClockRow, now_t_ns: int) -> None:
         """Keep a new measurement of a node's clock, with its sessions too.
 
-        The stream's log has it already; sessions are written with their next change.
+        The stream's log has it already; sessions are written with their next change. A row says
+        what this server's own clock showed some seconds ago: one that is far from that is not kept.
         """
+        said_t_ns = row.t_mono_ns + node.info.utc_offset_ns + row.server_minus_node_ns
+        if abs(said_t_ns - now_t_ns) > CLOCK_ROW_OFF_NS + row.uncertainty_ns:
+            log.warning(
+                "node %s: a measurement of its clock is not kept: it has this server's clock "
+                "%.0f s off. Was that set just now?",
+                node.name,
+                (said_t_ns - now_t_ns) * 1e-9,
+            )
+            return
         try:
             node.present.note_clock(row)
         except StorageError as error:  # it counts all the same

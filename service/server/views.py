@@ -22,9 +22,9 @@ T = TypeVar("T")
 
 
 class View(BaseModel):
-    """Base of all answers."""
+    """Base of all answers; what is not known is null, and never a NaN that JSON cannot write."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
 class Page(View, Generic[T]):

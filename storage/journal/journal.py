@@ -20,6 +20,7 @@ from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import make_folder, storage_errors
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
+from storage.journal.instants import Instants
 from storage.journal.open_segments import OpenSegments
 from storage.journal.segment import SUFFIX, UNREAD_SUFFIX, Segment, recover
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD, numbers, payload_of, read_header
@@ -51,6 +52,7 @@ class Journal:
         self._schema = wire_schema(info)
         self._segments: list[Segment] = []
         self._open = OpenSegments(folder, self._schema.serialize().to_pybytes())
+        self._instants = Instants(lambda seq, is_upper: self.t_ns_near(seq, newest=is_upper))
         with storage_errors(folder):
             make_folder(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
@@ -94,6 +96,10 @@ class Journal:
     def size_bytes(self) -> int:
         """What it takes on the disk, nearly."""
         return sum(segment.size_bytes for segment in self._segments)
+
+    def misplaced(self, frames: FrameBatch) -> str:
+        """Why frames cannot stand among those that are held, in words; empty if they can."""
+        return self._instants.misplaced(frames, self.held)
 
     def append(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
         """Hold the frames of `batch` that are not held yet; return their numbers.
@@ -314,6 +320,7 @@ class Journal:
             self.held = self.held | segment.held
 
     def _recount(self) -> None:
+        self._instants.forget()
         self.held = union(segment.held for segment in self._segments)
 
     def _write(self, message: EncodedBatch) -> None:
@@ -321,6 +328,7 @@ class Journal:
         if segment.held == numbers_:  # its first batch
             self._segments.append(segment)
         self.held.add(message.seq_first, message.seq_last)
+        self._instants.note(message, self.held)
         self.lost.found(numbers_)
 
     def _messages_of(

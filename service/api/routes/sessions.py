@@ -30,7 +30,7 @@ Tags = Annotated[tuple[Tag, ...], Field(max_length=50)]
 
 
 class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class SessionPage(Page[SessionView]):
