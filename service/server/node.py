@@ -221,13 +221,13 @@ class ServerNode:
         """
         try:
             frames = decode(payload, stream.schema)
-            stream.check(frames)
+            try:
+                stream.check(frames)
+                stream.take(frames, payload, now_t_ns)
+            except StorageError as error:  # the live picture goes on; nothing is acknowledged
+                self.storage_problem = str(error)
         except FileFormatError as error:
             raise LinkError(f"node {self.name!r}: {error}") from error
-        try:
-            stream.take(frames, payload, now_t_ns)
-        except StorageError as error:  # the live picture goes on; nothing is acknowledged
-            self.storage_problem = str(error)
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         self.last_seen_t_ns = now_t_ns
         if stream is not self.present:
