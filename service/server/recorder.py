@@ -7,6 +7,7 @@ Starting and stopping only note numbers and instants; the frames are in the jour
 from __future__ import annotations
 
 import logging
+from typing import Literal
 
 from devices.errors import (
     StateError,
@@ -48,6 +49,15 @@ class Recorder:
         self._settling = settling
         for session in book:
             book.note(self._with_clock(session))
+
+    def know(self, node: ServerNode) -> None:
+        """A node has said hello: if it was not known before, its sessions lack what is kept of it.
+
+        Those are the clock measurements since their last change.
+        """
+        for session in self._book.of_node(node.name):
+            if session.state != "sealing":
+                self._book.note(self._with_clock(session))
 
     def recording_on(self, node: str) -> list[Session]:
         """Sessions that are being recorded on a node."""
@@ -210,11 +220,25 @@ class Recorder:
         return self._settling.problem_of(session)
 
     def duration_s(self, session: Session, frames: int) -> float:
-        """Its length: exact for a sealed session, else estimated from the stream's nominal rate."""
+        """Its length: exact for a sealed session, else as long as frames have come for it.
+
+        No shorter than its frames take at the nominal rate, which is the fastest there is.
+        """
         node = self._nodes.find(session.node)
         if session.state == "sealed" or node is None:
             return session.duration_s
-        return frames / node.info.nominal_rate_hz
+        seen_t_ns = node.last_seen_t_ns if frames else None
+        end_t_ns = min(session.stopped_t_ns or NO_END, seen_t_ns or 0)
+        lasted_s = (end_t_ns - session.started_t_ns) * 1e-9
+        return max(frames / node.info.nominal_rate_hz, lasted_s)
+
+    def waits_for(self, session: Session, ledger: Ledger) -> Literal["frames", "end"] | None:
+        """What a pending session waits for: frames, or only to be told that there are no more."""
+        if session.state != "pending":
+            return None
+        if ledger.pending:
+            return "frames"
+        return "end" if session.parts[-1].seq_last is None else None
 
     def sources(self, session_id: str) -> Sources:
         """Sources that a session can be sealed or exported from.

@@ -20,7 +20,7 @@ from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
 from service.server.settling import Settling
 from service.server.streams import ServerStream
-from service.server.views import NodeView, SessionView
+from service.server.views import Counted, NodeView, SessionView
 from service.server_clock import utc_ns
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
@@ -74,7 +74,6 @@ class Server:
 
     Raises:
         StorageError: the folder cannot be written.
-        FileFormatError: something in it is damaged.
     """
 
     def __init__(self, data: Path) -> None:
@@ -98,6 +97,8 @@ class Server:
             self.folder.close()
             raise
         self.links: dict[str, Link] = {}
+        self._counts: dict[str, Counted] = {}
+        """What screens were told last, by session."""
         self._failing: dict[str, tuple[str, float]] = {}
         """What has failed in the last tick, how, and when that was said."""
 
@@ -118,6 +119,8 @@ class Server:
                 self.settling.settle()
             for link in list(self.links.values()):
                 self._tell_wanted(link)
+            with self._alone("counts"):
+                self._tell_counts()
             if now_s >= slow_s:
                 slow_s = now_s + _SLOW_TICK_S
                 with self._alone("heartbeat"):
@@ -167,6 +170,11 @@ class Server:
         """
         self.folder.check_writable()
 
+    @property
+    def problems(self) -> list[str]:
+        """What was found damaged in the data folder, and what became of it, in words."""
+        return self.folder.problems + self.nodes.problems + self.sessions.problems
+
     async def empty_trash(self) -> tuple[int, int]:
         """Delete what is in the trash for good; return the number of sessions and of bytes.
 
@@ -192,6 +200,16 @@ class Server:
         with self._alone(f"node {link.node.name}, what sessions need of it"):
             if link.wanted is not None and self.recorder.wanted(link.node.name) != link.wanted:
                 link.news.set()
+
+    def _tell_counts(self) -> None:
+        """Tell screens how far unsealed sessions are, where that has changed: by the ledger."""
+        counts: dict[str, Counted] = {}
+        for session in self.sessions if self.hub.subscribers else ():
+            if session.state in ("recording", "pending"):
+                counted = counts[session.id] = Counted.of(session, self.recorder)
+                if counted != self._counts.get(session.id):
+                    self.hub.count(session.node, {session.id: counted.model_dump()})
+        self._counts = counts
 
     @contextmanager
     def _alone(self, what: str) -> Iterator[None]:

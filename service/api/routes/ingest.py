@@ -100,6 +100,7 @@ def _joined(server: Server, hello: Hello) -> Iterator[Link]:
     try:
         node = server.nodes.greet(hello)
         node.attach(hello, utc_ns())
+        server.recorder.know(node)
         server.settling.follow(node)
     except Exception as error:
         if is_new:
@@ -165,8 +166,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
         said = _parse(message)
         match said:
             case Probe(id=number):
-                answer = Probe(id=number, server_t_ns=utc_ns())
-                await socket.send_text(say(answer))
+                await _answer(socket, Probe(id=number, server_t_ns=utc_ns()))
             case FramesOf(boot_id=boot_id):
                 link.stream = _announced(node, boot_id)
             case ClockRow():
@@ -185,6 +185,14 @@ def _announced(node: ServerNode, boot_id: str) -> ServerStream:
     if boot_id not in node.order:
         raise HangUp(Close.REFUSED, f"stream {boot_id!r} was not announced")
     return node.streams[boot_id]
+
+
+async def _answer(socket: WebSocket, probe: Probe) -> None:
+    try:
+        async with asyncio.timeout(SILENCE_S):
+            await socket.send_text(say(probe))
+    except TimeoutError as error:  # else nobody would notice that nothing is heard either
+        raise HangUp(Close.SILENT, f"nothing was read for {SILENCE_S:g} s") from error
 
 
 async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
