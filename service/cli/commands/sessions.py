@@ -175,10 +175,11 @@ def _in_folder(data: Path) -> list[dict[str, Any]]:
 
     if not data.is_dir():
         raise UsageError(f"no data folder {str(data)!r}")
-    folder = SessionFolder(data / "sessions")
+    sessions, unreadable = SessionFolder(data / "sessions").load_all()
+    for session_id, error in unreadable.items():
+        remark(f"session {session_id} is left out: {printable(str(error))}")
     found = []
-    for session_id in folder.ids():
-        session = folder.load(session_id)
+    for session in sessions:
         ledger = session.ledger
         content = session.model_dump(mode="json", exclude=_LONG)
         complete = False if ledger is None else "lossy" if ledger.lossy else ledger.complete
