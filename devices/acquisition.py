@@ -86,8 +86,7 @@ class Acquisition:
         is_new: the array was identified again in a running node: the first frame says so.
         keeper: keeps frames while their batch is being filled. Readings that are out of range are
             flagged when a batch is whole, see `RangeFlag`.
-        lead_end_ns: frames before this instant are the lead of an emulated load; None: there is
-            none.
+        lead_end_ns: as the attribute.
     """
 
     def __init__(
@@ -114,7 +113,8 @@ class Acquisition:
         self._servo = servo
         self._is_new = is_new
         self._keeper = keeper
-        self._lead_end_ns = lead_end_ns
+        self.lead_end_ns = lead_end_ns
+        """Frames before this instant are the lead of an emulated load; None: there is none."""
         self._range = RangeFlag(tiles)
         self._next_seq = 0
         self._last_t_mono_ns = 0
@@ -174,7 +174,7 @@ class Acquisition:
             self._is_new = False
         if scan.bus_fault:
             frame_status |= FrameStatus.BUS_FAULT
-        if self._lead_end_ns is not None and t_mono_ns < self._lead_end_ns:
+        if self.lead_end_ns is not None and t_mono_ns < self.lead_end_ns:
             frame_status |= FrameStatus.LEAD
         servo_counts, servo_age_us = NO_SERVO_COUNTS, NO_SERVO_AGE
         if self._servo is not None:

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict
+from pydantic import Field, model_validator
 
 from devices.arrays import Arrays, Times
+from devices.facts import TILES_MAX, Facts, Label, Metres, OffsetNs, Word
 
 NOT_READ = 65535
 NO_SERVO_COUNTS = -(2**31)
@@ -131,54 +133,59 @@ def zero_columns(n: int, tiles: int) -> dict[str, np.ndarray]:
     }
 
 
-class _Fact(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+_Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class TileInfo(_Fact):
+class TileInfo(Facts):
     """One tile as found on the bus at start-up."""
 
-    serial: str
-    mux: int
-    channel: int
-    coefficient_words: tuple[int, int, int, int]
+    serial: Label
+    mux: Annotated[int, Field(ge=0, le=0x7F)]
+    channel: Annotated[int, Field(ge=0, le=7)]
+    coefficient_words: tuple[Word, Word, Word, Word]
     """Registers a0, b1, b2, c12 as unsigned 16-bit words (data sheet table 4)."""
-    x_m: float
-    y_m: float
-    z_m: float
+    x_m: Metres
+    y_m: Metres
+    z_m: Metres
     reference: bool
-    conversion_ms: float
+    conversion_ms: Annotated[float, Field(gt=0, le=1000)]
     """Conversion time as measured, else the data sheet's typical 1.6 ms. The sample is taken to lie
     a quarter into it."""
 
 
-class ServoInfo(_Fact):
+class ServoInfo(Facts):
     """The servo whose position goes with the frames, and how it becomes the segment's angle."""
 
-    model: str
-    counts_per_turn: int
-    zero_counts: int
-    sign: int
-    ratio: float
-    ankle_travel_m_per_rad: float | None
+    model: Label
+    counts_per_turn: Annotated[int, Field(gt=0, lt=2**31)]
+    zero_counts: Annotated[int, Field(ge=-(2**31), lt=2**31)]
+    sign: Literal[-1, 1]
+    ratio: _Factor
+    ankle_travel_m_per_rad: _Factor | None
     """How far the ankle moves forward per radian (radius of a rolling foot); None: not known."""
 
 
-class ArrayInfo(_Fact):
+class ArrayInfo(Facts):
     """Everything a reader of the frames needs to know of the array. Travels as JSON with them."""
 
-    node: str
-    boot_id: str
-    tiles: tuple[TileInfo, ...]
+    node: Label
+    boot_id: Label
+    tiles: Annotated[tuple[TileInfo, ...], Field(max_length=TILES_MAX)]
     servo: ServoInfo | None
-    schedule: str
-    nominal_rate_hz: float
-    utc_offset_ns: int
+    schedule: Label
+    nominal_rate_hz: Annotated[float, Field(ge=1e-3, le=1e5)]
+    utc_offset_ns: OffsetNs
     """`t_ns` minus `t_mono_ns` of every frame of this stream."""
     clock_set: bool
-    software: str
-    scene: str
-    models: tuple[str, ...]
+    software: Label
+    scene: Label
+    models: Annotated[tuple[Label, ...], Field(max_length=TILES_MAX)]
+
+    @model_validator(mode="after")
+    def _tiles_differ(self) -> Self:
+        if len(set(self.serials)) < len(self.tiles):
+            raise ValueError("two tiles have the same serial")
+        return self
 
     def has_same_tiles_as(self, other: ArrayInfo) -> bool:
         """Are these the same chips in the same places?

@@ -26,13 +26,25 @@ from __future__ import annotations
 import re
 import zlib
 from enum import IntEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
 from devices.errors import FileFormatError, LinkError
+from devices.facts import Count, Facts, Label, OffsetNs, Seq, Text, TMonoNs, TNs
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
+from service.scene_content import SceneContent
+from storage.intervals import NO_END
+
+_T = TypeVar("_T")
 
 SUBPROTOCOL = "foottile.v1"
 PROTOCOL = 2
@@ -47,8 +59,19 @@ _REASON_BYTES_MAX = 123
 _CHECK_BYTES = 4
 _CHECKED = re.compile(r'(\{.*),"crc32":"([0-9a-f]{8})"\}', re.DOTALL)
 
-_Seq = Annotated[int, Field(ge=0, lt=2**62)]
-_Ns = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+_PAIRS_MAX = 1 << 15
+"""Intervals in a list: as many of a stream's gaps as a message has room for."""
+_STREAMS_MAX = 256
+_REASONS_MAX = 32
+_TROUBLES_MAX = 1000
+UNCERTAINTY_MAX_NS = 60_000_000_000
+"""No probe that took longer tells anything."""
+BOOT_ID = r"[0-9a-f]{32}"
+_AnySeq = Annotated[int, Field(ge=0, le=NO_END)]
+"""Of a frame, or after the last that there can be."""
+
+BootId = Annotated[str, Field(pattern=f"^{BOOT_ID}$")]
+"""Name of a stream."""
 
 
 class Close(IntEnum):
@@ -56,11 +79,14 @@ class Close(IntEnum):
 
     POLICY = 1008
     TOO_BIG = 1009
+    BUG = 1011
     RESTART = 1012
     TRY_LATER = 1013
-    BAD_HELLO = 4001
+    REFUSED = 4001
+    """What was said arrived whole, and cannot be."""
     WRONG_VERSION = 4002
     MALFORMED = 4004
+    """What was said was damaged on its way."""
     SILENT = 4005
     TOO_SLOW = 4008
     NAME_TAKEN = 4009
@@ -76,66 +102,85 @@ class HangUp(Exception):  # noqa: N818  # no error: how a connection ends
         self.reason = reason
 
 
-class _Message(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+def _rise(pairs: tuple[tuple[int, int | None], ...]) -> tuple[tuple[int, int | None], ...]:
+    end: int | None = -1
+    for first, last in pairs:
+        if end is None or first <= end or (last is not None and last < first):
+            raise ValueError("intervals have to rise, and none may be empty")
+        end = last
+    return pairs
 
 
-Pairs = tuple[tuple[_Seq, _Seq], ...]
-"""Numbers as closed intervals."""
-PairsByReason = dict[Annotated[str, Field(pattern=r"^[a-z_]{1,40}$")], Pairs]
+def _are_none_empty(
+    pairs: tuple[tuple[int, int | None], ...],
+) -> tuple[tuple[int, int | None], ...]:
+    if any(last is not None and last < first for first, last in pairs):
+        raise ValueError("an interval is empty")
+    return pairs
 
 
-class EarlierStream(_Message):
+Pairs = Annotated[tuple[tuple[Seq, Seq], ...], Field(max_length=_PAIRS_MAX), AfterValidator(_rise)]
+"""Numbers as closed intervals, in order."""
+PairsByReason = Annotated[
+    dict[Annotated[str, Field(pattern=r"^[a-z_]{1,40}$")], Pairs], Field(max_length=_REASONS_MAX)
+]
+
+
+class EarlierStream(Facts):
     """An ended stream of this node, if the node still has frames of it or knows losses."""
 
     array_info: ArrayInfo
     held: Pairs
     """What it has."""
-    next_seq: _Seq
+    next_seq: Seq
     """The number after the last frame that it knows of."""
-    lost: PairsByReason = {}
+    lost: PairsByReason = Field(default={})
     """Numbers that it should have and does not have, by reason."""
-    unsynced_tail_max: Annotated[int, Field(ge=0)] = 0
+    unsynced_tail_max: Count = 0
     """How many more frames there may have been: its power failed. 0: it ended in order, or was
     killed, which loses nothing."""
-    missed_slots: Annotated[int, Field(ge=0)] = 0
-    t_ns_first: _Ns = 0
+    missed_slots: Count = 0
+    t_ns_first: TNs = 0
     """Instant of the oldest frame that it has, in the node's UTC."""
 
 
-class Hello(_Message):
+class Hello(Facts):
     """Who the node is, and what it can give."""
 
     type: Literal["hello"] = "hello"
-    protocol: int
+    protocol: Count
     array_info: ArrayInfo
     held: Pairs
     """What it has of its present stream."""
-    next_seq: _Seq
+    next_seq: Seq
     """The number of the next frame to be taken."""
-    lost: PairsByReason = {}
+    lost: PairsByReason = Field(default={})
     """Numbers of its present stream that it should have and does not have, by reason."""
-    scene: dict[str, Any]
+    scene: SceneContent
     """The scene file's content."""
     emulated: bool
     calibration: Calibration | None
-    calibration_problem: str | None
+    calibration_problem: Text | None
     """Why there is none."""
-    earlier: tuple[EarlierStream, ...] = ()
+    earlier: Annotated[tuple[EarlierStream, ...], Field(max_length=_STREAMS_MAX)] = ()
     """Its streams before this one, oldest first."""
     has_more: bool = False
     """Are there more, which did not fit? They are announced once these are delivered."""
 
 
-class StreamNumbers(_Message):
+class StreamNumbers(Facts):
     """Numbers of one stream."""
 
-    boot_id: str
-    numbers: tuple[tuple[_Seq, _Seq | None], ...]
-    """An interval without an end goes on with every frame to come."""
+    boot_id: BootId
+    numbers: Annotated[
+        tuple[tuple[_AnySeq, _AnySeq | None], ...],
+        Field(max_length=2 * _PAIRS_MAX),
+        AfterValidator(_are_none_empty),
+    ]
+    """The most urgent first. An interval without an end goes on with every frame to come."""
 
 
-class Wanted(_Message):
+class Wanted(Facts):
     """What sessions need: the node keeps it until it is acknowledged, whatever its age."""
 
     type: Literal["wanted"] = "wanted"
@@ -146,12 +191,12 @@ class Wanted(_Message):
     frame on?"""
 
 
-class Welcome(_Message):
+class Welcome(Facts):
     """What the server lacks, and what sessions need."""
 
     type: Literal["welcome"] = "welcome"
-    protocol: int
-    server_id: str = ""
+    protocol: Count
+    server_id: Label = ""
     """Name of its data folder: one server cannot give up what another one needs."""
     lacks: tuple[StreamNumbers, ...]
     """Of the present stream everything that the node has and the server has not, of earlier ones
@@ -159,60 +204,69 @@ class Welcome(_Message):
     wanted: Wanted
 
 
-class Ack(_Message):
+class Ack(Facts):
     """These frames are on the server's disk: the node may forget them."""
 
     type: Literal["ack"] = "ack"
-    boot_id: str
-    seq_first: _Seq
-    seq_last: _Seq
+    boot_id: BootId
+    seq_first: Seq
+    seq_last: Seq
+
+    @model_validator(mode="after")
+    def _is_not_empty(self) -> Self:
+        if self.seq_last < self.seq_first:
+            raise ValueError("the interval is empty")
+        return self
 
 
-class FramesOf(_Message):
+class FramesOf(Facts):
     """The frames that follow are of this stream."""
 
     type: Literal["stream"] = "stream"
-    boot_id: str
+    boot_id: BootId
 
 
-class Probe(_Message):
+class Probe(Facts):
     """Asks for the server's clock; comes back with it."""
 
     type: Literal["probe"] = "probe"
-    id: _Seq
-    server_t_ns: _Ns | None = None
+    id: Seq
+    server_t_ns: TNs | None = None
     """The server's UTC; None on the way there."""
 
 
-class ClockRow(_Message):
+class ClockRow(Facts):
     """The best of eight probes. An offset that was not measured is not sent."""
 
     type: Literal["clock"] = "clock"
-    t_mono_ns: _Ns
-    server_minus_node_ns: _Ns
+    t_mono_ns: TMonoNs
+    server_minus_node_ns: OffsetNs
     """The server's UTC minus the `t_ns` that a frame taken now would have."""
-    uncertainty_ns: Annotated[int, Field(ge=0, lt=2**63)]
+    uncertainty_ns: Annotated[int, Field(ge=0, le=UNCERTAINTY_MAX_NS)]
     """Half the round trip: the server's reading lies somewhere in it."""
 
 
-class Lost(_Message):
+class Lost(Facts):
     """All that the node has lost of its present stream so far; sent whenever that changes."""
 
     type: Literal["lost"] = "lost"
-    boot_id: str
+    boot_id: BootId
     lost: PairsByReason
 
 
-class Status(_Message):
+class Status(Facts):
     """What the node counts beside its frames; each second."""
 
     type: Literal["status"] = "status"
-    missed_slots: Annotated[int, Field(ge=0)]
-    backlog_frames: Annotated[int, Field(ge=0)] = 0
+    missed_slots: Count
+    backlog_frames: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Frames that the server lacks and the node has; they are sent after the newest ones."""
-    troubles: tuple[str, ...] = ()
+    troubles: Annotated[tuple[Text, ...], Field(max_length=_TROUBLES_MAX)] = ()
     """What is wrong with the array or with the node's disk now, in words."""
-    counts: dict[str, dict[str, Annotated[int, Field(ge=0)]]] = {}
+    counts: Annotated[
+        dict[Label, Annotated[dict[Label, Count], Field(max_length=_REASONS_MAX)]],
+        Field(max_length=_TROUBLES_MAX),
+    ] = Field(default={})
     """How often what went wrong in this stream, by serial and reason."""
 
 
@@ -222,6 +276,25 @@ FromNode: TypeAdapter[SaidByNode] = TypeAdapter(Annotated[SaidByNode, Field(disc
 FromServer: TypeAdapter[SaidByServer] = TypeAdapter(
     Annotated[SaidByServer, Field(discriminator="type")]
 )
+
+
+def understood(messages: TypeAdapter[_T], text: str) -> _T:
+    """A message of one side; it can be written down, and read back as the same.
+
+    Args:
+        messages: `FromNode` or `FromServer`.
+        text: without its checksum.
+
+    Raises:
+        LinkError: it is no such message, or holds what cannot be.
+    """
+    try:
+        # Strict: true is not 1, and "1" neither.
+        return messages.validate_json(text, strict=True)
+    except ValidationError as error:
+        complaint = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        where = ".".join(str(part) for part in complaint["loc"])
+        raise LinkError(f"message not understood: {where}: {complaint['msg']}") from error
 
 
 def say(message: BaseModel) -> str:
@@ -263,5 +336,6 @@ def checked(message: bytes) -> bytes:
 
 
 def close_reason(text: str) -> str:
-    """A reason as a close frame can carry it: 123 bytes (RFC 6455 5.5)."""
-    return text.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")
+    """A reason as a close frame and a log can carry it: 123 bytes (RFC 6455 5.5) in one line."""
+    plain = "".join(char if char.isprintable() else "?" for char in text[:_REASON_BYTES_MAX])
+    return plain.encode()[:_REASON_BYTES_MAX].decode(errors="ignore")

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Mapping
+from heapq import merge
 from itertools import chain
+from operator import itemgetter
 
 NO_END = 2**62
 """In place of the last number of an interval that goes on with every number to come."""
@@ -67,7 +69,7 @@ class Intervals:
         """
         if last < first:
             raise ValueError(f"interval {first} to {last} is empty")
-        begin = bisect_left(self._intervals, first - 1, key=lambda interval: interval[1])
+        begin = bisect_left(self._intervals, first - 1, key=itemgetter(1))
         end = begin
         while end < len(self._intervals) and self._intervals[end][0] <= last + 1:
             first = min(first, self._intervals[end][0])
@@ -78,12 +80,22 @@ class Intervals:
     def within(self, first: int, last: int) -> Intervals:
         """The numbers of this set from `first` to `last`."""
         found = Intervals()
-        found._intervals = [
-            (max(a, first), min(b, last))
-            for a, b in self._intervals
-            if a <= last and b >= first and first <= last
-        ]
+        begin = bisect_left(self._intervals, first, key=itemgetter(1))
+        end = bisect_right(self._intervals, last, key=itemgetter(0))
+        if first <= last:
+            inside = self._intervals[begin:end]
+            found._intervals = [
+                (max(a, first), min(b, last)) for a, b in inside if a <= last and b >= first
+            ]
         return found
+
+    def neighbours(self, first: int, last: int) -> tuple[int | None, int | None]:
+        """The greatest number of this set below `first`, and the least above `last`; or None."""
+        at = bisect_left(self._intervals, first, key=itemgetter(0))
+        before = min(self._intervals[at - 1][1], first - 1) if at else None
+        at = bisect_right(self._intervals, last, key=itemgetter(1))
+        after = max(self._intervals[at][0], last + 1) if at < len(self._intervals) else None
+        return before, after
 
     def missing(self, first: int, last: int) -> Intervals:
         """The numbers from `first` to `last` that are not in this set."""
@@ -99,7 +111,7 @@ class Intervals:
 
     def __or__(self, other: Intervals) -> Intervals:
         """The numbers that are in either."""
-        return Intervals((*self, *other))
+        return Intervals(merge(self, other))  # in order, so that each is added at the end
 
     def __and__(self, other: Intervals) -> Intervals:
         """The numbers that are in both."""
@@ -133,6 +145,7 @@ EVICTED = "evicted"
 CORRUPT = "corrupt"
 NODE_RESTARTED = "node_restarted"
 GIVEN_UP = "given_up"
+REFUSED = "refused"
 
 AsPairs = dict[str, tuple[tuple[int, int], ...]]
 """How losses travel and are kept: `{"evicted": [[0, 99], [200, 299]]}`."""

@@ -14,7 +14,9 @@ import numpy as np
 import pyarrow as pa
 
 from devices.errors import FileFormatError
+from devices.facts import SEQ_END
 from devices.frames import ArrayInfo, FrameBatch
+from storage.arrow_header import BatchHeader, HeaderError, read_header
 from storage.intervals import Intervals
 from storage.schema import from_record_batch, to_record_batch, wire_schema
 
@@ -69,27 +71,19 @@ def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
         FileFormatError: it is no such message, is cut off, or its frames are not in order.
     """
     try:
-        record = pa.ipc.read_record_batch(pa.py_buffer(payload), schema)
-        record.validate(full=True)  # offsets and lengths of foreign bytes are not to be trusted
+        message = pa.ipc.read_message(pa.py_buffer(payload))
+        header = read_header(message)
+        _check_header(header, schema)
+        if 8 + message.metadata.size + header.body_bytes != len(payload):
+            raise HeaderError(f"it is {len(payload)} bytes long, and says another length")
+        record = pa.ipc.read_record_batch(message, schema)
+        record.validate(full=True)  # whatever the header did not say
     except (pa.ArrowException, EOFError, OSError, ValueError, IndexError) as error:
         raise FileFormatError(
             f"no Arrow message of frames: {error}",
             expected="a record batch of the schema announced in hello",
         ) from error
-    for column in record.columns:
-        # What is left over would be dealt out to the wrong rows.
-        if isinstance(column, pa.FixedSizeListArray) and (
-            len(column.values) != len(record) * column.type.list_size
-        ):
-            raise FileFormatError(
-                f"lists of {len(column.values) / max(1, len(record)):g} values",
-                expected=f"one value for each of {column.type.list_size} tiles",
-            )
     batch = from_record_batch(record)
-    if not 0 < len(batch) <= FRAMES_MAX:
-        raise FileFormatError(
-            f"a message of {len(batch)} frames", expected=f"1 to {FRAMES_MAX} frames"
-        )
     first, last = int(batch.seq[0]), int(batch.seq[-1])
     # A difference of unsigned numbers wraps, so both ends are looked at as well.
     if (np.diff(batch.seq) != 1).any() or last - first != len(batch) - 1:
@@ -97,11 +91,45 @@ def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
             f"frames {first} to {last} do not follow one another",
             expected="seq rising by one within a message",
         )
-    if last >= 2**62:
-        raise FileFormatError(f"frame number {last}", expected="less than 2^62")
+    if last >= SEQ_END:
+        raise FileFormatError(f"frame number {last}", expected="less than 2^53")
     if (batch.t_mono_ns[1:] < batch.t_mono_ns[:-1]).any():
         raise FileFormatError(
             f"time runs backwards within frames {first} to {last}",
             expected="t_mono_ns rising",
         )
     return batch
+
+
+def _check_header(header: BatchHeader, schema: pa.Schema) -> None:
+    """Whether a message is as large as its number of frames makes it, before memory is taken.
+
+    Raises:
+        FileFormatError: too many frames, or none.
+        HeaderError: columns or buffers are not those of so many frames.
+    """
+    rows = header.rows
+    if not 0 < rows <= FRAMES_MAX:
+        raise FileFormatError(f"a message of {rows} frames", expected=f"1 to {FRAMES_MAX} frames")
+    nodes: list[tuple[int, int]] = []
+    needed_bytes: list[int] = []
+    for type_ in schema.types:
+        nodes.append((rows, 0))
+        needed_bytes.append(0)  # which rows are empty: none
+        values, value_type = rows, type_
+        if isinstance(type_, pa.FixedSizeListType):
+            values, value_type = rows * type_.list_size, type_.value_type
+            nodes.append((values, 0))
+            needed_bytes.append(0)
+        needed_bytes.append(values * value_type.bit_width // 8)
+    if list(header.nodes) != nodes:
+        raise HeaderError(f"its columns are not those of {rows} frames without empty values")
+    if len(header.buffers) != len(needed_bytes):
+        raise HeaderError(f"{len(header.buffers)} buffers instead of {len(needed_bytes)}")
+    end = 0
+    for (offset, length), needed in zip(header.buffers, needed_bytes, strict=True):
+        if length < needed:
+            raise HeaderError(f"a column of {length} bytes where {needed} are needed")
+        if length and (offset < end or offset + length > header.body_bytes):
+            raise HeaderError("its buffers overlap, or reach outside of it")
+        end = max(end, offset + length if length else 0)

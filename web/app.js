@@ -23,16 +23,17 @@ import { Sessions } from "./sessions/list.js";
 import { Trash } from "./sessions/trash.js";
 
 const NODE_KEY = "foottile.node";
-const RESYNC_MS = 5000; // frame counts of a running recording are counted here between two looks
 
 const state = {
   nodes: new Map(),
+  problems: [], // what the server found damaged on its disk
   wanted: null, // name of the node to show: survives a restart of the server
   node: null, // the chosen one, as the server last described it
   frame: null, // the newest frame of the chosen node; spans merged since the last drawing
   fresh: false, // `frame` has not been drawn yet
   heard: { frameMs: null, beat: null, sinceMs: performance.now() },
   recordings: new Map(),
+  cannotRecord: "", // why a recording or a tare would be refused now
   serverAheadMs: 0,
   serverNowMs: () => Date.now() + state.serverAheadMs,
 };
@@ -52,6 +53,7 @@ const actions = new Actions(state, marks, takeSession);
 const handlers = {
   hello(message) {
     state.nodes = new Map((message.nodes ?? []).map((node) => [node.node, node]));
+    state.problems = message.problems ?? [];
     state.recordings.clear();
     (message.recording ?? []).forEach(takeSession);
     chooseNode();
@@ -71,6 +73,7 @@ const handlers = {
     if (isNew || !state.node) chooseNode();
   },
   session: ({ session }) => takeSession(session),
+  counted: ({ sessions: counts }) => Object.entries(counts).forEach(([id, counted]) => count(id, counted)),
   deleted: ({ session_id: id }) => forgetSession(id),
   heartbeat(message) {
     state.heard.beat = message.nodes?.[state.node?.node] ?? null;
@@ -79,9 +82,6 @@ const handlers = {
     if (message.node === state.node?.node) trace.dropped(message.from_seq, message.to_seq);
   },
   frame(message) {
-    for (const session of state.recordings.values()) {
-      if (session.node === message.node) session.since = (session.since ?? 0) + (message.n ?? 1);
-    }
     if (message.node === state.node?.node) takeFrame(message);
   },
 };
@@ -120,14 +120,17 @@ function keepSpan(frame, earlier) {
 }
 
 function takeSession(session) {
-  const before = state.recordings.get(session.id);
-  if (session.state === "recording") {
-    // Do not count backwards when the server's number is a little older than ours.
-    const since = before ? Math.max(0, before.frames + before.since - session.frames) : 0;
-    state.recordings.set(session.id, { ...session, since: since < 1000 ? since : 0 });
-  } else state.recordings.delete(session.id);
+  if (session.state === "recording") state.recordings.set(session.id, session);
+  else state.recordings.delete(session.id);
   sessions.take(session);
   actions.draw();
+}
+
+/** Frames are counted by the server's ledger alone; here its word is shown. */
+function count(id, counted) {
+  const session = state.recordings.get(id);
+  if (session) state.recordings.set(id, { ...session, ...counted });
+  sessions.count(id, counted);
 }
 
 function forgetSession(id) {
@@ -185,7 +188,8 @@ function tick() {
   const nowMs = performance.now();
   // The chosen node may not be known yet: the banner still says that the server is not there.
   status.draw(node ?? { node: "?", tiles: [] }, state.heard, nowMs, state.serverNowMs());
-  if (node) notes.draw(node, state.frame, nowMs, state.serverNowMs());
+  state.cannotRecord = node ? status.cannotRecord : "";
+  notes.draw(node, state.frame, nowMs, state.serverNowMs(), state.problems);
   tares.draw(node);
   actions.draw();
 }
@@ -206,8 +210,5 @@ function draw() {
 
 setText(byId("start-command"), `foottile node --scene FILE --server ${location.origin}`);
 setInterval(tick, 100);
-setInterval(() => {
-  if (state.recordings.size && !document.hidden) sessions.load().then((items) => items.forEach(takeSession));
-}, RESYNC_MS);
 tick();
 draw();

@@ -26,6 +26,8 @@ from devices.scene.emulated import EmulationScene
 GRID_S = 0.0005
 """Between grid points pressure is taken as linear: in a tap of 20 ms that is off by 0.01 kPa."""
 _BLOCK = 2000  # a second of the grid, computed at once
+_MOMENT = 40  # grid points, 20 ms: longer than a transfer and the wait for its sample
+_AHEAD_BLOCKS = 30  # for a driver that asks nothing for so long; bounds memory, 30 MB for 64 domes
 
 _KELVIN = 273.15
 _KAPPA = 0.4 / 1.4  # (gamma - 1) / gamma of air
@@ -33,6 +35,7 @@ _MODES = np.arange(1, 9)
 _MODE_WEIGHTS = 6.0 / (np.pi * _MODES) ** 2  # of the mean temperature of a heated sphere
 _PLAY_WIDTHS_N = np.array([0.5, 1.0, 2.0, 4.0])
 _UNLOADED_N = 0.05  # a dome that bears less is not touched: the next touch is a new loading
+_MANY_LAGS = 128
 _PICARD_LIMIT = 40  # a bound; the iteration contracts by `_KAPPA`
 _PICARD_TOLERANCE_K = 1e-6  # 3e-7 kPa
 
@@ -81,35 +84,51 @@ class Domes:
         self._last_ln_p = np.log(self._seal_kpa)
 
         self._next = 0  # grid index of the first point that is not computed
-        # First grid index that is kept, and the pressures from there on: swapped at one stroke,
-        # because on a real clock another thread computes ahead.
-        self._kept: tuple[int, list[list[float]]] = (0, [])
+        self._asked = 0  # the highest grid index that was asked for
+        # By number. What may still be asked for stays, however far another thread is ahead: how
+        # late a driver is decides when it asks, not what the dome was like then.
+        self._blocks: dict[int, Floats] = {}
         self._extending = threading.Lock()
         self._extend(0)
 
     def pressure_kpa(self, dome: int, t_s: float) -> float:
         """Absolute gas pressure of one dome, or around a bare chip.
 
-        Times may not go back by more than a block.
+        Times may go back, but not by more than a block from the latest that was asked for.
 
         Raises:
             ValueError: `t_s` lies before what is still kept.
         """
         position = t_s / GRID_S
         index = int(position)
+        self._asked = max(self._asked, index)
         if index + 1 >= self._next:
             self._extend(index + 1)
-        first, kept = self._kept
-        row = index - first
-        if row < 0:
-            raise ValueError(f"dome pressure at {t_s} s was asked for too late")
-        low, high = kept[row][dome], kept[row + 1][dome]
+        try:
+            low, high = self._at(index, dome), self._at(index + 1, dome)
+        except KeyError:
+            raise ValueError(f"dome pressure at {t_s} s was asked for too late") from None
         return low + (position - index) * (high - low)
 
-    def foresee(self, t_s: float) -> None:
-        """Compute the pressures up to `t_s`, so that no sample has to wait for them."""
-        if int(t_s / GRID_S) + 1 >= self._next:
-            self._extend(int(t_s / GRID_S) + 1)
+    def be_ready(self, t_s: float) -> None:
+        """Compute the pressures until a moment after `t_s`; samples from there on are next."""
+        self._asked = max(self._asked, int(t_s / GRID_S))
+        if self._asked + _MOMENT >= self._next:
+            self._extend(self._asked + _MOMENT)
+
+    def foresee(self, t_s: float) -> bool:
+        """Compute a block ahead, so that no sample up to `t_s` has to wait for it.
+
+        Returns:
+            Whether that is done; else call it again, with a pause for those who wait.
+        """
+        index = min(int(t_s / GRID_S) + 1, self._asked + _AHEAD_BLOCKS * _BLOCK)
+        if index >= self._next:
+            self._extend(self._next)
+        return index < self._next
+
+    def _at(self, index: int, dome: int) -> float:
+        return float(self._blocks[index // _BLOCK][index % _BLOCK, dome])
 
     def _extend(self, index: int) -> None:
         """Compute blocks until grid point `index` is there."""
@@ -118,7 +137,7 @@ class Domes:
                 self._compute_block()
 
     def _compute_block(self) -> None:
-        """Compute one more block; keep it and the one before."""
+        """Compute one more block; keep it, and those from a block before what was asked last."""
         t_s: Floats = GRID_S * np.arange(self._next, self._next + _BLOCK, dtype=np.float64)
         force_n = self._load.forces_n(t_s)
         apparent_n = self._hysteresis(self._creeping(force_n))
@@ -127,9 +146,11 @@ class Domes:
         around_kpa = self._surroundings.bare_kpa(t_s)
         kpa[:, self._bare] = np.broadcast_to(around_kpa, kpa.shape)[:, self._bare]
         self._last_force_n = force_n[-1]
-        before = self._kept[1][-_BLOCK:]
-        self._kept = (self._next - len(before), before + kpa.tolist())
+        self._blocks[self._next // _BLOCK] = kpa
         self._next += _BLOCK
+        oldest = min(self._asked, self._next) // _BLOCK - 1
+        for number in [number for number in self._blocks if number < oldest]:
+            del self._blocks[number]
 
     def _creeping(self, force_n: Floats) -> Floats:
         """Creep: part of the force appears only after each term's time, statically all of it."""
@@ -209,15 +230,7 @@ class Domes:
         for _ in range(_PICARD_LIMIT):
             ln_p = np.concatenate([self._last_ln_p[None], np.log(kpa)])
             drive = _KAPPA * (wall_k + excess_k) * np.diff(ln_p, axis=0)
-            modes_k = np.empty((*drive.shape, len(_MODES)))
-            for dome in range(drive.shape[1]):
-                for m in range(len(_MODES)):
-                    modes_k[:, dome, m], _ = lfilter(
-                        [gain[dome, m]],
-                        [1, -decay[dome, m]],
-                        drive[:, dome],
-                        zi=[decay[dome, m] * self._mode_k[dome, m]],
-                    )
+            modes_k = decaying(drive, gain, decay, self._mode_k)
             new_k = modes_k.sum(axis=2)
             change_k = np.abs(new_k - excess_k).max()
             excess_k = new_k
@@ -234,3 +247,35 @@ class Domes:
         linear = 1.0 - c * (self._seal_kpa + head_kpa)
         right = self._seal_kpa * gas_k / (self._seal_k * volume)
         return np.asarray(2 * right / (linear + np.sqrt(linear**2 + 4 * c * right)))
+
+
+def decaying(drive: Floats, gain: Floats, decay: Floats, before: Floats) -> Floats:
+    """First-order lags y[k] = decay y[k - 1] + gain drive[k], several of each column's drive.
+
+    Few are filtered one by one along time, many step by step all at once: whichever is quicker, to
+    the same bits.
+
+    Args:
+        drive: (times, columns).
+        gain: (columns, lags).
+        decay: (columns, lags).
+        before: (columns, lags), y before the first time.
+
+    Returns:
+        (times, columns, lags).
+    """
+    lagged = drive[:, :, None] * gain
+    if gain.size < _MANY_LAGS:
+        for column in range(gain.shape[0]):
+            for lag in range(gain.shape[1]):
+                keep = float(decay[column, lag])
+                lagged[:, column, lag], _ = lfilter(
+                    [1], [1, -keep], lagged[:, column, lag], zi=[keep * before[column, lag]]
+                )
+        return lagged
+    y = before.copy()
+    for driven in lagged:
+        np.multiply(y, decay, out=y)
+        y += driven
+        driven[:] = y
+    return lagged

@@ -37,6 +37,7 @@ from devices.scene.file import Scene
 from devices.scene.hardware import ServoScene
 
 _FORESIGHT_S = 0.4  # a thread that is late by less delays no sample
+_GIVE_WAY_S = 0.001
 
 
 @dataclass(frozen=True)
@@ -187,22 +188,33 @@ class World:
     def foresight(self) -> Iterator[None]:
         """For a real clock: compute the physics ahead in a thread while the block runs.
 
-        Without it the bus would now and then wait for it, which no silicon does.
+        Without it the bus would now and then wait for it, which no silicon does. Where the thread
+        was held up, what is lacking is waited for before a transfer begins, never within it: the
+        driver is late then, and its instants are right.
         """
         stop = threading.Event()
 
         def look_ahead() -> None:
-            while not stop.wait(_FORESIGHT_S / 4):
-                passed_ns = self._clock.now_ns() - self.epoch_ns if self._begun else 0
-                self._domes.foresee(passed_ns * 1e-9 + _FORESIGHT_S)
+            pause_s = 0.0
+            while not stop.wait(pause_s):
+                is_there = self._domes.foresee(self._now_s() + _FORESIGHT_S)
+                # Block by block: whoever is behind must neither keep a sample waiting for more than
+                # it needs, nor the node from ending.
+                pause_s = _FORESIGHT_S / 4 if is_there else _GIVE_WAY_S
 
         thread = threading.Thread(target=look_ahead, name="physics", daemon=True)
         thread.start()
+        self.i2c_adapter.before_transfer = lambda: self._domes.be_ready(self._now_s())
         try:
             yield
         finally:
+            self.i2c_adapter.before_transfer = None
             stop.set()
             thread.join()
+
+    def _now_s(self) -> float:
+        """The scene's time now."""
+        return (self._clock.now_ns() - self.epoch_ns) * 1e-9 if self._begun else 0.0
 
     def truth(self, t_mono_ns: Times) -> Truth:
         """Ground truth at instants of the node's monotonic clock."""

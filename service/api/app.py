@@ -67,9 +67,14 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
     api = APIRouter(
         prefix=API,
         responses=access.problems(
+            _400="This is not a request as HTTP/1.1 has them, or its body is not UTF-8.",
             _401="Off loopback a change needs the token.",
             _403="The Host header, or the Origin of a change, is not this server's.",
+            _408="Its headers or its body did not come in time.",
+            _413="The body is too long.",
             _422="A parameter or the body is not as described.",
+            _431="The headers are too long.",
+            _503="There are too many connections, or the data folder is not there.",
         ),
     )
     for module in (health, nodes, sessions, trash, data, clock):

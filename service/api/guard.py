@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from http import HTTPStatus
-from urllib.parse import SplitResult, urlsplit
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -22,6 +22,16 @@ from service.link import LIVE_PATH
 BODY_BYTES_MAX = 64 << 10
 """Longest body of a request: names and notes."""
 
+_ASKED = (
+    "To change something here the server's token is needed: it is shown, or where it is, on the "
+    "computer on which `foottile serve` runs. A program sends it as Authorization: Bearer TOKEN"
+)
+_WRONG = (
+    "This is not the server's token: that is shown, or where it is, on the computer on which "
+    "`foottile serve` runs"
+)
+_HOST = re.compile(r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)\])(?::[0-9]{1,5})?")
+"""As browsers write it: a name or an address, and a port; no user, no path."""
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 _DEFAULT_HEADERS = {
     "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
@@ -62,13 +72,13 @@ class Guard:
     def _refusal(self, scope: Scope) -> tuple[HTTPStatus, str] | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        if len(headers.getlist("host")) != 1 or not self._is_ours(_parts(f"//{host}").hostname):
+        if len(headers.getlist("host")) != 1 or not self._is_ours(host):
             what = f"Host {host[:80]!r} is not this server; name it with --allow-host"
             return HTTPStatus.FORBIDDEN, what
         websocket = scope["type"] == "websocket"
         changes = not websocket and scope["method"] not in SAFE_METHODS
         for origin in headers.getlist("origin") if websocket or changes else ():
-            if _parts(origin).netloc != host:
+            if origin not in (f"http://{host}", f"https://{host}"):
                 what = f"Origin {origin[:80]!r} is another site than {host[:80]!r}"
                 return HTTPStatus.FORBIDDEN, what
         length = headers.get("content-length", "0")
@@ -79,14 +89,17 @@ class Guard:
             return HTTPStatus.BAD_REQUEST, "The path has control characters in it"
         # Every websocket but the live one, so that no other way of writing a path is a way in.
         needs_token = changes or (websocket and scope["path"] != LIVE_PATH)
-        if needs_token and self._token is not None and not self._has_token(headers):
-            what = "This needs the server's token: Authorization: Bearer TOKEN"
-            return HTTPStatus.UNAUTHORIZED, what
+        if needs_token and self._token is not None:
+            given = bearer_token(headers.getlist("authorization"))
+            if given is None or not hmac.compare_digest(given.encode(), self._token.encode()):
+                return HTTPStatus.UNAUTHORIZED, _ASKED if given is None else _WRONG
         return None
 
-    def _is_ours(self, name: str | None) -> bool:
-        if name is None:
+    def _is_ours(self, host: str) -> bool:
+        found = _HOST.fullmatch(host)
+        if found is None:
             return False
+        name = (found["name"] or found["address"]).lower()
         if name == "localhost" or name in self._hosts:
             return True
         try:
@@ -96,9 +109,11 @@ class Guard:
             return False
         return True
 
-    def _has_token(self, headers: Headers) -> bool:
-        given = headers.get("authorization", "").removeprefix("Bearer ").strip()
-        return self._token is not None and hmac.compare_digest(given.encode(), self._token.encode())
+
+def bearer_token(given: Sequence[str]) -> str | None:
+    """The token in a request's Authorization headers; None unless it is one `Bearer TOKEN`."""
+    scheme, _, token = (given[0] if len(given) == 1 else "").partition(" ")
+    return token.strip() or None if scheme.lower() == "bearer" else None
 
 
 class _Limited:
@@ -130,14 +145,6 @@ def _hardened(send: Send) -> Send:
         await send(message)
 
     return with_headers
-
-
-def _parts(url: str) -> SplitResult:
-    """A URL's parts; all empty if it is not a URL."""
-    try:
-        return urlsplit(url)
-    except ValueError:
-        return urlsplit("")
 
 
 def is_loopback(host: str) -> bool:

@@ -11,6 +11,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.routing import Match, Mount
 
 from devices.errors import (
     FolderGoneError,
@@ -25,6 +27,7 @@ from devices.errors import (
 log = logging.getLogger("foottile.api")
 
 MEDIA_TYPE = "application/problem+json"
+_METHODS = ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT")
 
 _STATUS: tuple[tuple[type[FootTileError], HTTPStatus], ...] = (
     (UnknownError, HTTPStatus.NOT_FOUND),
@@ -95,9 +98,28 @@ async def _on_invalid(request: Request, error: Exception) -> JSONResponse:
     return problem(request.url.path, HTTPStatus.UNPROCESSABLE_ENTITY, complaints)
 
 
-async def _on_http(request: Request, error: Exception) -> JSONResponse:
+async def _on_http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)  # noqa: S101  # by registration
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        allow = {"Allow": ", ".join(_methods_of(request))}
+        if request.method == "OPTIONS":
+            return Response(status_code=HTTPStatus.NO_CONTENT, headers=allow)
+        what = f"{request.method} is not for this path; {allow['Allow']} are"
+        return problem(request.url.path, error.status_code, what, allow)
     return problem(request.url.path, error.status_code, str(error.detail), error.headers)
+
+
+def _methods_of(request: Request) -> list[str]:
+    """What may be asked of a path: the framework names the methods of its first route only."""
+    routes = [route for route in request.app.routes if not isinstance(route, Mount)]
+    found = {
+        method
+        for method in _METHODS
+        for route in routes
+        if route.matches({**request.scope, "method": method})[0] is Match.FULL
+    }
+    # What is under a mount is files.
+    return sorted((found or {"GET", "HEAD"}) | {"OPTIONS"})
 
 
 async def _on_bug(request: Request, error: Exception) -> JSONResponse:

@@ -9,14 +9,15 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from devices.arrays import Floats
 from devices.errors import CalibrationError
-from service.estimation.effects import CalibrationPart, Effects
+from devices.facts import Count, Label, Text, Word
+from service.estimation.effects import CalibrationPart, Effects, NotNegative, Number
 
 ANY_SERIAL = "*"
 UNPROVEN = ", unproven"
@@ -31,6 +32,11 @@ CURVE_OPENS_N = 0.2
 there is neither."""
 BASIS = 3
 """A cubic without constant term has three coefficients to be uncertain about."""
+_TILES_MAX = 256
+"""A calibration may know more tiles than an array has."""
+_ROWS_MAX = 1000
+_Scale = Annotated[float, Field(ge=1e-9, le=1e9)]
+_Pressure = Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
 class TileCalibration(CalibrationPart):
@@ -41,37 +47,37 @@ class TileCalibration(CalibrationPart):
     the same at zero gauge pressure.
     """
 
-    serial: str
+    serial: Label
     p_input: Literal["gauge_kpa", "normalised"]
-    p_offset_kpa: float
-    p_scale_kpa: float = Field(gt=0)
-    f_offset_n: float
-    f_scale_n: float = Field(gt=0)
+    p_offset_kpa: _Pressure
+    p_scale_kpa: _Scale
+    f_offset_n: Number
+    f_scale_n: _Scale
     zero_mode: Literal["as_fitted", "subtract_f0"]
-    coefficients: tuple[float, float, float, float]
-    range_kpa: tuple[float, float]
+    coefficients: tuple[Number, Number, Number, Number]
+    range_kpa: tuple[_Pressure, _Pressure]
     """Gauge pressures that were calibrated; above them force is a lower bound."""
     monotonic: bool
     absolute_scale: Literal["measured", "assumed"]
-    covariance: tuple[tuple[float, ...], ...]
+    covariance: tuple[tuple[Number, ...], ...]
     """Of coefficients 1 to 3, in units of `f_scale_n` squared."""
-    relative_misfit: float = Field(ge=0)
-    loop_misfit_n: float = Field(ge=0)
+    relative_misfit: NotNegative
+    loop_misfit_n: NotNegative
     """How a new loading's force scatters about the curve: the variance is the sum of
     (`relative_misfit` F)^2, a gain that differs between loadings, and (`loop_misfit_n`
     `loop_share(F)`)^2, a hysteresis loop that opens with the first newton."""
-    r2: float | None
-    rmse_n: float | None
-    cv_rmse_n: float | None
+    r2: Number | None
+    rmse_n: Number | None
+    cv_rmse_n: Number | None
     """Leave-one-repeat-out error."""
-    hysteresis_n: float | None
+    hysteresis_n: Number | None
     """Greatest distance between loading and unloading branch."""
-    repeats: int
-    baseline_kpa: float | None
+    repeats: Count
+    baseline_kpa: Number | None
     """Absolute pressure unloaded, when it was calibrated."""
-    noise_kpa: float | None
+    noise_kpa: Number | None
     """Standard deviation of a single reading, unloaded."""
-    coefficient_words: tuple[int, int, int, int] | None = None
+    coefficient_words: tuple[Word, Word, Word, Word] | None = None
     """Registers of the chip that was calibrated: a serial can be re-labelled, a chip can not.
     None: for any chip, as a preset is."""
     effects: Effects = Effects()
@@ -108,13 +114,13 @@ class Calibration(CalibrationPart):
     """Calibrations of tiles by serial, with the reference they were made against."""
 
     version: Literal[1] = 1
-    name: str
-    reference: str
+    name: Label
+    reference: Text
     """The force sensor, or the publication, that the scale comes from."""
-    date: str
+    date: Label
     """ISO 8601, of the recordings."""
-    tiles: tuple[TileCalibration, ...]
-    refused: dict[str, str] = Field(default={})
+    tiles: Annotated[tuple[TileCalibration, ...], Field(max_length=_TILES_MAX)]
+    refused: Annotated[dict[Label, Text], Field(max_length=_TILES_MAX)] = Field(default={})
     """Serials that were pressed as well, and why they have no curve."""
 
     @property
@@ -248,37 +254,37 @@ PRESETS = {"paper-eq2-shape": paper_eq2_shape}
 class BandPoint(CalibrationPart):
     """The curve at one pressure, with half widths of its 95 % bands."""
 
-    gauge_kpa: float
-    force_n: float
-    mean_n: float = Field(ge=0)
+    gauge_kpa: Number
+    force_n: Number
+    mean_n: NotNegative
     """Of the mean curve."""
-    new_loading_n: float = Field(ge=0)
+    new_loading_n: NotNegative
     """Of a reading in a single new loading."""
 
 
 class BenchFacts(CalibrationPart):
     """Facts about the slow strokes that a curve was fitted to."""
 
-    recordings: int = Field(ge=1)
+    recordings: Annotated[int, Field(ge=1, lt=2**31)]
     """Files with slow strokes of the tile."""
-    end_n: float
+    end_n: Number
     """Reference force where the range ends, mean over repeats."""
-    end_absolute_kpa: float
+    end_absolute_kpa: Number
     """Pressure where the range ends: baseline and range."""
-    spare_kpa: float
+    spare_kpa: Number
     """What of the chip's 115 kPa is left there; negative: beyond its rating."""
     ended_by: Literal["load", "chip"]
     """"load": the spindle turned back, and the tile would have gone on; "chip": its reading went no
     further, by wrapping or standing still."""
-    tadc_counts: float | None
+    tadc_counts: Number | None
     """Chip's temperature in counts, unloaded; None: not recorded."""
-    degc: float | None
+    degc: Number | None
     """The same, indicative: good to a few degrees."""
-    r2_of_mean: float
+    r2_of_mean: Number
     """Of the cubic to the mean of all repeats and both branches, as the paper states it."""
-    repeat_gains: tuple[float, ...]
+    repeat_gains: Annotated[tuple[Number, ...], Field(max_length=_ROWS_MAX)]
     """Force of each repeat over that of the curve."""
-    baseline_drift_kpa: float = Field(ge=0)
+    baseline_drift_kpa: NotNegative
     """Greatest change of the unloaded pressure between repeats of a file, from the second on."""
-    band_95: tuple[BandPoint, ...]
+    band_95: Annotated[tuple[BandPoint, ...], Field(max_length=_ROWS_MAX)]
     """At ten equal steps from zero to the end of the range."""

@@ -7,12 +7,13 @@ model that needs it is not offered for that tile, and `refused` says why.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from devices.arrays import Floats
+from devices.facts import Facts, Text
 
 WALL_PER_KPA = 0.00124
 """Part of the bubble's volume that the wall gives way for a kPa: elastic estimate for Vytaflex 60
@@ -21,17 +22,23 @@ WALL_PER_KPA = 0.00124
 EffectName = Literal["temperature", "ambient", "gas", "rubber", "hysteresis"]
 
 
-class CalibrationPart(BaseModel):
-    """A part of a calibration file: no unknown key, and no number that is not finite."""
+_MOST = 1e12
+"""Far beyond every quantity here, and near enough that no sum, product or cube overflows."""
+Number = Annotated[float, Field(ge=-_MOST, le=_MOST)]
+NotNegative = Annotated[float, Field(ge=0, le=_MOST)]
+Some = Field(max_length=32)
+"""Of parts that a model has some of."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+class CalibrationPart(Facts):
+    """A part of a calibration file."""
 
 
 class Parameter(CalibrationPart):
     """A fitted value and its standard uncertainty."""
 
-    value: float
-    sigma: float = Field(ge=0)
+    value: Number
+    sigma: NotNegative
 
     @property
     def interval_95(self) -> tuple[float, float]:
@@ -49,7 +56,7 @@ class GasEffect(CalibrationPart):
 
     gamma: Parameter
     tau_s: Parameter
-    misfit: float = Field(ge=0)
+    misfit: NotNegative
     """Part of the correction that the bench shows to be wrong, root mean square."""
 
     @model_validator(mode="after")
@@ -65,15 +72,15 @@ class RubberEffect(CalibrationPart):
     Curve as in `TileCalibration`, in the same variable and units.
     """
 
-    part: tuple[Parameter, ...]
-    tau_s: tuple[Parameter, ...]
-    coefficients: tuple[float, float, float, float]
-    covariance: tuple[tuple[float, ...], ...]
-    scatter: float = Field(ge=0)
+    part: Annotated[tuple[Parameter, ...], Some]
+    tau_s: Annotated[tuple[Parameter, ...], Some]
+    coefficients: tuple[Number, Number, Number, Number]
+    covariance: tuple[tuple[Number, ...], ...]
+    scatter: NotNegative
     """Standard deviation of a new loading's gauge pressure, relative."""
-    misfit: float = Field(ge=0)
+    misfit: NotNegative
     """Part of the correction that the bench shows to be wrong, root mean square."""
-    curve_misfit_n: float = Field(ge=0)
+    curve_misfit_n: NotNegative
     """How far a cubic is off where slow strokes agree with one another, root mean square."""
 
     @model_validator(mode="after")
@@ -87,7 +94,7 @@ class RubberEffect(CalibrationPart):
 class HysteresisEffect(CalibrationPart):
     """Of the model `hysteresis`: parts of its plays."""
 
-    part: tuple[Parameter, ...]
+    part: Annotated[tuple[Parameter, ...], Some]
 
     @model_validator(mode="after")
     def _can_be_undone(self) -> Self:
@@ -119,7 +126,7 @@ class Effects(CalibrationPart):
     rubber: RubberEffect | None = None
     hysteresis: HysteresisEffect | None = None
     temperature: TemperatureEffect | None = None
-    refused: dict[EffectName, str] = {}
+    refused: dict[EffectName, Text] = Field(default={})
 
     @property
     def wall_per_kpa(self) -> float:

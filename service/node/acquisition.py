@@ -12,6 +12,7 @@ import multiprocessing
 import queue
 import signal
 import threading
+import traceback
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -124,11 +125,22 @@ class AcquisitionProcess:
             self._on_message(
                 Failed(
                     FootTileError(
-                        f"the acquisition process ended with code {self._process.exitcode}",
-                        remedy="Look at what it wrote to stderr before",
+                        f"the acquisition process {_how_ended(self._process.exitcode)}",
+                        remedy="Look at what it wrote to stderr before. Start the node again: a "
+                        "new stream begins, sessions go on in it",
                     )
                 )
             )
+
+
+def _how_ended(code: int | None) -> str:
+    if code is None:
+        return "says nothing more"
+    if code >= 0:
+        return f"ended with code {code}"
+    with suppress(ValueError):  # a signal without a name
+        return f"was killed by {signal.Signals(-code).name}"
+    return f"was killed by signal {-code}"
 
 
 def _run(options: RigOptions, connection: Connection) -> None:
@@ -138,16 +150,31 @@ def _run(options: RigOptions, connection: Connection) -> None:
         signal.signal(number, signal.SIG_IGN)
     stop = threading.Event()
     threading.Thread(target=_await_stop, args=(connection, stop), daemon=True).start()
-    with suppress(OSError):  # a parent that died wants no more messages
-        try:
-            with ExitStack() as stack:
-                rig = Rig(options, stack)
-                while not stop.is_set():  # a replaced part begins a new stream
-                    _stream(rig, connection, stop)
-        except FootTileError as error:
-            connection.send(Failed(error))
-        else:
-            connection.send(Failed(None))
+    # Said before anything is closed: hardware that hangs may keep that waiting. A parent that died
+    # wants no more messages.
+    with suppress(OSError), ExitStack() as stack:
+        connection.send(Failed(_streamed(options, connection, stop, stack)))
+
+
+def _streamed(
+    options: RigOptions, connection: Connection, stop: threading.Event, stack: ExitStack
+) -> FootTileError | None:
+    """Take frames until told to stop; why it ended before that, if it did."""
+    try:
+        rig = Rig(options, stack)
+        while not stop.is_set():  # a replaced part begins a new stream
+            _stream(rig, connection, stop)
+    except FootTileError as error:
+        return error
+    except ConnectionError:  # the parent has died
+        return None
+    except Exception as error:
+        traceback.print_exc()
+        return FootTileError(
+            f"acquisition has failed: {type(error).__name__}: {error}",
+            remedy="This is a bug. Start the node again: a new stream begins, sessions go on in it",
+        )
+    return None
 
 
 def _stream(rig: Rig, connection: Connection, stop: threading.Event) -> None:

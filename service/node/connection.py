@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from itertools import takewhile
 from typing import Any
 
-from pydantic import ValidationError
 from websockets.asyncio.client import ClientConnection
 
 from devices.errors import LinkError
@@ -32,6 +31,7 @@ from service.link import (
     Welcome,
     heard,
     say,
+    understood,
 )
 from service.node.options import NodeOptions
 from service.node.sending import Greeted, Sending
@@ -43,10 +43,16 @@ STATUS_EVERY_S = 1.0
 
 
 class Connection:
-    """What goes each way on one connection."""
+    """What goes each way on one connection.
 
-    def __init__(self, link: Greeted) -> None:
+    Args:
+        link: both sides have greeted each other on it.
+        delivered: called whenever the server has acknowledged frames.
+    """
+
+    def __init__(self, link: Greeted, delivered: Callable[[], None]) -> None:
         self._link = link
+        self._delivered = delivered
         self._sending = Sending(link)
         self._probes = ClockProbes(link.socket, link.hello.array_info.utc_offset_ns)
         self._take_wanted(link.welcome.wanted)
@@ -72,7 +78,10 @@ class Connection:
             match message:
                 case Ack(boot_id=boot_id, seq_first=first, seq_last=last):
                     stream = self._link.source.streams().get(boot_id)
-                    if stream is not None:
+                    self._delivered()
+                    # What was never taken, nobody can have: it is not forgotten when it comes.
+                    if stream is not None and first < stream.next_seq:
+                        last = min(last, stream.next_seq - 1)
                         stream.acknowledge(self._link.welcome.server_id, first, last)
                 case Wanted():
                     self._take_wanted(message)
@@ -106,10 +115,10 @@ def parse(message: str | bytes) -> Welcome | Ack | Wanted | Probe:
         LinkError: it is no message of the link.
     """
     try:
-        return FromServer.validate_json(heard(message))
-    except ValidationError as error:
+        return understood(FromServer, heard(message))
+    except LinkError as error:
         raise LinkError(
-            "the server said something that is no message",
+            f"the server said something that is no message: {error}",
             expected=f"{SUBPROTOCOL} messages",
             remedy="Is it a foottile server of this version?",
         ) from error

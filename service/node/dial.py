@@ -121,7 +121,10 @@ class BackOff:
         self._wait_s = 0.0
 
     def succeeded(self) -> None:
-        """A server has welcomed the node."""
+        """A server has acknowledged frames.
+
+        A welcome alone is none: whoever is let go for what it sends would come back at once.
+        """
         self._bounds, self._wait_s = BACK_OFF_S, 0.0
 
     def failed(self, error: Exception) -> None:
@@ -150,7 +153,13 @@ def reason_of(error: Exception) -> str:
     if isinstance(error, ConnectionClosed) and error.rcvd is not None:
         return error.rcvd.reason or f"closed with code {error.rcvd.code}"
     if isinstance(error, InvalidStatus) and error.response.status_code == _UNAUTHORISED:
-        return "the server wants its token: set FOOTTILE_TOKEN to the one `foottile serve` prints"
+        is_wrong = b"is not the server's token" in (error.response.body or b"")
+        what = (
+            "FOOTTILE_TOKEN is not the server's token" if is_wrong else "the server wants its token"
+        )
+        return (
+            f"{what}: set FOOTTILE_TOKEN to the one that `foottile serve` shows or keeps in a file"
+        )
     if isinstance(error, InvalidStatus):
         said = error.response.body.decode(errors="replace")[:300] if error.response.body else ""
         return f"HTTP {error.response.status_code} {said}".strip()

@@ -88,9 +88,8 @@ class Publisher:
         ) as socket:
             hello, welcome = await self._greet(socket)
             link = Greeted(socket, self._source, hello, welcome, self._wake)
-            connection = Connection(link)
+            connection = Connection(link, delivered=back_off.succeeded)
             self._say(f"connected to {self._url}")
-            back_off.succeeded()
             self._connected = True
             await connection.run(self._renewed)
             await socket.close(CloseCode.GOING_AWAY, "another stream has begun")

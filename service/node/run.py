@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import math
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -26,8 +28,12 @@ _DRAIN_S = 3.0
 """A node that is stopped waits no longer for the server."""
 _AWAY_LOOKS = 50
 """After this many looks without a link, a second in all, it waits no longer."""
+_PROBLEMS_MAX, _PROBLEM_LENGTH = 20, 400
+"""What a server is told of what was found damaged; all of it was said here."""
 _TROUBLES_S = 0.5
-"""Between two looks at the disk's troubles."""
+"""Between two looks at what is wrong."""
+_SILENT_S = 2.0
+"""Acquisition that gives nothing for this long is held up: it gives a batch every 25 ms."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +100,13 @@ class RunningNode:
             emulated=options.rig.emulated,
             report=report,
         )
+        for problem in journal.problems:
+            report(problem)
         self._health = Health()
         self._present: NodeStream | None = None
         self._messages: asyncio.Queue[Message] = asyncio.Queue()
+        self._heard_s = math.inf
+        """When acquisition gave something last; never so far."""
         self._publisher: Publisher | None = None
         self._publishing: asyncio.Task[None] | None = None
         self._told: tuple[str, ...] = ()
@@ -110,7 +120,7 @@ class RunningNode:
     async def run(self, stop: asyncio.Event) -> Outcome:
         """Until it is stopped, or the array fails for good."""
         stopping = asyncio.create_task(stop.wait())
-        tasks: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._watch_disk())]
+        tasks: list[asyncio.Task[Any]] = [stopping, asyncio.create_task(self._watch())]
         try:
             started = await _started(self._messages, stopping)
             if started is None:
@@ -122,6 +132,7 @@ class RunningNode:
             if self._options.server is not None:
                 self._publish(self._options.server)
             while not isinstance(message := await self._messages.get(), Failed):
+                self._heard_s = time.monotonic()
                 if isinstance(message, Started):
                     self._report("the tiles have a new description: a new stream begins")
                     await self._begin(message)
@@ -202,7 +213,12 @@ class RunningNode:
         return Status(
             missed_slots=self._present_stream().missed_slots,
             backlog_frames=backlog_frames,
-            troubles=(*self._health.troubles, *self._journal.troubles),
+            troubles=(
+                *self._silence(),
+                *self._health.troubles,
+                *self._journal.troubles,
+                *(problem[:_PROBLEM_LENGTH] for problem in self._journal.problems[:_PROBLEMS_MAX]),
+            ),
             counts={serial: dict(counts) for serial, counts in self._health.counts.items()},
         )
 
@@ -211,11 +227,19 @@ class RunningNode:
         wants = ServerWants(streams=streams, recording=wanted.recording, known=known)
         self._journal.want(server_id, wants)
 
-    async def _watch_disk(self) -> None:
-        """Say when the disk takes nothing any more, and when it does again."""
+    def _silence(self) -> tuple[str, ...]:
+        """Whether acquisition is held up: this process and its link go on without it."""
+        silent_s = time.monotonic() - self._heard_s
+        if silent_s < _SILENT_S:
+            return ()
+        return (f"acquisition is held up; no frames for {silent_s:.0f} s",)
+
+    async def _watch(self) -> None:
+        """Say when acquisition is held up or the disk takes nothing, and when that is over."""
         while True:
             await asyncio.sleep(_TROUBLES_S)
-            kinds = tuple(trouble.partition(";")[0] for trouble in self._journal.troubles)
+            troubles = (*self._silence(), *self._journal.troubles)
+            kinds = tuple(trouble.partition(";")[0] for trouble in troubles)
             for kind in kinds:
                 if kind not in self._told:
                     self._report(kind)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from devices.acquisition import Acquisition
-from devices.array.startup import make_ready, renew
+from devices.array.startup import Ready, make_ready, renew
 from devices.buses.i2c import open_bus
 from devices.buses.spi import open_spi
 from devices.chips.dynamixel.reader import open_servo
@@ -22,7 +22,7 @@ from devices.chips.dynamixel.servo import ServoReader
 from devices.chips.mcp3208 import Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
 from devices.errors import I2cError, TileSetupError, UsageError
-from devices.frames import ArrayInfo, FrameBatch
+from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
 from devices.recovery.recovery import BusRecovery, GpioRecovery, open_recovery
 from devices.reference import ReferenceForce
@@ -30,11 +30,10 @@ from devices.scene.file import Scene
 from devices.scene.hardware import EMULATED, ServoScene
 from service.rig.description import describe
 from service.rig.emulated import EmulatedFoot
+from service.rig.lead import Lead
+from service.rig.pace import Pace, undisturbed_hz
 from storage.journal.in_flight import InFlight, open_in_flight
 
-if TYPE_CHECKING:
-    from devices.array.array import TileArray
-    from devices.emulation.world import World
 if TYPE_CHECKING:
     from devices.emulation.world import World
 
@@ -79,7 +78,7 @@ def open_recovery_lines(scene: Scene, clock: Clock, world: World | None) -> BusR
 
 
 _TRIAL_FRAMES = 100
-"""Frames that the bus's rate is measured over: a fifth of a second."""
+"""A fifth of a second with four tiles."""
 _RENEW_AGAIN_NS = 2_000_000_000
 """Between attempts to identify a part that is being plugged."""
 
@@ -121,7 +120,7 @@ class Rig:
         self._clock = SpinningClock()
         # What runs beside the loop, or plays the wires, must not keep it from its core.
         self._line_clock = SystemClock()
-        self._lead_end_ns: int | None = None
+        self._lead: Lead | None = None
         world = self._world(options, stack)
         self._bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
         stack.callback(self._bus.close)
@@ -145,12 +144,12 @@ class Rig:
         )
         self._renew_at_ns = 0
         self._in_flight: InFlight | None = None
-        # Before the world begins: on a busy machine the trial would use up the lead.
-        bus_hz = self._bus_hz(self._ready.array)
-        if world is not None:
+        bus_hz = self._bus_hz(self._ready)
+        # Only now: on a busy machine all that was before would use up the lead.
+        if world is not None and options.emulated:
+            self._lead = Lead(world, options.foot.lead_s)
+        elif world is not None:
             world.begin()
-            if options.emulated:
-                self._lead_end_ns = world.epoch_ns + round(options.foot.lead_s * 1e9)
         self._begin_stream(bus_hz, is_new=False)
         if not options.emulated:
             # Last, and only this thread: an emulated world would starve the rest of the machine.
@@ -185,17 +184,28 @@ class Rig:
             servo=self._servo_source,
             is_new=is_new,
             keeper=self._in_flight,
-            lead_end_ns=self._lead_end_ns,
+            lead_end_ns=None if self._lead is None else self._lead.end_ns,
         )
+        self._pace = Pace(self.info.nominal_rate_hz)
 
     def batches(self, stop: Callable[[], bool]) -> Iterator[FrameBatch]:
         """Frames until `stop()`; those before an emulated load begins are marked as lead.
 
-        Ends before that when another part was plugged in: then `info` describes a new stream, and
-        the next call goes on with it.
+        Ends before that when another part was plugged in, or the stream turned out to be faster
+        than its nominal rate: then `info` describes a new stream, and the next call goes on with
+        it.
         """
         while not stop():
-            yield from self.acquisition.run(lambda: stop() or self._is_renewal_due())
+            for batch in self.acquisition.run(lambda: stop() or self._is_renewal_due()):
+                if self._lead is not None:
+                    self._lead.see(batch)
+                    self.acquisition.lead_end_ns = self._lead.end_ns
+                if not batch.frame_status[-1] & FrameStatus.LEAD:  # a lead is of one stream
+                    self._pace.see(batch)
+                yield batch
+                if self._pace.found_hz is not None:
+                    self._begin_stream(self._pace.found_hz, is_new=False)
+                    return
             if not stop() and self._renew():
                 return
 
@@ -229,7 +239,7 @@ class Rig:
             self._renew_at_ns = self._clock.now_ns() + _RENEW_AGAIN_NS
             self._ready.array.resume()
             return False
-        self._begin_stream(self._bus_hz(self._ready.array), is_new=True)
+        self._begin_stream(self._bus_hz(self._ready), is_new=True)
         return True
 
     def _world(self, options: RigOptions, stack: ExitStack) -> World | None:
@@ -258,9 +268,14 @@ class Rig:
         self.remarks += servo.remarks
         return stack.enter_context(ServoReader(servo, self._line_clock, rate_hz=scene.rate_hz))
 
-    def _bus_hz(self, array: TileArray) -> float:
-        """What rate this bus gives, from some frames before the stream begins."""
-        begin_ns = self._clock.now_ns()
+    def _bus_hz(self, ready: Ready) -> float:
+        """Frames a second that the bus can give, by what transfers and conversions take.
+
+        Both were measured beside whatever else this machine does; if some frames of no stream come
+        faster than they allow, these are right.
+        """
+        t_ns = [self._clock.now_ns()]
         for _ in range(_TRIAL_FRAMES):
-            array.scan()
-        return 1e9 * _TRIAL_FRAMES / (self._clock.now_ns() - begin_ns)
+            ready.array.scan()
+            t_ns.append(self._clock.now_ns())
+        return max(ready.predicted_hz, undisturbed_hz(t_ns))

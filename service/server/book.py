@@ -8,14 +8,38 @@ from __future__ import annotations
 import logging
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from devices.errors import UnknownError
+from devices.errors import StateError, StorageError, UnknownError
 from service.server_clock import utc_ns
+from service.sessions.restore import restore
 from storage.durable import storage_errors
 from storage.sessions.beside import write_events
 from storage.sessions.folder import DOOMED_PREFIX, Event, Session, SessionFolder
+
+log = logging.getLogger("foottile.book")
+
+
+def load_or_restore(folder: SessionFolder) -> tuple[list[Session], dict[str, str]]:
+    """All sessions that can be read, or made again; and of the others what is wrong, by id."""
+    found, unreadable = folder.load_all()
+    left: dict[str, str] = {}
+    for session_id, error in unreadable.items():
+        if not any(folder.path(session_id).glob("[!.]*")):
+            continue  # never written down
+        try:
+            session = restore(folder, session_id)
+        except StorageError as refused:
+            log.warning("session %s cannot be made again: %s", session_id, refused)
+            session = None
+        if session is None:
+            log.warning("session %s is left out, and no frames are dropped: %s", session_id, error)
+            left[session_id] = str(error)
+        else:
+            log.warning("session %s: %s", session_id, session.problem)
+            found.append(session)
+    return found, left
 
 
 class Trash:
@@ -29,11 +53,9 @@ class Trash:
         self.folder = SessionFolder(folder)
         for doomed in folder.glob(DOOMED_PREFIX + "*"):
             shutil.rmtree(doomed, ignore_errors=True)
-        found, unreadable = self.folder.load_all()
-        for session_id, error in unreadable.items():
-            log.warning("session %s in the trash is left out: %s", session_id, error)
-        self.has_unreadable = bool(unreadable)
-        """Is there one that cannot be read?"""
+        found, unreadable = load_or_restore(self.folder)
+        self.problems = [f"in the trash, {text}" for text in _in_words(unreadable)]
+        """Sessions that cannot be read, and why."""
         self._sessions = {session.id: session for session in found}
 
     def __contains__(self, session_id: str) -> bool:
@@ -93,9 +115,6 @@ def destroy(folders: list[Path]) -> int:
     return size_bytes
 
 
-log = logging.getLogger("foottile.book")
-
-
 class SessionBook:
     """All sessions of a server.
 
@@ -111,10 +130,11 @@ class SessionBook:
         self.folder = folder
         self.trash = trash
         self.changed = changed
-        found, unreadable = folder.load_all()
-        for session_id, error in unreadable.items():
-            log.warning("session %s is left out: %s", session_id, error)
-        self.has_unreadable = bool(unreadable) or trash.has_unreadable
+        found, self.unreadable = load_or_restore(folder)
+        """By id why these cannot be read; their files are as they were."""
+        self.problems = _in_words(self.unreadable) + trash.problems
+        """The same in words, with those in the trash."""
+        self.has_unreadable = bool(self.problems)
         """Is a session unreadable? Then it is not known which frames it needs."""
         self._sessions = {session.id: session for session in found}
 
@@ -134,9 +154,15 @@ class SessionBook:
 
         Raises:
             UnknownError: there is none of this id.
+            StateError: it cannot be read.
         """
         self.folder.path(session_id)
         if session_id not in self._sessions:
+            if session_id in self.unreadable:
+                raise StateError(
+                    f"session {session_id} cannot be read: {self.unreadable[session_id]}",
+                    remedy="No frames of its nodes are dropped meanwhile. See `foottile verify`",
+                )
             remedy = "It is in the trash: restore it first" if session_id in self.trash else ""
             raise UnknownError(f"no session {session_id!r}", remedy=remedy)
         return self._sessions[session_id]
@@ -195,3 +221,7 @@ class SessionBook:
         """
         self.trash.take(session, self.folder)
         del self._sessions[session.id]
+
+
+def _in_words(unreadable: Mapping[str, str]) -> list[str]:
+    return [f"session {name} is left out: {error}" for name, error in unreadable.items()]

@@ -88,6 +88,7 @@ class Subscriber:
         self._last_seq: dict[str, tuple[str, int]] = {}
         self._dropped: dict[str, Intervals] = {}
         self._notices: deque[str] = deque(maxlen=_NOTICES_MAX)
+        self._counted: dict[str, Mapping[str, Any]] = {}
         self.news = asyncio.Event()
 
     def notice(self, message: str) -> None:
@@ -114,6 +115,12 @@ class Subscriber:
         self._pieces[key] = piece
         self.news.set()
 
+    def count(self, node: str, counted: Mapping[str, Mapping[str, Any]]) -> None:
+        """What sessions of a node have come to, by id; of each only the newest word is told."""
+        if self._only in (None, node):
+            self._counted |= counted
+            self.news.set()
+
     def answer(self, message: Mapping[str, Any]) -> None:
         """A message for this client only."""
         self.notice(dumps(message))
@@ -128,6 +135,9 @@ class Subscriber:
         self.news.clear()
         texts = list(self._notices)
         self._notices.clear()
+        if self._counted:
+            texts.append(dumps({"type": "counted", "sessions": self._counted}))
+            self._counted = {}
         for node, dropped in self._dropped.items():
             for first, last in dropped:
                 message = {"type": "dropped", "node": node, "from_seq": first, "to_seq": last}
@@ -206,6 +216,11 @@ class Hub:
             text = dumps(message)
             for subscriber in self._subscribers:
                 subscriber.notice(text)
+
+    def count(self, node: str, counted: Mapping[str, Mapping[str, Any]]) -> None:
+        """Tell everybody what sessions of a node have come to, by id."""
+        for subscriber in self._subscribers:
+            subscriber.count(node, counted)
 
     def publish(self, node: ServerNode, due: list[Estimated]) -> None:
         """Frames of a node with their estimates."""

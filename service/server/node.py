@@ -13,18 +13,23 @@ from pathlib import Path
 
 from devices.errors import (
     FileFormatError,
+    FootTileError,
+    LinkError,
     StateError,
     StorageError,
 )
 from devices.frames import ArrayInfo, FrameBatch
-from service.link import Hello, StreamNumbers
+from service.link import BOOT_ID, Hello, StreamNumbers
 from service.server.live_estimates import LiveEstimates
 from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
+from service.server_clock import utc_ns
 from service.sessions.pipeline import Columns
-from service.sessions.tares import RecordedTare, TareHistory
+from service.sessions.tare_file import RecordedTare
+from service.sessions.tares import TareHistory
+from storage.checked_json import write_checked
 from storage.clock.log import ClockOffset
-from storage.durable import make_folder, storage_errors, write_whole
+from storage.durable import make_folder, storage_errors
 from storage.intervals import NO_END, NODE_RESTARTED, Intervals, with_open_ends
 from storage.journal.journal import RING_NS, Journal
 from storage.wire import decode
@@ -32,7 +37,9 @@ from storage.wire import decode
 log = logging.getLogger("foottile.nodes")
 
 _RATE_OVER_NS = 1_000_000_000
-BOOT_ID = re.compile(r"[0-9a-f]{32}")
+_JITTER = 1.02
+IS_BOOT_ID = re.compile(BOOT_ID)
+HELLO_FILE = "hello.json"
 
 Estimated = tuple[FrameBatch, Columns]
 
@@ -70,15 +77,29 @@ class ServerNode:
         self._folder = folder
         self._journals_folder = journals
         self._pace: deque[tuple[int, int]] = deque()
+        self._found: list[str] = []
         for path in sorted(journals.glob("*")):
-            if BOOT_ID.fullmatch(path.name):
+            if IS_BOOT_ID.fullmatch(path.name):
                 try:
-                    self.streams[path.name] = ServerStream.open(path)
-                except FileFormatError as error:
-                    log.warning("a journal is left out: %s", error)
+                    self.streams[path.name] = stream = ServerStream.open(path)
+                    self._found += stream.problems
+                except FootTileError as error:
+                    self._found.append(f"a journal is left out: {error}")
+        if self.tares.problem is not None:
+            self._found.append(self.tares.problem)
+        for text in self._found:
+            log.warning("node %s: %s", self.name, text)
         self.present = self._stream_of(self.info)
         """The stream that it takes now."""
-        self.live, self.tare_keeper = self._estimates()
+        self.live: LiveEstimates
+        self.tare_keeper: TareKeeper
+        self._has_failed = False
+        self._estimate_anew()
+
+    @property
+    def problems(self) -> list[str]:
+        """What was found damaged of what is kept of it, and what became of it, in words."""
+        return [f"node {self.name}: {text}" for text in self._found]
 
     @property
     def info(self) -> ArrayInfo:
@@ -134,13 +155,20 @@ class ServerNode:
 
     @property
     def rate_hz(self) -> float | None:
-        """Frames a second over the last second, by the node's clock."""
+        """Frames a second over the last second, by the node's clock; 0 if none came in it."""
         if len(self._pace) < 2:  # a rate needs two instants
             return None
+        if self.present.last_seen_t_ns is None or (
+            utc_ns() - self.present.last_seen_t_ns > 2 * _RATE_OVER_NS
+        ):
+            return 0.0
         (first_ns, first_seq), (last_ns, last_seq) = self._pace[0], self._pace[-1]
-        return (
-            (last_seq - first_seq) / ((last_ns - first_ns) * 1e-9) if last_ns > first_ns else None
-        )
+        if last_ns <= first_ns:
+            return None
+        rate_hz = (last_seq - first_seq) / ((last_ns - first_ns) * 1e-9)
+        # The nominal rate is what bus and node can do: more in one second is its jitter.
+        nominal_hz = self.info.nominal_rate_hz
+        return nominal_hz if nominal_hz < rate_hz < _JITTER * nominal_hz else rate_hz
 
     def attach(self, hello: Hello, now_t_ns: int) -> None:
         """The node has connected, and said which frames it has.
@@ -156,10 +184,12 @@ class ServerNode:
         known = (self.hello.array_info, self.hello.calibration)
         self.hello = hello
         self.has_spoken, self.greeted_t_ns = True, now_t_ns
-        for stream in self.streams.values():
+        for stream in list(self.streams.values()):
             stream.owed = Intervals()
             if stream.boot_id not in self.order and not hello.has_more:
                 stream.is_gone()
+                if stream.journal is None:  # nothing of it ever came
+                    del self.streams[stream.boot_id]
         for earlier in hello.earlier:
             self._stream_of(earlier.array_info).has_ended(earlier)
         self.present = self._stream_of(hello.array_info)
@@ -168,8 +198,8 @@ class ServerNode:
         for name in self.order:
             stream = self.streams[name]
             stream.owed = stream.held & stream.may_come
-        if known != (hello.array_info, hello.calibration):
-            self.live, self.tare_keeper = self._estimates()
+        if known != (hello.array_info, hello.calibration) or self._has_failed:
+            self._estimate_anew()
         try:
             self.keep()
         except StorageError as error:  # the picture goes on; what is sent is not acknowledged
@@ -211,16 +241,14 @@ class ServerNode:
             First and last number of the message, and the frames whose estimates are now due.
 
         Raises:
-            FileFormatError: it is not a message of this stream's frames.
+            LinkError: it is not a message of this stream's frames, or they break a rule of theirs.
         """
-        frames = decode(payload, stream.schema)
-        if (frames.t_ns - frames.t_mono_ns != stream.info.utc_offset_ns).any():
-            raise FileFormatError(
-                f"frames {frames.seq[0]} to {frames.seq[-1]} are not t_mono_ns plus the offset",
-                expected=f"t_ns - t_mono_ns = {stream.info.utc_offset_ns}, as announced in hello",
-            )
         try:
+            frames = decode(payload, stream.schema)
+            stream.check(frames)
             stream.take(frames, payload, now_t_ns)
+        except FileFormatError as error:
+            raise LinkError(f"node {self.name!r}: {error}") from error
         except StorageError as error:  # the live picture goes on; nothing is acknowledged
             self.storage_problem = str(error)
         first, last = int(frames.seq[0]), int(frames.seq[-1])
@@ -236,9 +264,7 @@ class ServerNode:
         self._pace.append((int(frames.t_mono_ns[-1]), last))
         while self._pace[-1][0] - self._pace[0][0] > _RATE_OVER_NS and len(self._pace) > 2:
             self._pace.popleft()
-        due = list(self.live.feed(frames))
-        self._look_for_tare()
-        return first, last, due
+        return first, last, self._estimated(frames)
 
     def take_tare(self, reason: str = "") -> RecordedTare:
         """Tare from an unloaded interval of the last seconds, and put it in force.
@@ -286,12 +312,29 @@ class ServerNode:
         """
         with storage_errors(self._folder):
             make_folder(self._folder)
-        write_whole(self._folder / "hello.json", self.hello.model_dump_json().encode())
+        write_checked(self._folder / HELLO_FILE, self.hello.model_dump_json().encode())
 
     def _stream_of(self, info: ArrayInfo) -> ServerStream:
         if info.boot_id not in self.streams:
             self.streams[info.boot_id] = ServerStream(self._journals_folder / info.boot_id, info)
         return self.streams[info.boot_id]
+
+    def _estimated(self, frames: FrameBatch) -> list[Estimated]:
+        """Frames whose estimates are due; a bug there costs this node its estimates, no more."""
+        try:
+            due = list(self.live.feed(frames))
+        except Exception as error:
+            self._go_without_estimates(error)
+            return [(frames, {})]
+        self._look_for_tare()
+        return due
+
+    def _go_without_estimates(self, error: Exception) -> None:
+        log.exception("node %s: this is a bug; it goes on without estimates", self.name)
+        self._has_failed = True
+        self.live = LiveEstimates(self.info, None, None)
+        self.live.calibration_problem = f"the estimator failed, until it connects again: {error!r}"
+        self.tare_keeper = TareKeeper(self.info, self.live, self.tares, automatic=False)
 
     def _look_for_tare(self) -> None:
         if self.storage_problem is not None:  # it could not be kept
@@ -301,13 +344,19 @@ class ServerNode:
             self.tare_keeper.look(self.journal, to_come)
         except StorageError as error:  # not in force then; tried again once it can be kept
             self.storage_problem = str(error)
+        except Exception as error:
+            self._go_without_estimates(error)
 
-    def _estimates(self) -> tuple[LiveEstimates, TareKeeper]:
-        in_force = self.tares.in_force(self.info)
-        tare = in_force.tare if in_force is not None else None
-        live = LiveEstimates(self.info, self.hello.calibration, tare)
+    def _estimate_anew(self) -> None:
+        self._has_failed = False
+        try:
+            tare = self.tares.to_use(self.info)
+            self.live = LiveEstimates(self.info, self.hello.calibration, tare)
+        except Exception as error:
+            self._go_without_estimates(error)
+            return
         automatic = self.hello.scene.get("auto_tare", True) is not False
-        return live, TareKeeper(self.info, live, self.tares, automatic=automatic)
+        self.tare_keeper = TareKeeper(self.info, self.live, self.tares, automatic=automatic)
 
 
 def _joined(numbers: list[tuple[int, int]]) -> list[tuple[int, int]]:

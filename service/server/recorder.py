@@ -7,6 +7,7 @@ Starting and stopping only note numbers and instants; the frames are in the jour
 from __future__ import annotations
 
 import logging
+from typing import Literal
 
 from devices.errors import (
     StateError,
@@ -29,6 +30,8 @@ from storage.sessions.ledger import numbers_of
 log = logging.getLogger("foottile.recorder")
 
 BEHIND_S = 2.0
+CLOCK_ROW_OFF_NS = 60_000_000_000
+"""Eight probes may take 40 s on a link that hardly carries anything."""
 
 
 class Recorder:
@@ -46,6 +49,15 @@ class Recorder:
         self._settling = settling
         for session in book:
             book.note(self._with_clock(session))
+
+    def know(self, node: ServerNode) -> None:
+        """A node has said hello: if it was not known before, its sessions lack what is kept of it.
+
+        Those are the clock measurements since their last change.
+        """
+        for session in self._book.of_node(node.name):
+            if session.state != "sealing":
+                self._book.note(self._with_clock(session))
 
     def recording_on(self, node: str) -> list[Session]:
         """Sessions that are being recorded on a node."""
@@ -165,11 +177,21 @@ class Recorder:
         book.changed(book.get(session_id))
         return book.get(session_id)
 
-    def note_clock(self, node: ServerNode, row: ClockRow) -> None:
+    def note_clock(self, node: ServerNode, row: ClockRow, now_t_ns: int) -> None:
         """Keep a new measurement of a node's clock, with its sessions too.
 
-        The stream's log has it already; sessions are written with their next change.
+        The stream's log has it already; sessions are written with their next change. A row says
+        what this server's own clock showed some seconds ago: one that is far from that is not kept.
         """
+        said_t_ns = row.t_mono_ns + node.info.utc_offset_ns + row.server_minus_node_ns
+        if abs(said_t_ns - now_t_ns) > CLOCK_ROW_OFF_NS + row.uncertainty_ns:
+            log.warning(
+                "node %s: a measurement of its clock is not kept: it has this server's clock "
+                "%.0f s off. Was that set just now?",
+                node.name,
+                (said_t_ns - now_t_ns) * 1e-9,
+            )
+            return
         try:
             node.present.note_clock(row)
         except StorageError as error:  # it counts all the same
@@ -198,11 +220,25 @@ class Recorder:
         return self._settling.problem_of(session)
 
     def duration_s(self, session: Session, frames: int) -> float:
-        """Its length: exact for a sealed session, else estimated from the stream's nominal rate."""
+        """Its length: exact for a sealed session, else as long as frames have come for it.
+
+        No shorter than its frames take at the nominal rate, which is the fastest there is.
+        """
         node = self._nodes.find(session.node)
         if session.state == "sealed" or node is None:
             return session.duration_s
-        return frames / node.info.nominal_rate_hz
+        seen_t_ns = node.last_seen_t_ns if frames else None
+        end_t_ns = min(session.stopped_t_ns or NO_END, seen_t_ns or 0)
+        lasted_s = (end_t_ns - session.started_t_ns) * 1e-9
+        return max(frames / node.info.nominal_rate_hz, lasted_s)
+
+    def waits_for(self, session: Session, ledger: Ledger) -> Literal["frames", "end"] | None:
+        """What a pending session waits for: frames, or only to be told that there are no more."""
+        if session.state != "pending":
+            return None
+        if ledger.pending:
+            return "frames"
+        return "end" if session.parts[-1].seq_last is None else None
 
     def sources(self, session_id: str) -> Sources:
         """Sources that a session can be sealed or exported from.

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
@@ -18,7 +20,7 @@ from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
 from service.server.settling import Settling
 from service.server.streams import ServerStream
-from service.server.views import NodeView, SessionView
+from service.server.views import Counted, NodeView, SessionView
 from service.server_clock import utc_ns
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
@@ -72,7 +74,6 @@ class Server:
 
     Raises:
         StorageError: the folder cannot be written.
-        FileFormatError: something in it is damaged.
     """
 
     def __init__(self, data: Path) -> None:
@@ -80,7 +81,6 @@ class Server:
         self.folder = DataFolder(data)
         self.id = self.folder.id
         """Name of this data folder: a node keeps what this server needs apart from others."""
-        self._said: tuple[str, float] = ("", 0.0)
         self._unkept: set[str] = set()
         """Nodes of which was said that nothing is kept."""
         try:
@@ -97,6 +97,10 @@ class Server:
             self.folder.close()
             raise
         self.links: dict[str, Link] = {}
+        self._counts: dict[str, Counted] = {}
+        """What screens were told last, by session."""
+        self._failing: dict[str, tuple[str, float]] = {}
+        """What has failed in the last tick, how, and when that was said."""
 
     async def run(self) -> None:
         """Sync, acknowledge, settle, prune and tell, until cancelled."""
@@ -104,22 +108,28 @@ class Server:
         while True:
             await asyncio.sleep(TICK_S)
             now_s = time.monotonic()
-            try:
-                await asyncio.gather(*(self._sync(node) for node in self.nodes))
+            await asyncio.gather(*(self._sync(node) for node in list(self.nodes)))
+            folder_is_there = False
+            with self._alone("data folder"):
                 await self._check_folder()
+                folder_is_there = True
+            if not folder_is_there:
+                continue
+            with self._alone("sessions"):
                 self.settling.settle()
-                self._tell_wanted()
-                if now_s >= slow_s:
-                    slow_s = now_s + _SLOW_TICK_S
+            for link in list(self.links.values()):
+                self._tell_wanted(link)
+            with self._alone("counts"):
+                self._tell_counts()
+            if now_s >= slow_s:
+                slow_s = now_s + _SLOW_TICK_S
+                with self._alone("heartbeat"):
                     self._heartbeat()
-                if now_s >= prune_s:
-                    prune_s = now_s + _PRUNE_EVERY_S
-                    for node in self.nodes:
+            if now_s >= prune_s:
+                prune_s = now_s + _PRUNE_EVERY_S
+                for node in list(self.nodes):
+                    with self._alone(f"node {node.name}, deleting what nobody needs"):
                         node.prune(self.recorder.needed(node.name))
-            except (FootTileError, OSError) as error:
-                self._say(str(error))
-            except Exception as error:
-                self._say(f"this is a bug; the server goes on: {error!r}", error)
 
     async def _check_folder(self) -> None:
         """While the folder is away nothing is settled or deleted, and every node says so.
@@ -137,13 +147,6 @@ class Server:
                         with suppress(StorageError):
                             await asyncio.to_thread(stream.sync)
             raise
-
-    def _say(self, text: str, bug: Exception | None = None) -> None:
-        """Log what is wrong, once: five times a second it would fill the log."""
-        before, said_s = self._said
-        if text != before or time.monotonic() - said_s > _SAY_AGAIN_S:
-            self._said = (text, time.monotonic())
-            log.log(logging.WARNING if bug is None else logging.ERROR, "%s", text, exc_info=bug)
 
     async def close(self) -> None:
         """End the links and wait for what is being sealed."""
@@ -167,6 +170,11 @@ class Server:
         """
         self.folder.check_writable()
 
+    @property
+    def problems(self) -> list[str]:
+        """What was found damaged in the data folder, and what became of it, in words."""
+        return self.folder.problems + self.nodes.problems + self.sessions.problems
+
     async def empty_trash(self) -> tuple[int, int]:
         """Delete what is in the trash for good; return the number of sessions and of bytes.
 
@@ -176,16 +184,48 @@ class Server:
         doomed = self.sessions.trash.doom()
         return len(doomed), await asyncio.to_thread(destroy, doomed)
 
+    def node_as_json(self, node: ServerNode) -> dict[str, Any] | None:
+        """How a node is, for screens; None if that cannot be said, which is said in the log."""
+        with self._alone(f"node {node.name}, as screens see it"):
+            return NodeView.of(node, self.recorder).model_dump(mode="json")
+        return None
+
     def tell_node(self, node: ServerNode) -> None:
         """Tell every screen how a node is."""
-        view = NodeView.of(node, self.recorder).model_dump(mode="json")
-        self.hub.notice({"type": "node", "node": view})
+        if (view := self.node_as_json(node)) is not None:
+            self.hub.notice({"type": "node", "node": view})
 
-    def _tell_wanted(self) -> None:
-        """Tell nodes what sessions need, where that has changed."""
-        for link in self.links.values():
+    def _tell_wanted(self, link: Link) -> None:
+        """Tell a node what sessions need, if that has changed."""
+        with self._alone(f"node {link.node.name}, what sessions need of it"):
             if link.wanted is not None and self.recorder.wanted(link.node.name) != link.wanted:
                 link.news.set()
+
+    def _tell_counts(self) -> None:
+        """Tell screens how far unsealed sessions are, where that has changed: by the ledger."""
+        counts: dict[str, Counted] = {}
+        for session in self.sessions if self.hub.subscribers else ():
+            if session.state in ("recording", "pending"):
+                counted = counts[session.id] = Counted.of(session, self.recorder)
+                if counted != self._counts.get(session.id):
+                    self.hub.count(session.node, {session.id: counted.model_dump()})
+        self._counts = counts
+
+    @contextmanager
+    def _alone(self, what: str) -> Iterator[None]:
+        """Whatever fails here ends nothing else; it is said when it begins, not at every tick."""
+        try:
+            yield
+        except Exception as error:
+            before, said_s = self._failing.get(what, ("", 0.0))
+            if str(error) != before or time.monotonic() - said_s > _SAY_AGAIN_S:
+                self._failing[what] = (str(error), time.monotonic())
+                if isinstance(error, FootTileError | OSError):
+                    log.warning("%s: %s", what, error)
+                else:
+                    log.exception("%s: this is a bug; the server goes on", what)
+        else:
+            self._failing.pop(what, None)
 
     def _ask_again(self, node: ServerNode) -> None:
         link = self.links.get(node.name)
@@ -222,11 +262,12 @@ class Server:
 
     async def _sync(self, node: ServerNode) -> None:
         """Sync a node's journals to disk, then acknowledge the frames that were in them before."""
-        if node.storage_problem is not None:  # perhaps not even a journal could be begun
-            await self._try_again(node)
-            return
-        streams = [stream for stream in node.streams.values() if stream.has_news]
-        await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
+        with self._alone(f"node {node.name}, bringing its frames to the disk"):
+            if node.storage_problem is not None:  # perhaps not even a journal could be begun
+                await self._try_again(node)
+                return
+            streams = [stream for stream in node.streams.values() if stream.has_news]
+            await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
 
     async def _sync_stream(self, node: ServerNode, stream: ServerStream) -> None:
         unsynced, stream.unsynced = stream.unsynced, Intervals()

@@ -16,7 +16,8 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.link import ClockRow, EarlierStream, Hello, PairsByReason
 from service.sessions.ends import SessionStream, around_in
 from storage.clock.log import ClockLog, ClockOffset
-from storage.intervals import CORRUPT, NO_END, Intervals, Losses
+from storage.frame_rules import broken_rule
+from storage.intervals import CORRUPT, NO_END, REFUSED, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import wire_schema
@@ -55,7 +56,10 @@ class ServerStream:
         """Frames appended to the journal since the last sync."""
         self.owed = Intervals()
         """Frames to be acknowledged once the journal is synced."""
+        self.problems: list[str] = []
+        """What was found damaged when it was opened, and what became of it, in words."""
         self._first_seq: int | None = None
+        self._refused = Intervals()
         self._forgotten = Intervals()
         self._guessed = False
         self._notes_on_disk: StreamNotes | None = None
@@ -74,11 +78,12 @@ class ServerStream:
         journal = Journal.open(folder)
         stream = cls(folder, journal.info)
         stream.journal = journal
-        with suppress(FileFormatError):  # the node says it again
-            notes = StreamNotes.load(folder)
-            if notes is not None:
-                stream.notes = stream._notes_on_disk = notes
-                stream.missed_slots = notes.missed_slots
+        stream.problems = list(journal.problems)
+        notes = StreamNotes.load_whole(folder, stream.problems)  # without, the node says it again
+        if notes is not None:
+            stream.notes = stream._notes_on_disk = notes
+            stream.missed_slots = notes.missed_slots
+            stream._refused = Intervals(notes.lost.get(REFUSED, ()))
         with suppress(StorageError):
             lines = stream._clock_log.lines()
             stream.clock_rows.extend(lines.rows)
@@ -227,13 +232,39 @@ class ServerStream:
         self._said(said.lost, next_seq=said.next_seq + beyond, unsynced_tail_max=tail)
 
     def is_gone(self) -> None:
-        """The node has not mentioned it: nothing more will come of it."""
+        """The node has not mentioned it: nothing more will come of it, and no file stays open."""
         self.node_has = Intervals()
+        with suppress(StorageError):  # said when it is synced
+            if self.journal is not None:
+                self.journal.close()
 
     def note_losses(self, lost: PairsByReason) -> None:
         """Note all frames of this stream that the node has lost so far."""
         notes = self.notes
         self._said(lost, next_seq=notes.next_seq, unsynced_tail_max=notes.unsynced_tail_max)
+
+    def check(self, frames: FrameBatch) -> None:
+        """Whether frames that came may be kept; those that may not are never asked for again.
+
+        Raises:
+            FileFormatError: they break a rule that `verify` asks for as well.
+            StorageError: what stands beside them cannot be read.
+        """
+        first, last = int(frames.seq[0]), int(frames.seq[-1])
+        end = self.notes.next_seq
+        wrong = broken_rule(frames, self.info)
+        if not wrong and end is not None and last >= end:
+            wrong = f"the stream has ended with frame {end - 1}"
+        if not wrong and self.journal is not None:
+            wrong = self.journal.misplaced(frames)
+        if wrong:
+            refused = Intervals([(first, last)]) - self.held
+            self._refused = self._refused | refused
+            self.note_losses(self.notes.lost)
+            raise FileFormatError(
+                f"frames {first} to {last} of stream {self.boot_id} are refused: {wrong}",
+                expected="frames as docs/formats.md says",
+            )
 
     def take(self, frames: FrameBatch, payload: bytes, now_t_ns: int) -> None:
         """Keep frames that came.
@@ -321,12 +352,14 @@ class ServerStream:
     def _said(
         self, lost: PairsByReason, *, next_seq: int | None, unsynced_tail_max: int = 0
     ) -> None:
+        losses = Losses(lost)
+        losses.add(self._refused, REFUSED)
         self.notes = StreamNotes(
             array_info=self.info,
             next_seq=next_seq,
             unsynced_tail_max=unsynced_tail_max,
             missed_slots=self.missed_slots,
-            lost=Losses(lost).as_pairs(),
+            lost=losses.as_pairs(),
         )
         if self._guessed:
             self._guessed = False
@@ -334,12 +367,12 @@ class ServerStream:
 
     @property
     def _notes_to_keep(self) -> StreamNotes:
-        """The notes, with what is damaged here now."""
+        """The notes, with what is damaged here, and what the node has counted, by now."""
         lost = self.journal.lost.by_reason if self.journal is not None else {}
-        damaged = tuple(lost.get(CORRUPT, ()))
-        if damaged == self.notes.damaged:
+        now = {"damaged": tuple(lost.get(CORRUPT, ())), "missed_slots": self.missed_slots}
+        if all(getattr(self.notes, name) == value for name, value in now.items()):
             return self.notes
-        return self.notes.model_copy(update={"damaged": damaged})
+        return self.notes.model_copy(update=now)
 
     def _log_clock(self, row: ClockOffset) -> None:
         self._clock_log.append(row)

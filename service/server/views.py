@@ -11,20 +11,20 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from devices.frames import ServoInfo
 from service.estimation.calibration import Calibration
-from service.estimation.tare.tare import Source, expected_shift_kpa, trend, warmer_k
+from service.estimation.tare.tare import TakenFrom, expected_shift_kpa, trend, warmer_k
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
 from service.server.tare_keeper import AutoTare
-from service.sessions.tares import RecordedTare
+from service.sessions.tare_file import RecordedTare
 from storage.sessions.folder import Part, Session
 
 T = TypeVar("T")
 
 
 class View(BaseModel):
-    """Base of all answers."""
+    """Base of all answers; what is not known is null, and never a NaN that JSON cannot write."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
 class Page(View, Generic[T]):
@@ -65,7 +65,7 @@ class TareView(View):
 
     id: str
     t_ns: int = Field(description="End of the interval it was taken from, node's UTC.")
-    source: Source = Field(
+    source: TakenFrom = Field(
         description="unloaded: by hand; flight: automatic; lead: of an emulation."
     )
     reason: str = Field(description="Why, in words.")
@@ -255,7 +255,7 @@ class SessionView(View):
     name: str
     node: str
     state: Literal["recording", "pending", "sealing", "sealed"] = Field(
-        description="pending: frames are still with the node, it completes when they have come."
+        description="pending: what `waits_for` says is still with the node; it completes by itself."
     )
     complete: bool | Literal["lossy"] = Field(
         description="true: every frame is in it; 'lossy': some never will be."
@@ -265,11 +265,16 @@ class SessionView(View):
     duration_s: float
     frames: int
     pending_frames: int = Field(description="Still with the node.")
+    waits_for: Literal["frames", "end"] | None = Field(
+        description="frames: `pending_frames` are still with the node; end: nothing is known to be "
+        "missing, but the node has not said yet what it took until the stop; null: for nothing."
+    )
     lost: dict[str, int] = Field(
         description="Frames that will never be in it, by reason.", examples=[{"evicted": 12}]
     )
     tail_frames_max: int = Field(
-        description="How many more there may have been where a node's power failed."
+        description="How many more there may have been at an end that the node could not tell: its "
+        "power failed, or it was given up."
     )
     marks: int = Field(description="Events that were marked in it.")
     bytes: int | None = Field(description="Size of the sealed file.")
@@ -288,16 +293,38 @@ class SessionView(View):
         """Of a session as it is now."""
         ledger = recorder.ledger_of(session)
         made = {"frames", "pending_frames", "lost", "tail_frames_max", "duration_s", "problem"}
-        content = session.model_dump(include=set(cls.model_fields) - made - {"marks"})
+        made |= {"marks", "waits_for"}
+        content = session.model_dump(include=set(cls.model_fields) - made)
         return cls(
             **content | {"complete": "lossy" if ledger.lossy else ledger.complete},
             frames=ledger.recorded,
             pending_frames=ledger.pending,
+            waits_for=recorder.waits_for(session, ledger),
             lost=ledger.lost,
             marks=len(session.events),
             tail_frames_max=ledger.unsynced_tail_max,
             problem=recorder.problem_of(session),
             duration_s=recorder.duration_s(session, ledger.recorded),
+        )
+
+
+class Counted(View):
+    """How far a session has come that is not sealed yet; the fields are those of `SessionView`."""
+
+    frames: int
+    pending_frames: int
+    waits_for: Literal["frames", "end"] | None
+    duration_s: float
+
+    @classmethod
+    def of(cls, session: Session, recorder: Recorder) -> Counted:
+        """By the ledger, as of now."""
+        ledger = recorder.ledger_of(session)
+        return cls(
+            frames=ledger.recorded,
+            pending_frames=ledger.pending,
+            waits_for=recorder.waits_for(session, ledger),
+            duration_s=round(recorder.duration_s(session, ledger.recorded), 1),
         )
 
 

@@ -19,6 +19,7 @@ from devices.errors import DamagedFileError, DamagedFramesError, FootTileError, 
 from service.sessions.begin import begun
 from service.sessions.ends import SessionStream, at_stop, broken_off, open_tail
 from service.sessions.recover_streams import OpenedStream, hello_of, open_streams
+from service.sessions.restore import restore
 from service.sessions.sealing import seal
 from service.sessions.sources import sources_of
 from service.sessions.tares import TareHistory
@@ -62,6 +63,7 @@ class Recovery:
         removed: half-written files of dead processes.
         cut: bytes that were cut off, by journal; they are set aside, not deleted.
         mended: sessions whose `events.parquet` was written again.
+        restored: sessions whose `session.json` was, from what lies beside it.
         problems: what could not be recovered, beside sessions.
     """
 
@@ -69,13 +71,15 @@ class Recovery:
     removed: list[Path] = field(default_factory=list)
     cut: dict[str, int] = field(default_factory=dict)
     mended: list[str] = field(default_factory=list)
+    restored: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
     @property
     def is_nothing(self) -> bool:
         """Was there nothing to do?"""
         done = any(one.outcome != "waiting" for one in self.sessions)
-        return not (done or self.removed or self.cut or self.mended or self.problems)
+        made = (self.removed, self.cut, self.mended, self.restored, self.problems)
+        return not (done or any(made))
 
 
 def _silent(_: str) -> None:
@@ -115,8 +119,12 @@ def recover(
     known, unreadable = sessions.load_all()
     known.sort(key=lambda session: session.id)
     for session_id, error in sorted(unreadable.items()):
-        if any(sessions.path(session_id).iterdir()):
+        if not any(sessions.path(session_id).iterdir()):
+            continue
+        if restore(sessions, session_id) is None:
             recovery.problems.append(str(error))
+        else:
+            recovery.restored.append(session_id)
     for session in known:
         if session.state == "sealed":
             if _mend_events(session, sessions.path(session.id)):

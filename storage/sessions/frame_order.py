@@ -14,6 +14,7 @@ import numpy as np
 
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
+from storage.frame_rules import out_of_range
 from storage.intervals import Intervals
 from storage.schema import Array
 
@@ -117,10 +118,15 @@ class FrameOrder:
         for at in np.flatnonzero(back & ~falls).tolist():
             late_ns = int(with_before[at]) - int(with_before[at + 1])
             _say(part, f"time runs back by {late_ns} ns before frame {seq[at + 1]}")
-        shifted = t_ns - t_mono_ns != part.offset_ns
-        if shifted.any():
-            first = int(seq[len(seq) - len(t_ns) + int(np.argmax(shifted))])
-            _say(part, f"t_ns of frame {first} is not t_mono_ns plus the part's offset")
+        beyond = out_of_range(t_mono_ns, t_ns)
+        shifted = (t_ns - t_mono_ns != part.offset_ns) & ~beyond  # beyond, a difference may wrap
+        for wrong, said in (
+            (beyond, "is of no year that a clock says"),
+            (shifted, "is not t_mono_ns plus the part's offset"),
+        ):
+            if wrong.any():
+                first = int(seq[len(seq) - len(t_ns) + int(np.argmax(wrong))])
+                _say(part, f"t_ns of frame {first} {said}")
         breaks = np.flatnonzero((seq[1:] - seq[:-1] != 1) | falls) + 1
         cuts = [0, *breaks.tolist(), len(seq)]
         for begin, end in pairwise(cuts):

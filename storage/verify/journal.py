@@ -12,6 +12,7 @@ from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo
 from storage.clock.log import NAME as CLOCK_LOG
 from storage.clock.log import ClockLog
+from storage.frame_rules import runs_back
 from storage.intervals import CORRUPT, Intervals, Losses
 from storage.journal.segment import SUFFIX, UNREAD_SUFFIX
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD
@@ -162,9 +163,9 @@ def _check_stream(report: StreamReport, segments: list[SegmentReport], *, is_ser
     # What a disk refused once was written again: a second copy is neither damage nor out of order.
     ends = np.maximum.accumulate(index["seq_first"] + index["count"])
     index = index[np.concatenate([[True] * min(1, len(index)), ends[1:] > ends[:-1]]).astype(bool)]
-    back = np.flatnonzero(index["t_ns_first"][1:] < index["t_ns_last"][:-1])
+    back = runs_back(index["t_ns_first"], index["t_ns_last"])
     if len(back):
-        report.problems.append(f"time runs back before frame {index['seq_first'][back[0] + 1]}")
+        report.problems.append(f"time runs back before frame {index['seq_first'][back[0]]}")
     if notes is None or notes.next_seq is None:
         return
     last = report.held.last

@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
+from storage.frame_rules import broken_rule
 from storage.intervals import Intervals
 from storage.journal.segment_format import (
     INDEX_SUFFIX,
@@ -142,7 +143,7 @@ def _check_batches(
 ) -> None:
     doubtful, said = Intervals(), list[str]()
     good = []
-    end, offset_ns = header_bytes, array_info(schema, where="").utc_offset_ns
+    end, info = header_bytes, array_info(schema, where="")
     descriptor = os.open(report.path, os.O_RDONLY)
     try:
         for at, record in enumerate(index):
@@ -161,7 +162,7 @@ def _check_batches(
             report.damaged, doubtful = report.damaged | doubtful, Intervals()
             report.problems += said
             said = []
-            wrong = _wrong_in(payload, record, schema, offset_ns)
+            wrong = _wrong_in(payload, record, schema, info)
             if int(record["offset"]) < end:
                 wrong = "they stand where other frames stand as well"
             end = int(record["offset"]) + int(record["length"])
@@ -185,7 +186,7 @@ def _check_batches(
         )
 
 
-def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, offset_ns: int) -> str:
+def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, info: ArrayInfo) -> str:
     """Why the bytes are not what the index says; empty if they are."""
     try:
         batch = decode(payload, schema)
@@ -195,9 +196,7 @@ def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, offset_ns: int
         return f"the batch holds {len(batch)} frames from {int(batch.seq[0])} on"
     if (int(batch.t_ns[0]), int(batch.t_ns[-1])) != (record["t_ns_first"], record["t_ns_last"]):
         return "the index says other instants than the batch"
-    if (batch.t_ns - batch.t_mono_ns != offset_ns).any():
-        return "t_ns is not t_mono_ns plus the stream's anchor"
-    return ""
+    return broken_rule(batch, info)
 
 
 def _holds_any(path: Path, index: Records) -> bool:

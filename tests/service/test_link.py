@@ -1,22 +1,189 @@
-"""Messages of the link: what was damaged on its way is not heard."""
+"""Messages of the link: what was damaged on its way is not heard, what cannot be not understood."""
 
 from __future__ import annotations
 
 import json
+import math
+from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, LinkError
-from service.link import Ack, FromServer, checked, heard, say, with_check
+from service.link import (
+    PROTOCOL,
+    Ack,
+    ClockRow,
+    EarlierStream,
+    FramesOf,
+    FromNode,
+    FromServer,
+    Hello,
+    Lost,
+    Probe,
+    Status,
+    StreamNumbers,
+    Wanted,
+    Welcome,
+    checked,
+    close_reason,
+    heard,
+    say,
+    understood,
+    with_check,
+)
+from tests.builders.arrays import make_array, make_servo
+from tests.builders.calibrations import make_calibration, make_effects, newton_tile
+from tests.builders.odd_values import ODD_VALUES, places, with_value
 
 ACK = Ack(boot_id="0" * 32, seq_first=100, seq_last=199)
+WANTED = Wanted(
+    streams=(StreamNumbers(boot_id="a" * 32, numbers=((5, 9), (0, 3), (20, None))),), recording=True
+)
+FROM_NODE = (
+    Hello(
+        protocol=PROTOCOL,
+        array_info=make_array(servo=make_servo()),
+        held=((0, 99), (200, 299)),
+        next_seq=300,
+        lost={"evicted": ((100, 199),)},
+        scene={"name": "test", "tile": [{"x_m": 0.5, "on": True, "note": None, "n": 7}]},
+        emulated=False,
+        calibration=make_calibration(newton_tile("T01", effects=make_effects()), "T02"),
+        calibration_problem=None,
+        earlier=(
+            EarlierStream(
+                array_info=make_array(boot_id="b" * 32),
+                held=((0, 9),),
+                next_seq=10,
+                lost={"disk_full": ((3, 4),)},
+                unsynced_tail_max=7,
+                t_ns_first=10**18,
+            ),
+        ),
+    ),
+    FramesOf(boot_id="b" * 32),
+    Probe(id=3),
+    ClockRow(t_mono_ns=5, server_minus_node_ns=-77, uncertainty_ns=9),
+    Lost(boot_id="b" * 32, lost={"node_busy": ((0, 0), (5, 6))}),
+    Status(missed_slots=3, troubles=("T01: does not answer",), counts={"T01": {"stale": 4}}),
+)
+FROM_SERVER = (
+    ACK,
+    WANTED,
+    Welcome(protocol=PROTOCOL, server_id="e" * 32, lacks=WANTED.streams, wanted=WANTED),
+    Probe(id=3, server_t_ns=10**18),
+)
+
+
+def assert_taken_as_it_is_or_refused(messages: Any, text: str) -> None:
+    try:
+        taken = understood(messages, text)
+    except LinkError:
+        return
+    written = taken.model_dump_json()
+    assert understood(messages, written) == taken
+    assert understood(messages, written).model_dump_json() == written
+    json.loads(written, parse_constant=pytest.fail)  # no NaN, which JSON has not
+    assert messages.validate_python(taken.model_dump()) == taken
+    written.encode()
 
 
 def test_a_message_is_json_and_comes_back() -> None:
     assert json.loads(say(ACK))["seq_last"] == 199
-    assert FromServer.validate_json(heard(say(ACK))) == ACK
+    for message in FROM_NODE:
+        assert understood(FromNode, heard(say(message))) == message
+    for answer in FROM_SERVER:
+        assert understood(FromServer, heard(say(answer))) == answer
+
+
+@settings(deadline=None, max_examples=1500)
+@given(data=st.data())
+def test_what_is_taken_can_be_written_down_and_read_back_as_the_same(data: st.DataObject) -> None:
+    """Any one or two values of any message replaced by what JSON, and Python's JSON, can say."""
+    at = data.draw(st.integers(0, len(FROM_NODE) + len(FROM_SERVER) - 1))
+    messages: Any = FromNode if at < len(FROM_NODE) else FromServer
+    content = json.loads((*FROM_NODE, *FROM_SERVER)[at].model_dump_json())
+    for _ in range(data.draw(st.integers(1, 2))):
+        found = list(places(content))
+        place = found[data.draw(st.integers(0, len(found) - 1))]
+        value = ODD_VALUES[data.draw(st.integers(0, len(ODD_VALUES) - 1))]
+        content = with_value(content, place, value)
+    assert_taken_as_it_is_or_refused(messages, json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("array_info", "tiles", 0, "conversion_ms"), math.nan),
+        (("array_info", "tiles", 0, "conversion_ms"), 0.0),
+        (("array_info", "tiles", 0, "conversion_ms"), -1.6),
+        (("array_info", "tiles", 0, "x_m"), math.inf),
+        (("array_info", "tiles", 0, "y_m"), 14.0),
+        (("array_info", "tiles", 0, "coefficient_words", 1), 70_000),
+        (("array_info", "tiles", 0, "coefficient_words", 1), -1),
+        (("array_info", "tiles", 0, "serial"), "T02"),
+        (("array_info", "tiles", 0, "serial"), "T01\n"),
+        (("array_info", "nominal_rate_hz"), math.nan),
+        (("array_info", "nominal_rate_hz"), 0.0),
+        (("array_info", "nominal_rate_hz"), 1e9),
+        (("array_info", "utc_offset_ns"), 2**63),
+        (("array_info", "software"), "x" * 1000),
+        (("array_info", "clock_set"), 1),
+        (("array_info", "servo", "ratio"), math.nan),
+        (("calibration", "tiles", 0, "f_scale_n"), math.inf),
+        (("calibration", "tiles", 0, "coefficients", 3), 1e308),
+        (("calibration", "tiles", 0, "coefficient_words"), [70_000, 0, 0, 0]),
+        (("calibration", "tiles", 0, "effects", "gas", "tau_s", "sigma"), math.nan),
+        (("scene", "tile", 0, "x_m"), math.nan),
+        (("scene", "name"), "a\x1b[31m"),
+        (("scene", "name"), 2**64),
+        (("held",), [[0, 2**53]]),
+        (("held",), [[5, 9], [0, 3]]),
+        (("lost",), {"x": [[0, 4611686018427387903]]}),
+        (("next_seq",), 2**53),
+        (("next_seq",), True),
+        (("earlier", 0, "t_ns_first"), -1),
+        (("calibration_problem",), "\x07"),
+    ],
+    ids=str,
+)
+def test_a_hello_with_a_value_that_cannot_be_is_not_understood(
+    place: tuple[Any, ...], value: Any
+) -> None:
+    content = with_value(json.loads(FROM_NODE[0].model_dump_json()), place, value)
+    with pytest.raises(LinkError, match="not understood") as refused:
+        understood(FromNode, json.dumps(content))
+    assert str(place[0]) in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        json.loads("[" * 20 + "]" * 20),
+        {str(i): "x" * 9000 for i in range(40)},
+        {"x" * 300: 1},
+    ],
+    ids=["deep", "long", "key"],
+)
+def test_a_scene_beyond_all_bounds_is_not_understood(scene: Any) -> None:
+    content = json.loads(FROM_NODE[0].model_dump_json()) | {"scene": {"a": scene}}
+    with pytest.raises(LinkError, match="scene"):
+        understood(FromNode, json.dumps(content))
+
+
+def test_half_a_surrogate_pair_is_not_understood() -> None:
+    text = json.dumps(json.loads(FROM_NODE[0].model_dump_json()) | {"scene": {"a": "\ud800"}})
+    with pytest.raises(LinkError):
+        understood(FromNode, text)
+
+
+@given(st.text())
+def test_a_reason_fits_into_a_close_frame_and_a_line_of_a_log(text: str) -> None:
+    reason = close_reason(text)
+    assert len(reason.encode()) <= 123
+    assert reason.isprintable()
 
 
 @given(at=st.integers(0, len(say(ACK)) - 1), bit=st.integers(0, 7))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
-from storage.schema import wire_schema
+from storage.schema import to_record_batch, wire_schema
 from storage.wire import FRAMES_MAX, decode, encode
 from tests.builders.arrays import make_array
 from tests.builders.frames import any_frames, assert_same_bits
@@ -49,7 +50,7 @@ def refused(batch: FrameBatch, match: str) -> None:
     rows=st.integers(1, 40),
     tiles=st.integers(1, 9),
     seed=st.integers(0, 2**32 - 1),
-    first=st.sampled_from([0, 1, 10**12, 2**62 - 40]),
+    first=st.sampled_from([0, 1, 10**12, 2**53 - 40]),
 )
 def test_frames_survive_the_wire_bit_by_bit(rows: int, tiles: int, seed: int, first: int) -> None:
     batch, schema = frames(rows, tiles, seed, first=first), schema_of(tiles)
@@ -168,9 +169,87 @@ def test_numbers_that_do_not_rise_by_one_are_refused(seq: Sequence[int]) -> None
     refused(batch, "do not follow one another|less than 2")
 
 
-@pytest.mark.parametrize("first", [2**62, 2**62 - 1, 2**63 - 1, 2**64 - 2])
+@pytest.mark.parametrize("first", [2**53, 2**53 - 1, 2**62, 2**63 - 1, 2**64 - 2])
 def test_a_number_that_no_stream_reaches_is_refused(first: int) -> None:
-    refused(frames(2, first=first), r"less than 2\^62")
+    refused(frames(2, first=first), r"less than 2\^53")
+
+
+# --- refused before memory is taken ---------------------------------------------------------------
+
+
+def _written(record: pa.RecordBatch, options: pa.ipc.IpcWriteOptions) -> bytes:
+    """The record's own message, as a stream writer with these options makes it."""
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, record.schema, options=options) as writer:
+        writer.write_batch(record)
+    stream = sink.getvalue()
+    begin = len(record.schema.serialize())
+    return stream.slice(begin, stream.size - begin - 8).to_pybytes()
+
+
+@pytest.mark.parametrize("codec", ["zstd", "lz4"])
+def test_compressed_buffers_are_refused_before_they_are_unpacked(
+    codec: Literal["zstd", "lz4"],
+) -> None:
+    schema, batch = schema_of(64), frames(4096, 64)
+    options = pa.ipc.IpcWriteOptions(compression=codec)
+    payload = _written(to_record_batch(batch, schema), options)
+    before = pa.total_allocated_bytes()
+    with pytest.raises(FileFormatError, match="compressed"):
+        decode(payload, schema)
+    assert pa.total_allocated_bytes() - before < 1 << 20
+
+
+@given(data=st.data())
+def test_whatever_a_header_says_of_lengths_little_memory_is_taken(data: st.DataObject) -> None:
+    """Any 64 bits of the header as any number: rows, nulls, offsets, lengths."""
+    schema = schema_of(2)
+    payload = bytearray(encode(frames(5), schema))
+    header_bytes = int.from_bytes(payload[4:8], "little")
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = 8 + 8 * data.draw(st.integers(0, header_bytes // 8 - 1))
+        number = data.draw(st.sampled_from([-1, 0, 1, 2**31, 2**40, 2**62, 2**63 - 1]))
+        payload[at : at + 8] = number.to_bytes(8, "little", signed=True)
+    before = pa.total_allocated_bytes()
+    try:
+        batch = decode(bytes(payload), schema)
+    except FileFormatError:
+        pass
+    else:
+        assert len(batch) == 5
+    assert pa.total_allocated_bytes() - before < 1 << 20
+
+
+def test_a_message_with_bytes_behind_it_is_refused() -> None:
+    """In a journal they would stand where the next message has to begin."""
+    schema = schema_of(2)
+    with pytest.raises(FileFormatError, match="another length"):
+        decode(encode(frames(5), schema) + bytes(8), schema)
+
+
+def test_a_dictionary_is_refused() -> None:
+    words = pa.array(["a", "b"]).dictionary_encode()
+    record = pa.RecordBatch.from_arrays([words], names=["seq"])
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, record.schema) as writer:
+        writer.write_batch(record)
+    stream = sink.getvalue()
+    begin = len(record.schema.serialize())
+    payload = stream.slice(begin, stream.size - begin - 8).to_pybytes()
+    with pytest.raises(FileFormatError, match="no Arrow message of frames"):
+        decode(payload, schema_of(2))
+
+
+def test_a_column_with_empty_values_is_refused() -> None:
+    schema = schema_of(2)
+    record = to_record_batch(frames(5), schema)
+    at = schema.get_field_index("servo_counts")
+    columns = [*record.columns]
+    columns[at] = pa.array([1, None, 3, 4, 5], pa.int32())
+    loose = pa.schema([field.with_nullable(True) for field in schema])
+    payload = pa.RecordBatch.from_arrays(columns, schema=loose).serialize().to_pybytes()
+    with pytest.raises(FileFormatError, match="without empty values"):
+        decode(payload, schema)
 
 
 @given(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=2, max_size=6))

@@ -16,6 +16,11 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
+import service.api.routes.sessions
+import service.server
+import service.server.recorder
+from tests.web.scripted import Scripted
+
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 
 CHROMIUM = next(
@@ -141,3 +146,13 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
     # A server that was killed on purpose, or refuses, shows up there: that is not the page's fault.
     ours = [c for c in complaints if "ERR_" not in c and "WebSocket" not in c and "409" not in c]
     assert ours == []
+
+
+@pytest.fixture
+def scripted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scripted]:
+    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
+    monkeypatch.setattr(service.server.server, "TICK_S", 0.05)
+    monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # its lead is long ago
+    one = Scripted(tmp_path)
+    yield one
+    one.close()

@@ -4,73 +4,21 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
 
-import service.api.routes.sessions
-import service.server
-import service.server.recorder
-from tests.service.fake_node import FakeNode, Play
+from tests.service.fake_node import Play
 from tests.service.recording import Recording
-from tests.service.running import Running
 from tests.web.conftest import wait_until
+from tests.web.scripted import Scripted
 
 pytestmark = pytest.mark.real_time
 
 OpenPage = Callable[..., Page]
-
-
-class Scripted:
-    """A server, and a node that streams whenever the test does not have it do otherwise."""
-
-    def __init__(self, folder: Path) -> None:
-        self.running = Running(folder / "data")
-        self.running.start()
-        self.node = FakeNode(self.running)
-        self.node.connect()
-        self.node.tared()
-
-    @property
-    def url(self) -> str:
-        return self.running.url
-
-    def recorded(self, name: str) -> Recording:
-        """A sealed session."""
-        with Play(self.node):
-            session = self.node.record(name=name)
-            time.sleep(0.2)
-            session.stop()
-            session.sealed()
-        return session
-
-    def pending(self, name: str) -> Recording:
-        """A session with a hundred frames that are still with the node."""
-        session = self.node.record(name=name)
-        self.node.next_t_mono_ns = time.monotonic_ns()
-        self.node.frames(100)
-        self.node.send(50)
-        time.sleep(0.4)
-        session.stop()
-        self.node.send(10, now=True)
-        return session
-
-    def close(self) -> None:
-        self.node.close()
-        self.running.stop()
-
-
-@pytest.fixture
-def scripted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scripted]:
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
-    monkeypatch.setattr(service.server.server, "TICK_S", 0.05)
-    monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # its lead is long ago
-    one = Scripted(tmp_path)
-    yield one
-    one.close()
 
 
 def row_of(page: Page, session: Recording) -> Any:

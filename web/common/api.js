@@ -4,6 +4,10 @@ import { byId } from "./text.js";
 
 const PREFIX = "/api/v1";
 const TOKEN_KEY = "foottile.token";
+const WHERE = "Ask who started the server: it is shown on that computer, or where it is kept. " +
+  "Type it in here, or open the address with #token=… that is shown there.";
+const ASKED = `Anyone may watch; to tare, record or change something you need the server's token. ${WHERE}`;
+const WRONG_TOKEN = `That is not this server's token. ${WHERE}`;
 
 /** A refusal by the server; `message` is its `detail`, which says what to do. */
 export class Refusal extends Error {
@@ -75,7 +79,7 @@ export async function call(method, path, body) {
   const answer = response.status === 204 ? null : await response.json().catch(() => null);
   if (response.ok) return answer;
   const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
-  if (response.status === 401 && await askForToken(String(detail))) return call(method, path, body);
+  if (response.status === 401 && await askForToken(bearer ? WRONG_TOKEN : ASKED)) return call(method, path, body);
   throw new Refusal(String(detail), response.status);
 }
 

@@ -9,6 +9,7 @@ const REASONS = {
   corrupt: "damaged on the disk",
   node_restarted: "the node came back without them",
   given_up: "sealed without them",
+  refused: "refused by the server: no frame can be so",
 };
 
 const many = (count) => `${count.toLocaleString("en-GB")} frame${count === 1 ? "" : "s"}`;

@@ -20,13 +20,23 @@ export class Actions {
     for (const name of ["tare", "undo", "record", "stop", "mark"]) {
       byId(name).addEventListener("click", () => this.run(name));
     }
-    byId("mark-label").addEventListener("keydown", (event) => {
-      if (event.key === "Enter" && !event.isComposing) this.run("mark");
-    });
-    byId("session-name").addEventListener("keydown", (event) => {
-      if (event.key === "Enter" && !event.isComposing) this.run("record");
-    });
+    this.field("mark-label", "mark");
+    this.field("session-name", "record");
     document.addEventListener("keydown", (event) => this.shortcut(event));
+    const bar = byId("actions");
+    new ResizeObserver(() => document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`)).observe(bar);
+  }
+
+  /** Enter does it, Escape gives it up; both leave the field, or the next shortcut would be typed into it. */
+  field(id, name) {
+    const field = byId(id);
+    field.addEventListener("keydown", (event) => {
+      if (event.isComposing) return;
+      if (event.key === "Escape") field.value = "";
+      else if (event.key !== "Enter") return;
+      field.blur();
+      if (event.key === "Enter") this.run(name);
+    });
   }
 
   shortcut(event) {
@@ -43,6 +53,7 @@ export class Actions {
     const button = byId(name);
     if (button.disabled || button.hidden || this.busy.has(name)) {
       if (name === "mark" && !this.running().length) notice("Marks belong to a recording: press Record first.", { bad: true });
+      else if (["record", "tare"].includes(name) && this.state.cannotRecord) notice(this.state.cannotRecord, { bad: true });
       return;
     }
     this.busy.add(name);
@@ -124,7 +135,11 @@ export class Actions {
   draw() {
     const { node } = this.state;
     const running = this.running();
-    byId("tare").disabled = byId("record").disabled = !node;
+    const why = this.state.cannotRecord;
+    byId("tare").disabled = byId("record").disabled = !node || Boolean(why);
+    const box = byId("cannot-record");
+    box.hidden = !why;
+    setText(box, why ? `Record and Tare wait: ${why[0].toLowerCase()}${why.slice(1)}` : "");
     byId("stop").disabled = byId("mark").disabled = !running.length;
     setText(byId("record-text"), running.length ? "Record another" : "Record");
     if (this.undoId === undefined) {
@@ -146,7 +161,7 @@ export class Actions {
     if (wanted.length !== box.children.length || wanted.some((row, i) => row !== box.children[i])) box.replaceChildren(...wanted);
     for (const session of running) {
       const elapsedS = Math.max(0, (this.state.serverNowMs() - session.started_t_ns / 1e6) / 1000);
-      const frames = (session.frames + (session.since ?? 0)).toLocaleString("en-GB");
+      const frames = session.frames.toLocaleString("en-GB");
       setText(rows.get(session.id).querySelector(".recording-text"), `“${session.name}” ${duration(elapsedS)}, ${frames} frames`);
     }
   }

@@ -5,6 +5,8 @@ import { byId, number, roughly, setData, setText } from "../common/text.js";
 const FROZEN_AFTER_MS = 600; // with a tick of 100 ms well within the promised second
 const LATE_MS = 1000; // frames that old when they arrive show the past
 const SHOWN_BEHIND_S = 0.5; // what is on its way in good order is not behind
+const REFUSED_AFTER_MS = 2000; // the server records no node that is further behind
+const SLOW = 0.9; // of what the bus gives; a little less is what a machine does beside it
 const EVERY_MS = 250; // numbers that change faster cannot be read
 
 export class Status {
@@ -13,6 +15,7 @@ export class Status {
     this.live = false;
     this.writtenMs = 0;
     this.delayMs = null;
+    this.cannotRecord = ""; // why, in a sentence
   }
 
   clear() {
@@ -29,7 +32,7 @@ export class Status {
 
   /** Decide on live or frozen, and show it. Returns true while live. */
   draw(node, heard, nowMs, serverNowMs) {
-    const sinceMs = heard.frameMs === null ? null : nowMs - heard.frameMs;
+    const sinceMs = silence(node, heard, nowMs, serverNowMs);
     const late = this.delayMs !== null && this.delayMs > LATE_MS;
     const live = sinceMs !== null && sinceMs <= FROZEN_AFTER_MS && !late;
     const banner = byId("frozen");
@@ -38,9 +41,11 @@ export class Status {
     if (!live) {
       const frozen = sinceMs === null || sinceMs > FROZEN_AFTER_MS;
       setText(byId("frozen-text"), !frozen ? `Picture is ${number(this.delayMs / 1000)} s late`
-        : `No data for ${howLong(sinceMs, node, nowMs, serverNowMs, heard)}`);
+        : sinceMs === null ? "No data yet" : `No data for ${sinceMs < 90_000 ? `${number(sinceMs / 1000)} s` : roughly(sinceMs / 1000)}`);
       setText(byId("frozen-reason"), frozen ? this.reason(node) : "The network is slower than the frames come.");
     }
+    const refused = !this.link.open || !node.connected || sinceMs === null || sinceMs > REFUSED_AFTER_MS;
+    this.cannotRecord = !live && refused ? this.reason(node) : "";
     if (live !== this.live) {
       this.live = live;
       // Said once; the counting banner itself would never let a screen reader finish.
@@ -66,8 +71,10 @@ export class Status {
     const beat = heard.beat ?? {};
     const rateHz = beat.rate_hz ?? node.rate_hz;
     const nominalHz = node.nominal_rate_hz;
-    const slow = rateHz !== null && nominalHz && rateHz < 0.97 * nominalHz;
-    write("rate", `${number(rateHz ?? NaN)} of ${number(nominalHz ?? NaN)} `, slow);
+    const slow = rateHz !== null && nominalHz && rateHz < SLOW * nominalHz;
+    // A rate that proves the nominal one wrong stands alone.
+    const of = nominalHz && !(rateHz > nominalHz) ? ` of ${number(nominalHz)}` : "";
+    write("rate", `${number(rateHz ?? NaN)}${of}`, slow);
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
     const behind = beat.backlog_frames ?? node.backlog_frames ?? 0;
     const missed = beat.missed_slots ?? node.missed_slots ?? 0;
@@ -87,13 +94,11 @@ function write(id, text, bad) {
   setData(element, "bad", String(Boolean(bad)));
 }
 
-/** After a reload the page has heard nothing, but the node's own last word tells how long it is silent. */
-function howLong(sinceMs, node, nowMs, serverNowMs, heard) {
-  let silentMs = sinceMs;
-  if (silentMs === null) {
-    silentMs = node.last_seen_t_ns ? serverNowMs - node.last_seen_t_ns / 1e6 : nowMs - heard.sinceMs;
-    silentMs = Math.max(silentMs, nowMs - heard.sinceMs);
-  }
-  const seconds = silentMs / 1000;
-  return seconds < 90 ? `${number(seconds)} s` : roughly(seconds);
+/**
+ * Milliseconds since the newest frame came: here or, if this page has not seen one, by the server's word.
+ * Null if the node has never sent one.
+ */
+function silence(node, heard, nowMs, serverNowMs) {
+  if (heard.frameMs !== null) return nowMs - heard.frameMs;
+  return node.last_seen_t_ns ? Math.max(serverNowMs - node.last_seen_t_ns / 1e6, nowMs - heard.sinceMs) : null;
 }

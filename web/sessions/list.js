@@ -4,21 +4,25 @@ import * as api from "../common/api.js";
 import { ask, edit } from "../common/dialogs.js";
 import { frames, lossesInWords } from "../common/losses.js";
 import { notice, quietly } from "../common/notices.js";
-import { byId, bytes, duration, el, localTime } from "../common/text.js";
+import { byId, bytes, duration, el, localTime, setText } from "../common/text.js";
 
 const MOST = 500; // a page left open for weeks must not grow without end
+
+const WAITS = {
+  frames: (session) => `${frames(session.pending_frames)} are still with the node; it completes by itself when they have come.`,
+  end: () => "Only its end is open: the node has not said yet what it took until the stop. It completes by itself when the node is back.",
+};
 
 /** State and completeness in plain words: [short, long, how serious]. */
 export function plainState(session) {
   const why = session.problem ? ` ${session.problem}` : "";
   const losses = lossesInWords(session.lost).map((loss) => `${loss}.`);
-  if (session.tail_frames_max) losses.push(`At most ${frames(session.tail_frames_max)} more may be missing where the node's power failed.`);
+  if (session.tail_frames_max) losses.push(`At most ${frames(session.tail_frames_max)} more may be missing where the node could not tell its end.`);
   const missing = losses.length ? ` Missing: ${losses.join(" ")}` : "";
   switch (session.state) {
     case "recording": return ["recording", missing.trim(), "run"];
     case "pending": {
-      const waits = session.pending_frames ? `${frames(session.pending_frames)} are still with the node` : "Its end is still with the node";
-      return ["pending", `${waits}; it completes by itself when they have come.${missing}${why}`, "warn"];
+      return ["pending", `${WAITS[session.waits_for]?.(session) ?? "All frames are here; it is sealed in a moment."}${missing}${why}`, "warn"];
     }
     case "sealing": return ["sealing", `Being written; Parquet follows.${missing}${why}`, "run"];
     case "sealed":
@@ -69,6 +73,18 @@ export class Sessions {
     this.draw();
   }
 
+  /** How far an unsealed session has come: in its place, so that its buttons stay as they are. */
+  count(id, counted) {
+    const session = this.sessions.get(id);
+    if (!session) return;
+    const now = { ...session, ...counted };
+    const shown = this.rows.get(id);
+    if (plainState(now)[1] !== plainState(session)[1] || !shown) return this.take(now);
+    this.sessions.set(id, now);
+    shown.key = JSON.stringify(now);
+    for (const [cls, text] of Object.entries(counts(now))) setText(shown.row.querySelector(`.${cls}`), text);
+  }
+
   drop(id) {
     this.sessions.delete(id);
     this.draw();
@@ -80,9 +96,11 @@ export class Sessions {
     byId("sessions-more").hidden = this.cursor === null || sorted.length >= MOST;
     if (!sorted.length) {
       this.rows.clear();
-      this.box.replaceChildren(el("p", { cls: "none", role: "row", text: "No sessions yet. Press Record to start one." }));
+      this.box.setAttribute("role", "group"); // a table has rows
+      this.box.replaceChildren(el("p", { cls: "none", text: "No sessions yet. Press Record to start one." }));
       return;
     }
+    this.box.setAttribute("role", "table");
     const rows = new Map();
     for (const session of sorted) {
       const key = JSON.stringify(session);
@@ -110,11 +128,11 @@ export class Sessions {
     if (long) state.append(" ", el("span", { cls: "why", text: long }));
     if (session.absolute_scale === "assumed") state.append(" ", el("span", { cls: "why", text: "Scale assumed." }));
     const cell = (cls, label, text) => el("div", { cls, role: "cell", "data-label": label, text });
-    return el("article", { cls: "session", role: "row", "data-session-id": session.id, "data-state": session.state, "data-complete": String(session.complete) },
+    return el("div", { cls: "session", role: "row", "data-session-id": session.id, "data-state": session.state, "data-complete": String(session.complete) },
       nameCell,
       cell("c-start", "Started", localTime(new Date(session.started_t_ns / 1e6))),
-      cell("c-duration", "Duration", duration(session.duration_s)),
-      cell("c-frames", "Frames", Number.isFinite(session.frames) ? session.frames.toLocaleString("en-GB") : "–"),
+      cell("c-duration", "Duration", counts(session)["c-duration"]),
+      cell("c-frames", "Frames", counts(session)["c-frames"]),
       cell("c-marks", "Marks", Number.isFinite(session.marks) ? String(session.marks) : "–"),
       cell("c-size", "Size", bytes(session.bytes)),
       state,
@@ -125,14 +143,15 @@ export class Sessions {
   /** What can be done with a session in its present state. */
   buttons(session) {
     const box = el("div", { cls: "c-do", role: "cell" });
-    const add = (part, text, long, action) => {
-      const button = el("button", { type: "button", cls: "small", text, "data-part": part, "aria-label": `${long} ${session.name}` });
+    const add = (part, text, action) => {
+      // Its name begins with what is seen: who speaks to the page says that.
+      const button = el("button", { type: "button", cls: "small", text, "data-part": part, "aria-label": `${text}: ${session.name}` });
       button.addEventListener("click", () => quietly(() => action(this.sessions.get(session.id) ?? session)));
       box.append(button);
     };
-    add("edit", "Edit", "Edit", (now) => this.edit(now));
-    if (session.state === "pending") add("seal", "Seal without them", "Seal without what is missing:", (now) => this.seal(now));
-    if (session.state === "sealed" || session.state === "pending") add("delete", "Delete", "Delete", (now) => this.delete(now));
+    add("edit", "Edit", (now) => this.edit(now));
+    if (session.state === "pending") add("seal", session.waits_for === "end" ? "Seal with what is here" : "Seal without them", (now) => this.seal(now));
+    if (session.state === "sealed" || session.state === "pending") add("delete", "Delete", (now) => this.delete(now));
     return box;
   }
 
@@ -142,13 +161,16 @@ export class Sessions {
   }
 
   async seal(session) {
-    const what = session.pending_frames ? frames(session.pending_frames) : "what is still with the node";
-    const sure = await ask(`Seal “${session.name}” without them?`,
-      `${what[0].toUpperCase()}${what.slice(1)} will be missing for good, and the session is marked lossy. Do this only if the node never comes back: while you wait, it completes by itself as soon as the node does.`,
+    const many = frames(session.pending_frames);
+    const [question, loss] = session.waits_for === "end"
+      ? ["with what is here", "What the node may have taken after the last frame that came is given up, and"]
+      : ["without them", `${many[0].toUpperCase()}${many.slice(1)} will be missing for good, and`];
+    const sure = await ask(`Seal “${session.name}” ${question}?`,
+      `${loss} the session is marked lossy. Do this only if the node never comes back: while you wait, it completes by itself as soon as the node does.`,
       "Seal as lossy");
     if (!sure) return;
     this.onSession(await api.sealSession(session.id));
-    notice(`Sealed “${session.name}” without what was missing.`);
+    notice(`Sealed “${session.name}” ${question}.`);
   }
 
   async delete(session) {
@@ -160,9 +182,17 @@ export class Sessions {
   }
 }
 
+/** What changes while a session grows, by the class of its cell. */
+function counts(session) {
+  return {
+    "c-duration": duration(session.duration_s),
+    "c-frames": Number.isFinite(session.frames) ? session.frames.toLocaleString("en-GB") : "–",
+  };
+}
+
 function head() {
   const row = el("div", { cls: "head", role: "row" });
-  for (const text of ["Name", "Started", "Duration", "Frames", "Marks", "Size", "State", "Download", ""]) row.append(el("span", { role: "columnheader", text }));
+  for (const text of ["Name", "Started", "Duration", "Frames", "Marks", "Size", "State", "Download", "Actions"]) row.append(el("span", { role: "columnheader", text }));
   return row;
 }
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
-from pydantic import ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from devices.errors import FileFormatError, LinkError, StorageError
@@ -32,31 +32,35 @@ from service.link import (
     close_reason,
     heard,
     say,
+    understood,
 )
+from service.server.node import ServerNode
 from service.server.server import Link, Server
+from service.server.streams import ServerStream
 from service.server_clock import utc_ns
 
 log = logging.getLogger("foottile.ingest")
 
 
 async def ingest(socket: WebSocket, server: Server) -> None:
-    """Serve one node's connection until it ends."""
+    """Serve one node's connection until it ends; whatever is said on it, nothing else ends."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
-    link: Link | None = None
     try:
-        link = await _greet(socket, server, offered)
-        await _serve(socket, server, link)
+        hello = await _greeting(socket, offered)
+        with _joined(server, hello) as link:
+            await _welcome(socket, server, link)
+            await _serve(socket, server, link)
     except HangUp as end:
         await _close(socket, end)
     except (WebSocketDisconnect, RuntimeError):  # it went away, perhaps while we were sending
         pass
-    finally:
-        if link is not None:
-            _leave(server, link)
+    except Exception:
+        log.exception("this is a bug; a node's connection ends, the server goes on")
+        await _close(socket, HangUp(Close.BUG, "the server has a bug; its log says which"))
 
 
-async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
+async def _greeting(socket: WebSocket, offered: list[str]) -> Hello:
     if SUBPROTOCOL not in offered:
         raise HangUp(
             Close.WRONG_VERSION,
@@ -70,9 +74,17 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
             f"protocol {protocol}; this server speaks {PROTOCOL}: update the "
             + ("node" if protocol < PROTOCOL else "server"),
         )
-    hello = _parse(first, Close.BAD_HELLO)
+    if isinstance(first, bytes):
+        raise HangUp(Close.REFUSED, "the first message has to be hello, in text")
+    hello = _parse(first)
     if not isinstance(hello, Hello):
-        raise HangUp(Close.BAD_HELLO, "the first message has to be hello")
+        raise HangUp(Close.REFUSED, "the first message has to be hello")
+    return hello
+
+
+@contextmanager
+def _joined(server: Server, hello: Hello) -> Iterator[Link]:
+    """A node's place among those that are connected, for as long as it is."""
     name, boot_id = hello.array_info.node, hello.array_info.boot_id
     other = server.links.get(name)
     if other is not None:
@@ -84,26 +96,39 @@ async def _greet(socket: WebSocket, server: Server, offered: list[str]) -> Link:
                 f"a node {name!r} is connected already; give this one another name (--name)",
             )
         other.end(Close.SUPERSEDED, "the same node has connected again")
+    is_new = server.nodes.find(name) is None
     try:
         node = server.nodes.greet(hello)
         node.attach(hello, utc_ns())
+        server.recorder.know(node)
         server.settling.follow(node)
-    except (LinkError, StorageError) as error:
-        code = Close.TRY_LATER if isinstance(error, StorageError) else Close.BAD_HELLO
+    except Exception as error:
+        if is_new:
+            server.nodes.forget(name)
+        if not isinstance(error, LinkError | StorageError):
+            raise
+        code = Close.TRY_LATER if isinstance(error, StorageError) else Close.REFUSED
         raise HangUp(code, str(error)) from error
-    node.connected = True
     link = server.links[name] = Link(node)
-    link.wanted = server.recorder.wanted(name)
-    lacks = node.lacks(server.recorder.needed(name))
-    welcome = Welcome(protocol=PROTOCOL, server_id=server.id, lacks=lacks, wanted=link.wanted)
+    node.connected = True
     try:
-        await socket.send_text(say(welcome))
-    except BaseException:  # it went away before it was welcomed
-        _leave(server, link)
-        raise
-    log.info("node %s connected, stream %s", name, boot_id)
+        yield link
+    finally:
+        if server.links.get(name) is link:
+            del server.links[name]
+            node.detach()
+            server.tell_node(node)
+            log.info("node %s has gone", name)
+
+
+async def _welcome(socket: WebSocket, server: Server, link: Link) -> None:
+    node = link.node
+    link.wanted = server.recorder.wanted(node.name)
+    lacks = node.lacks(server.recorder.needed(node.name))
+    welcome = Welcome(protocol=PROTOCOL, server_id=server.id, lacks=lacks, wanted=link.wanted)
+    await socket.send_text(say(welcome))
+    log.info("node %s connected, stream %s", node.name, node.boot_id)
     server.tell_node(node)
-    return link
 
 
 async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
@@ -131,37 +156,43 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
         if isinstance(message, bytes):
             tare_before = node.live.tare
             try:
-                *_, due = node.take(link.stream, checked(message), utc_ns())
-            except FileFormatError as error:
-                raise HangUp(Close.MALFORMED, f"node {node.name!r}: {error}") from error
+                *_, due = node.take(link.stream, _frames(message), utc_ns())
+            except LinkError as error:
+                raise HangUp(Close.REFUSED, str(error)) from error
             server.hub.publish(node, due)
             if node.live.tare is not tare_before:
                 server.tell_node(node)
             continue
-        said = _parse(message, Close.MALFORMED)
+        said = _parse(message)
         match said:
             case Probe(id=number):
-                answer = Probe(id=number, server_t_ns=utc_ns())
-                await socket.send_text(say(answer))
+                await _answer(socket, Probe(id=number, server_t_ns=utc_ns()))
             case FramesOf(boot_id=boot_id):
-                if boot_id not in node.order:
-                    raise HangUp(Close.MALFORMED, f"stream {boot_id[:80]!r} was not announced")
-                link.stream = node.streams[boot_id]
+                link.stream = _announced(node, boot_id)
             case ClockRow():
-                server.recorder.note_clock(node, said)
+                server.recorder.note_clock(node, said, utc_ns())
             case Status():
                 node.present.missed_slots = said.missed_slots
                 node.troubles, node.fault_counts = said.troubles, said.counts
                 server.tell_node(node)
             case Lost():
-                if said.boot_id not in node.order:
-                    raise HangUp(Close.MALFORMED, f"stream {said.boot_id[:80]!r} was not announced")
-                try:
-                    node.streams[said.boot_id].note_losses(said.lost)
-                except ValueError as error:
-                    raise HangUp(Close.MALFORMED, f"lost: {error}") from error
+                _announced(node, said.boot_id).note_losses(said.lost)
             case Hello():
-                raise HangUp(Close.MALFORMED, "hello was said before")
+                raise HangUp(Close.REFUSED, "hello was said before")
+
+
+def _announced(node: ServerNode, boot_id: str) -> ServerStream:
+    if boot_id not in node.order:
+        raise HangUp(Close.REFUSED, f"stream {boot_id!r} was not announced")
+    return node.streams[boot_id]
+
+
+async def _answer(socket: WebSocket, probe: Probe) -> None:
+    try:
+        async with asyncio.timeout(SILENCE_S):
+            await socket.send_text(say(probe))
+    except TimeoutError as error:  # else nobody would notice that nothing is heard either
+        raise HangUp(Close.SILENT, f"nothing was read for {SILENCE_S:g} s") from error
 
 
 async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
@@ -196,17 +227,22 @@ async def _receive(socket: WebSocket) -> str | bytes:
     return data
 
 
-def _parse(message: str | bytes, code: Close) -> SaidByNode:
+def _parse(message: str) -> SaidByNode:
     try:
-        if isinstance(message, bytes):
-            raise HangUp(code, "a text message was expected, and a binary one came")
-        return FromNode.validate_json(heard(message))
+        text = heard(message)
     except LinkError as error:
-        raise HangUp(code, str(error)) from error
-    except ValidationError as error:
-        complaint = error.errors()[0]
-        where = ".".join(str(part) for part in complaint["loc"])
-        raise HangUp(code, f"message not understood: {where}: {complaint['msg']}") from error
+        raise HangUp(Close.MALFORMED, str(error)) from error
+    try:
+        return understood(FromNode, text)
+    except LinkError as error:
+        raise HangUp(Close.REFUSED, str(error)) from error
+
+
+def _frames(message: bytes) -> bytes:
+    try:
+        return checked(message)
+    except FileFormatError as error:
+        raise HangUp(Close.MALFORMED, str(error)) from error
 
 
 def _protocol_of(message: str | bytes) -> int | None:
@@ -222,15 +258,8 @@ def _protocol_of(message: str | bytes) -> int | None:
 
 
 async def _close(socket: WebSocket, end: HangUp) -> None:
-    log.warning("link closed: %s", end.reason)
+    reason = close_reason(end.reason)
+    log.warning("link closed: %s", reason)
     if socket.application_state is not WebSocketState.DISCONNECTED:
         with suppress(RuntimeError, WebSocketDisconnect):
-            await socket.close(end.code, close_reason(end.reason))
-
-
-def _leave(server: Server, link: Link) -> None:
-    if server.links.get(link.node.name) is link:
-        del server.links[link.node.name]
-        link.node.detach()
-        server.tell_node(link.node)
-        log.info("node %s has gone", link.node.name)
+            await socket.close(end.code, reason)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from contextlib import suppress
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
@@ -11,9 +12,11 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from service.link import SUBPROTOCOL, Close, HangUp, close_reason
 from service.server.live import Subscriber, dumps
 from service.server.server import Server
-from service.server.views import NodeView, SessionView
+from service.server.views import SessionView
 from service.server_clock import utc_ns
 from service.version import SOFTWARE
+
+log = logging.getLogger("foottile.live")
 
 PROTOCOL = 1
 """Of this socket; the nodes' link counts its own."""
@@ -52,6 +55,8 @@ async def live(socket: WebSocket, server: Server) -> None:
                     await socket.close(end.code, close_reason(end.reason))
     except (WebSocketDisconnect, RuntimeError):  # it went away, perhaps while we were sending
         pass
+    except Exception:
+        log.exception("this is a bug; one screen's connection ends, the server goes on")
     finally:
         if subscriber is not None:
             server.hub.leave(subscriber)
@@ -83,10 +88,11 @@ def _hello(server: Server, node: str | None) -> dict[str, object]:
         "protocol": PROTOCOL,
         "software": SOFTWARE,
         "t_ns": utc_ns(),
+        "problems": server.problems,
         "nodes": [
-            NodeView.of(known, recorder).model_dump(mode="json")
+            view
             for known in server.nodes
-            if node in (None, known.name)
+            if node in (None, known.name) and (view := server.node_as_json(known)) is not None
         ],
         "recording": [
             SessionView.of(session, recorder).model_dump(mode="json")

@@ -20,7 +20,7 @@ router = APIRouter(prefix="/sessions", tags=["sessions"])
 SETTLE_S = 5.0
 """How long a stop waits for the sealed file before it answers."""
 
-_UNKNOWN = problems(_404="No such session.")
+_UNKNOWN = problems(_404="No such session.", _409="Its files are damaged.")
 _FULL = problems(_507="The data folder cannot be written.")
 
 Name = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200)]
@@ -30,7 +30,17 @@ Tags = Annotated[tuple[Tag, ...], Field(max_length=50)]
 
 
 class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class SessionPage(Page[SessionView]):
+    """A page of sessions."""
+
+    unreadable: dict[str, str] = Field(
+        default={},
+        description="By id, sessions whose files are damaged, and what is wrong with them. No "
+        "frames are dropped meanwhile; `foottile verify` says more.",
+    )
 
 
 class StartSession(_Body):
@@ -38,7 +48,7 @@ class StartSession(_Body):
 
     node: str = Field(examples=["demo"])
     name: Name = Field(examples=["mud, third trial"])
-    pre_roll_s: Annotated[float, Field(ge=0, le=600, allow_inf_nan=False)] = Field(
+    pre_roll_s: Annotated[float, Field(ge=0, le=600, allow_inf_nan=False, strict=True)] = Field(
         default=0.0, description="Begin so much earlier, as far as the server still has it."
     )
     subject: Name | None = None
@@ -59,7 +69,7 @@ class MarkEvent(_Body):
     """An event."""
 
     label: Name = Field(examples=["stepped on a stone"])
-    t_ns: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
+    t_ns: Annotated[int, Field(ge=0, lt=2**63, strict=True)] | None = Field(
         default=None, description="Server's UTC; left out: now."
     )
     id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")] | None = Field(
@@ -137,7 +147,7 @@ async def list_sessions(
     q: Annotated[
         str | None, Query(max_length=200, description="Text in name, subject, notes, tag or node.")
     ] = None,
-) -> Page[SessionView]:
+) -> SessionPage:
     """A page of sessions."""
     found = [s for s in server.sessions.all() if q is None or _mentions(s, q.casefold())]
     if cursor is not None:
@@ -145,13 +155,19 @@ async def list_sessions(
         found = [session for session in found if (session.started_t_ns, session.id) < key]
     page = found[:limit]
     more = len(found) > limit
-    return Page(
+    return SessionPage(
         items=[SessionView.of(session, server.recorder) for session in page],
+        unreadable=server.sessions.unreadable,
         next_cursor=f"{page[-1].started_t_ns}.{page[-1].id}" if more else None,
     )
 
 
-@router.get("/{session_id}", operation_id="getSession", summary="A session", responses=_UNKNOWN)
+@router.get(
+    "/{session_id}",
+    operation_id="getSession",
+    summary="A session",
+    responses=_UNKNOWN,
+)
 async def get_session(session_id: str, server: ServerState) -> SessionView:
     """As it is now."""
     return SessionView.of(server.sessions.get(session_id), server.recorder)

@@ -75,17 +75,20 @@ async def _demo(
     from service.api.app import make_app
     from service.api.serve import listen, serving, token_for, urls_of
     from service.server.server import Server
+    from storage.private import keep_private
 
     stop = stop_on_signals()
+    keep_private(data)
     with listen(host, port) as listening:
         server = Server(data)
-        token = token_for(host, os.environ.get("FOOTTILE_TOKEN"), data)
+        given = os.environ.get("FOOTTILE_TOKEN")
+        token = token_for(host, given, data)
         remark(PREPARING)
         async with serving(make_app(server, token=token), listening):
             urls = urls_of(listening, host)
             node = await _start_node(urls[-1], token, node_arguments)
             try:
-                announce(urls, data, token)
+                announce(urls, data, token, is_kept=not given)
                 remark(f"what was recorded: foottile sessions --server {urls[-1]}")
                 ended = asyncio.create_task(node.wait())
                 stopped = asyncio.create_task(stop.wait())

@@ -6,12 +6,13 @@ import asyncio
 import os
 import re
 import socket
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from devices.errors import CalibrationError, MissingExtraError, UsageError
+from devices.errors import CalibrationError, MissingExtraError, StorageError, UsageError
 from service.cli.options import (
     FootOptions,
     remark,
@@ -75,6 +76,7 @@ def node_command(
     from service.node.dial import ingest_url
     from service.node.options import NodeOptions
     from service.rig.rig import RigOptions
+    from storage.private import keep_private
 
     if end_with_parent:
         from devices import realtime
@@ -84,16 +86,21 @@ def node_command(
         server = SERVER
     if server is not None:
         ingest_url(server)  # refuse a wrong address before anything else
+    if journal is not None and os.path.lexists(journal) and not journal.is_dir():
+        raise UsageError(f"--journal {str(journal)!r} is no folder", remedy="Choose another one")
     if record is not None and not record.strip():
         raise UsageError("--record without a name", expected="the name of the session")
     the_scene = scene_with(scene, bus=bus, servo=servo)
     rig = RigOptions(the_scene, _name(name), options.foot(the_scene))
     calibration, problem = calibration_of(rig)
+    folder = journal if journal is not None else user_state_path("foottile")
+    with suppress(StorageError):  # a card that takes nothing is said later, and stops nothing
+        keep_private(folder)
     outcome = asyncio.run(
         _run(
             NodeOptions(
                 rig=rig,
-                journal=journal if journal is not None else user_state_path("foottile"),
+                journal=folder,
                 server=server,
                 record=record,
                 calibration=calibration,

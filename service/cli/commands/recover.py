@@ -39,12 +39,14 @@ def recover_command(
     """
     from service.sessions.recover import recover
     from storage.durable import locked
+    from storage.private import keep_private
 
     if not any((folder / name).is_dir() for name in ("journal", "sessions")):
         raise UsageError(
             f"no data folder {str(folder)!r}",
             expected="a folder with `journal` and `sessions`, of a server or a node",
         )
+    keep_private(folder)
     with locked(folder), progress("opening journals") as tell:
         recovery = recover(folder, streams=streams, give_up=give_up, tell=tell)
     if as_json:
@@ -73,6 +75,7 @@ def _as_dict(recovery: Recovery) -> dict[str, Any]:
         "removed": [str(path) for path in recovery.removed],
         "cut_bytes": recovery.cut,
         "mended": recovery.mended,
+        "restored": recovery.restored,
         "problems": recovery.problems,
     }
 
@@ -84,6 +87,8 @@ def _tell(recovery: Recovery) -> None:
         say(f"{len(recovery.removed)} half-written files were removed")
     for session_id in recovery.mended:
         say(f"session {session_id}: events.parquet was written again")
+    for session_id in recovery.restored:
+        say(f"session {session_id}: session.json was made again from the files beside it")
     for found in recovery.sessions:
         say(f"session {found.session.id} ({found.session.name}): {_outcome(found)}")
         if found.problem:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -77,25 +79,49 @@ async def _serve(settings: Settings) -> None:
     from service.api.app import make_app
     from service.api.serve import listen, serving, token_for, urls_of
     from service.server.server import Server
+    from storage.private import keep_private
 
     stop = stop_on_signals()
+    keep_private(settings.data)
     with listen(settings.host, settings.port) as listening:
         server = Server(settings.data)
         token = token_for(settings.host, settings.token, settings.data)
         app = make_app(server, hosts=settings.allow_host, token=token)
         remark(PREPARING)
         async with serving(app, listening, settings):
-            announce(urls_of(listening, settings.host), settings.data, token)
+            announce(
+                urls_of(listening, settings.host),
+                settings.data,
+                token,
+                is_kept=not settings.token,
+            )
             await stop.wait()
 
 
 PREPARING = "preparing the models; on a new machine that takes some ten seconds"
 
 
-def announce(urls: list[str], data: Path, token: str | None) -> None:
-    """Say where the page is, and how a node gets there."""
+def announce(urls: list[str], data: Path, token: str | None, *, is_kept: bool) -> None:
+    """Say where the page is, and how a node gets there.
+
+    The token is shown on a terminal only: what is not one is often a log, which others may read.
+
+    Args:
+        urls: addresses of the server.
+        data: its data folder.
+        token: what it asks for.
+        is_kept: is the token the one that is kept in the data folder?
+    """
+    from service.api.serve import KEPT_IN
+
     for url in urls:
-        say(f"FootTile is at {url}/" + (f"#token={token}" if token else ""))
+        say(f"FootTile is at {url}/" + (f"#token={token}" if token and sys.stdout.isatty() else ""))
     remark(f"data in {data}; Ctrl-C ends it")
-    if token:
-        remark(f"a node: FOOTTILE_TOKEN={token} foottile node --scene FILE --server {urls[0]}")
+    if not token:
+        return
+    where = f"$(cat {shlex.quote(str(data / KEPT_IN))})" if is_kept else '"$FOOTTILE_TOKEN"'
+    if not sys.stdout.isatty():
+        place = f"in {data / KEPT_IN}" if is_kept else "the one that was given"
+        remark(f"its token is {place}; on the page it is asked for, or put #token=TOKEN behind /")
+    shown = token if sys.stderr.isatty() else where
+    remark(f"a node: FOOTTILE_TOKEN={shown} foottile node --scene FILE --server {urls[0]}")

@@ -297,3 +297,38 @@ def test_no_get_changes_anything(running: Running, node: FakeNode) -> None:
         for method in ("GET", "HEAD", "OPTIONS"):
             assert running.http.request(method, path).status_code < 500, path
     assert state() == before
+
+
+@pytest.mark.parametrize(
+    ("path", "allowed"),
+    [
+        ("/sessions", {"GET", "POST"}),
+        ("/sessions/20200101T000000Z-000000", {"GET", "PATCH", "DELETE"}),
+        ("/sessions/20200101T000000Z-000000/events", {"GET", "POST"}),
+        ("/sessions/20200101T000000Z-000000/data", {"GET", "HEAD"}),
+        ("/trash", {"GET", "DELETE"}),
+        ("/health", {"GET"}),
+    ],
+)
+def test_what_is_allowed_is_all_of_it(running: Running, path: str, allowed: set[str]) -> None:
+    for method in ("OPTIONS", "PUT"):
+        answer = running.http.request(method, path)
+        assert answer.status_code == (204 if method == "OPTIONS" else 405)
+        assert set(answer.headers["allow"].split(", ")) == {*allowed, "OPTIONS"}
+
+
+@pytest.mark.parametrize("wrong", [False, True, "1", 1.5, "2020-01-01", -1, 2**63, [], {}])
+def test_an_instant_is_a_number_and_nothing_like_it(
+    running: Running, tared: FakeNode, wrong: object
+) -> None:
+    recording = tared.record()
+    answer = running.http.post(f"{recording.url}/events", json={"label": "x", "t_ns": wrong})
+    assert answer.status_code == 422, answer.text
+    assert recording.now()["id"] == recording.id
+    assert running.http.get(f"{recording.url}/events").json()["items"] == []
+
+
+@pytest.mark.parametrize("wrong", [True, "1", [1], -1, 601, None])
+def test_a_pre_roll_is_a_number_and_nothing_like_it(running: Running, wrong: object) -> None:
+    body = {"node": "bench", "name": "x", "pre_roll_s": wrong}
+    assert running.http.post("/sessions", json=body).status_code == 422

@@ -16,6 +16,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 
+from service import server_clock
 from service.cli.main import main
 from service.client import Client
 from storage.checked_table import write_table
@@ -204,13 +205,14 @@ def test_a_node_nobody_measured_has_no_servers_time(
 
 
 def test_the_servers_clock_set_by_an_hour_is_a_step_of_the_session(
-    running: Running, node: FakeNode
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun(node, 0)
     session = node.record()
     node.send(50)
     measured(node, 0)
     node.send(50)
+    monkeypatch.setattr(server_clock, "_OFFSET_NS", server_clock._OFFSET_NS + HOUR_NS)
     measured(node, HOUR_NS)
     node.send(50)
     until(lambda: session.now()["frames"] == 150)
@@ -301,6 +303,7 @@ def test_two_nodes_that_saw_the_same_event_are_put_on_one_axis(
         session = node.record()
         node.send(100, [20.0, 60.0])
         if event_t_ns is None:
+            node.next_t_mono_ns += 10_000_000_000  # later than what the other takes before it
             event_t_ns = node.next_t_mono_ns + node.utc_offset_ns + offset_ns
         else:
             node.next_t_mono_ns = event_t_ns - node.utc_offset_ns - offset_ns
@@ -318,3 +321,18 @@ def test_two_nodes_that_saw_the_same_event_are_put_on_one_axis(
         assert abs(t_server_ns - event_t_ns) <= bound_ns < 2 * HALF_NS
     (left_ns, left_bound_ns), (right_ns, right_bound_ns) = seen.values()
     assert abs(left_ns - right_ns) <= left_bound_ns + right_bound_ns
+
+
+def test_a_measurement_that_has_the_servers_clock_elsewhere_is_not_kept(
+    running: Running, node: FakeNode
+) -> None:
+    """The server knows what its clock showed; a row that is absurd would move whole sessions."""
+    begun(node, 0)
+    now_ns = time.monotonic_ns()
+    for offset_ns in (-HOUR_NS, 90_000_000_000, 10**18, -(10**18)):
+        node.say_clock(offset_ns, t_mono_ns=now_ns)
+    node.say_clock(0, t_mono_ns=now_ns - HOUR_NS)
+    measured(node, 5)
+    assert running.node()["clock"]["server_minus_node_ns"] == 5
+    rows = running.call(lambda: list(running.server.nodes.get("bench").present.clock_rows))
+    assert [row.server_minus_node_ns for row in rows] == [0, 5]

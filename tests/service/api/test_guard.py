@@ -19,8 +19,32 @@ LIVE = "/api/v1/live"
 TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
 
 
+STRANGE_HOSTS = (
+    *("x@127.0.0.1", "evil.example@localhost", "x:y@127.0.0.1:80", "127.0.0.1/", "127.0.0.1?x"),
+    *(
+        "127.0.0.1#x",
+        "127.0.0.1:",
+        "127.0.0.1:x",
+        "127.0.0.1:123456",
+        "[127.0.0.1",
+        "::1",
+        "[::1]x",
+    ),
+    *("[localhost]", "[fe80::1%25eth0]", "0x7f.1", "localhost,evil.example"),
+)
+
+
 def test_a_host_of_another_name_is_refused(running: Running) -> None:
-    for host in ("evil.example", "evil.example:80", "127.0.0.1.evil.example", "", "[", "a b", "."):
+    for host in (
+        "evil.example",
+        "evil.example:80",
+        "127.0.0.1.evil.example",
+        "",
+        "[",
+        "a b",
+        ".",
+        *STRANGE_HOSTS,
+    ):
         for path in ("/health", "/sessions", "/nothing"):
             answer = running.http.get(path, headers={"Host": host})
             assert answer.status_code == 403, host
@@ -59,8 +83,15 @@ def test_a_websocket_of_another_host_is_refused(running: Running, path: str) -> 
     assert running.http.get(running.url + path, headers=headers).status_code == 403
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "", "//["])
+@pytest.mark.parametrize(
+    "origin",
+    [
+        *("http://evil.example", "null", "http://127.0.0.1:1", "", "//[", "//{ours}", "{ours}"),
+        *("http://x@{ours}", "http://{ours}/evil", "http://{ours}#", "ftp://{ours}"),
+    ],
+)
 def test_a_change_from_another_site_is_refused(running: Running, origin: str) -> None:
+    origin = origin.replace("{ours}", f"127.0.0.1:{running.port}")
     for method in ("POST", "PATCH", "DELETE", "PUT"):
         answer = running.http.request(
             method, "/sessions", json={"node": "x", "name": "x"}, headers={"Origin": origin}
@@ -112,7 +143,10 @@ CHANGES = (
 
 @pytest.mark.parametrize(
     "given",
-    [None, "", "Bearer", f"Bearer {TOKEN}x", f"Bearer {TOKEN[:-1]}", "Basic eDp5", "\xe9"],
+    [
+        *(None, "", "Bearer", f"Bearer {TOKEN}x", f"Bearer {TOKEN[:-1]}", "Basic eDp5", "\xe9"),
+        *(TOKEN, f"Basic {TOKEN}", f"Token {TOKEN}", f"Bearer{TOKEN}", f"Bearer Bearer {TOKEN}"),
+    ],
 )
 def test_a_change_without_the_token_is_refused(serve_with: ServeWith, given: str | None) -> None:
     running = serve_with(token=TOKEN)
@@ -130,6 +164,20 @@ def test_a_change_without_the_token_is_refused(serve_with: ServeWith, given: str
         pass
     assert refused.value.response.status_code == 401
     assert refused.value.response.headers["www-authenticate"] == "Bearer"
+
+
+def test_a_wrong_token_is_not_called_a_missing_one(serve_with: ServeWith) -> None:
+    running = serve_with(token=TOKEN)
+    for given, said in ((None, "is needed"), (TOKEN, "is needed"), ("Bearer x", "is not the")):
+        headers = {"Authorization": given} if given else {}
+        answer = running.http.post("/nodes/bench/tare", headers=headers)
+        assert said in answer.json()["detail"], given
+
+
+def test_two_tokens_are_none(serve_with: ServeWith) -> None:
+    running = serve_with(token=TOKEN)
+    twice = [("Authorization", f"Bearer {TOKEN}"), ("Authorization", "Bearer x")]
+    assert running.http.post("/nodes/bench/tare", headers=twice).status_code == 401
 
 
 def test_a_change_with_the_token_passes(serve_with: ServeWith, node_of: NodeOf) -> None:

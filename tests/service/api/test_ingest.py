@@ -281,4 +281,4 @@ def test_frames_of_an_earlier_stream_are_held_to_its_own_description(
     assert running.node()["last_seq"] == 19
     node.socket.send(json.dumps({"type": "stream", "boot_id": before.boot_id}))
     node.socket.send(node.payload(node.frames(10)))  # of three tiles
-    assert closed(node.socket)[0] == 4004
+    assert closed(node.socket)[0] == 4001

@@ -71,7 +71,7 @@ def test_a_frame_has_what_the_contract_says(running: Running, tared: FakeNode) -
 
 
 def test_the_age_of_a_frame_is_known_once_the_clocks_are(running: Running, tared: FakeNode) -> None:
-    tared.say_clock(0, uncertainty_ns=1000, t_mono_ns=5)
+    tared.say_clock(0, uncertainty_ns=1000)
     with running.socket(f"{LIVE}?rate_hz=60") as live:
         tared.send(30, now=True)
         frame = next_frame_from(live, tared.seq - 15)

@@ -266,7 +266,7 @@ def test_a_session_ends_by_the_servers_clock(tared: FakeNode) -> None:
     tared.restart()
     tared.utc_offset_ns -= hour_ns
     tared.connect()
-    tared.say_clock(hour_ns, t_mono_ns=5)
+    tared.say_clock(hour_ns)
     tared.deliver(20)
     session = tared.record()
     tared.deliver(30)

@@ -155,7 +155,8 @@ def test_an_event_after_sealing_is_in_the_events_file(running: Running, tared: F
 
 def test_clock_measurements_are_kept_beside_the_session(tared: FakeNode) -> None:
     session = tared.record()
-    tared.say_clock(1000, t_mono_ns=5)
+    t_mono_ns = tared.next_t_mono_ns
+    tared.say_clock(1000)
     tared.deliver(20)
     tared.finish(session)
     path = session.folder / "clock.parquet"
@@ -164,7 +165,7 @@ def test_clock_measurements_are_kept_beside_the_session(tared: FakeNode) -> None
     assert [later] == [
         {
             "boot_id": tared.boot_id,
-            "t_mono_ns": 5,
+            "t_mono_ns": t_mono_ns,
             "server_minus_node_ns": 1000,
             "uncertainty_ns": 7,
         }
@@ -177,7 +178,7 @@ def test_clock_measurements_outlive_the_server_without_rewriting_the_session_eac
     session = tared.record()
     written = (session.folder / "session.json").read_bytes()
     for number in range(3):
-        tared.say_clock(number, t_mono_ns=10**15 + number)
+        tared.say_clock(number, t_mono_ns=time.monotonic_ns())
     tared.deliver(20)
     assert (session.folder / "session.json").read_bytes() == written
     running.restart()
@@ -275,7 +276,7 @@ def test_tares_count_by_the_frames_own_time_however_wrong_the_nodes_date_is(node
     years_ns = 4 * 365 * 86_400 * 1_000_000_000
     node.utc_offset_ns += years_ns
     node.connect()
-    node.say_clock(-years_ns, t_mono_ns=5)
+    node.say_clock(-years_ns)
     node.tared()
     node.taken_in()
     session = node.record()

@@ -51,7 +51,7 @@ def changed(value: object) -> object:
     scale_kpa=st.floats(0.01, 100),
     high_kpa=st.floats(0.1, 100),
     variance=st.floats(0, 1),
-    serial=st.text(min_size=1, max_size=8),
+    serial=st.text(st.characters(exclude_categories=["C"]), min_size=1, max_size=8),
 )
 def test_a_calibration_survives_its_json_bit_by_bit(
     c: tuple[float, float, float, float],

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from service.node.sending import Backlog
 from storage.intervals import Intervals
+from tests.waiting import until
 
 pairs = st.lists(
     st.tuples(st.integers(0, 60), st.integers(0, 20)).map(lambda p: (p[0], p[0] + p[1])), max_size=4
@@ -58,3 +62,24 @@ def test_a_stream_that_nobody_lacked_anything_of_can_fall_behind() -> None:
     assert backlog.next(10) is None
     backlog.add("a", 5, 9)
     assert backlog.next(3) == ("a", 5, 7)
+
+
+class Meanwhile(Intervals):
+    """Numbers that are overtaken by the loop just when a thread takes some off."""
+
+    overtake: Callable[[], None]
+
+    def __sub__(self, other: Intervals) -> Intervals:
+        left = super().__sub__(other)
+        adding = threading.Thread(target=Meanwhile.overtake)
+        adding.start()
+        adding.join(0.2)  # it may have to wait until that is done
+        return left
+
+
+def test_what_is_added_while_a_thread_takes_off_what_is_done_is_not_forgotten() -> None:
+    backlog = Backlog([("a", Meanwhile([(0, 5)]))])
+    Meanwhile.overtake = staticmethod(lambda: backlog.add("a", 8, 9))
+    backlog.done("a", 0, 3)
+    until(lambda: backlog.count == 4)
+    assert sent(backlog, 10) == [("a", 4, 5), ("a", 8, 9)]

@@ -106,7 +106,7 @@ async def test_a_wrong_token_is_reported_once_and_it_keeps_trying(
         await publishing.until(lambda: publishing.reports)
         await asyncio.sleep(0.5)  # several attempts
     [reason] = publishing.reports
-    assert "FOOTTILE_TOKEN" in reason
+    assert "FOOTTILE_TOKEN is not the server's token" in reason
     assert running.http.get("/nodes").json()["items"] == []
 
 

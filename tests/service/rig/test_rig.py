@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from devices.array.array import TileArray
+from devices.array.startup import Ready
 from devices.frames import FrameStatus
 from devices.scene.file import load_scene
 from service.rig.emulated import EmulatedFoot
@@ -21,12 +21,28 @@ def test_a_machine_that_is_busy_during_the_trial_frames_does_not_use_up_the_lead
     # A hundred trial frames took as long as the lead; no frame was marked, and nothing was tared.
     measured = Rig._bus_hz
 
-    def slow(rig: Rig, array: TileArray) -> float:
+    def slow(rig: Rig, ready: Ready) -> float:
         time.sleep(0.6)
-        return measured(rig, array)
+        return measured(rig, ready)
 
     monkeypatch.setattr(Rig, "_bus_hz", slow)
     with ExitStack() as stack:
         rig = Rig(RigOptions(load_scene("standing"), "busy", EmulatedFoot(lead_s=0.5)), stack)
         first = next(rig.batches(lambda: False))
     assert first.frame_status[0] & FrameStatus.LEAD
+
+
+@pytest.mark.slow
+def test_a_stream_that_is_faster_than_its_bus_was_measured_to_be_goes_on_as_one_that_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Rig, "_bus_hz", lambda rig, ready: 30.0)  # the start was that busy
+    with ExitStack() as stack:
+        rig = Rig(RigOptions(load_scene("standing"), "busy", EmulatedFoot(lead_s=0.2)), stack)
+        first, boot_id = list(rig.batches(lambda: False)), rig.info.boot_id
+        assert not first[-1].frame_status[-1] & FrameStatus.LEAD, "a lead is never broken off"
+        second = next(rig.batches(lambda: False))
+    assert rig.info.nominal_rate_hz > 40.0
+    assert rig.info.boot_id == boot_id
+    assert second.seq[0] == 0
+    assert second.t_mono_ns[0] > first[-1].t_mono_ns[-1]

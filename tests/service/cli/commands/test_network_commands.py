@@ -305,15 +305,20 @@ def test_settings_come_from_option_environment_and_file_in_that_order(tmp_path: 
 
 
 def test_off_loopback_a_token_is_made_kept_and_asked_for(tmp_path: Path) -> None:
-    serve = subprocess.Popen(
-        [*COMMAND, "serve", "--host=0.0.0.0", "--port", "0", "--data", str(tmp_path)],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    log = tmp_path.with_name("log")
+    with log.open("w") as stderr:
+        serve = subprocess.Popen(
+            [*COMMAND, "serve", "--host=0.0.0.0", "--port", "0", "--data", str(tmp_path)],
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+        )
     assert serve.stdout is not None
-    url, token = serve.stdout.readline().split()[-1].split("/#token=")
+    line = serve.stdout.readline()
+    url = line.split()[-1].rstrip("/")
     url = f"http://127.0.0.1:{url.rsplit(':', 1)[1]}"
     assert (tmp_path / "token").stat().st_mode & 0o077 == 0
+    token = (tmp_path / "token").read_text().strip()
     refused = httpx.post(f"{url}/api/v1/nodes/x/tare", trust_env=False)
     allowed = httpx.post(
         f"{url}/api/v1/nodes/x/tare", headers={"Authorization": f"Bearer {token}"}, trust_env=False
@@ -323,6 +328,9 @@ def test_off_loopback_a_token_is_made_kept_and_asked_for(tmp_path: Path) -> None
     assert by_name.status_code == 403
     serve.terminate()
     assert ended(serve) == 0
+    said = log.read_text()
+    assert str(tmp_path / "token") in said
+    assert token not in said + line  # they may be a log
 
 
 def test_a_port_that_is_taken_by_somebody_else_is_named(tmp_path: Path) -> None:

@@ -1,0 +1,91 @@
+"""What the frames of a stream keep to: a server asks before it takes them, and `verify` after.
+
+Both ask here, so nothing is acknowledged, sealed and called complete that is called damaged later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Times
+from devices.facts import T_MONO_NS_END, T_NS_END
+from devices.frames import (
+    NO_SERVO_AGE,
+    NOT_READ,
+    ArrayInfo,
+    FrameBatch,
+    FrameStatus,
+    TileStatus,
+)
+
+COUNTS_MAX = 1023
+_OFFSET_MAX_US = 60_000_000
+"""A tile is read in its own frame, and no frame takes a minute."""
+_FORCE_MAX_N = 1e6
+_TILE_BITS = sum(TileStatus)
+_FRAME_BITS = sum(FrameStatus)
+
+Wrong = npt.NDArray[np.bool_]
+
+
+def broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
+    """Why these cannot be frames of this array, in words; empty if they can.
+
+    Args:
+        frames: of one message, `seq` rising by one.
+        info: the array of their stream.
+    """
+    for rule, wrong in _rules(frames, info):
+        rows = np.flatnonzero(wrong if wrong.ndim == 1 else wrong.any(axis=1))
+        if len(rows):
+            return f"{rule} in frame {int(frames.seq[rows[0]])}"
+    return ""
+
+
+def out_of_range(t_mono_ns: Times, t_ns: Times) -> Wrong:
+    """Which instants, int64[n] each, no clock says; of all others differences fit 64 bits."""
+    mono = (t_mono_ns <= -T_MONO_NS_END) | (t_mono_ns >= T_MONO_NS_END)
+    return mono | (t_ns < 0) | (t_ns >= T_NS_END)
+
+
+def runs_back(t_ns_first: Times, t_ns_last: Times) -> npt.NDArray[np.intp]:
+    """Which batches begin before the one before them has ended.
+
+    Args:
+        t_ns_first: int64[n], instant of each batch's first frame; batches in order of numbers.
+        t_ns_last: int64[n], instant of its last one.
+    """
+    return np.flatnonzero(t_ns_first[1:] < t_ns_last[:-1]) + 1
+
+
+def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Wrong]]:
+    t_mono_ns, t_ns = frames.t_mono_ns, frames.t_ns
+    # This first: within the range no difference of instants wraps.
+    yield (
+        "t_ns is outside of the years 1970 to 2199, or t_mono_ns beyond 36 years",
+        out_of_range(t_mono_ns, t_ns),
+    )
+    yield (
+        f"t_ns is not t_mono_ns plus the {info.utc_offset_ns} ns announced with the stream",
+        t_ns - t_mono_ns != info.utc_offset_ns,
+    )
+    yield "t_mono_ns runs backwards", np.diff(t_mono_ns, prepend=t_mono_ns[:1]) < 0
+    for name in ("padc", "tadc"):
+        counts = getattr(frames, name)
+        yield f"{name} has more than 10 bits", (counts > COUNTS_MAX) & (counts != NOT_READ)
+    offset_us = frames.sample_offset_us
+    yield (
+        "a tile was sampled more than a minute away",
+        (offset_us > _OFFSET_MAX_US) | (offset_us < -_OFFSET_MAX_US),
+    )
+    yield "servo_age_us is negative", frames.servo_age_us < NO_SERVO_AGE
+    yield "status has bits that mean nothing", (frames.status & ~np.uint8(_TILE_BITS)) != 0
+    yield (
+        "frame_status has bits that mean nothing",
+        (frames.frame_status & ~np.uint8(_FRAME_BITS)) != 0,
+    )
+    force_n = frames.reference_force_n
+    yield "reference_force_n is no force", ~np.isnan(force_n) & ~(np.abs(force_n) <= _FORCE_MAX_N)

@@ -1,0 +1,41 @@
+"""Who may read what a process writes: its user, unless the folder's owner lets a group in."""
+
+from __future__ import annotations
+
+import os
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+from storage.durable import LOCK_NAME, make_folder, storage_errors
+
+
+def keep_private(folder: Path) -> None:
+    """What this process writes from now on is for its user, whatever the umask was.
+
+    A folder that is made here, or is empty, or is ours and every user could read it, is closed to
+    others. One that its owner has opened to its group, and to it only, stays so, and what is
+    written is the group's to read.
+
+    Args:
+        folder: where it will write; made if absent.
+
+    Raises:
+        StorageError: it cannot be made.
+    """
+    os.umask(0o077)
+    with storage_errors(folder):
+        make_folder(folder)
+    mode = stat.S_IMODE(folder.stat().st_mode)
+    if mode & 0o050 and not mode & 0o007:
+        os.umask(0o027)
+    elif mode & 0o077 and _is_ours(folder):
+        with suppress(PermissionError):  # another user's, as some mounted disks are
+            folder.chmod(mode & ~0o077)
+
+
+def _is_ours(folder: Path) -> bool:
+    """Is there nothing in it but what we wrote? Somebody's home is not ours to close."""
+    known = {"server_id", LOCK_NAME, "journal", "nodes", "sessions", "state.json"}
+    names = {path.name for path in folder.iterdir()}
+    return not names or bool(names & known)

@@ -1,0 +1,98 @@
+"""Connected is who was heard of in the last five seconds, whatever happened to him."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from websockets.sync.client import ClientConnection
+
+from service.link import SILENCE_S
+from tests.faults.proxy import Proxy
+from tests.service.fake_node import FakeNode
+from tests.service.running import Running
+from tests.waiting import until
+
+pytestmark = pytest.mark.real_time
+
+LOOKING_S = 1.5
+"""What looking takes, beside other tests."""
+
+
+class Through:
+    """A server as it is reached over a link that may fail."""
+
+    def __init__(self, running: Running, link: Proxy) -> None:
+        self._running = running
+        self._over = Running(running.data)
+        self._over.port = link.port
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._running, name)
+
+    def socket(self, path: str, **options: Any) -> ClientConnection:
+        return self._over.socket(path, **options)
+
+
+@pytest.fixture
+def link(running: Running) -> Iterator[Proxy]:
+    with Proxy(running.port) as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def far(running: Running, link: Proxy) -> Iterator[FakeNode]:
+    """A tared node behind that link."""
+    node = FakeNode(Through(running, link))  # type: ignore[arg-type]  # reached another way
+    node.connect()
+    node.tared()
+    yield node
+    link.mend()
+    node.close()
+
+
+def disconnected_within(running: Running, seconds: float) -> bool:
+    begin_s = time.monotonic()
+    until(lambda: not running.node()["connected"], seconds + LOOKING_S)
+    return time.monotonic() - begin_s < seconds + LOOKING_S
+
+
+def test_a_node_out_of_reach_is_away_five_seconds_after_its_last_word(
+    running: Running, link: Proxy, far: FakeNode
+) -> None:
+    assert running.node()["connected"]
+    link.black_hole()
+    assert disconnected_within(running, SILENCE_S)
+    node = running.node()
+    assert node["rate_hz"] is None
+    refused = running.http.post("/sessions", json={"node": "bench", "name": "late"})
+    assert refused.status_code == 409
+    assert "is not sending" in refused.json()["detail"]
+
+
+def test_a_node_that_takes_nothing_in_is_away_as_soon(
+    running: Running, link: Proxy, far: FakeNode
+) -> None:
+    # What the server owes it does not get through either: closing must not be waited for.
+    far.send(200)
+    running.call(lambda: running.server.links["bench"].acknowledge("0" * 32, far.acked))
+    link.black_hole()
+    assert disconnected_within(running, SILENCE_S)
+
+
+def test_a_node_whose_process_is_killed_is_away_at_once(
+    running: Running, link: Proxy, far: FakeNode
+) -> None:
+    link.cut()  # the kernel of a killed process says RST
+    assert disconnected_within(running, 0.5)
+
+
+def test_a_rate_is_of_the_last_second_and_none_when_nothing_comes(
+    running: Running, far: FakeNode
+) -> None:
+    far.send(200)
+    far.taken_in()
+    assert running.node()["rate_hz"] > 0.0
+    until(lambda: running.node()["rate_hz"] == 0.0, 4.0)

@@ -1,0 +1,65 @@
+"""What a process writes is its user's, whatever the umask was."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from storage.durable import make_folder, write_whole
+from storage.private import keep_private
+
+
+@pytest.fixture(autouse=True)
+def _umask() -> Iterator[None]:
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+def mode_of(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def written(folder: Path) -> tuple[int, int]:
+    """Modes of a folder and a file that are made in it."""
+    make_folder(folder / "inner")
+    write_whole(folder / "inner" / "file", b"x")
+    return mode_of(folder / "inner"), mode_of(folder / "inner" / "file")
+
+
+def test_a_folder_that_is_made_is_its_users(tmp_path: Path) -> None:
+    keep_private(tmp_path / "a" / "data")
+    assert mode_of(tmp_path / "a" / "data") == 0o700
+    assert written(tmp_path / "a" / "data") == (0o700, 0o600)
+
+
+@pytest.mark.parametrize("found", [(), ("server_id", "journal"), (".lock",)])
+def test_a_folder_of_ours_that_all_could_read_is_closed(
+    tmp_path: Path, found: tuple[str, ...]
+) -> None:
+    for name in found:
+        (tmp_path / name).touch()
+    tmp_path.chmod(0o755)
+    keep_private(tmp_path)
+    assert mode_of(tmp_path) == 0o700
+
+
+def test_somebodys_home_stays_as_it_is_but_what_we_write_there_is_closed(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").touch()
+    tmp_path.chmod(0o755)
+    keep_private(tmp_path)
+    assert mode_of(tmp_path) == 0o755
+    assert written(tmp_path) == (0o700, 0o600)
+
+
+@pytest.mark.parametrize("mode", [0o750, 0o770, 0o2750])
+def test_a_group_that_the_owner_let_in_may_read(tmp_path: Path, mode: int) -> None:
+    tmp_path.chmod(mode)
+    keep_private(tmp_path)
+    assert mode_of(tmp_path) == mode
+    folder, file = written(tmp_path)
+    assert (folder & 0o777, file) == (0o750, 0o640)

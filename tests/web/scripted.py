@@ -1,0 +1,49 @@
+"""A server in this process, and a node that does what a test has it do."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from tests.service.fake_node import FakeNode, Play
+from tests.service.recording import Recording
+from tests.service.running import Running
+
+
+class Scripted:
+    """A server, and a node that streams whenever the test does not have it do otherwise."""
+
+    def __init__(self, folder: Path) -> None:
+        self.running = Running(folder / "data")
+        self.running.start()
+        self.node = FakeNode(self.running)
+        self.node.connect()
+        self.node.tared()
+
+    @property
+    def url(self) -> str:
+        return self.running.url
+
+    def recorded(self, name: str) -> Recording:
+        """A sealed session."""
+        with Play(self.node):
+            session = self.node.record(name=name)
+            time.sleep(0.2)
+            session.stop()
+            session.sealed()
+        return session
+
+    def pending(self, name: str) -> Recording:
+        """A session with a hundred frames that are still with the node."""
+        session = self.node.record(name=name)
+        self.node.next_t_mono_ns = time.monotonic_ns()
+        self.node.frames(100)
+        self.node.send(50)
+        time.sleep(0.4)
+        session.stop()
+        self.node.send(10, now=True)
+        return session
+
+    def close(self) -> None:
+        self.node.close()
+        self.running.stop()

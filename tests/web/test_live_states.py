@@ -1,0 +1,159 @@
+"""One truth on the page: what is counted, who is there, and where what is typed goes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.service.fake_node import Play
+from tests.service.recording import Recording
+from tests.waiting import until
+from tests.web.scripted import Scripted
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+LIVE = "body[data-live=true]"
+
+
+def row_of(page: Page, session: Recording) -> Any:
+    return page.locator(f'#sessions [data-session-id="{session.id}"]')
+
+
+def counted(page: Page, session: Recording) -> tuple[int, ...]:
+    """Frames of a recording as the page, its list, REST and the ledger say."""
+    said = page.locator("#recordings .recording-text").inner_text()
+    found = re.search(r"([\d,]+) frames", said)
+    assert found is not None, said
+    listed = row_of(page, session).locator(".c-frames").inner_text()
+    here = [int(text.replace(",", "")) for text in (found[1], listed)]
+    ledger = sum(part["recorded"] for part in session.ledger()["parts"])
+    return (*here, session.now()["frames"], ledger)
+
+
+def test_frames_are_counted_once_by_the_ledger_whatever_becomes_of_the_node(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    node = scripted.node
+    session = node.record(name="walk")
+    page = open_page(scripted.url)
+    with Play(node):
+        expect(page.locator(LIVE)).to_have_count(1, timeout=20_000)
+        until(lambda: session.now()["frames"] > 300)
+    node.frames(40)  # taken, and not sent before it is killed
+    for _ in range(3):
+        node.leave()
+        node.connect()
+        node.send(20)
+    node.leave()
+    total = session.now()["frames"]
+    until(lambda: counted(page, session) == (total,) * 4, 8.0)
+    page.reload()
+    expect(page.locator("#recordings li")).to_have_count(1)
+    until(lambda: counted(page, session) == (total,) * 4, 8.0)
+
+
+def test_a_page_opened_after_the_node_died_tells_one_story(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    scripted.node.leave()
+    page = open_page(scripted.url)
+    expect(page.locator("#frozen")).to_contain_text("No data for")
+    expect(page.locator("#frozen")).to_contain_text("Node bench is away.")
+    expect(page.locator("#age")).to_contain_text("ago")
+    for button in ("#record", "#tare"):
+        expect(page.locator(button)).to_be_disabled()
+    expect(page.locator("#cannot-record")).to_have_text("Record and Tare wait: node bench is away.")
+    page.keyboard.press("r")
+    expect(page.locator("#notices")).to_contain_text("Node bench is away.")
+    assert scripted.running.sessions() == []
+    scripted.node.connect()
+    with Play(scripted.node):
+        expect(page.locator(LIVE)).to_have_count(1, timeout=20_000)
+        expect(page.locator("#record")).to_be_enabled()
+        expect(page.locator("#cannot-record")).to_be_hidden()
+
+
+def test_a_node_out_of_reach_is_away_on_the_page_within_five_seconds(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    page = open_page(scripted.url)
+    with Play(scripted.node):
+        expect(page.locator(LIVE)).to_have_count(1, timeout=20_000)
+    # Nothing comes any more, and nobody says goodbye: as when a cable is pulled.
+    expect(page.locator("#frozen")).to_contain_text("silent, though connected", timeout=3000)
+    expect(page.locator("#frozen")).to_contain_text("Node bench is away.", timeout=7000)
+
+
+def test_what_follows_a_labelled_mark_is_a_shortcut_again(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    session = scripted.node.record(name="walk")
+    page = open_page(scripted.url)
+    with Play(scripted.node):
+        expect(page.locator("#mark")).to_be_enabled()
+        page.focus("#mark-label")
+        page.keyboard.type("a stone")
+        page.keyboard.press("Enter")
+        page.keyboard.press("s")
+        expect(page.locator("#recordings")).to_be_hidden()
+        assert page.input_value("#mark-label") == ""
+        session.sealed()
+    events = scripted.running.http.get(f"{session.url}/events").json()["items"]
+    assert [event["label"] for event in events] == ["a stone"]
+
+
+@pytest.mark.parametrize("field", ["#mark-label", "#session-name"])
+def test_escape_empties_a_field_and_leaves_it(
+    scripted: Scripted, open_page: OpenPage, field: str
+) -> None:
+    page = open_page(scripted.url)
+    page.focus(field)
+    page.keyboard.type("rest")
+    page.keyboard.press("Escape")
+    assert page.input_value(field) == ""
+    assert page.evaluate("document.activeElement === document.body")
+
+
+def ends_open(scripted: Scripted) -> Recording:
+    """A session of which nothing is missing, stopped while its node was away."""
+    session = scripted.node.record(name="walk")
+    scripted.node.deliver(50)
+    scripted.node.leave()
+    assert session.stop()["state"] == "pending"
+    return session
+
+
+def test_a_session_whose_end_alone_is_open_says_so_and_completes_when_the_node_is_back(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    session = ends_open(scripted)
+    now = session.now()
+    assert (now["pending_frames"], now["waits_for"]) == (0, "end")
+    page = open_page(scripted.url)
+    row = row_of(page, session)
+    expect(row).to_contain_text("Only its end is open")
+    expect(row.get_by_role("button", name="Seal with what is here")).to_be_visible()
+    expect(row.get_by_role("button", name="Seal without")).to_have_count(0)
+    scripted.node.connect()
+    scripted.node.send(10, now=True)
+    expect(row.locator(".state")).to_have_text("complete", timeout=15_000)
+    assert session.now()["waits_for"] is None
+
+
+def test_a_session_whose_node_never_comes_back_is_sealed_with_what_is_here(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    session = ends_open(scripted)
+    page = open_page(scripted.url)
+    row = row_of(page, session)
+    row.get_by_role("button", name="Seal with what is here").click()
+    expect(page.locator("#ask-dialog")).to_contain_text("is given up")
+    page.get_by_role("button", name="Seal as lossy").click()
+    expect(row.locator(".state")).to_have_text("lossy", timeout=15_000)
+    expect(row).to_contain_text("more may be missing where the node could not tell its end")
+    assert session.now()["frames"] == 50
