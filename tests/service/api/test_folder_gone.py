@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import storage.sessions.folder
 from devices.errors import FolderGoneError, StorageError
 from service.server.data_folder import DataFolder
 from storage.durable import LOCK_NAME
@@ -19,11 +20,19 @@ from storage.intervals import Intervals
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, Play
 from tests.service.running import Running, assert_refused, closed
+from tests.storage.faulty_disk import refusing
 from tests.waiting import until
 
 
 def files_in(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def delete(folder: Path) -> None:
+    """All at once, before something new is written into it."""
+    doomed = folder.with_name("doomed")
+    folder.rename(doomed)
+    shutil.rmtree(doomed)
 
 
 def nothing(data: Path) -> None:
@@ -111,7 +120,7 @@ def test_a_recording_is_complete_although_the_folder_was_away_in_the_middle(
 def test_frames_whose_own_file_was_deleted_are_not_acknowledged(
     running: Running, tared: FakeNode
 ) -> None:
-    shutil.rmtree(running.data / "journal" / "bench")
+    delete(running.data / "journal" / "bench")
     tared.send(30, 20.0)
     until(lambda: running.node()["storage_problem"])
     tared.socket.send('{"type":"probe","id":1}')
@@ -120,7 +129,7 @@ def test_frames_whose_own_file_was_deleted_are_not_acknowledged(
 
 
 def test_a_folder_that_was_deleted_is_not_made_again(running: Running, tared: FakeNode) -> None:
-    shutil.rmtree(running.data)
+    delete(running.data)
     with Play(tared, 20.0):
         until(lambda: running.node()["storage_problem"])
         assert_refused(running.http.get("/ready"), 503, "nothing in its place")
@@ -191,3 +200,15 @@ def test_a_disk_that_is_unmounted_takes_nothing_and_its_mount_point_neither(moun
         folder.check_writable()
     assert list(mounted.iterdir()) == []
     folder.close()
+
+
+def test_a_start_that_a_full_disk_refuses_leaves_nothing(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = refusing(StorageError, "No space left on device")
+    with monkeypatch.context() as patched:
+        patched.setattr(storage.sessions.folder, "write_checked", full)
+        assert_refused(running.http.post("/sessions", json={"node": "bench", "name": "x"}), 507)
+    assert list((running.data / "sessions").iterdir()) == []
+    assert running.sessions() == []
+    assert tared.finish(tared.record())["complete"] is True
