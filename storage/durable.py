@@ -20,7 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
-from devices.errors import DamagedFileError, FolderGoneError, StorageError
+from devices.errors import DamagedFileError, FolderGoneError, FootTileError, StorageError
 
 _TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp")
 _OLDER_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
@@ -220,9 +220,13 @@ def locked(
     Raises:
         StorageError: another process holds it (`errno` is None), or it cannot be opened.
     """
+    path = folder / LOCK_NAME
     with storage_errors(folder):
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            set_aside(path)
         # Opening for reading is enough for a lock, and works on a disk that takes no more writes.
-        descriptor = os.open(folder / LOCK_NAME, os.O_RDONLY | os.O_CREAT, 0o666)
+        flags = os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+        descriptor = os.open(path, flags, 0o666)
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -291,3 +295,11 @@ def set_aside(path: Path) -> Path:
         path.rename(aside)
         sync_folder(path.parent)
     return aside
+
+
+def put_aside(path: Path, why: FootTileError) -> str:
+    """Set aside what turned out to be damaged, if that can be; what happened, in words."""
+    try:
+        return f"{why}; it is kept as {set_aside(path).name}"
+    except StorageError as error:
+        return f"{why}; it cannot be set aside: {error.what}"

@@ -26,6 +26,7 @@ const NODE_KEY = "foottile.node";
 
 const state = {
   nodes: new Map(),
+  problems: [], // what the server found damaged on its disk
   wanted: null, // name of the node to show: survives a restart of the server
   node: null, // the chosen one, as the server last described it
   frame: null, // the newest frame of the chosen node; spans merged since the last drawing
@@ -52,6 +53,7 @@ const actions = new Actions(state, marks, takeSession);
 const handlers = {
   hello(message) {
     state.nodes = new Map((message.nodes ?? []).map((node) => [node.node, node]));
+    state.problems = message.problems ?? [];
     state.recordings.clear();
     (message.recording ?? []).forEach(takeSession);
     chooseNode();
@@ -187,7 +189,7 @@ function tick() {
   // The chosen node may not be known yet: the banner still says that the server is not there.
   status.draw(node ?? { node: "?", tiles: [] }, state.heard, nowMs, state.serverNowMs());
   state.cannotRecord = node ? status.cannotRecord : "";
-  if (node) notes.draw(node, state.frame, nowMs, state.serverNowMs());
+  notes.draw(node, state.frame, nowMs, state.serverNowMs(), state.problems);
   tares.draw(node);
   actions.draw();
 }

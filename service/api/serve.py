@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import secrets
 import socket
 from collections.abc import AsyncIterator, Iterator
@@ -13,13 +14,15 @@ from pathlib import Path
 import uvicorn
 from fastapi import FastAPI
 
-from devices.errors import LinkError
+from devices.errors import DamagedFileError, LinkError
 from service.api.doors import Bounds, Doors, open_files_max
 from service.api.guard import is_loopback
 from service.api.protocols import DoorsConfig, Http, WebSocket, accept
 from service.estimation.warm import warm_up
 from service.link import MESSAGE_BYTES_MAX
-from storage.durable import storage_errors, write_whole
+from storage.durable import put_aside, read_whole, storage_errors, write_whole
+
+log = logging.getLogger("foottile.serve")
 
 KEPT_IN = "token"
 """File of the data folder with the token that was made."""
@@ -87,13 +90,25 @@ def token_for(host: str, given: str | None, data: Path) -> str | None:
     if given or is_loopback(host):
         return given or None
     path = data / KEPT_IN
+    try:
+        kept = read_whole(path).decode("ascii", "replace").strip()
+        if not _TOKEN.fullmatch(kept):
+            raise DamagedFileError("it holds no token", where=str(path))  # noqa: TRY301
+    except FileNotFoundError:
+        pass
+    except DamagedFileError as error:
+        log.warning("%s, and a new token is made", put_aside(path, error))
+    else:
+        return kept
     with storage_errors(path):
-        kept = path.read_text().strip() if path.exists() else ""
-        if not kept:
-            data.mkdir(parents=True, exist_ok=True)
-            kept = secrets.token_urlsafe(18)
-            write_whole(path, kept.encode() + b"\n", mode=0o600)
+        data.mkdir(parents=True, exist_ok=True)
+        kept = secrets.token_urlsafe(18)
+        write_whole(path, kept.encode() + b"\n", mode=0o600)
     return kept
+
+
+_TOKEN = re.compile(r"[!-~]{8,200}")
+"""What people may have put there themselves, too."""
 
 
 @asynccontextmanager

@@ -43,6 +43,8 @@ class EstimateStatus(IntFlag):
     """The tare was long ago, or at another temperature that no model corrects."""
     OVER_RATED = 256
     """A tile is above the chip's 115 kPa, but within its calibration."""
+    TARE_LOST = 512
+    """The tare that was in force is damaged on disk: no pressure and no force is known."""
 
 
 @dataclass(frozen=True)

@@ -207,7 +207,8 @@ def apparent_forces(
         state = replace(state, gas=warm, bound_ns=last_ns)
     static_kpa = settled_kpa - plan.baseline_kpa
     static = ladder.curves.force(static_kpa)
-    status[np.isnan(static.force_n).any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
+    unknown = np.isnan(kpa[:, columns] if plan.tare.is_lost else static.force_n)
+    status[unknown.any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
     # After a bound the gas' temperature is unknown until it has cooled.
     beyond = (static_kpa > ladder.curves.high_kpa) | uncertain
     status[beyond.any(axis=1)] |= np.uint16(EstimateStatus.SATURATED)
@@ -259,12 +260,14 @@ def _frame_status(
     status = np.zeros(len(frames), dtype=np.uint16)
     known = ~np.isnan(kpa)
     status[broken] |= np.uint16(EstimateStatus.GAP)
+    if plan.assumed_scale:
+        status |= np.uint16(EstimateStatus.ASSUMED_SCALE)
+    if plan.tare.is_lost:
+        return status | np.uint16(EstimateStatus.TARE_LOST)
     doubtful = frames.t_ns - plan.tare.t_ns > TARE_OLD_NS
     if plan.ladder.temperature is None:
         doubtful |= (known & has_warmed(plan.tare, frames.tadc))[:, plan.bearing].any(axis=1)
     status[doubtful] |= np.uint16(EstimateStatus.TARE_OLD)
-    if plan.assumed_scale:
-        status |= np.uint16(EstimateStatus.ASSUMED_SCALE)
     return status
 
 

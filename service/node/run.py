@@ -28,6 +28,8 @@ _DRAIN_S = 3.0
 """A node that is stopped waits no longer for the server."""
 _AWAY_LOOKS = 50
 """After this many looks without a link, a second in all, it waits no longer."""
+_PROBLEMS_MAX, _PROBLEM_LENGTH = 20, 400
+"""What a server is told of what was found damaged; all of it was said here."""
 _TROUBLES_S = 0.5
 """Between two looks at what is wrong."""
 _SILENT_S = 2.0
@@ -98,6 +100,8 @@ class RunningNode:
             emulated=options.rig.emulated,
             report=report,
         )
+        for problem in journal.problems:
+            report(problem)
         self._health = Health()
         self._present: NodeStream | None = None
         self._messages: asyncio.Queue[Message] = asyncio.Queue()
@@ -209,7 +213,12 @@ class RunningNode:
         return Status(
             missed_slots=self._present_stream().missed_slots,
             backlog_frames=backlog_frames,
-            troubles=(*self._silence(), *self._health.troubles, *self._journal.troubles),
+            troubles=(
+                *self._silence(),
+                *self._health.troubles,
+                *self._journal.troubles,
+                *(problem[:_PROBLEM_LENGTH] for problem in self._journal.problems[:_PROBLEMS_MAX]),
+            ),
             counts={serial: dict(counts) for serial, counts in self._health.counts.items()},
         )
 

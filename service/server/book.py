@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from devices.errors import StateError, StorageError, UnknownError
@@ -54,8 +54,8 @@ class Trash:
         for doomed in folder.glob(DOOMED_PREFIX + "*"):
             shutil.rmtree(doomed, ignore_errors=True)
         found, unreadable = load_or_restore(self.folder)
-        self.has_unreadable = bool(unreadable)
-        """Is there one that cannot be read?"""
+        self.problems = [f"in the trash, {text}" for text in _in_words(unreadable)]
+        """Sessions that cannot be read, and why."""
         self._sessions = {session.id: session for session in found}
 
     def __contains__(self, session_id: str) -> bool:
@@ -132,7 +132,9 @@ class SessionBook:
         self.changed = changed
         found, self.unreadable = load_or_restore(folder)
         """By id why these cannot be read; their files are as they were."""
-        self.has_unreadable = bool(self.unreadable) or trash.has_unreadable
+        self.problems = _in_words(self.unreadable) + trash.problems
+        """The same in words, with those in the trash."""
+        self.has_unreadable = bool(self.problems)
         """Is a session unreadable? Then it is not known which frames it needs."""
         self._sessions = {session.id: session for session in found}
 
@@ -219,3 +221,7 @@ class SessionBook:
         """
         self.trash.take(session, self.folder)
         del self._sessions[session.id]
+
+
+def _in_words(unreadable: Mapping[str, str]) -> list[str]:
+    return [f"session {name} is left out: {error}" for name, error in unreadable.items()]

@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import errno
+import logging
 import re
 import threading
 import uuid
-from contextlib import ExitStack
+import zlib
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from devices.errors import FolderGoneError, StorageError
-from storage.durable import is_held, locked, make_folder, storage_errors, write_whole
+from devices.errors import DamagedFileError, FolderGoneError
+from storage.durable import (
+    is_held,
+    locked,
+    make_folder,
+    put_aside,
+    read_whole,
+    set_aside,
+    storage_errors,
+    write_whole,
+)
+
+log = logging.getLogger("foottile.server")
 
 _ID_NAME = "server_id"
-_ID = re.compile(r"[0-9a-f]{32}")
+_PROBE_NAME = ".writable"
+_ID = re.compile(r"([0-9a-f]{32})(?: ([0-9a-f]{8}))?")
+"""The id and its CRC-32, which older versions did not write."""
 _PROBE_BYTES = 64 << 10
 
 
@@ -36,8 +51,12 @@ class DataFolder:
         with storage_errors(path, "Choose another folder with --data"):
             make_folder(path)
         self._lock = self._locked()
+        self.problems: list[str] = []
+        """What was found damaged of what is kept here, and what became of it, in words."""
         try:
-            self.id = self._kept_id() or self._new_id()
+            if (path / _PROBE_NAME).is_dir():
+                set_aside(path / _PROBE_NAME)
+            self.id = self._known_id() or self._new_id(uuid.uuid4().hex)
         except BaseException:
             self._lock.close()
             raise
@@ -52,7 +71,9 @@ class DataFolder:
         with self._checking:
             if is_held(self.path):
                 return
-            found = self._kept_id() if self.path.is_dir() else None
+            found: str | None = None
+            with suppress(DamagedFileError):
+                found, _ = self._kept_id()
             if found == self.id:  # mounted anew, or a copy in its place
                 lock = self._locked()
                 self._lock.close()
@@ -83,7 +104,7 @@ class DataFolder:
         """
         self.check()
         # As much as some seconds of frames: on a full disk an empty file can still be written.
-        write_whole(self.path / ".writable", bytes(_PROBE_BYTES))
+        write_whole(self.path / _PROBE_NAME, bytes(_PROBE_BYTES))
 
     def close(self) -> None:
         """Let another server have it."""
@@ -100,19 +121,37 @@ class DataFolder:
         )
         return stack
 
-    def _kept_id(self) -> str | None:
+    def _known_id(self) -> str | None:
+        """The id, written anew if it states no checksum; None if there is none, or not any more."""
+        try:
+            kept, is_proven = self._kept_id()
+        except DamagedFileError as error:
+            problem = put_aside(self.path / _ID_NAME, error)
+            self.problems.append(f"{problem}; nodes get to know this server anew")
+            log.warning("%s", self.problems[-1])
+            return None
+        return kept if kept is None or is_proven else self._new_id(kept)
+
+    def _kept_id(self) -> tuple[str | None, bool]:
+        """The id, and whether it proves itself.
+
+        Raises:
+            DamagedFileError: it is not what was written.
+        """
         path = self.path / _ID_NAME
         try:
-            kept = path.read_text("utf-8", "replace").strip()
+            text = read_whole(path).decode("ascii", "replace").strip()
         except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise StorageError(
-                f"cannot be read: {error}", where=str(path), errno=error.errno
-            ) from error
-        return kept if _ID.fullmatch(kept) else None
+            return None, False
+        found = _ID.fullmatch(text)
+        if found is None or found[2] not in (None, _check_of(found[1])):
+            raise DamagedFileError("it is not the id that was written", where=str(path))
+        return found[1], found[2] is not None
 
-    def _new_id(self) -> str:
-        made = uuid.uuid4().hex
-        write_whole(self.path / _ID_NAME, made.encode() + b"\n")
+    def _new_id(self, made: str) -> str:
+        write_whole(self.path / _ID_NAME, f"{made} {_check_of(made)}\n".encode())
         return made
+
+
+def _check_of(made: str) -> str:
+    return f"{zlib.crc32(made.encode()):08x}"

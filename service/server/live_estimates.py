@@ -86,11 +86,12 @@ class LiveEstimates:
 
     @property
     def tare(self) -> Tare | None:
-        """The tare in use."""
-        return self._run.plan.tare if self._run is not None else None
+        """The tare in use; None: there is none, or it is lost."""
+        tare = self._run.plan.tare if self._run is not None else None
+        return None if tare is None or tare.is_lost else tare
 
     def use(self, tare: Tare | None) -> None:
-        """Estimate with this tare from the next frame on."""
+        """Estimate with this tare from the next frame on; all is NaN with one that is lost."""
         if self._run is not None:  # frames that wait for their look-ahead
             self._left.extend(self._run.finish())
         self.free_since_t_ns = None

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from devices.errors import (
     FileFormatError,
+    FootTileError,
     LinkError,
     StateError,
     StorageError,
@@ -24,9 +25,11 @@ from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
 from service.server_clock import utc_ns
 from service.sessions.pipeline import Columns
-from service.sessions.tares import RecordedTare, TareHistory
+from service.sessions.tare_file import RecordedTare
+from service.sessions.tares import TareHistory
+from storage.checked_json import write_checked
 from storage.clock.log import ClockOffset
-from storage.durable import make_folder, storage_errors, write_whole
+from storage.durable import make_folder, storage_errors
 from storage.intervals import NO_END, NODE_RESTARTED, Intervals, with_open_ends
 from storage.journal.journal import RING_NS, Journal
 from storage.wire import decode
@@ -36,6 +39,7 @@ log = logging.getLogger("foottile.nodes")
 _RATE_OVER_NS = 1_000_000_000
 _JITTER = 1.02
 IS_BOOT_ID = re.compile(BOOT_ID)
+HELLO_FILE = "hello.json"
 
 Estimated = tuple[FrameBatch, Columns]
 
@@ -73,18 +77,29 @@ class ServerNode:
         self._folder = folder
         self._journals_folder = journals
         self._pace: deque[tuple[int, int]] = deque()
+        self._found: list[str] = []
         for path in sorted(journals.glob("*")):
             if IS_BOOT_ID.fullmatch(path.name):
                 try:
-                    self.streams[path.name] = ServerStream.open(path)
-                except FileFormatError as error:
-                    log.warning("a journal is left out: %s", error)
+                    self.streams[path.name] = stream = ServerStream.open(path)
+                    self._found += stream.problems
+                except FootTileError as error:
+                    self._found.append(f"a journal is left out: {error}")
+        if self.tares.problem is not None:
+            self._found.append(self.tares.problem)
+        for text in self._found:
+            log.warning("node %s: %s", self.name, text)
         self.present = self._stream_of(self.info)
         """The stream that it takes now."""
         self.live: LiveEstimates
         self.tare_keeper: TareKeeper
         self._has_failed = False
         self._estimate_anew()
+
+    @property
+    def problems(self) -> list[str]:
+        """What was found damaged of what is kept of it, and what became of it, in words."""
+        return [f"node {self.name}: {text}" for text in self._found]
 
     @property
     def info(self) -> ArrayInfo:
@@ -231,10 +246,9 @@ class ServerNode:
         try:
             frames = decode(payload, stream.schema)
             stream.check(frames)
+            stream.take(frames, payload, now_t_ns)
         except FileFormatError as error:
             raise LinkError(f"node {self.name!r}: {error}") from error
-        try:
-            stream.take(frames, payload, now_t_ns)
         except StorageError as error:  # the live picture goes on; nothing is acknowledged
             self.storage_problem = str(error)
         first, last = int(frames.seq[0]), int(frames.seq[-1])
@@ -298,7 +312,7 @@ class ServerNode:
         """
         with storage_errors(self._folder):
             make_folder(self._folder)
-        write_whole(self._folder / "hello.json", self.hello.model_dump_json().encode())
+        write_checked(self._folder / HELLO_FILE, self.hello.model_dump_json().encode())
 
     def _stream_of(self, info: ArrayInfo) -> ServerStream:
         if info.boot_id not in self.streams:
@@ -309,10 +323,10 @@ class ServerNode:
         """Frames whose estimates are due; a bug there costs this node its estimates, no more."""
         try:
             due = list(self.live.feed(frames))
-            self._look_for_tare()
         except Exception as error:
             self._go_without_estimates(error)
             return [(frames, {})]
+        self._look_for_tare()
         return due
 
     def _go_without_estimates(self, error: Exception) -> None:
@@ -330,12 +344,13 @@ class ServerNode:
             self.tare_keeper.look(self.journal, to_come)
         except StorageError as error:  # not in force then; tried again once it can be kept
             self.storage_problem = str(error)
+        except Exception as error:
+            self._go_without_estimates(error)
 
     def _estimate_anew(self) -> None:
-        in_force = self.tares.in_force(self.info)
-        tare = in_force.tare if in_force is not None else None
         self._has_failed = False
         try:
+            tare = self.tares.to_use(self.info)
             self.live = LiveEstimates(self.info, self.hello.calibration, tare)
         except Exception as error:
             self._go_without_estimates(error)

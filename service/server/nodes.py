@@ -8,16 +8,17 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from devices.errors import (
+    DamagedFileError,
     FileFormatError,
     FootTileError,
     LinkError,
     UnknownError,
 )
 from service.link import PROTOCOL, Hello
-from service.server.node import IS_BOOT_ID, ServerNode
+from service.server.node import HELLO_FILE, IS_BOOT_ID, ServerNode
+from storage.checked_json import read_checked
+from storage.durable import put_aside, storage_errors
 
 log = logging.getLogger("foottile.nodes")
 
@@ -29,31 +30,46 @@ _NODE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
 class ServerNodes:
     """All nodes of a server.
 
+    A node whose description is damaged is not known until it says hello again; all that is kept of
+    it, journals, sessions and tares, waits for that.
+
     Args:
         data: the server's data folder.
 
     Raises:
         StorageError: it cannot be read.
-        FileFormatError: a file in it is damaged.
     """
 
     def __init__(self, data: Path) -> None:
         self._data = data
         self._nodes: dict[str, ServerNode] = {}
-        for path in sorted((data / "nodes").glob("*/hello.json")):
+        self._problems: list[str] = []
+        with storage_errors(data):
+            folders = sorted(path for path in (data / "nodes").glob("*") if path.is_dir())
+        for folder in folders:
             try:
-                content = path.read_bytes()
-                if _protocol_of(content) != PROTOCOL:
-                    log.warning("%s is of another version: not known until it connects", path)
-                    continue
-                hello = Hello.model_validate_json(content)
-            except (OSError, ValidationError) as error:
-                raise FileFormatError(
-                    f"not a node's description: {error}",
-                    where=str(path),
-                    remedy="Move it away; it is written again when the node connects",
-                ) from error
-            self._nodes[hello.array_info.node] = self._make(hello)
+                hello = _read_hello(folder / HELLO_FILE)
+            except FileNotFoundError:
+                continue
+            except DamagedFileError as error:
+                self._problem(f"node {folder.name}: {put_aside(folder / HELLO_FILE, error)}")
+                continue
+            except FileFormatError as error:
+                self._problem(f"node {folder.name}: {error}")
+                continue
+            try:
+                self._nodes[folder.name] = self._make(hello)
+            except FootTileError as error:
+                self._problem(f"node {folder.name} is left out: {error}")
+
+    @property
+    def problems(self) -> list[str]:
+        """What was found damaged of what is kept of nodes, and what became of it, in words."""
+        return self._problems + [text for node in self for text in node.problems]
+
+    def _problem(self, text: str) -> None:
+        log.warning("%s", text)
+        self._problems.append(text)
 
     def __iter__(self) -> Iterator[ServerNode]:
         return iter(self._nodes.values())
@@ -108,6 +124,36 @@ class ServerNodes:
         return ServerNode(self._data / "nodes" / name, self._data / "journal" / name, hello)
 
 
+def _read_hello(path: Path) -> Hello:
+    """What a node said last.
+
+    Raises:
+        FileNotFoundError: nothing.
+        DamagedFileError: that is damaged, or was said by another node.
+        FileFormatError: it was said to another version.
+    """
+    text = read_checked(path).text
+    again = "it is known again when it connects"
+    try:
+        said = json.loads(text)
+        protocol = said["protocol"]
+        hello = Hello.model_validate_json(text) if protocol == PROTOCOL else None
+        if hello is not None:
+            _check(hello)
+    except (ValueError, KeyError, TypeError, RecursionError, LinkError) as error:
+        what = " ".join(str(error).split())[:200]
+        raise DamagedFileError(
+            f"not what this node said last: {what}", where=str(path), remedy=again.capitalize()
+        ) from error
+    if hello is None:
+        raise FileFormatError(
+            f"written by another version, of protocol {protocol!r}: {again}", where=str(path)
+        )
+    if hello.array_info.node != path.parent.name:
+        raise DamagedFileError(f"it is of node {hello.array_info.node!r}", where=str(path))
+    return hello
+
+
 def _check(hello: Hello) -> None:
     streams = [hello.array_info, *(each.array_info for each in hello.earlier)]
     for info in streams:
@@ -122,11 +168,3 @@ def _check(hello: Hello) -> None:
             raise LinkError(f"an earlier stream of node {hello.array_info.node!r} is {info.node!r}")
     if len({info.boot_id for info in streams}) < len(streams):
         raise LinkError(f"node {hello.array_info.node!r} names a stream twice")
-
-
-def _protocol_of(content: bytes) -> object:
-    try:
-        said = json.loads(content)
-    except ValueError:
-        return PROTOCOL  # it is damaged, which is said elsewhere
-    return said.get("protocol") if isinstance(said, dict) else PROTOCOL

@@ -50,6 +50,15 @@ class Recorder:
         for session in book:
             book.note(self._with_clock(session))
 
+    def know(self, node: ServerNode) -> None:
+        """A node has said hello: if it was not known before, its sessions lack what is kept of it.
+
+        Those are the clock measurements since their last change.
+        """
+        for session in self._book.of_node(node.name):
+            if session.state != "sealing":
+                self._book.note(self._with_clock(session))
+
     def recording_on(self, node: str) -> list[Session]:
         """Sessions that are being recorded on a node."""
         return [s for s in self._book.of_node(node) if s.state == "recording"]

@@ -74,7 +74,6 @@ class Server:
 
     Raises:
         StorageError: the folder cannot be written.
-        FileFormatError: something in it is damaged.
     """
 
     def __init__(self, data: Path) -> None:
@@ -170,6 +169,11 @@ class Server:
             StorageError: it cannot.
         """
         self.folder.check_writable()
+
+    @property
+    def problems(self) -> list[str]:
+        """What was found damaged in the data folder, and what became of it, in words."""
+        return self.folder.problems + self.nodes.problems + self.sessions.problems
 
     async def empty_trash(self) -> tuple[int, int]:
         """Delete what is in the trash for good; return the number of sessions and of bytes.

@@ -56,6 +56,8 @@ class ServerStream:
         """Frames appended to the journal since the last sync."""
         self.owed = Intervals()
         """Frames to be acknowledged once the journal is synced."""
+        self.problems: list[str] = []
+        """What was found damaged when it was opened, and what became of it, in words."""
         self._first_seq: int | None = None
         self._refused = Intervals()
         self._forgotten = Intervals()
@@ -76,12 +78,12 @@ class ServerStream:
         journal = Journal.open(folder)
         stream = cls(folder, journal.info)
         stream.journal = journal
-        with suppress(FileFormatError):  # the node says it again
-            notes = StreamNotes.load(folder)
-            if notes is not None:
-                stream.notes = stream._notes_on_disk = notes
-                stream.missed_slots = notes.missed_slots
-                stream._refused = Intervals(notes.lost.get(REFUSED, ()))
+        stream.problems = list(journal.problems)
+        notes = StreamNotes.load_whole(folder, stream.problems)  # without, the node says it again
+        if notes is not None:
+            stream.notes = stream._notes_on_disk = notes
+            stream.missed_slots = notes.missed_slots
+            stream._refused = Intervals(notes.lost.get(REFUSED, ()))
         with suppress(StorageError):
             lines = stream._clock_log.lines()
             stream.clock_rows.extend(lines.rows)
@@ -230,8 +232,11 @@ class ServerStream:
         self._said(said.lost, next_seq=said.next_seq + beyond, unsynced_tail_max=tail)
 
     def is_gone(self) -> None:
-        """The node has not mentioned it: nothing more will come of it."""
+        """The node has not mentioned it: nothing more will come of it, and no file stays open."""
         self.node_has = Intervals()
+        with suppress(StorageError):  # said when it is synced
+            if self.journal is not None:
+                self.journal.close()
 
     def note_losses(self, lost: PairsByReason) -> None:
         """Note all frames of this stream that the node has lost so far."""
@@ -243,6 +248,7 @@ class ServerStream:
 
         Raises:
             FileFormatError: they break a rule that `verify` asks for as well.
+            StorageError: what stands beside them cannot be read.
         """
         first, last = int(frames.seq[0]), int(frames.seq[-1])
         end = self.notes.next_seq

@@ -16,7 +16,8 @@ from service.estimation.plan import TARE_OLD_NS
 from service.estimation.tare.automatic import APART_NS, SETTLE_NS, WINDOW_NS, Look
 from service.estimation.tare.tare import Tare, expected_shift_kpa, has_warmed, warmer_k
 from service.server.live_estimates import LiveEstimates
-from service.sessions.tares import RecordedTare, TareHistory
+from service.sessions.tare_file import RecordedTare
+from service.sessions.tares import TareHistory
 from storage.journal.journal import Journal
 
 LOOK_EVERY_NS = 5_000_000_000
@@ -46,6 +47,7 @@ class TareKeeper:
         self._history = history
         self._automatic = automatic
         self._lead_is_over = False  # and has been looked at
+        self._has_seen_lead = False
         self._lead_over_t_ns: int | None = None
         self._lead_problem: str | None = None
         self._is_tared = False  # in this stream, other than by its lead
@@ -64,6 +66,8 @@ class TareKeeper:
         """Why there is no tare, or why it is not this stream's own."""
         if self._lead_problem is not None:
             return f"the lead gave no tare ({self._lead_problem}): {_BY_HAND}"
+        if self._history.is_lost(self._info):
+            return f"the tare in force is damaged and lost, so no force is known: {_BY_HAND}"
         return f"not tared: {_BY_HAND}" if self._history.in_force(self._info) is None else None
 
     def warnings(self) -> list[str]:
@@ -115,9 +119,8 @@ class TareKeeper:
             UnknownError, StorageError: as for `TareHistory.undo`.
         """
         self._history.undo(tare_id)
-        in_force = self._history.in_force(self._info)
         self._doubt = None
-        self._live.use(in_force.tare if in_force is not None else None)
+        self._live.use(self._history.to_use(self._info))
 
     def look(self, journal: Journal | None, node_first_seq: int) -> None:
         """After more frames: tare from a lead that is over, or in flight.
@@ -139,6 +142,7 @@ class TareKeeper:
     def _look_at_lead(self, journal: Journal, node_first_seq: int) -> None:
         newest = self._live.newest
         if newest is None or newest.frame_status[-1] & FrameStatus.LEAD:
+            self._has_seen_lead |= newest is not None
             return
         # From the journal, not as frames come: after a break of the link they come in any order.
         seq, t_ns = int(newest.seq[-1]), int(newest.t_ns[-1])
@@ -165,7 +169,9 @@ class TareKeeper:
             self._lead_is_over, self._lead_problem = True, error.what
             return
         known = {(t.tare.source, t.tare.t_ns) for t in self._history.all}
-        if ("lead", tare.t_ns) not in known:  # else the server was restarted since
+        # Known, or lost since: the server was restarted, and another one may have followed it.
+        is_older = not self._has_seen_lead and self._history.may_have_held(tare.t_ns)
+        if ("lead", tare.t_ns) not in known and not is_older:
             self._live.use(self._history.add(tare, self._info).tare)
         self._lead_is_over = True
 

@@ -11,11 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from devices.frames import ServoInfo
 from service.estimation.calibration import Calibration
-from service.estimation.tare.tare import Source, expected_shift_kpa, trend, warmer_k
+from service.estimation.tare.tare import TakenFrom, expected_shift_kpa, trend, warmer_k
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
 from service.server.tare_keeper import AutoTare
-from service.sessions.tares import RecordedTare
+from service.sessions.tare_file import RecordedTare
 from storage.sessions.folder import Part, Session
 
 T = TypeVar("T")
@@ -65,7 +65,7 @@ class TareView(View):
 
     id: str
     t_ns: int = Field(description="End of the interval it was taken from, node's UTC.")
-    source: Source = Field(
+    source: TakenFrom = Field(
         description="unloaded: by hand; flight: automatic; lead: of an emulation."
     )
     reason: str = Field(description="Why, in words.")

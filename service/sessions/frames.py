@@ -21,13 +21,17 @@ from service.sessions.sources import Sources
 Columns = Mapping[str, npt.NDArray[Any]]
 
 _GATHER_FRAMES = 4096
+TARE_LOST = (
+    "a tare is damaged and lost: where it may have been in force, forces are not known (bit 512 of "
+    "estimate_status)"
+)
 
 
 class SessionFrames:
     """Frames of a session, with the column `part` and, where possible, estimates.
 
     Once the first frames are there, `notes` is what a file says of their estimates, and `problem`
-    why there are none.
+    why there are none, or not for all frames.
     """
 
     def __init__(self, sources: Sources) -> None:
@@ -63,6 +67,8 @@ class SessionFrames:
         for frames, columns in stream.run(self.raw()):
             if not self.notes and stream.plan is not None:
                 self.notes = notes_of(stream.plan, sources.tares)
+                if any(tare.is_lost for tare in sources.tares):
+                    self.problem = TARE_LOST
             yield frames, columns
 
     def _without_estimates(self, reason: object) -> None:

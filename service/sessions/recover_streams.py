@@ -11,7 +11,8 @@ from typing import Any
 
 from devices.errors import DamagedFramesError, FileFormatError
 from service.sessions.ends import SessionStream, around_in
-from storage.durable import remove_stale_temporaries
+from storage.checked_json import read_checked
+from storage.durable import ASIDE, remove_stale_temporaries
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.segment import SUFFIX
@@ -78,8 +79,8 @@ class OpenedStream:
         else:
             found = {"damaged": tuple(self.damaged)}
         now = notes.model_copy(update=found)
-        is_broken = self.notes is None and (self.journal.folder / NOTES_FILE).exists()
-        if now != notes or is_broken:
+        was_broken = self.notes is None and any(self.journal.folder.glob(NOTES_FILE + ASIDE + "*"))
+        if now != notes or was_broken:
             self.notes = now
             self.notes.save(self.journal.folder)
 
@@ -130,7 +131,8 @@ def open_streams(
         remove_stale_temporaries(folder)
         try:
             journal = Journal.open(folder)
-            notes = _notes_of(folder, problems)
+            problems += journal.problems
+            notes = StreamNotes.load_whole(folder, problems)
         except FileFormatError as error:
             problems.append(f"journal {folder.parent.name}/{folder.name}: {error}")
             continue
@@ -143,15 +145,7 @@ def open_streams(
 def hello_of(data: Path, node: str) -> dict[str, Any]:
     """The node's last hello as the server kept it; empty if there is none."""
     try:
-        content = json.loads((data / "nodes" / node / "hello.json").read_bytes())
-    except (OSError, ValueError):
+        content = json.loads(read_checked(data / "nodes" / node / "hello.json").text)
+    except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
-
-
-def _notes_of(folder: Path, problems: list[str]) -> StreamNotes | None:
-    try:
-        return StreamNotes.load(folder)
-    except FileFormatError as error:  # what it says is bounded without it
-        problems.append(str(error))
-        return None

@@ -31,7 +31,7 @@ class Sources:
         journals: by boot_id.
         calibration: to estimate with; None: raw frames only.
         problem: why there is none.
-        tares: that were in force, oldest first.
+        tares: that were in force, oldest first; `Tare.lost` where one is lost.
         notes: more for the file's metadata.
     """
 
@@ -86,10 +86,7 @@ def sources_of(
     calibration, problem = _calibration_of(session)
     in_force: tuple[Tare, ...] = ()
     if calibration is not None and tares is not None:
-        try:
-            in_force, problem = _tares_of(session, streams, tares(), info)
-        except FootTileError as error:  # their file is damaged
-            problem = str(error)
+        in_force, problem = _tares_of(session, streams, tares(), info)
     notes: dict[str, object] = {
         "scene": session.scene_content,
         "lost": lost_numbers(session.parts, states_of(session, streams)),
@@ -131,7 +128,7 @@ def _tares_of(
     if begin_t_ns is None or end_t_ns is None:
         return (), None
     tares = history.during(info, begin_t_ns, end_t_ns)
-    if not tares and history.in_force(info) is not None:
+    if not tares and not history.is_empty(info):
         return (), "all tares of the node were taken after this session"
     return tares, None
 

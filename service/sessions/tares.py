@@ -7,54 +7,38 @@ until one is taken by hand: an undone tare says that automatic ones are not trus
 
 from __future__ import annotations
 
-import json
 import uuid
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from devices.errors import FileFormatError, TareError, UnknownError
+from devices.errors import StorageError, UnknownError
 from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Tare
-from storage.durable import make_folder, storage_errors, write_whole
+from service.sessions.tare_file import (
+    REASONS,
+    Entry,
+    LostTares,
+    RecordedTare,
+    chips_of,
+    in_order,
+    read_tares,
+    write_tares,
+)
+from storage.durable import make_folder, set_aside, storage_errors
 
 KEPT_MAX = 1000
 AUTOMATIC_KEPT_MAX = 200
 """Above this number the older half is thinned out, which keeps the trend over hours."""
 REASON_LENGTH_MAX = 200
 
-_REASONS = {
-    "lead": "unloaded lead of the emulation",
-    "unloaded": "by hand",
-    "flight": "in flight",
-}
-
-
-@dataclass(frozen=True)
-class RecordedTare:
-    """A tare, the tiles it is of, why it was taken, and what became of it."""
-
-    id: str
-    serials: tuple[str, ...]
-    tare: Tare
-    undone: bool = False
-    reason: str = ""
-    """In words."""
-    chips: tuple[tuple[int, ...], ...] | None = None
-    """Coefficients of the tiles' chips; None in tares of older versions, which kept none."""
-
-    def is_of(self, info: ArrayInfo) -> bool:
-        """Does it belong to these tiles? A swapped part has the same serial but another chip."""
-        return self.serials == info.serials and self.chips in (None, _chips(info))
-
-    @property
-    def is_automatic(self) -> bool:
-        """Did it come unasked?"""
-        return self.tare.source == "flight"
-
 
 class TareHistory:
     """Tares in the order they were taken; the newest that was not undone is in force.
+
+    If one of them is damaged on disk, nothing is in force from the one before it until the next: it
+    is not known whose tiles it was of, nor whether it was undone, and none that is older takes its
+    place. What was damaged is set aside, and the others are written anew.
 
     Args:
         path: file to keep them in.
@@ -62,26 +46,67 @@ class TareHistory:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._tares: list[RecordedTare] = _read(path) if path.exists() else []
+        found = read_tares(path)
+        self._entries: tuple[Entry, ...] = found.entries
+        self.problem: str | None = None
+        """What was wrong with the file when it was read, and what became of it."""
+        if found.problem is not None:
+            self._mend(found.problem, is_damaged=found.is_damaged)
+
+    def _mend(self, problem: str, *, is_damaged: bool) -> None:
+        done = "it is written anew"
+        try:
+            if is_damaged:
+                done = f"it is kept as {set_aside(self._path).name}"
+            self._keep(self._entries)
+        except StorageError as error:
+            done = f"that cannot be mended: {error}"
+        self.problem = f"{self._path}: {problem}; {done}"
 
     @property
     def all(self) -> list[RecordedTare]:
-        """All of them, oldest first."""
-        return list(self._tares)
+        """All that are known, oldest first."""
+        return [entry for entry in self._entries if isinstance(entry, RecordedTare)]
+
+    def is_empty(self, info: ArrayInfo) -> bool:
+        """Was there never a tare that may be of this array, or were all undone?"""
+        return not self._of(info) and not any(isinstance(e, LostTares) for e in self._entries)
 
     def in_force(self, info: ArrayInfo) -> RecordedTare | None:
-        """The one in force for an array; tares of other tiles do not count."""
-        fitting = self._of(info)
+        """The one in force for an array; tares of other tiles do not count.
+
+        None if there is none, or if it is lost.
+        """
+        fitting = self._since_lost(info)
         return fitting[-1] if fitting else None
 
+    def is_lost(self, info: ArrayInfo) -> bool:
+        """Is one lost that may be the one in force?"""
+        lost = any(isinstance(entry, LostTares) for entry in self._entries)
+        return lost and not self._since_lost(info)
+
+    def may_have_held(self, t_ns: int) -> bool:
+        """May one that is lost have been taken at this instant?"""
+        return any(first <= t_ns <= last for first, last in self._gaps())
+
+    def to_use(self, info: ArrayInfo) -> Tare | None:
+        """What to estimate with: the tare in force, what stands for a lost one, or none."""
+        in_force = self.in_force(info)
+        if in_force is not None:
+            return in_force.tare
+        return Tare.lost(tiles=len(info.tiles), t_ns=0) if self.is_lost(info) else None
+
     def anchor(self, info: ArrayInfo) -> RecordedTare | None:
-        """What automatic tares are compared with: the last other tare, else the oldest."""
-        fitting = self._of(info)
+        """What automatic tares are compared with: the last other tare, else the oldest.
+
+        None before a lost one counts: that may have been the last other tare.
+        """
+        fitting = self._since_lost(info)
         return next((t for t in reversed(fitting) if not t.is_automatic), (*fitting, None)[0])
 
     def is_automatic_paused(self, info: ArrayInfo) -> bool:
         """Was an automatic tare undone, with no other kind taken since?"""
-        for recorded in reversed(self._tares):
+        for recorded in reversed(self.all):
             if not recorded.is_of(info):
                 continue
             if recorded.is_automatic and recorded.undone:
@@ -98,12 +123,37 @@ class TareHistory:
         """Tares that were in force at some time of an interval, oldest first.
 
         Those are the last one before it and all within; if it began without, the first within
-        serves from the beginning on.
+        serves from the beginning on. Where one is lost, `Tare.lost` stands for it from the instant
+        on at which it may have been in force.
         """
-        fitting = [recorded.tare for recorded in self._of(info) if recorded.tare.t_ns <= end_t_ns]
-        fitting.sort(key=lambda tare: tare.t_ns)
-        before = [tare for tare in fitting if tare.t_ns <= begin_t_ns][-1:]
-        return tuple(before + [tare for tare in fitting if tare.t_ns > begin_t_ns])
+        gaps = list(self._gaps())
+        known = [(recorded.tare.t_ns, recorded.tare) for recorded in self._of(info)]
+        fitting = [
+            (t_ns, tare)
+            for t_ns, tare in known
+            # A lost one may have been taken after it.
+            if not any(first < t_ns < last for first, last in gaps)
+        ]
+        tiles = len(info.tiles)
+        for first, _ in gaps:
+            t_ns = max(first, min(begin_t_ns, end_t_ns))
+            fitting.append((first, Tare.lost(tiles=tiles, t_ns=t_ns)))
+        fitting.sort(key=lambda item: (item[0], item[1].is_lost))
+        before = [tare for t_ns, tare in fitting if t_ns <= begin_t_ns][-1:]
+        within = [tare for t_ns, tare in fitting if begin_t_ns < t_ns <= end_t_ns]
+        return tuple(before + within)
+
+    def _gaps(self) -> Iterator[tuple[int, int]]:
+        """Between which instants lost tares were taken: those of the tares next to them."""
+        for at, entry in enumerate(self._entries):
+            if isinstance(entry, LostTares):
+                beside = self._t_ns(at - 1, _EVER[0]), self._t_ns(at + 1, _EVER[1])
+                # A clock that was set back in between has them the other way round.
+                yield min(beside), max(beside)
+
+    def _t_ns(self, at: int, otherwise: int) -> int:
+        entry = self._entries[at] if 0 <= at < len(self._entries) else None
+        return entry.tare.t_ns if isinstance(entry, RecordedTare) else otherwise
 
     def add(self, tare: Tare, info: ArrayInfo, reason: str = "") -> RecordedTare:
         """Put a tare in force.
@@ -116,11 +166,11 @@ class TareHistory:
         Raises:
             StorageError: it cannot be kept; it is not in force then.
         """
-        reason = (reason or _REASONS.get(tare.source, tare.source))[:REASON_LENGTH_MAX]
+        reason = (reason or REASONS.get(tare.source, tare.source))[:REASON_LENGTH_MAX]
         recorded = RecordedTare(
-            uuid.uuid4().hex[:12], info.serials, tare, reason=reason, chips=_chips(info)
+            uuid.uuid4().hex[:12], info.serials, tare, reason=reason, chips=chips_of(info)
         )
-        self._keep(_bounded([*self._tares, recorded]))
+        self._keep(_bounded((*self._entries, recorded)))
         return recorded
 
     def undo(self, tare_id: str) -> None:
@@ -130,43 +180,42 @@ class TareHistory:
             UnknownError: there is no such tare, or it was undone already.
             StorageError: that cannot be kept; nothing has changed then.
         """
-        if not any(tare.id == tare_id and not tare.undone for tare in self._tares):
+        if not any(tare.id == tare_id and not tare.undone for tare in self.all):
             raise UnknownError(f"no tare {tare_id!r} that could be undone")
         self._keep(
-            [replace(tare, undone=tare.undone or tare.id == tare_id) for tare in self._tares]
+            tuple(
+                replace(entry, undone=True)
+                if isinstance(entry, RecordedTare) and entry.id == tare_id
+                else entry
+                for entry in self._entries
+            )
         )
 
     def _of(self, info: ArrayInfo) -> list[RecordedTare]:
-        return [t for t in self._tares if t.is_of(info) and not t.undone]
+        return [t for t in self.all if t.is_of(info) and not t.undone]
 
-    def _keep(self, tares: list[RecordedTare]) -> None:
-        content = [
-            {
-                "id": t.id,
-                "serials": t.serials,
-                "undone": t.undone,
-                "reason": t.reason,
-                "chips": t.chips,
-                "tare": t.tare.as_dict(),
-            }
-            for t in tares
-        ]
+    def _since_lost(self, info: ArrayInfo) -> list[RecordedTare]:
+        """The same, after the last that is lost."""
+        fitting: list[RecordedTare] = []
+        for entry in self._entries:
+            if isinstance(entry, LostTares):
+                fitting.clear()
+            elif entry.is_of(info) and not entry.undone:
+                fitting.append(entry)
+        return fitting
+
+    def _keep(self, entries: tuple[Entry, ...]) -> None:
         with storage_errors(self._path):
             make_folder(self._path.parent)
-        write_whole(self._path, json.dumps(content).encode())
-        self._tares = tares
+        write_tares(self._path, entries)
+        self._entries = entries
 
 
-def _chips(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
-    return tuple(tuple(tile.coefficient_words) for tile in info.tiles)
+_EVER = (-(2**63), 2**63 - 1)
 
 
-def _read_chips(content: Any) -> tuple[tuple[int, ...], ...] | None:
-    return None if content is None else tuple(tuple(int(w) for w in words) for words in content)
-
-
-def _bounded(tares: list[RecordedTare]) -> list[RecordedTare]:
-    automatic = [t for t in tares if t.is_automatic]
+def _bounded(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    automatic = [t for t in entries if isinstance(t, RecordedTare) and t.is_automatic]
     if len(automatic) > AUTOMATIC_KEPT_MAX:
         # Drop the tare that says least: in the older half, the one with the closest neighbours. The
         # very first stays, because others may be compared with it.
@@ -174,31 +223,7 @@ def _bounded(tares: list[RecordedTare]) -> list[RecordedTare]:
             now.id: after.tare.t_ns - before.tare.t_ns
             for before, now, after in zip(automatic, automatic[1:], automatic[2:], strict=False)
         }
-        older = [t.id for t in automatic[1 : len(automatic) // 2]]
-        least = min(older, key=lambda tare_id: gaps_ns[tare_id])
-        tares = [t for t in tares if t.id != least]
-    return tares[-KEPT_MAX:]
-
-
-def _read(path: Path) -> list[RecordedTare]:
-    try:
-        content = json.loads(path.read_bytes())
-        if not isinstance(content, list):
-            raise TypeError("it is no list")  # noqa: TRY301  # caught with the others
-        return [
-            RecordedTare(
-                str(entry["id"]),
-                tuple(entry["serials"]),
-                Tare.from_dict(entry["tare"], tiles=len(entry["serials"])),
-                bool(entry["undone"]),
-                str(entry.get("reason") or _REASONS.get(entry["tare"]["source"], "")),
-                _read_chips(entry.get("chips")),
-            )
-            for entry in content
-        ]
-    except (OSError, ValueError, KeyError, TypeError, TareError) as error:
-        raise FileFormatError(
-            f"the node's tares are not readable: {error}",
-            where=str(path),
-            remedy="Move the file away; the node has to be tared again then",
-        ) from error
+        older = automatic[1 : len(automatic) // 2]
+        least = min(older, key=lambda tare: gaps_ns[tare.id])
+        entries = tuple(entry for entry in entries if entry is not least)
+    return in_order(entries[-KEPT_MAX:])

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from devices.acquisition import FrameRow, RangeFlag
-from devices.errors import StorageError
+from devices.errors import DamagedFileError, StorageError
 from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
-from storage.durable import make_folder, storage_errors
+from storage.durable import make_folder, read_whole, storage_errors
 
 IN_FLIGHT_FILE = "in_flight"
 ROWS = 8192
@@ -93,15 +93,14 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     from the newest frame, the frames end where the first one is missing.
 
     Raises:
-        StorageError: it cannot be read.
+        DamagedFileError: it is not what was written, or cannot be read.
     """
     path = folder / IN_FLIGHT_FILE
-    with storage_errors(path):
-        try:
-            content = path.read_bytes()
-        except FileNotFoundError:
-            return None
-    info = _described(content)
+    try:
+        content = read_whole(path)
+    except FileNotFoundError:
+        return None
+    info = _described(content, where=str(path))
     if info is None:
         return None
     tiles = len(info.tiles)
@@ -160,9 +159,13 @@ def _codes(tiles: int) -> str:
     return "<" + "".join(codes)
 
 
-def _described(content: bytes) -> ArrayInfo | None:
-    if len(content) < _HEAD.size:
+def _described(content: bytes, *, where: str) -> ArrayInfo | None:
+    """The array of a file of this start of the machine; None of an earlier one, or a file begun."""
+    if not any(content[: _HEAD.size]):
         return None
+    damage = DamagedFileError("its head is not what was written", where=where)
+    if len(content) < _HEAD.size:
+        raise damage
     magic, tiles, rows, length, boot_id, check = _HEAD.unpack_from(content)
     description = content[_HEAD.size : _HEAD.size + length]
     boot_id = boot_id.rstrip(b"\0")
@@ -172,13 +175,17 @@ def _described(content: bytes) -> ArrayInfo | None:
         or rows != ROWS
         or len(content) != expected
         or zlib.crc32(description + boot_id) != check
-        or boot_id.decode(errors="replace") != (kernel_boot_id() or "")
     ):
+        raise damage
+    if boot_id.decode(errors="replace") != (kernel_boot_id() or ""):
         return None
     try:
-        return ArrayInfo.model_validate_json(description)
-    except ValueError:
-        return None
+        info = ArrayInfo.model_validate_json(description)
+    except ValueError as error:
+        raise damage from error
+    if len(info.tiles) != tiles:
+        raise damage
+    return info
 
 
 BOOT_ID_FILE = Path("/proc/sys/kernel/random/boot_id")

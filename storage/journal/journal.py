@@ -10,19 +10,20 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from devices.errors import DamagedFramesError, FileFormatError, StorageError
+from devices.errors import DamagedFileError, DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
-from storage.durable import make_folder, storage_errors
+from storage.durable import make_folder, put_aside, storage_errors
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
 from storage.journal.instants import Instants
 from storage.journal.open_segments import OpenSegments
-from storage.journal.segment import SUFFIX, UNREAD_SUFFIX, Segment, recover
+from storage.journal.segment import SUFFIX, Segment, recover, unread_of
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD, numbers, payload_of, read_header
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import array_info, wire_schema
@@ -49,12 +50,15 @@ class Journal:
         """Numbers that were appended, synced or not."""
         self.lost = Losses()
         """Numbers that were held, or should have been, and why they are not."""
+        self.problems: list[str] = []
+        """What was found damaged when it was opened, and what became of it, in words."""
         self._schema = wire_schema(info)
         self._segments: list[Segment] = []
         self._open = OpenSegments(folder, self._schema.serialize().to_pybytes())
         self._instants = Instants(lambda seq, is_upper: self.t_ns_near(seq, newest=is_upper))
         with storage_errors(folder):
             make_folder(folder)
+            self._set_aside_no_files()
             for path in sorted(folder.glob("*" + SUFFIX)):
                 segment, damaged = recover(path, self._schema)
                 self.lost.add(damaged, CORRUPT)
@@ -62,12 +66,10 @@ class Journal:
                     self._take_in(segment)
             for path in folder.glob("*" + INDEX_SUFFIX):
                 # A power cut may take the name of a segment and leave that of its index. Nothing in
-                # it was promised then; but a person may have deleted it, so the index is set aside,
-                # unless what was set aside before has its name.
-                aside = path.with_suffix(UNREAD_SUFFIX)
-                if not path.with_suffix(SUFFIX).exists() and not aside.exists():
+                # it was promised then; but a person may have deleted it, so the index is set aside.
+                if not path.with_suffix(SUFFIX).exists():
                     with suppress(OSError):
-                        path.rename(aside)
+                        path.rename(unread_of(path))
         self.lost.found(self.held)
 
     @classmethod
@@ -78,19 +80,18 @@ class Journal:
             FileFormatError: no readable segment in it.
             StorageError: it cannot be read.
         """
+        problems: list[str] = []
         with storage_errors(folder):
-            with suppress(FileFormatError):
-                notes = StreamNotes.load(folder)
-                if notes is not None:
-                    journal = cls(folder, notes.array_info)
-                    journal.lost.add(Intervals(notes.damaged) - journal.held, CORRUPT)
-                    return journal
-            for path in sorted(folder.glob("*" + SUFFIX)):
-                schema, _ = read_header(path)
-                with suppress(FileFormatError):
-                    if schema is not None:
-                        return cls(folder, array_info(schema, where=str(path)))
-        raise FileFormatError("no readable journal segment", where=str(folder))
+            notes = StreamNotes.load_whole(folder, problems)
+            info = notes.array_info if notes is not None else _described(folder)
+        if info is None:
+            said = "; ".join(("no readable journal segment", *problems))
+            raise FileFormatError(said, where=str(folder))
+        journal = cls(folder, info)
+        journal.problems[:0] = problems
+        if notes is not None:
+            journal.lost.add(Intervals(notes.damaged) - journal.held, CORRUPT)
+        return journal
 
     @property
     def size_bytes(self) -> int:
@@ -98,8 +99,13 @@ class Journal:
         return sum(segment.size_bytes for segment in self._segments)
 
     def misplaced(self, frames: FrameBatch) -> str:
-        """Why frames cannot stand among those that are held, in words; empty if they can."""
-        return self._instants.misplaced(frames, self.held)
+        """Why frames cannot stand among those that are held, in words; empty if they can.
+
+        Raises:
+            StorageError: an index cannot be read.
+        """
+        with storage_errors(self.folder):
+            return self._instants.misplaced(frames, self.held)
 
     def append(self, batch: FrameBatch, payload: bytes | None = None) -> Intervals:
         """Hold the frames of `batch` that are not held yet; return their numbers.
@@ -311,6 +317,16 @@ class Journal:
         self._open.retire_all()
         self.sync()
 
+    def _set_aside_no_files(self) -> None:
+        """Set aside what has the name of a segment or index and is none, or may not be read."""
+        for path in sorted(
+            (*self.folder.glob("*" + SUFFIX), *self.folder.glob("*" + INDEX_SUFFIX))
+        ):
+            regular = stat.S_ISREG(path.lstat().st_mode)
+            if not regular or not os.access(path, os.R_OK):
+                what = "it cannot be read" if regular else "it is not a file"
+                self.problems.append(put_aside(path, DamagedFileError(what, where=str(path))))
+
     def _take_in(self, segment: Segment) -> None:
         """Take in a segment that was there; what was disowned once may be in two of them."""
         if segment.held & self.held:
@@ -355,6 +371,16 @@ class Journal:
         finally:
             for descriptor in opened.values():
                 os.close(descriptor)
+
+
+def _described(folder: Path) -> ArrayInfo | None:
+    """The array that the oldest readable segment says it is of; None if there is none."""
+    for path in sorted(folder.glob("*" + SUFFIX)):
+        with suppress(FileFormatError):
+            schema = read_header(path)[0] if stat.S_ISREG(path.lstat().st_mode) else None
+            if schema is not None:
+                return array_info(schema, where=str(path))
+    return None
 
 
 def _nearest(segments: Iterable[Segment], seq: int, *, newest: bool) -> list[tuple[int, int]]:

@@ -5,17 +5,20 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from devices.errors import FileFormatError
+from devices.errors import DamagedFileError, FileFormatError
+from storage.durable import put_aside
 from storage.intervals import DISK_SLOW
-from storage.journal.in_flight import kernel_boot_id, read_in_flight
+from storage.journal.in_flight import IN_FLIGHT_FILE, kernel_boot_id, read_in_flight
 from storage.journal.journal import Journal
 from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
 from storage.wire import messages_of
 
 
-def recover_stream(folder: Path) -> NodeStream | None:
+def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
     """A stream that an earlier process left, with what it had in flight; None if nothing is left.
+
+    What is damaged is set aside, and `problems` is told.
 
     If the machine itself went down, the frames in flight are lost. The notes say how many there may
     have been: those taken since the last sync, by the slowest sync of this disk.
@@ -23,8 +26,12 @@ def recover_stream(folder: Path) -> NodeStream | None:
     Raises:
         StorageError: it cannot be read.
     """
-    left = read_in_flight(folder)
-    stream = _open(folder)
+    try:
+        left = read_in_flight(folder)
+    except DamagedFileError as error:
+        left = None
+        problems.append(put_aside(folder / IN_FLIGHT_FILE, error))
+    stream = _open(folder, problems)
     if stream is None:
         if left is None:
             return None
@@ -49,18 +56,17 @@ def recover_stream(folder: Path) -> NodeStream | None:
     return stream
 
 
-def _open(folder: Path) -> NodeStream | None:
+def _open(folder: Path, problems: list[str]) -> NodeStream | None:
     """Open a stream that is on disk; None if nothing of it can be read.
 
     Raises:
         StorageError: it cannot be read.
     """
-    notes: StreamNotes | None = None
+    notes = StreamNotes.load_whole(folder, problems)
     journal: Journal | None = None
     with suppress(FileFormatError):
-        notes = StreamNotes.load(folder)
-    with suppress(FileFormatError):
         journal = Journal.open(folder)
+        problems += journal.problems
     if notes is None and journal is not None:  # its segments still say which array they are of
         notes = StreamNotes(array_info=journal.info)
     return None if notes is None else NodeStream(folder, notes, journal)

@@ -55,7 +55,6 @@ class NodeJournal:
 
     Raises:
         StorageError: another process uses it.
-        FileFormatError: a file in it is damaged.
     """
 
     def __init__(
@@ -84,6 +83,9 @@ class NodeJournal:
                 self._lock_folder(root, is_shared=True)
                 self._lock_folder(self.folder, is_shared=False)
             self.wanted = Wanted(self.folder / "wanted.json")
+            self._wants_changed = not self.wanted.is_proven
+            self.problems = list(self.wanted.problems)
+            """What was found damaged when it was opened, and what became of it, in words."""
             self._retention = Retention(
                 self.folder, self.wanted, budget_bytes=budget_bytes, may_drop=not is_recovery
             )
@@ -261,7 +263,11 @@ class NodeJournal:
             with storage_errors(self.folder):
                 folders = [path for path in self.folder.iterdir() if path.is_dir()]
             for folder in folders:
-                stream = recover_stream(folder)
+                try:
+                    stream = recover_stream(folder, self.problems)
+                except StorageError as error:
+                    self.problems.append(f"a stream is left out: {error}")
+                    continue
                 if stream is not None:
                     streams.append(stream)
         # A stream killed before its notes were written has no number yet: it is the newest.

@@ -16,7 +16,7 @@ from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
 
-from devices.errors import StorageError
+from devices.errors import DamagedFileError, StorageError
 from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, union
 from storage.journal.in_flight import delete_in_flight, read_in_flight
 from storage.journal.journal import Journal
@@ -355,7 +355,7 @@ class NodeStream:
         """Take over the frames that acquisition had in flight when it was killed; False if none."""
         try:
             left = read_in_flight(self.folder)
-        except StorageError:
+        except DamagedFileError:
             return False
         if left is None or left[1] is None or int(left[1].seq[-1]) < self.next_seq:
             return False

@@ -80,6 +80,9 @@ class Retention:
             return False
         past_ring = self._is_past_ring(stream)
         newest = stream.recent(max(0, stream.next_seq - 1))
+        if self._wanted.may_be_all:  # until there is no room
+            stream.save_losses()
+            return False
         with suppress(StorageError):
             if not stream.has_ended and newest:
                 stream.prune(newest[-1].t_ns_last - RING_NS, self._wanted)

@@ -12,6 +12,7 @@ import os
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -223,6 +224,13 @@ class SegmentWriter:
         self._index.close()
 
 
+def unread_of(path: Path) -> Path:
+    """A free name beside a segment for what of it could not be read."""
+    taken = {each.name for each in path.parent.iterdir()}
+    names = (f"{path.stem}{f'.{n}' if n > 1 else ''}{UNREAD_SUFFIX}" for n in count(1))
+    return path.with_name(next(name for name in names if name not in taken))
+
+
 def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
     """Take in a segment that is there: what counts in it, and which frames in it are damaged.
 
@@ -258,7 +266,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
                     end = max(end, int(found["offset"]) + int(found["length"]))
         if end < size:
             file.seek(end)
-            path.with_suffix(UNREAD_SUFFIX).write_bytes(file.read())
+            unread_of(path).write_bytes(file.read())
     segment = Segment(path)
     if not good:
         segment.delete()

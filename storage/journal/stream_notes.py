@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
 from storage.checked_json import read_checked, write_checked
+from storage.durable import put_aside
 from storage.intervals import AsPairs
 
 NOTES_FILE = "stream.json"
@@ -88,4 +89,21 @@ class StreamNotes(BaseModel):
         except FileNotFoundError:
             return None, True
         except ValidationError as error:
-            raise FileFormatError(f"not a stream's notes: {error}", where=str(path)) from error
+            # A field that is not known here is not dropped in silence: it may bound what is lost.
+            newer = [e["loc"][0] for e in error.errors() if e["type"] == "extra_forbidden"]
+            other = f" of another version, with {newer[0]!r}" if newer else f": {error}"
+            raise FileFormatError(f"not a stream's notes{other}", where=str(path)) from error
+
+    @classmethod
+    def load_whole(cls, folder: Path, problems: list[str]) -> StreamNotes | None:
+        """As `load`, and what cannot be read is set aside.
+
+        Args:
+            folder: the stream's own.
+            problems: told what was found damaged and what became of it.
+        """
+        try:
+            return cls.load(folder)
+        except FileFormatError as error:
+            problems.append(put_aside(folder / NOTES_FILE, error))
+            return None

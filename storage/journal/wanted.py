@@ -11,8 +11,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from devices.errors import FileFormatError
-from storage.durable import write_whole
+from devices.errors import DamagedFileError
+from storage.checked_json import read_checked, write_checked
+from storage.durable import ASIDE, put_aside
 from storage.intervals import NO_END, Intervals, OpenPairs, closed, union
 
 
@@ -43,32 +44,43 @@ class ServerWants(BaseModel):
 class _File(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    servers: dict[str, ServerWants] = Field(default_factory=dict)
+    servers: dict[str, ServerWants]
 
 
 class Wanted:
     """All that is wanted of one node.
 
+    A damaged file is set aside. As long as it lies there, any server may want any frame.
+
     Args:
         path: where it is kept.
-
-    Raises:
-        FileFormatError: the file is damaged.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._local: dict[str, Intervals] = {}
+        self._servers: dict[str, ServerWants] = {}
+        self.is_proven = True
+        """Was its file written by a version that writes a hash?"""
+        self.problems: list[str] = []
+        """What was found damaged, and what became of it, in words."""
         try:
-            self._servers = _File.model_validate_json(path.read_bytes()).servers
+            found = read_checked(path)
+            self.is_proven = found.is_proven
+            self._servers = _File.model_validate_json(found.text).servers
         except FileNotFoundError:
-            self._servers = {}
-        except (OSError, ValidationError) as error:
-            raise FileFormatError(
-                f"what sessions need cannot be read: {error}",
-                where=str(path),
-                remedy="Move it away; servers say it again when they are connected",
-            ) from error
+            pass
+        except (DamagedFileError, ValidationError) as error:
+            damage = DamagedFileError(f"what servers need cannot be read: {error}", where=str(path))
+            self.problems.append(put_aside(path, damage))
+        aside = sorted(each.name for each in path.parent.glob(path.name + ASIDE + "*"))
+        self.may_be_all = bool(aside or self.problems)
+        """Is it not known what servers need? Then nothing is deleted for its age alone."""
+        if aside:
+            self.problems.append(
+                f"what servers need was damaged, so frames are kept as long as there is room: "
+                f"delete {path.with_name(aside[-1])} when servers have all they need"
+            )
 
     def numbers(self, boot_id: str) -> Intervals:
         """What servers and the node's own session need of a stream."""
@@ -112,4 +124,4 @@ class Wanted:
         Raises:
             StorageError: the disk is full or not writable.
         """
-        write_whole(self._path, _File(servers=self._servers).model_dump_json().encode())
+        write_checked(self._path, _File(servers=self._servers).model_dump_json().encode())

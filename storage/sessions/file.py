@@ -19,11 +19,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from devices.errors import FileFormatError
+from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.inputs import check_file
 from storage.durable import storage_errors, sync_folder, temporary_of
-from storage.file_hash import FILE_HASH_KEY, write_file_hash
+from storage.file_hash import FILE_HASH_KEY, file_hashes, write_file_hash
 from storage.schema import (
     ARRAY_INFO_KEY,
     FRAMES,
@@ -191,11 +191,18 @@ def _encoding(type_: pa.DataType) -> str | None:
 class SessionReader:
     """Reads what `SessionWriter` wrote, one row group at a time."""
 
-    def __init__(self, path: Path) -> None:
-        """Open a sealed session.
+    def __init__(self, path: Path, *, is_checked: bool = False) -> None:
+        """Open a sealed session, whose every byte is held against the file's hash.
+
+        Checksums of pages alone are not enough: a flip in the footer may give a column the name or
+        the place of another one.
+
+        Args:
+            path: the file.
+            is_checked: its bytes were held against the hash already.
 
         Raises:
-            FileFormatError: no such file, not Parquet, or not one of ours.
+            FileFormatError: no such file, not Parquet, not one of ours, or damaged.
         """
         self.path = path
         try:
@@ -215,6 +222,8 @@ class SessionReader:
                 expected=f"a session of format {FORMAT.decode()}, written by foottile",
                 remedy="Update foottile" if version else "",
             )
+        if not is_checked:
+            self._check_bytes()
         self.info = array_info(schema, where=str(path))
         self.notes = _notes(metadata.get(NOTES_KEY), where=str(path))
         self.format = version
@@ -228,6 +237,20 @@ class SessionReader:
         self.frame_count = self._file.metadata.num_rows
         if not self.frame_count:
             raise FileFormatError("the session has no frames", where=str(path))
+
+    def _check_bytes(self) -> None:
+        try:
+            hashes = file_hashes(self.path)
+        except OSError as error:
+            raise FileFormatError(f"cannot be read: {error}", where=str(self.path)) from error
+        # Another program that writes the file anew leaves out all three hashes, not one.
+        is_gone = hashes is None and CONTENT_KEY in (self._file.metadata.metadata or {})
+        if is_gone or (hashes is not None and hashes[0] != hashes[1]):
+            raise DamagedFileError(
+                "its bytes are not those that were sealed, by the hash in its footer",
+                where=str(self.path),
+                remedy="`foottile verify` says more; pull it again, or use a copy",
+            )
 
     def _content(self, metadata: Mapping[bytes, bytes]) -> tuple[str | None, dict[str, Any] | None]:
         """What the file says of its content; None if another program wrote it last."""

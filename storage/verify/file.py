@@ -72,7 +72,7 @@ def verify_file(path: Path) -> FileReport:
             "its bytes are not those that were sealed, by the hash in its footer"
         )
     try:
-        with SessionReader(path) as reader:
+        with SessionReader(path, is_checked=True) as reader:
             _read_through(reader, report, has_file_hash=hashes is not None)
     except FileFormatError as error:
         if not report.problems and not _is_ours(path):

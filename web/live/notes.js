@@ -44,8 +44,10 @@ export class Notes {
     });
   }
 
-  draw(node, frame, nowMs, serverNowMs) {
-    const notes = standing(node, frame, serverNowMs);
+  /** `problems`: what the server found damaged; said without a node, too. */
+  draw(node, frame, nowMs, serverNowMs, problems = []) {
+    const notes = node ? standing(node, frame, serverNowMs) : [];
+    for (const problem of problems) notes.push(sentence(`damaged on the server: ${problem}`));
     for (const [text, seenMs] of this.seenMs) {
       if (nowMs - seenMs > HOLD_MS) this.seenMs.delete(text);
       else notes.push(text);
@@ -55,7 +57,7 @@ export class Notes {
       this.shown = key;
       this.list.replaceChildren(...notes.map((text) => el("li", { text })));
     }
-    setText(byId("facts"), facts(node, frame, serverNowMs));
+    setText(byId("facts"), node ? facts(node, frame, serverNowMs) : "");
   }
 }
 
@@ -67,6 +69,7 @@ function standing(node, frame, serverNowMs) {
   else if (node.calibration.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE) {
     notes.push("Scale assumed, not measured: newtons are not to be trusted.");
   }
+  if (bits & ESTIMATE.TARE_LOST) notes.push("Tare lost: no force is known.");
   if (!tare) notes.push(said("Not tared", node.tare_problem || "lift the foot off the ground and press Tare."));
   else {
     if (node.tare_problem) notes.push(`Tare: ${node.tare_problem}.`);

@@ -17,6 +17,10 @@ class Health(View):
     """The process answers."""
 
     status: str = Field(examples=["ok"])
+    problems: list[str] = Field(
+        description="What was found damaged in the data folder when the server was started, and "
+        "what became of it, in words. The rest is served."
+    )
 
 
 class Ready(View):
@@ -36,9 +40,9 @@ class Version(View):
 
 
 @router.get("/health", operation_id="getHealth", summary="Is the process alive?")
-async def health() -> Health:
-    """Answers while the process runs."""
-    return Health(status="ok")
+async def health(server: ServerState) -> Health:
+    """Answers while the process runs; says what it found damaged."""
+    return Health(status="ok", problems=server.problems)
 
 
 @router.get(

@@ -100,6 +100,7 @@ def _joined(server: Server, hello: Hello) -> Iterator[Link]:
     try:
         node = server.nodes.greet(hello)
         node.attach(hello, utc_ns())
+        server.recorder.know(node)
         server.settling.follow(node)
     except Exception as error:
         if is_new:

@@ -88,6 +88,7 @@ def _hello(server: Server, node: str | None) -> dict[str, object]:
         "protocol": PROTOCOL,
         "software": SOFTWARE,
         "t_ns": utc_ns(),
+        "problems": server.problems,
         "nodes": [
             view
             for known in server.nodes

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,8 @@ from devices.arrays import Bools, Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import TareError
 
-Source = Literal["interval", "lead", "recognised", "unloaded", "flight"]
+TakenFrom = Literal["interval", "lead", "recognised", "unloaded", "flight"]
+Source = TakenFrom | Literal["lost"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Tare:
         begin_s: begin of the interval, in seconds from the first frame.
         end_s: its end.
         frames: number of frames it was taken from.
-        source: how the interval was found.
+        source: how the interval was found; "lost": there was a tare, and it is not known what it
+            said: its arrays are NaN, and so is every force while it is in force.
     """
 
     baseline_kpa: Floats
@@ -44,6 +46,17 @@ class Tare:
     end_s: float
     frames: int
     source: Source
+
+    @classmethod
+    def lost(cls, *, tiles: int, t_ns: int) -> Tare:
+        """In place of one that was lost; it may have been in force from `t_ns` on."""
+        unknown = np.full(tiles, np.nan)
+        return cls(unknown, unknown, unknown, unknown, t_ns, 0.0, 0.0, 0, "lost")
+
+    @property
+    def is_lost(self) -> bool:
+        """Does it stand for one that was lost?"""
+        return self.source == "lost"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON, which has no NaN: `None`."""
@@ -63,9 +76,15 @@ class Tare:
             TareError: it is no tare, or of another number of tiles.
         """
         try:
-            values: dict[str, Any] = {"source": str(content["source"])}
+            if content["source"] == "lost":
+                return cls.lost(tiles=tiles, t_ns=int(content["t_ns"]))
+            if content["source"] not in get_args(TakenFrom):
+                raise ValueError(f"source {content['source']!r}")  # noqa: TRY301  # caught with the others
+            values: dict[str, Any] = {"source": content["source"]}
             values |= {name: int(content[name]) for name in ("t_ns", "frames")}
             values |= {name: float(content[name]) for name in ("begin_s", "end_s")}
+            if not -(2**63) <= values["t_ns"] < 2**63:
+                raise ValueError(f"t_ns is {values['t_ns']}")  # noqa: TRY301  # caught with the others
             for name in ("baseline_kpa", "baseline_sigma_kpa", "noise_kpa"):
                 values[name] = np.array(content[name], dtype=np.float64)
                 if values[name].shape != (tiles,) or not np.isfinite(values[name]).all():

@@ -94,8 +94,15 @@ class TareFrames:
 
     @property
     def step_noise_kpa(self) -> Floats:
-        """(tiles,), noise from differences between two frames, which slow motion hardly changes."""
-        return np.asarray(np.nanstd(np.diff(self.kpa, axis=0), axis=0) / np.sqrt(2.0))
+        """(tiles,), noise from differences between two frames, which slow motion hardly changes.
+
+        NaN where there are none.
+        """
+        steps_kpa = np.diff(self.kpa, axis=0)
+        noise_kpa = np.full(steps_kpa.shape[1], np.nan)
+        known = np.isfinite(steps_kpa).any(axis=0)  # of nothing numpy takes no deviation
+        noise_kpa[known] = np.nanstd(steps_kpa[:, known], axis=0) / np.sqrt(2.0)
+        return noise_kpa
 
     def quiet_windows(self, spans: Iterable[tuple[int, int]], noise_kpa: Floats) -> list[Window]:
         """The `spans`, each first row and row after the last, that may be without load.

@@ -27,7 +27,7 @@ def let_go(node: FakeNode, healthy: FakeNode) -> tuple[int, str]:
 
 def assert_goes_on(healthy: FakeNode) -> None:
     """The server answers, and a node that was there all the time is taken in as before."""
-    assert healthy.running.http.get("/health").json() == {"status": "ok"}
+    assert healthy.running.http.get("/health").json() == {"status": "ok", "problems": []}
     healthy.deliver(20)
 
 

@@ -9,9 +9,12 @@ import pytest
 
 from devices.frames import TileStatus
 from service.estimation.estimates import EstimateStatus
+from service.estimation.ladder import MODELS
 from service.estimation.models.temperature import Temperature
-from tests.builders.arrays import COUNT_KPA, array_at
-from tests.builders.calibrations import newton_tile
+from service.estimation.plan import make_plan
+from service.estimation.tare.tare import Tare
+from tests.builders.arrays import COUNT_KPA, array_at, make_servo
+from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import estimate, newton_plan
 from tests.builders.frames import loaded_frames
 from tests.service.estimation.feet import COP, SQUARE, held
@@ -185,5 +188,42 @@ def test_every_flag_has_a_bit_of_its_own(status: EstimateStatus) -> None:
         "assumed_scale": 64,
         "tare_old": 128,
         "over_rated": 256,
+        "tare_lost": 512,
     }
     assert bits[str(status.name).lower()] == status
+
+
+@pytest.mark.parametrize("lag_ms", [0.0, 10.0])
+def test_with_a_tare_that_is_lost_nothing_is_known_but_the_angle_and_a_flag_says_so(
+    lag_ms: float,
+) -> None:
+    info, chips = array_at(SQUARE, servo=make_servo()), loaded_frames(held([9] * 4))
+    models = [name for name in MODELS if name != "ambient"]
+    tiles = [newton_tile(serial, effects=make_effects()) for serial in info.serials]
+    plan = newton_plan(info, models=models, tiles=tiles, lag_ms=lag_ms)
+    lost = make_plan(
+        info,
+        plan.calibration,
+        Tare.lost(tiles=4, t_ns=0),
+        models=models,
+        lag_ms=lag_ms,
+    )
+    whole, e = estimate(plan, chips), estimate(lost, chips)
+    for name in ("gauge_kpa", "force_n", "force_sigma_n", "grf_n", "grf_sigma_n", *COP):
+        assert np.isnan(getattr(e, name)).all(), name
+        assert np.isfinite(getattr(whole, name)).any() or "ground" in name, name
+    assert (e.contact == 255).all()
+    assert (e.estimate_status == EstimateStatus.TARE_LOST | EstimateStatus.COP_MASKED).all()
+    assert e.angle_rad.tobytes() == whole.angle_rad.tobytes()
+
+
+def test_a_tile_that_is_missing_is_said_even_if_the_tare_is_lost() -> None:
+    status = np.zeros((12, 4))
+    status[11, 1] = TileStatus.NO_ANSWER
+    info = array_at(SQUARE)
+    plan = make_plan(
+        info, newton_plan(info).calibration, Tare.lost(tiles=4, t_ns=0), models=("static",)
+    )
+    e = estimate(plan, loaded_frames(held([9] * 4), status=status))
+    missing = e.estimate_status & EstimateStatus.TILE_MISSING
+    assert np.flatnonzero(missing).tolist() == [11]

@@ -6,9 +6,11 @@ import asyncio
 import socket
 
 import pytest
+from websockets.exceptions import ConnectionClosed, ConnectionClosedError
+from websockets.frames import Close
 
 from service.node import dial as dial_module
-from service.node.dial import dial
+from service.node.dial import BackOff, dial
 from tests.waiting import in_a_loop
 
 
@@ -77,3 +79,29 @@ async def test_nobody_who_answers_is_waited_for_for_ever(monkeypatch: pytest.Mon
     monkeypatch.setattr(loop, "sock_connect", connect)
     with pytest.raises(TimeoutError, match="no answer"):
         await dial("ws://127.0.0.1:9")
+
+
+def let_go_with(code: int) -> ConnectionClosed:
+    return ConnectionClosedError(Close(code, "for this test"), None)
+
+
+def test_a_node_that_is_let_go_for_what_it_sends_comes_back_ever_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A welcome is no success: it would be let go for the same again, twice a second."""
+    monkeypatch.setattr(dial_module, "REFUSED_BACK_OFF_S", (0.2, 5.0))
+    back_off, waits = BackOff(), []
+    for _ in range(8):
+        back_off.failed(let_go_with(4001))
+        waits.append(back_off.next_s())
+    assert waits[0] <= 0.5
+    assert 2.5 <= waits[-1] <= 5.0
+    back_off.succeeded()  # frames were acknowledged
+    assert back_off.next_s() <= 0.5
+
+
+def test_a_node_whose_message_was_damaged_on_its_way_sends_it_again_soon() -> None:
+    back_off = BackOff()
+    for _ in range(8):
+        back_off.failed(let_go_with(4004))
+        assert back_off.next_s() <= 0.5

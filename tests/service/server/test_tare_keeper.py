@@ -339,7 +339,7 @@ def test_an_automatic_tare_that_cannot_be_kept_is_not_in_force(
     foot: Foot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = foot.node.live.tare
-    monkeypatch.setattr("service.sessions.tares.write_whole", refusing(StorageError, "full"))
+    monkeypatch.setattr("service.sessions.tares.write_tares", refusing(StorageError, "full"))
     foot.live(70.0, 0.9)
     assert foot.history == [("lead", False)]
     assert foot.node.live.tare is before

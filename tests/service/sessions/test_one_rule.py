@@ -99,8 +99,6 @@ def session(**content: Any) -> Session:
 
 
 SEQ = st.integers(0, BATCHES * BATCH)
-# One frame is no interval to tare from, and numpy says so before it is refused.
-pytestmark = pytest.mark.filterwarnings("ignore:Degrees of freedom:RuntimeWarning")
 
 
 def keep(data: Path, kept: Session) -> Path:

@@ -75,7 +75,7 @@ def test_one_in_the_trash_is_made_again_as_well(data: Path) -> None:
     (data / "trash").mkdir()
     shutil.move(data / "sessions" / ID, data / "trash" / ID)
     trash = Trash(SessionFolder(data / "trash").path(ID).parent)
-    assert (ID in trash, trash.has_unreadable) == (True, False)
+    assert (ID in trash, trash.problems) == (True, [])
     trash.give_back(ID, SessionFolder(data / "sessions"))
     assert_made_again(data, before)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.errors import FileFormatError, StorageError, UnknownError
+from devices.errors import StorageError, UnknownError
 from devices.frames import ArrayInfo
 from service.estimation.tare.tare import Source, Tare
-from service.sessions.tares import KEPT_MAX, RecordedTare, TareHistory
+from service.sessions.tare_file import RecordedTare
+from service.sessions.tares import KEPT_MAX, TareHistory
+from storage.checked_json import read_checked
 from tests.builders.arrays import make_array, make_tile
 from tests.builders.calibrations import make_tare
 from tests.storage.faulty_disk import NO_SPACE, refusing
@@ -57,6 +59,16 @@ def history(tmp_path: Path, *t_ns: int) -> TareHistory:
     for t in t_ns:
         made.add(tare(t), INFO)
     return made
+
+
+def as_older(path: Path, change: Callable[[Any], None] = lambda _: None) -> None:
+    """The file as it was written before there were hashes, with a change."""
+    content = json.loads(path.read_bytes())["tares"]
+    for entry in content:
+        for name in ("number", "of", "sha256"):
+            del entry[name]
+    change(content)
+    path.write_text(json.dumps(content))
 
 
 def instants(tares: Sequence[Tare]) -> list[int]:
@@ -119,10 +131,11 @@ def test_a_tare_does_not_count_for_a_part_that_was_swapped(tmp_path: Path) -> No
     assert tares.during(swapped, 0, 100) == ()
     tares.add(tare(2), swapped)
     assert instants(history(tmp_path).during(INFO, 0, 100)) == [1]
-    path = tmp_path / "node" / "tares.json"
-    content = json.loads(path.read_bytes())
-    del content[0]["chips"]  # an older version's knows only serials
-    path.write_text(json.dumps(content))
+
+    def without(content: Any) -> None:
+        del content[0]["chips"]  # a still older version's knows only serials
+
+    as_older(tmp_path / "node" / "tares.json", without)
     assert instants(history(tmp_path).during(swapped, 0, 100)) == [1, 2]
 
 
@@ -175,10 +188,11 @@ def test_every_tare_has_a_reason_in_words(tmp_path: Path) -> None:
     tares.add(tare(2), INFO)
     tares.add(tare(3), INFO, "new shoe")
     tares.add(tare(4), INFO, "x" * 500)
-    path = tmp_path / "node" / "tares.json"
-    content = json.loads(path.read_bytes())
-    del content[1]["reason"]  # an older version's
-    path.write_text(json.dumps(content))
+
+    def without(content: Any) -> None:
+        del content[1]["reason"]  # a still older version's
+
+    as_older(tmp_path / "node" / "tares.json", without)
     assert [recorded.reason for recorded in history(tmp_path).all] == [
         "unloaded lead of the emulation",
         "by hand",
@@ -250,7 +264,7 @@ def test_automatic_tares_never_push_out_one_that_was_taken_by_hand(
 
 def test_the_history_survives_a_restart_bit_by_bit(tmp_path: Path) -> None:
     tares = history(tmp_path, 1, 2**62)
-    tares.add(tare(5, tiles=1), array("Ü\n\u2028"))
+    tares.add(tare(5, tiles=1), array("Ü"))
     tares.undo(tares.all[1].id)
     again = history(tmp_path)
     assert len(again.all) == 3
@@ -298,23 +312,34 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None
     assert tares.all == []
 
 
-# --- damaged --------------------------------------------------------------------------------------
+# --- of an older version --------------------------------------------------------------------------
 
 
-def assert_damaged(path: Path) -> None:
-    with pytest.raises(FileFormatError, match="not readable") as caught:
-        TareHistory(path)
-    assert caught.value.where == str(path)
-    assert "tared again" in caught.value.remedy
+def assert_lost(path: Path) -> None:
+    found = TareHistory(path)
+    assert found.all == []
+    assert found.in_force(INFO) is None
+    assert found.is_lost(INFO)
+    assert [tare.is_lost for tare in found.during(INFO, 0, 9)] == [True]
+    assert path.with_name("tares.json.damaged-1").exists()
+    assert found.problem is not None
+    assert "tares.json.damaged-1" in found.problem
 
 
-def test_a_file_that_is_cut_off_anywhere_is_damaged(tmp_path: Path) -> None:
-    history(tmp_path, 1)
+def test_tares_of_an_older_version_are_read_called_unproven_and_written_with_hashes(
+    tmp_path: Path,
+) -> None:
+    before = history(tmp_path, 1, 2).all
     path = tmp_path / "node" / "tares.json"
-    content = path.read_bytes()
-    for length in range(len(content)):
-        path.write_bytes(content[:length])
-        assert_damaged(path)
+    as_older(path)
+    found = TareHistory(path)
+    for one, other in zip(before, found.all, strict=True):
+        same(one, other)
+    assert found.problem is not None
+    assert "unproven" in found.problem
+    again = TareHistory(path)
+    assert again.problem is None
+    assert read_checked(path).is_proven
 
 
 DAMAGES: dict[str, dict[str, Any]] = {
@@ -329,6 +354,8 @@ DAMAGES: dict[str, dict[str, Any]] = {
     "another shape": {"tare": {"baseline_sigma_kpa": [[1.0, 1.0]]}},
     "words for an instant": {"tare": {"t_ns": "yesterday"}},
     "no instant": {"tare": {"t_ns": None}},
+    "an instant of no time": {"tare": {"t_ns": 2**63}},
+    "a source that is none": {"tare": {"source": "flighu"}},
     "other tiles": {"serials": ["T01", "T02", "T03"]},
     "words for chips": {"chips": [["a"], ["b"]]},
     "a number for chips": {"chips": 7},
@@ -337,45 +364,46 @@ DAMAGES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("change", DAMAGES.values(), ids=DAMAGES.keys())
-def test_an_entry_that_is_no_tare_of_its_tiles_is_damaged(
+def test_an_older_list_with_what_is_no_tare_of_its_tiles_is_lost(
     tmp_path: Path, change: dict[str, Any]
 ) -> None:
     history(tmp_path, 1)
     path = tmp_path / "node" / "tares.json"
-    content = json.loads(path.read_bytes())
-    for name, value in change.items():
-        content[0][name] = content[0][name] | value if name == "tare" else value
-    path.write_text(json.dumps(content))
-    assert_damaged(path)
+
+    def changed(content: Any) -> None:
+        for name, value in change.items():
+            content[0][name] = content[0][name] | value if name == "tare" else value
+
+    as_older(path, changed)
+    assert_lost(path)
 
 
 @pytest.mark.parametrize(
     "missing", ["id", "serials", "undone", "tare", "baseline_kpa", "t_ns", "source", "frames"]
 )
-def test_an_entry_that_lacks_something_is_damaged(tmp_path: Path, missing: str) -> None:
+def test_an_older_list_with_a_tare_that_lacks_something_is_lost(
+    tmp_path: Path, missing: str
+) -> None:
     history(tmp_path, 1)
     path = tmp_path / "node" / "tares.json"
-    content = json.loads(path.read_bytes())
-    del (content[0] if missing in content[0] else content[0]["tare"])[missing]
-    path.write_text(json.dumps(content))
-    assert_damaged(path)
+
+    def without(content: Any) -> None:
+        del (content[0] if missing in content[0] else content[0]["tare"])[missing]
+
+    as_older(path, without)
+    assert_lost(path)
 
 
 def test_tares_of_an_older_version_have_no_temperature_and_are_readable(tmp_path: Path) -> None:
     history(tmp_path, 1)
     path = tmp_path / "node" / "tares.json"
-    content = json.loads(path.read_bytes())
-    del content[0]["tare"]["tadc_counts"]
-    path.write_text(json.dumps(content))
+
+    def without(content: Any) -> None:
+        del content[0]["tare"]["tadc_counts"]
+
+    as_older(path, without)
     (old,) = history(tmp_path).all
     assert np.isnan(old.tare.tadc_counts).tolist() == [True, True]
     history(tmp_path).add(tare(2), INFO)  # and can be written again, as JSON that has no NaN
     json.loads(path.read_bytes(), parse_constant=pytest.fail)
     assert np.isnan(history(tmp_path).all[0].tare.tadc_counts).all()
-
-
-@pytest.mark.parametrize("content", [b"null", b"7", b'"tares"', b"{}", b"[7]", b"[null]", b"\xff"])
-def test_what_is_no_list_of_tares_is_damaged(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "tares.json"
-    path.write_bytes(content)
-    assert_damaged(path)

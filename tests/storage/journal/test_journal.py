@@ -154,7 +154,7 @@ def test_an_index_whose_segment_a_power_cut_took_is_set_aside_when_the_journal_i
     assert gone.with_suffix(".unread").exists()
 
 
-def test_what_was_set_aside_before_is_not_replaced_by_an_index(tmp_path: Path) -> None:
+def test_what_was_set_aside_before_is_not_replaced(tmp_path: Path) -> None:
     filled(tmp_path, (0, 9)).close()
     (path,) = segments(tmp_path)
     path.unlink()
@@ -162,7 +162,12 @@ def test_what_was_set_aside_before_is_not_replaced_by_an_index(tmp_path: Path) -
     aside.write_bytes(b"what followed the last whole batch")
     begun(tmp_path).close()
     assert aside.read_bytes() == b"what followed the last whole batch"
-    assert path.with_suffix(".idx").exists()
+    assert not path.with_suffix(".idx").exists()
+    assert path.with_suffix(".2.unread").exists()
+    path.write_bytes(b"no segment")
+    begun(tmp_path).close()
+    assert aside.read_bytes() == b"what followed the last whole batch"
+    assert path.with_suffix(".3.unread").read_bytes() == b"no segment"
 
 
 def test_a_deleted_journal_is_gone(tmp_path: Path) -> None:

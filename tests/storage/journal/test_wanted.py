@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from devices.errors import FileFormatError
 from storage.intervals import NO_END, Intervals
 from storage.journal.wanted import ServerWants, Wanted
 
@@ -41,7 +40,47 @@ def test_one_server_does_not_give_up_what_another_needs(tmp_path: Path) -> None:
     assert wanted.numbers("a") == Intervals([(5, 14), (100, 109)])
 
 
-def test_a_damaged_file_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
-    (tmp_path / "wanted.json").write_text("{")
-    with pytest.raises(FileFormatError, match="Move it away"):
-        Wanted(tmp_path / "wanted.json")
+DAMAGES = (b"", b"{", b"[]", b"null", b'{"servers": 7}', b"\xff", b"[" * 100_000, b"1e999")
+
+
+@pytest.mark.parametrize("content", DAMAGES, ids=lambda c: repr(c[:12]))
+def test_a_damaged_file_is_set_aside_and_as_long_as_it_is_there_all_may_be_wanted(
+    tmp_path: Path, content: bytes
+) -> None:
+    path = tmp_path / "wanted.json"
+    path.write_bytes(content)
+    wanted = Wanted(path)
+    assert wanted.may_be_all
+    assert "wanted.json.damaged-1" in " ".join(wanted.problems)
+    assert path.with_name("wanted.json.damaged-1").read_bytes() == content
+    wanted.say("laptop", ServerWants(streams={"a": ((0, 9),)}))
+    wanted.save()
+    again = Wanted(path)
+    assert again.numbers("a") == Intervals([(0, 9)])
+    assert again.may_be_all
+    assert "delete" in again.problems[0]
+    path.with_name("wanted.json.damaged-1").unlink()
+    assert not Wanted(path).may_be_all
+    assert Wanted(path).problems == []
+
+
+def test_a_flipped_bit_is_noticed_wherever_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "wanted.json"
+    wanted = Wanted(path)
+    wanted.say("laptop", ServerWants(streams={"a": ((0, 9),)}, recording=True, known=("a",)))
+    wanted.save()
+    whole = path.read_bytes()
+    for at in range(len(whole)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1 << at % 8]) + whole[at + 1 :])
+        assert Wanted(path).may_be_all
+        path.with_name("wanted.json.damaged-1").unlink()
+
+
+def test_a_file_of_an_older_version_is_read_and_called_unproven(tmp_path: Path) -> None:
+    path = tmp_path / "wanted.json"
+    path.write_text('{"servers":{"laptop":{"streams":{"a":[[0,9]]}}}}')
+    wanted = Wanted(path)
+    assert wanted.numbers("a") == Intervals([(0, 9)])
+    assert not wanted.is_proven
+    wanted.save()
+    assert Wanted(path).is_proven

@@ -176,7 +176,7 @@ def test_a_changed_note_is_seen_whenever_the_file_is_opened(tmp_path: Path) -> N
     said = metadata_of(path)
     kept = {key: said[key] for key in said if key.startswith(b"foottile.content")}
     pq.write_table(table.replace_schema_metadata({**changed, **kept}), path)
-    with pytest.raises(FileFormatError, match="not the one that was sealed"):
+    with pytest.raises(FileFormatError, match="are not those that were sealed"):
         SessionReader(path)
     path.write_bytes(whole)
     SessionReader(path).close()
@@ -209,3 +209,17 @@ def test_a_note_that_looks_like_the_hash_is_none(tmp_path: Path) -> None:
     path = write(tmp_path / "s.parquet", trap=trap)
     stated, found = file_hashes(path) or ("", "other")
     assert stated == found
+
+
+def test_a_footer_that_gives_a_column_the_name_of_another_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    with SessionWriter(path, make_array(2), {}) as writer:
+        writer.append(make_frames(20, 2), {})
+    whole = path.read_bytes()
+    # Every page keeps its checksum: only the footer's names are exchanged.
+    swapped = whole.replace(b"tadc_0", b"tadc_x").replace(b"tadc_1", b"tadc_0")
+    for changed in (swapped.replace(b"tadc_x", b"tadc_1"), whole.replace(b"padc_1", b"padc_0")):
+        assert len(changed) == len(whole)
+        path.write_bytes(changed)
+        with pytest.raises(FileFormatError, match="are not those that were sealed"):
+            SessionReader(path)

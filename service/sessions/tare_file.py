@@ -1,0 +1,218 @@
+"""`tares.json`: the tares of one node on disk, each of which proves itself.
+
+A tare is a line with a hash of its own text, and says which of how many it is. So whatever is
+changed in the file, cut off, taken out, doubled or moved: the tares that are whole are read, and
+where others are missing among them is known. What they said is not: a `LostTares` stands for them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from devices.errors import DamagedFileError
+from devices.frames import ArrayInfo
+from service.estimation.tare.tare import Tare
+from storage.checked_json import checked, write_checked
+from storage.durable import ASIDE, read_whole
+
+REASONS = {
+    "lead": "unloaded lead of the emulation",
+    "unloaded": "by hand",
+    "flight": "in flight",
+}
+_LINE = re.compile(
+    rb'(\{"number": ([0-9]{1,9}), "of": ([0-9]{1,9}), [^\n]*?), "sha256": "([0-9a-f]{64})"\}'
+)
+
+
+@dataclass(frozen=True)
+class RecordedTare:
+    """A tare, the tiles it is of, why it was taken, and what became of it."""
+
+    id: str
+    serials: tuple[str, ...]
+    tare: Tare
+    undone: bool = False
+    reason: str = ""
+    """In words."""
+    chips: tuple[tuple[int, ...], ...] | None = None
+    """Coefficients of the tiles' chips; None in tares of older versions, which kept none."""
+
+    def is_of(self, info: ArrayInfo) -> bool:
+        """Does it belong to these tiles? A swapped part has the same serial but another chip."""
+        return self.serials == info.serials and self.chips in (None, chips_of(info))
+
+    @property
+    def is_automatic(self) -> bool:
+        """Did it come unasked?"""
+        return self.tare.source == "flight"
+
+
+@dataclass(frozen=True)
+class LostTares:
+    """One tare, or some in a row, of which nothing is known but their place in the order."""
+
+
+Entry = RecordedTare | LostTares
+LOST = LostTares()
+
+
+@dataclass(frozen=True)
+class TaresFound:
+    """What a file holds.
+
+    Attributes:
+        entries: in the order in which they were taken.
+        problem: what is wrong with it, in words; None: it is as it was written.
+        is_damaged: is it to be set aside?
+    """
+
+    entries: tuple[Entry, ...]
+    problem: str | None = None
+    is_damaged: bool = False
+
+
+def chips_of(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
+    """Coefficients of an array's chips."""
+    return tuple(tuple(tile.coefficient_words) for tile in info.tiles)
+
+
+def read_tares(path: Path) -> TaresFound:
+    """Whatever can be proven in a file, and a `LostTares` wherever something else was."""
+    try:
+        text = read_whole(path)
+    except FileNotFoundError:
+        return _missing(path)
+    except DamagedFileError as error:
+        return TaresFound((LOST,), f"{error.what}: all of its tares are lost", is_damaged=True)
+    is_proven, what = False, "it is no whole list of tares"
+    try:
+        is_proven = checked(text, where=str(path)).is_proven
+        older = None if is_proven else _of_older_version(text)
+    except DamagedFileError as error:
+        older, what = None, error.what
+    if older is not None:
+        return TaresFound(older, "it is of an older version, which wrote no hashes: unproven")
+    entries, lost = _proven(text)
+    if is_proven and lost == 0:
+        return TaresFound(entries)
+    return TaresFound(entries, f"{what}: {_in_words(lost)}", is_damaged=True)
+
+
+def write_tares(path: Path, entries: Sequence[Entry]) -> None:
+    """Write all of them, in the order in which they were taken.
+
+    Raises:
+        StorageError: the disk is full or not writable; the old file is still there then.
+    """
+    lines = []
+    for number, entry in enumerate(entries):
+        content = {"number": number, "of": len(entries), **_content(entry)}
+        body = json.dumps(content).encode()[:-1]
+        lines.append(body + b', "sha256": "' + _hash(body) + b'"}')
+    write_checked(path, b'{"tares": [\n' + b",\n".join(lines) + b"\n]}")
+
+
+def _missing(path: Path) -> TaresFound:
+    """No file: there were no tares, unless a damaged file was set aside and no other written."""
+    try:
+        was_set_aside = any(path.parent.glob(path.name + ASIDE + "*"))
+    except OSError:
+        was_set_aside = False
+    if not was_set_aside:
+        return TaresFound(())
+    return TaresFound((LOST,), "a damaged one was set aside, and no other written: all are lost")
+
+
+def _in_words(lost: int | None) -> str:
+    if lost is None:
+        return "all of its tares are lost"
+    if lost == 0:
+        return "none of its tares is lost"
+    return "1 tare is lost" if lost == 1 else f"{lost} tares are lost"
+
+
+def _proven(text: bytes) -> tuple[tuple[Entry, ...], int | None]:
+    """Entries in order, and how many of them were lost now; None: not even that is known."""
+    places: dict[int, set[bytes]] = {}
+    totals = set()
+    for line in _LINE.finditer(text):
+        body, number, of, digits = line.groups()
+        if _hash(body) == digits:
+            places.setdefault(int(number), set()).add(body)
+            totals.add(int(of))
+    if len(totals) != 1:
+        return (LOST,), None
+    entries: list[Entry] = []
+    lost = 0
+    for number in range(totals.pop()):
+        bodies = places.get(number, set())
+        entry = _entry(json.loads(bodies.pop() + b"}")) if len(bodies) == 1 else None
+        lost += entry is None
+        entries.append(entry or LOST)
+    return in_order(entries), lost
+
+
+def in_order(entries: Iterable[Entry]) -> tuple[Entry, ...]:
+    """The same; of lost ones in a row one stands for all."""
+    kept: list[Entry] = []
+    for entry in entries:
+        if not (isinstance(entry, LostTares) and kept and kept[-1] == entry):
+            kept.append(entry)
+    return tuple(kept)
+
+
+def _content(entry: Entry) -> dict[str, object]:
+    if isinstance(entry, LostTares):
+        return {"lost": True}
+    return {
+        "id": entry.id,
+        "serials": entry.serials,
+        "undone": entry.undone,
+        "reason": entry.reason,
+        "chips": entry.chips,
+        "tare": entry.tare.as_dict(),
+    }
+
+
+def _entry(content: Mapping[str, Any]) -> Entry | None:
+    """None if it is of another version."""
+    if content.get("lost") is True:
+        return LOST
+    try:
+        return _recorded(content)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def _recorded(entry: Mapping[str, Any]) -> RecordedTare:
+    chips = entry.get("chips")
+    return RecordedTare(
+        str(entry["id"]),
+        tuple(entry["serials"]),
+        Tare.from_dict(entry["tare"], tiles=len(entry["serials"])),
+        bool(entry["undone"]),
+        str(entry.get("reason") or REASONS.get(entry["tare"]["source"], "")),
+        None if chips is None else tuple(tuple(int(w) for w in words) for words in chips),
+    )
+
+
+def _of_older_version(text: bytes) -> tuple[RecordedTare, ...] | None:
+    """Tares of a plain list, as it was written before there were hashes; None if it is none."""
+    try:
+        content = json.loads(text)
+        if not isinstance(content, list):
+            return None
+        return tuple(_recorded(entry) for entry in content) or None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+def _hash(body: bytes) -> bytes:
+    return hashlib.sha256(body).hexdigest().encode()

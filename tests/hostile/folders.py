@@ -1,0 +1,172 @@
+"""Small data folders as a server, a node and a user leave them, and every number read from them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from devices.errors import FootTileError
+from devices.frames import ArrayInfo
+from service.link import PROTOCOL, Hello
+from service.offline.calibrations import read_calibration, write_calibration
+from service.sessions.recover import recover
+from service.sessions.tares import TareHistory
+from storage.checked_json import write_checked
+from storage.clock.log import ClockLog, ClockOffset
+from storage.journal.wanted import ServerWants, Wanted
+from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
+from storage.sessions.file import SessionReader
+from storage.sessions.folder import FRAMES_NAME, Event, Part, SessionFolder
+from tests.builders.arrays import make_array
+from tests.builders.calibrations import make_calibration, make_tare
+from tests.service.sessions.crashed import BOOT, session, stream, t_ns
+
+SEALED = "20200101T000000Z-00000a"
+DELETED = "20200101T000000Z-00000b"
+PENDING = "20200101T000000Z-00000c"
+FRAMES = 120
+REFUSED = "refused: "
+
+Readings = dict[str, str]
+"""What each reader gives: a hash of its numbers, or `REFUSED` and the error."""
+
+
+def make_server(data: Path) -> None:
+    """A server's: a sealed session, one in the trash, one that waits, journal, clock, tares."""
+    info, node = make_array(boot_id=BOOT), data / "nodes" / "bench"
+    TareHistory(node / "tares.json").add(make_tare(t_ns=t_ns(0)), info)
+    hello = Hello(
+        protocol=PROTOCOL,
+        array_info=info,
+        held=((0, FRAMES - 1),),
+        next_seq=FRAMES,
+        scene={"name": "test"},
+        emulated=True,
+        calibration=make_calibration("T01", "T02"),
+        calibration_problem=None,
+    )
+    write_checked(node / "hello.json", hello.model_dump_json().encode())
+    (data / "server_id").write_text("5" * 32 + "\n")
+    (data / "token").write_text("a token that nobody has\n")
+    folder = _journal(data, info)
+    log = ClockLog(folder)
+    for row in range(6):
+        log.append(
+            ClockOffset(
+                boot_id=BOOT,
+                t_mono_ns=row * 30_000_000,
+                server_minus_node_ns=1_000_000 + row,
+                uncertainty_ns=300_000 - row,
+            )
+        )
+    for session_id, first, last in ((SEALED, 5, 60), (DELETED, 20, 40)):
+        _session(data, session_id, first, last)
+    recover(data, give_up=True)
+    sessions = SessionFolder(data / "sessions")
+    sessions.move(DELETED, SessionFolder(data / "trash"))
+    _session(data, PENDING, 50, FRAMES - 1)
+
+
+def make_node(root: Path) -> None:
+    """A node's that recorded by itself and was killed."""
+    folder = _journal(root, make_array(boot_id=BOOT))
+    wanted = Wanted(folder.parent / "wanted.json")
+    wanted.say("5" * 32, ServerWants(streams={BOOT: ((0, None),)}, known=(BOOT,)))
+    wanted.save()
+    _session(root, PENDING, 0, FRAMES - 1)
+
+
+def make_user(folder: Path) -> None:
+    """A user's calibrations."""
+    folder.mkdir()
+    write_calibration(folder / "toe.json", make_calibration("T01", "T02"))
+
+
+def _journal(data: Path, info: ArrayInfo) -> Path:
+    return stream(data, info, (0, FRAMES - 1), next_seq=FRAMES)
+
+
+def _session(data: Path, session_id: str, first: int, last: int) -> None:
+    session(
+        data,
+        session_id,
+        state="pending",
+        stopped_t_ns=t_ns(last),
+        parts=(Part(boot_id=BOOT, seq_first=first, seq_last=last),),
+        events=(Event(id="e1", label="slip", t_ns=t_ns(first + 3)),),
+        calibration=make_calibration("T01", "T02").model_dump(mode="json"),
+    )
+
+
+def session_readings(folder: Path) -> Readings:
+    """What a sealed session's files give, each by itself."""
+    readers: Mapping[str, Callable[[], bytes]] = {
+        "session": lambda: (
+            SessionFolder(folder.parent).load(folder.name).model_dump_json().encode()
+        ),
+        "frames": lambda: _frames(folder / FRAMES_NAME),
+        "events": lambda: repr(read_events(folder / EVENTS_NAME).events).encode(),
+        "clock": lambda: _clock(folder / FRAMES_NAME),
+    }
+    return {f"{folder.name} {name}": _read(reader) for name, reader in readers.items()}
+
+
+def recovered_readings(data: Path) -> Readings:
+    """What a session gives that is sealed now, from journal, tares, clock log and calibration.
+
+    A loss that its ledger counts, or a problem that it says, is as good as a refusal.
+    """
+
+    def sealed() -> bytes:
+        recover(data, give_up=True)
+        done = SessionFolder(data / "sessions").load(PENDING)
+        ledger = done.ledger
+        if ledger is None or ledger.lossy or done.problem:
+            raise FootTileError(done.problem or f"the ledger says {ledger}")
+        return _frames(data / "sessions" / PENDING / FRAMES_NAME)
+
+    return {"sealed now": _read(sealed)}
+
+
+def user_readings(folder: Path) -> Readings:
+    """What calibrations give."""
+    return {path.name: _read(partial(_calibration, path)) for path in sorted(folder.glob("*.json"))}
+
+
+def _calibration(path: Path) -> bytes:
+    return read_calibration(path).model_dump_json().encode()
+
+
+def _frames(path: Path) -> bytes:
+    """Every column of every frame, whatever the file says beside them."""
+    digest = hashlib.sha256()
+    with SessionReader(path) as reader:
+        digest.update(reader.info.model_dump_json(exclude={"software"}).encode())
+        for table in reader.tables():
+            for name in table.column_names:
+                digest.update(name.encode())
+                values = table.column(name).to_numpy()
+                digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.digest()
+
+
+def _clock(path: Path) -> bytes:
+    with SessionReader(path) as reader:
+        table = clock_beside(reader)
+        columns = [
+            table.columns(frames.t_mono_ns, frames.t_ns, extra["part"])
+            for frames, extra in reader.batches("part")
+        ]
+    values = [values.tobytes() for each in columns for values in each.values()]
+    return b"".join([table.summary().model_dump_json().encode(), *values])
+
+
+def _read(reader: Callable[[], bytes]) -> str:
+    try:
+        return hashlib.sha256(reader()).hexdigest()
+    except FootTileError as error:
+        return f"{REFUSED}{error}"

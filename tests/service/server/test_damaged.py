@@ -1,0 +1,203 @@
+"""A server that finds its files damaged starts, says what it found, and gives no wrong number."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.estimation.estimates import EstimateStatus
+from service.sessions.tares import TareHistory
+from storage.checked_json import read_checked
+from tests.service.fake_node import FakeNode
+from tests.service.running import Running
+from tests.waiting import until
+
+LOST = int(EstimateStatus.TARE_LOST)
+
+
+def flip(path: Path, before: bytes, after: bytes) -> None:
+    text = path.read_bytes()
+    assert text.count(before) >= 1
+    at = text.rindex(before)
+    path.write_bytes(text[:at] + after + text[at + len(before) :])
+
+
+def problems(running: Running) -> str:
+    return " ".join(running.http.get("/health").json()["problems"])
+
+
+def shown(running: Running, node: FakeNode) -> dict[str, Any]:
+    """What a screen gets of the next frames."""
+    with running.socket("/api/v1/live?rate_hz=60") as live:
+        assert json.loads(live.recv(timeout=5.0))["type"] == "hello"
+        node.deliver(60, 3.0)
+        while True:
+            message: dict[str, Any] = json.loads(live.recv(timeout=5.0))
+            if message["type"] == "frame" and message["seq"] >= node.seq - 20:
+                return message
+
+
+@pytest.fixture
+def lost(running: Running, tared: FakeNode) -> FakeNode:
+    """The node, whose tare was damaged while the server was down."""
+    running.stop()
+    path = running.data / "nodes" / "bench" / "tares.json"
+    flip(path, b'"baseline_kpa": [100.', b'"baseline_kpa": [102.')
+    running.start()
+    tared.connect()
+    return tared
+
+
+def test_while_a_tare_is_lost_no_force_is_known_and_everybody_says_so(
+    running: Running, lost: FakeNode
+) -> None:
+    node = running.node()
+    assert node["tare"] is None
+    assert "damaged and lost" in node["tare_problem"]
+    assert "tares.json.damaged-1" in problems(running)
+    message = shown(running, lost)
+    assert message["gauge_kpa"] == message["force_n"] == [None, None]
+    assert message["grf_n"] is None
+    assert message["contact"] is None
+    assert message["estimate_status"] & LOST
+    recording = lost.record()
+    lost.deliver(100, 3.0, now=True)
+    sealed = lost.finish(recording)
+    assert sealed["complete"] is True
+    assert "a tare is damaged and lost" in sealed["problem"]
+    assert np.isnan(recording.column("grf_n").astype(float)).all()
+    assert (recording.column("estimate_status") & LOST).all()
+    with recording.reader() as reader:
+        assert [tare["source"] for tare in reader.notes["tares"]] == ["lost"]
+
+
+def test_a_tare_by_hand_ends_that_in_the_middle_of_a_session(
+    running: Running, lost: FakeNode
+) -> None:
+    lost.deliver(10)
+    recording = lost.record()
+    lost.deliver(300, alive=True, now=True)
+    answer = running.http.post("/nodes/bench/tare", json={})
+    assert answer.status_code == 201, answer.text
+    assert running.node()["tare_problem"] is None
+    message = shown(running, lost)
+    assert message["force_n"] == pytest.approx([3.0, 3.0], abs=0.05)
+    assert not message["estimate_status"] & LOST
+    lost.finish(recording)
+    is_lost = (recording.column("estimate_status") & LOST) != 0
+    assert is_lost[:300].all()
+    assert not is_lost[300:360].any()
+    assert recording.column("grf_n")[300:360] == pytest.approx(6.0, abs=0.1)
+    running.restart()
+    assert running.node()["tare"]["id"] == answer.json()["id"]
+    assert running.http.get("/health").json()["problems"] == []
+
+
+def test_a_lead_that_was_seen_before_does_not_come_back_in_place_of_a_lost_tare(
+    running: Running, lost: FakeNode
+) -> None:
+    lost.deliver(100)
+    node = running.node()
+    assert node["tare"] is None
+    assert running.http.get("/nodes/bench/tares").json()["items"] == []
+
+
+def test_a_session_from_before_the_loss_is_sealed_as_if_nothing_had_happened(
+    running: Running, tared: FakeNode
+) -> None:
+    pending = tared.record()
+    tared.deliver(100, 5.0)
+    later_ns = tared.next_t_mono_ns + 60_000_000_000
+    tared.leave()
+    pending.stop()
+    tared.next_t_mono_ns = later_ns
+    running.stop()
+    path = running.data / "nodes" / "bench" / "tares.json"
+    info, by_lead = tared.info, TareHistory(path).all[0].tare
+    TareHistory(path).add(replace(by_lead, t_ns=by_lead.t_ns + 10**11, source="unloaded"), info)
+    flip(path, b'"undone": false', b'"undone": true ')
+    running.start()
+    assert "1 tare is lost" in problems(running)
+    tared.connect()
+    tared.send(10, now=True)
+    assert "lost" in pending.sealed()["problem"], "it may have been taken right after the lead"
+
+
+@pytest.mark.parametrize("damage", ["flip", "folder", "of another node", "another version"])
+def test_a_node_whose_hello_is_damaged_is_known_again_when_it_connects(
+    running: Running, tared: FakeNode, node_of: Any, damage: str
+) -> None:
+    other = node_of(running, "other")
+    other.connect()
+    pending = tared.record()
+    tared.deliver(100, 5.0)
+    tared.leave()
+    pending.stop()
+    ends = tared.frames(10, now=True)
+    running.stop()
+    path = running.data / "nodes" / "bench" / "hello.json"
+    match damage:
+        case "flip":
+            flip(path, b'"x_m":0.0', b'"x_m":1.0')
+        case "folder":
+            path.unlink()
+            path.mkdir()
+        case "of another node":
+            shutil.copy(path.parent.parent / "other" / "hello.json", path)
+        case _:
+            path.write_text('{"type":"hello","protocol":1,"first_seq":0}')
+    running.start()
+    assert [node["node"] for node in running.http.get("/nodes").json()["items"]] == ["other"]
+    assert "hello.json" in problems(running)
+    assert path.with_name("hello.json.damaged-1").exists() == (damage != "another version")
+    assert pending.now()["state"] == "pending"
+    with running.socket("/api/v1/live") as live:
+        assert "hello.json" in " ".join(json.loads(live.recv(timeout=5.0))["problems"])
+    tared.connect()
+    tared.send_again(ends)
+    sealed = pending.sealed()
+    assert (sealed["frames"], sealed["complete"], sealed["problem"]) == (100, True, None)
+    assert pending.clock() != {}
+    assert running.node()["tare"] is not None
+    assert read_checked(path).is_proven
+
+
+def test_files_of_an_older_version_are_read_and_written_anew_with_a_hash(
+    running: Running, tared: FakeNode
+) -> None:
+    running.stop()
+    folder = running.data / "nodes" / "bench"
+    hello = json.loads((folder / "hello.json").read_bytes())
+    del hello["check"]
+    (folder / "hello.json").write_text(json.dumps(hello))
+    tares = json.loads((folder / "tares.json").read_bytes())["tares"]
+    (folder / "tares.json").write_text(json.dumps(tares))
+    stated = (running.data / "server_id").read_text().split()
+    (running.data / "server_id").write_text(stated[0] + "\n")
+    running.start()
+    assert running.server.id == stated[0]
+    assert (running.data / "server_id").read_text().split() == stated
+    assert running.node()["tare"] is not None
+    assert "unproven" in problems(running)
+    assert read_checked(folder / "tares.json").is_proven
+    tared.connect()
+    until(lambda: read_checked(folder / "hello.json").is_proven)
+
+
+def test_a_lock_or_probe_that_is_no_file_keeps_nobody_from_starting(
+    running: Running, tared: FakeNode
+) -> None:
+    running.stop()
+    (running.data / ".lock").unlink()
+    os.mkfifo(running.data / ".lock")
+    (running.data / ".writable").unlink()
+    (running.data / ".writable").mkdir()
+    running.start()
+    assert running.http.get("/ready").status_code == 200
