@@ -28,7 +28,7 @@ y_m = 0.0
 z_m = -0.15
 """
 _PATIENCE_S = 180.0
-"""64 tiles are measured before the first frame, and a busy machine computes the domes' last minute before the next frame comes."""
+"""64 tiles are measured before the first frame, which takes its time on a busy machine."""
 _SAID_S = 4.0
 """By then the node has said that acquisition is held up."""
 

@@ -302,3 +302,17 @@ def test_many_lags_at_once_give_the_bits_of_each_alone(columns: int, before: flo
         one = slice(i, i + 1)
         alone = decaying(drive[:, one], gain[one], decay[one], begin[one])
         assert together[:, one].tobytes() == alone.tobytes()
+
+
+@pytest.mark.parametrize("late_s", [2.0, 5.5, 55.5])
+def test_a_driver_that_was_away_for_long_finds_the_dome_as_it_is_by_now(late_s: float) -> None:
+    def pressed(t_s: Floats) -> Floats:
+        """Twenty newtons and nothing in turn, three seconds each; nothing for the last three."""
+        return np.where(np.mod(t_s - late_s, 6.0) < 3.0, 0.0, 20.0)
+
+    present = domes_of(pressed, **ALL)
+    present_kpa = kpa_at(present, grid(0.0, late_s))[-1]
+    away = domes_of(pressed, **ALL)
+    away.be_ready(late_s)
+    assert away.pressure_kpa(0, late_s) == pytest.approx(present_kpa, abs=0.05)
+    assert len(away._blocks) <= 6
