@@ -81,6 +81,8 @@ def _record(folder: Path) -> None:
                 pending = node.record(name="pending")
                 node.deliver(100, 7.0)
                 node.leave()
+                newest_ns = node.next_t_mono_ns
+                until(lambda newest_ns=newest_ns: time.monotonic_ns() > newest_ns)  # type: ignore[misc]
                 pending.stop()
                 assert pending.now()["state"] == "pending"
     finally:
