@@ -30,4 +30,5 @@ USER foottile
 VOLUME /data
 EXPOSE 8000
 STOPSIGNAL SIGTERM
+# Without FOOTTILE_TOKEN it makes a token, which is not in the log: docker exec NAME cat /data/token
 CMD ["foottile", "serve", "--host", "0.0.0.0", "--data", "/data"]

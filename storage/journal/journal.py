@@ -8,6 +8,7 @@ whole. Nothing is held twice: a number that is there already is left as it is.
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import stat
@@ -195,12 +196,10 @@ class Journal:
                 if segment.held and segment.span[0] < end and segment.span[1] >= at:
                     try:
                         records = segment.records()
-                    except OSError as error:
-                        if isinstance(error, FileNotFoundError) and segment not in self._segments:
+                    except StorageError as error:
+                        if error.errno == errno.ENOENT and segment not in self._segments:
                             continue  # pruned meanwhile
-                        raise StorageError(
-                            f"cannot be read: {error}", where=str(segment.path), errno=error.errno
-                        ) from error
+                        raise
                     inside = (records["seq_first"] >= at) & (records["seq_first"] < end)
                     found += [(numbers(r), segment.path, r) for r in records[inside]]
             found.sort(key=lambda item: item[0])

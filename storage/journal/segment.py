@@ -86,9 +86,14 @@ class Segment:
         """Index of the batches that count, in order of their frames.
 
         Raises:
-            OSError: the index cannot be read.
+            StorageError: the index cannot be read.
         """
-        found = batches_in(read_index(self.path))
+        try:
+            found = batches_in(read_index(self.path))
+        except OSError as error:
+            raise StorageError(
+                f"cannot be read: {error}", where=str(self.path), errno=error.errno
+            ) from error
         held = [not self.held.missing(*numbers(record)) for record in found]
         found = found[np.array(held, dtype=np.bool_)]
         return found[np.argsort(found["seq_first"], kind="stable")]
@@ -97,7 +102,9 @@ class Segment:
         """Stop holding batches within these numbers."""
         try:
             records = self.records()
-        except OSError:  # gone, or no descriptor is left: what is doubtful is whole batches anyway
+        except (
+            StorageError
+        ):  # gone, or no descriptor is left: what is doubtful is whole batches anyway
             self.held = self.held - doubtful
             return
         for record in records:

@@ -125,9 +125,9 @@ def _screen(port: int) -> socket.socket:
 def _is_refused(connection: socket.socket) -> bool:
     said = b""
     with suppress(OSError):
-        while len(said) < 2000 and (piece := connection.recv(4096)):
+        while len(said.partition(b"\r\n\r\n")[2]) < 4 and (piece := connection.recv(4096)):
             said += piece
-    return (1013).to_bytes(2, "big") in said.partition(b"\r\n\r\n")[2][:8]
+    return (1013).to_bytes(2, "big") in said.partition(b"\r\n\r\n")[2][:4]
 
 
 @attack("requests that are too long, too slow or no requests", tries=14, soak_tries=600)

@@ -38,7 +38,7 @@ class Root:
     """Every number that may depend on the file of this name, from a folder that is a copy."""
 
 
-@attack("a flip in every file of a data folder", tries=60, soak_tries=6000)
+@attack("a flip in every file of a data folder", tries=60, soak_tries=8500)
 def flips(play: Play) -> Outcome:
     """One bit at a tenth byte of one file of a server's, a node's or a user's folder, drawn anew.
 

@@ -63,9 +63,9 @@ def make_server(data: Path) -> None:
                 uncertainty_ns=300_000 - row,
             )
         )
-    for session_id, first, last in ((SEALED, 5, 60), (DELETED, 20, 40)):
-        _session(data, session_id, first, last)
+    _session(data, SEALED, 5, 60)
     recover(data, give_up=True)
+    _session(data, DELETED, 20, 40)
     sessions = SessionFolder(data / "sessions")
     sessions.move(DELETED, SessionFolder(data / "trash"))
     _session(data, PENDING, 50, FRAMES - 1)
@@ -103,7 +103,7 @@ def _session(data: Path, session_id: str, first: int, last: int) -> None:
 
 
 def session_readings(folder: Path) -> Readings:
-    """What a sealed session's files give, each by itself."""
+    """What a session's files give, each by itself; of one that is not sealed there is only one."""
     readers: Mapping[str, Callable[[], bytes]] = {
         "session": lambda: (
             SessionFolder(folder.parent).load(folder.name).model_dump_json().encode()
@@ -112,7 +112,10 @@ def session_readings(folder: Path) -> Readings:
         "events": lambda: repr(read_events(folder / EVENTS_NAME).events).encode(),
         "clock": lambda: _clock(folder / FRAMES_NAME),
     }
-    return {f"{folder.name} {name}": _read(reader) for name, reader in readers.items()}
+    wanted = readers if folder.name == SEALED else {"session"}
+    return {
+        f"{folder.name} {name}": _read(reader) for name, reader in readers.items() if name in wanted
+    }
 
 
 def recovered_readings(data: Path) -> Readings:

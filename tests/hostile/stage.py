@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import httpx
@@ -86,7 +86,8 @@ class Screen:
     """A viewer that notes the longest pause between two frames."""
 
     def __init__(self, served: Served) -> None:
-        self._socket = served.socket("/api/v1/live")
+        self._sockets = ExitStack()
+        self._socket = self._sockets.enter_context(served.socket("/api/v1/live"))
         self.frames = 0
         self.gap_s = 0.0
         self.is_gone = False
@@ -97,7 +98,7 @@ class Screen:
     def close(self) -> None:
         self._stop.set()
         self._thread.join(10.0)
-        self._socket.close()
+        self._sockets.close()
 
     def _run(self) -> None:
         last_s = time.monotonic()

@@ -177,8 +177,11 @@ def _in_folder(data: Path) -> list[dict[str, Any]]:
         raise UsageError(f"no data folder {str(data)!r}")
     folder = SessionFolder(data / "sessions")
     found = []
-    for session_id in folder.ids():
-        session = folder.load(session_id)
+    sessions, unreadable = folder.load_all()
+    for session_id, error in unreadable.items():
+        if any(folder.path(session_id).glob("[!.]*")):  # else it was never written down
+            remark(f"session {session_id} is left out: {error}")
+    for session in sessions:
         ledger = session.ledger
         content = session.model_dump(mode="json", exclude=_LONG)
         complete = False if ledger is None else "lossy" if ledger.lossy else ledger.complete

@@ -26,6 +26,13 @@ def files_in(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*")}
 
 
+def delete(folder: Path) -> None:
+    """All at once, before something new is written into it."""
+    doomed = folder.with_name("doomed")
+    folder.rename(doomed)
+    shutil.rmtree(doomed)
+
+
 def nothing(data: Path) -> None:
     """In the place of the folder."""
 
@@ -111,7 +118,7 @@ def test_a_recording_is_complete_although_the_folder_was_away_in_the_middle(
 def test_frames_whose_own_file_was_deleted_are_not_acknowledged(
     running: Running, tared: FakeNode
 ) -> None:
-    shutil.rmtree(running.data / "journal" / "bench")
+    delete(running.data / "journal" / "bench")
     tared.send(30, 20.0)
     until(lambda: running.node()["storage_problem"])
     tared.socket.send('{"type":"probe","id":1}')
@@ -120,7 +127,7 @@ def test_frames_whose_own_file_was_deleted_are_not_acknowledged(
 
 
 def test_a_folder_that_was_deleted_is_not_made_again(running: Running, tared: FakeNode) -> None:
-    shutil.rmtree(running.data)
+    delete(running.data)
     with Play(tared, 20.0):
         until(lambda: running.node()["storage_problem"])
         assert_refused(running.http.get("/ready"), 503, "nothing in its place")

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import builtins
+import errno
 import fcntl
+import io
 import json
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -298,3 +302,35 @@ def test_verify_goes_on_behind_a_folder_that_is_none(run: Run, data: Path) -> No
     found = json.loads(run("verify", data, "--json").out)
     assert [one["id"] for one in found["sessions"]] == [OTHER_ID]
     assert len(found["problems"]) == 2
+
+
+def test_a_list_of_sessions_goes_on_behind_a_damaged_one(run: Run, data: Path) -> None:
+    begun(data, OTHER_ID, last=49)
+    path = data / "sessions" / ID / "session.json"
+    path.write_bytes(path.read_bytes().replace(b"walk", b"talk"))
+    (data / "sessions" / "20200101T000000Z-0000ff").mkdir()
+    found = run("sessions", "--data", data, "--json")
+    assert [one["id"] for one in found.printed()["items"]] == [OTHER_ID]
+    assert f"session {ID} is left out" in found.err
+    assert "0000ff" not in found.err
+
+
+def test_verify_says_what_it_may_not_read(
+    run: Run, data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run("recover", data)
+    forbidden = {str(path) for path in (data / "sessions" / ID).iterdir()}
+    forbidden |= {str(path) for path in data.glob("journal/*/*/*")}
+    opened = builtins.open
+
+    def guarded(path: object, *args: Any, **options: Any) -> Any:
+        if str(path) in forbidden:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return opened(path, *args, **options)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(builtins, "open", guarded)
+    monkeypatch.setattr(io, "open", guarded)
+    found = run("verify", data)
+    assert found.code == 1
+    for name in ("session.json", "stream.json"):
+        assert name in found.out
