@@ -8,6 +8,7 @@ import json
 import os
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
@@ -18,7 +19,7 @@ from pydantic import BaseModel
 from typer.core import TyperGroup
 
 from devices.scene.emulated import EmulationScene, FaultScene, GroundScene, MudGround, PoppyGround
-from devices.scene.file import Scene, builtin_scenes
+from devices.scene.file import Scene, builtin_scenes, load_scene
 from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
 from service.api.app import make_app
 from service.api.settings import Settings
@@ -135,6 +136,28 @@ def test_every_option_in_the_readme_exists() -> None:
         if line.startswith("foottile "):
             used = {word for word in line.split("#")[0].split() if word.startswith("--")}
             assert used <= known, line
+
+
+def test_every_scene_and_file_that_a_command_of_the_readme_reads_is_there_or_made_before() -> None:
+    made = {"walk.csv", "jump.csv"}  # recordings of your own, as the text says
+    read = 0
+    for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL):
+        for line in block.splitlines():
+            words = line.split("#")[0].split()
+            if words[:1] == ["cp"]:
+                assert (ROOT / words[1]).is_file(), line
+                load_scene(str(ROOT / words[1]))
+                made.add(words[2])
+            if words[:1] != ["foottile"]:
+                continue
+            given = [after for word, after in pairwise(words) if word in ("--scene", "--load")]
+            given += [word for word in words[2:] if re.fullmatch(r"\w+\.(parquet|toml|json)", word)]
+            outputs = {after for word, after in pairwise(words) if word in ("--out", "--plot")}
+            for name in set(given) - outputs:
+                read += 1
+                assert name in made or name in builtin_scenes(), f"{name} of {line!r} is nowhere"
+            made |= outputs
+    assert read > 8
 
 
 def test_the_calibration_file_is_described() -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
-import time
 import zipfile
 from pathlib import Path
 
@@ -62,26 +60,3 @@ def test_what_needs_no_heavy_library_loads_none(imports: str, absent: tuple[str,
     code = f"import sys, {imports}; print([m for m in {absent!r} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
     assert done.stdout.decode().strip() == "[]"
-
-
-def test_ctrl_c_leaves_no_file_and_a_failing_exit_code(tmp_path: Path) -> None:
-    # Tests that a shell starts in the background ignore Ctrl-C, and their children inherit that.
-    hears = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    code = f"{hears}; from service.cli.main import main; main()"
-    command = [sys.executable, "-c", code, "simulate"]
-    arguments = ["--scene", "standing", "--seconds", "100000", "--no-estimates"]
-    process = subprocess.Popen(
-        command + arguments, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-    try:
-        for _ in range(600):  # until it has begun to write
-            if any(tmp_path.iterdir()):
-                break
-            time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
-    assert process.returncode == 1
-    assert b"Traceback" not in err
-    assert list(tmp_path.iterdir()) == []

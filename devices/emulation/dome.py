@@ -27,6 +27,8 @@ GRID_S = 0.0005
 """Between grid points pressure is taken as linear: in a tap of 20 ms that is off by 0.01 kPa."""
 _BLOCK = 2000  # a second of the grid, computed at once
 _MOMENT = 40  # grid points, 20 ms: longer than a transfer and the wait for its sample
+_LATE_BLOCKS = 3  # so far behind it is quicker to go on coarsely
+_COARSE = 40  # grid points, 20 ms
 _AHEAD_BLOCKS = 30  # for a driver that asks nothing for so long; bounds memory, 30 MB for 64 domes
 
 _KELVIN = 273.15
@@ -89,6 +91,7 @@ class Domes:
         # late a driver is decides when it asks, not what the dome was like then.
         self._blocks: dict[int, Floats] = {}
         self._extending = threading.Lock()
+        self._step_s = GRID_S
         self._extend(0)
 
     def pressure_kpa(self, dome: int, t_s: float) -> float:
@@ -113,6 +116,7 @@ class Domes:
     def be_ready(self, t_s: float) -> None:
         """Compute the pressures until a moment after `t_s`; samples from there on are next."""
         self._asked = max(self._asked, int(t_s / GRID_S))
+        self._leap(self._asked // _BLOCK - 1)
         if self._asked + _MOMENT >= self._next:
             self._extend(self._asked + _MOMENT)
 
@@ -136,9 +140,31 @@ class Domes:
             while index >= self._next:
                 self._compute_block()
 
+    def _leap(self, to_block: int) -> None:
+        """Go on to a block in coarse steps, if nobody can ask any more for much of what is between.
+
+        Else a machine that needs more than a second for the physics of a second would fall behind
+        ever further. The last block before a sample is computed finely: it has settled then.
+        """
+        with self._extending:
+            while to_block * _BLOCK - self._next > _LATE_BLOCKS * _BLOCK:
+                blocks = min(to_block - self._next // _BLOCK, _COARSE)
+                self._compute(blocks * _BLOCK // _COARSE, _COARSE)
+                self._next += blocks * _BLOCK
+
     def _compute_block(self) -> None:
         """Compute one more block; keep it, and those from a block before what was asked last."""
-        t_s: Floats = GRID_S * np.arange(self._next, self._next + _BLOCK, dtype=np.float64)
+        self._blocks[self._next // _BLOCK] = self._compute(_BLOCK, 1)
+        self._next += _BLOCK
+        oldest = min(self._asked, self._next) // _BLOCK - 1
+        for number in [number for number in self._blocks if number < oldest]:
+            del self._blocks[number]
+
+    def _compute(self, points: int, stride: int) -> Floats:
+        """The pressures of so many points from the next grid point on, each `stride` further."""
+        steps = self._next + stride * np.arange(points, dtype=np.float64)
+        self._step_s = stride * GRID_S
+        t_s: Floats = GRID_S * steps
         force_n = self._load.forces_n(t_s)
         apparent_n = self._hysteresis(self._creeping(force_n))
         lost = self._stiffening * np.log1p(apparent_n / self._knee_n) * self._loading_gains(force_n)
@@ -146,11 +172,7 @@ class Domes:
         around_kpa = self._surroundings.bare_kpa(t_s)
         kpa[:, self._bare] = np.broadcast_to(around_kpa, kpa.shape)[:, self._bare]
         self._last_force_n = force_n[-1]
-        self._blocks[self._next // _BLOCK] = kpa
-        self._next += _BLOCK
-        oldest = min(self._asked, self._next) // _BLOCK - 1
-        for number in [number for number in self._blocks if number < oldest]:
-            del self._blocks[number]
+        return kpa
 
     def _creeping(self, force_n: Floats) -> Floats:
         """Creep: part of the force appears only after each term's time, statically all of it."""
@@ -160,8 +182,8 @@ class Domes:
         for dome, part in enumerate(self._parts):
             f = np.concatenate([[self._last_force_n[dome]], force_n[:, dome]])
             for term, (share, tau_s) in enumerate(zip(part.creep_parts, part.creep_s, strict=True)):
-                decay = np.exp(-GRID_S / tau_s)
-                mean = (1 - decay) * tau_s / GRID_S
+                decay = np.exp(-self._step_s / tau_s)
+                mean = (1 - decay) * tau_s / self._step_s
                 # Exact for a force that is linear between grid points.
                 drive = (mean - decay) * f[:-1] + (1 - mean) * f[1:]
                 slow, _ = lfilter([1], [1, -decay], drive, zi=[decay * self._creep[dome, term]])
@@ -224,7 +246,9 @@ class Domes:
         if not self._scene.gas:
             return kpa
         decay = np.exp(
-            -GRID_S * _MODES**2 / np.array([part.conduction_s for part in self._parts])[:, None]
+            -self._step_s
+            * _MODES**2
+            / np.array([part.conduction_s for part in self._parts])[:, None]
         )
         gain = _MODE_WEIGHTS * (1 - decay) / -np.log(decay)
         for _ in range(_PICARD_LIMIT):

@@ -24,7 +24,8 @@ from service.cli.commands.verify import verify_command
 from service.cli.options import printable, with_finite_numbers
 from service.version import SOFTWARE
 
-_TYPER_INTERRUPTED = 130
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, typer's and any shell's."""
 
 app = typer.Typer(
     name="foottile",
@@ -61,7 +62,10 @@ def _root(
 
 
 def main() -> None:
-    """Run the command line; every expected error becomes one line on stderr and an exit code."""
+    """Run the command line; every expected error becomes one line on stderr and an exit code.
+
+    So does Ctrl-C, where it does not end a command well, as it does `serve`, `node` and `demo`.
+    """
     # So that what is half-written is cleaned up when the machine is shut down, too.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     try:
@@ -70,8 +74,16 @@ def main() -> None:
         sys.stderr.write(f"foottile: {printable(str(error))}\n")
         sys.exit(error.exit_code)
     except SystemExit as end:
-        # typer's code for Ctrl-C; ours are 0 to 3, and what was not finished has failed.
-        sys.exit(1 if end.code == _TYPER_INTERRUPTED else end.code)
+        if end.code == INTERRUPTED:
+            _say_interrupted()
+        raise
+    except KeyboardInterrupt:
+        _say_interrupted()
+        sys.exit(INTERRUPTED)
     except OSError as error:
         sys.stderr.write(f"foottile: {printable(str(error))}\n")
         sys.exit(1)
+
+
+def _say_interrupted() -> None:
+    sys.stderr.write("foottile: interrupted\n")

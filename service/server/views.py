@@ -266,8 +266,8 @@ class SessionView(View):
     frames: int
     pending_frames: int = Field(description="Still with the node.")
     waits_for: Literal["frames", "end"] | None = Field(
-        description="frames: `pending_frames` are still with the node; end: nothing is known to be "
-        "missing, but the node has not said yet what it took until the stop; null: for nothing."
+        description="frames: `pending_frames` are still with the node; end: none is missing up "
+        "to the newest, but what the node took last, until the stop, has not come; null: nothing."
     )
     lost: dict[str, int] = Field(
         description="Frames that will never be in it, by reason.", examples=[{"evicted": 12}]

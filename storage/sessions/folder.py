@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import re
 import secrets
+import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -176,15 +176,14 @@ class SessionFolder:
         """
         folder = self.path(session.id)
         is_new = not folder.exists()
-        with storage_errors(folder):
-            make_folder(folder)
         text = session.model_dump_json(indent=1).encode()
         try:
+            with storage_errors(folder):
+                make_folder(folder)
             write_checked(folder / "session.json", text)
         except StorageError:
-            if is_new:  # a full disk still takes an empty folder, which is no session
-                with suppress(OSError):
-                    folder.rmdir()
+            if is_new:  # a full disk still takes an empty folder, and perhaps a file's name
+                shutil.rmtree(folder, ignore_errors=True)
             raise
 
     def load(self, session_id: str) -> Session:
@@ -252,6 +251,16 @@ class SessionFolder:
         """Ids of all sessions, newest first."""
         if self._folder.is_dir():
             names = [
-                path.name for path in self._folder.iterdir() if SESSION_ID.fullmatch(path.name)
+                path.name
+                for path in self._folder.iterdir()
+                if SESSION_ID.fullmatch(path.name) and not _holds_nothing(path)
             ]
             yield from sorted(names, reverse=True)
+
+
+def _holds_nothing(folder: Path) -> bool:
+    """Is it what is left of a session that was never begun: made, and nothing written whole?"""
+    try:
+        return all(path.match(".*.tmp") for path in folder.iterdir())
+    except OSError:  # a file, or not readable: then it may be one
+        return False

@@ -115,7 +115,7 @@ def many_screens(play: Play) -> Outcome:
 def _screen(port: int) -> socket.socket:
     connection = socket.create_connection(("127.0.0.1", port), timeout=10.0)
     connection.sendall(
-        f"GET {LIVE_PATH}?rate_hz=60 HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
+        f"GET {LIVE_PATH}?rate_hz=5 HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
         "Upgrade: websocket\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
         "Sec-WebSocket-Version: 13\r\n\r\n".encode()
     )

@@ -40,8 +40,8 @@ def test_frames_are_counted_once_by_the_ledger_whatever_becomes_of_the_node(
 ) -> None:
     node = scripted.node
     session = node.record(name="walk")
-    page = open_page(scripted.url)
     with Play(node):
+        page = open_page(scripted.url)
         expect(page.locator(LIVE)).to_have_count(1, timeout=20_000)
         until(lambda: session.now()["frames"] > 300)
     node.frames(40)  # taken, and not sent before it is killed
@@ -81,8 +81,8 @@ def test_a_page_opened_after_the_node_died_tells_one_story(
 def test_a_node_out_of_reach_is_away_on_the_page_within_five_seconds(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
-    page = open_page(scripted.url)
     with Play(scripted.node):
+        page = open_page(scripted.url)
         expect(page.locator(LIVE)).to_have_count(1, timeout=20_000)
     # Nothing comes any more, and nobody says goodbye: as when a cable is pulled.
     expect(page.locator("#frozen")).to_contain_text("silent, though connected", timeout=3000)
@@ -93,8 +93,8 @@ def test_what_follows_a_labelled_mark_is_a_shortcut_again(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     session = scripted.node.record(name="walk")
-    page = open_page(scripted.url)
     with Play(scripted.node):
+        page = open_page(scripted.url)
         expect(page.locator("#mark")).to_be_enabled()
         page.focus("#mark-label")
         page.keyboard.type("a stone")
@@ -137,7 +137,8 @@ def test_a_session_whose_end_alone_is_open_says_so_and_completes_when_the_node_i
     page = open_page(scripted.url)
     row = row_of(page, session)
     expect(row).to_contain_text("Only its end is open")
-    expect(row.get_by_role("button", name="Seal with what is here")).to_be_visible()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 1366
+    expect(row.get_by_role("button", name="Seal as it is")).to_be_visible()
     expect(row.get_by_role("button", name="Seal without")).to_have_count(0)
     scripted.node.connect()
     scripted.node.send(10, now=True)
@@ -151,7 +152,7 @@ def test_a_session_whose_node_never_comes_back_is_sealed_with_what_is_here(
     session = ends_open(scripted)
     page = open_page(scripted.url)
     row = row_of(page, session)
-    row.get_by_role("button", name="Seal with what is here").click()
+    row.get_by_role("button", name="Seal as it is").click()
     expect(page.locator("#ask-dialog")).to_contain_text("is given up")
     page.get_by_role("button", name="Seal as lossy").click()
     expect(row.locator(".state")).to_have_text("lossy", timeout=15_000)

@@ -73,7 +73,7 @@ export class Status {
     const nominalHz = node.nominal_rate_hz;
     const slow = rateHz !== null && nominalHz && rateHz < SLOW * nominalHz;
     // A rate that proves the nominal one wrong stands alone.
-    const of = nominalHz && !(rateHz > nominalHz) ? ` of ${number(nominalHz)}` : "";
+    const of = rateHz !== null && rateHz <= nominalHz ? ` of ${number(nominalHz)}` : "";
     write("rate", `${number(rateHz ?? NaN)}${of}`, slow);
     const lost = beat.lost_frames ?? node.lost_frames ?? 0;
     const behind = beat.backlog_frames ?? node.backlog_frames ?? 0;

@@ -10,7 +10,7 @@ const MOST = 500; // a page left open for weeks must not grow without end
 
 const WAITS = {
   frames: (session) => `${frames(session.pending_frames)} are still with the node; it completes by itself when they have come.`,
-  end: () => "Only its end is open: the node has not said yet what it took until the stop. It completes by itself when the node is back.",
+  end: () => "Only its end is open: what the node took last, until the stop, has not come yet. It completes by itself when it has.",
 };
 
 /** State and completeness in plain words: [short, long, how serious]. */
@@ -150,7 +150,7 @@ export class Sessions {
       box.append(button);
     };
     add("edit", "Edit", (now) => this.edit(now));
-    if (session.state === "pending") add("seal", session.waits_for === "end" ? "Seal with what is here" : "Seal without them", (now) => this.seal(now));
+    if (session.state === "pending") add("seal", session.waits_for === "end" ? "Seal as it is" : "Seal without them", (now) => this.seal(now));
     if (session.state === "sealed" || session.state === "pending") add("delete", "Delete", (now) => this.delete(now));
     return box;
   }
@@ -163,7 +163,7 @@ export class Sessions {
   async seal(session) {
     const many = frames(session.pending_frames);
     const [question, loss] = session.waits_for === "end"
-      ? ["with what is here", "What the node may have taken after the last frame that came is given up, and"]
+      ? ["as it is", "What the node may have taken after the last frame that came is given up, and"]
       : ["without them", `${many[0].toUpperCase()}${many.slice(1)} will be missing for good, and`];
     const sure = await ask(`Seal “${session.name}” ${question}?`,
       `${loss} the session is marked lossy. Do this only if the node never comes back: while you wait, it completes by itself as soon as the node does.`,

@@ -117,8 +117,10 @@ async def stop(session_id: str, server: ServerState) -> SessionView:
     If the node is away the session is `pending`, and completes when the node has come back.
     """
     session = server.recorder.stop(session_id)
-    server.tell_node(server.nodes.get(session.node))
-    if server.nodes.get(session.node).connected:
+    node = server.nodes.find(session.node)  # its folder may be gone
+    if node is not None:
+        server.tell_node(node)
+    if node is not None and node.connected:
         session = await server.settling.settled(session_id, SETTLE_S)
     return SessionView.of(session, server.recorder)
 

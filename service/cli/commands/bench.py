@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -111,7 +113,6 @@ def bench_command(
     if seconds is not None and not 0.0 < seconds <= SECONDS_MAX:
         raise UsageError(f"--seconds {seconds:g}", expected=f"0 to {SECONDS_MAX:g}")
     new_figure(1.0, 1.0)  # says what is missing before anything takes time
-    folder = _folder(out)
     options = BenchOptions(
         scenes=scenes,
         draws=draws or (QUICK_DRAWS if quick else DRAWS),
@@ -124,13 +125,14 @@ def bench_command(
         repeatability=repeatability,
         correlated_ms=correlated_ms,
     )
-    with progress("starting") as tell:
-        bench = run_bench(options, tell)
-        text, png = markdown(bench), plot_bench(bench.scenes)
-    content = json_text(bench.as_dict())
-    write_whole(folder / "bench.json", content.encode())
-    write_whole(folder / "bench.md", text.encode())
-    write_whole(folder / "bench.png", png)
+    with _folder(out) as folder:
+        with progress("starting") as tell:
+            bench = run_bench(options, tell)
+            text, png = markdown(bench), plot_bench(bench.scenes)
+        content = json_text(bench.as_dict())
+        write_whole(folder / "bench.json", content.encode())
+        write_whole(folder / "bench.md", text.encode())
+        write_whole(folder / "bench.png", png)
     if as_json:
         print_json(bench.as_dict())
     else:
@@ -146,11 +148,24 @@ def bench_command(
         raise typer.Exit(3)
 
 
-def _folder(out: Path) -> Path:
+@contextmanager
+def _folder(out: Path) -> Iterator[Path]:
+    """The folder to write in, made if it is missing, and gone again if nothing came of it."""
+    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        _make(out)
+        yield out.resolve()
+    except BaseException:
+        for folder in missing:
+            with suppress(OSError):  # not empty, or not made yet
+                folder.rmdir()
+        raise
+
+
+def _make(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"no folder {str(out)!r} can be made: {error}") from error
     if not os.access(out, os.W_OK):
         raise UsageError(f"{str(out)!r} cannot be written in")
-    return out.resolve()

@@ -86,6 +86,8 @@ def node_command(
         server = SERVER
     if server is not None:
         ingest_url(server)  # refuse a wrong address before anything else
+    if journal is not None and os.path.lexists(journal) and not journal.is_dir():
+        raise UsageError(f"--journal {str(journal)!r} is no folder", remedy="Choose another one")
     if record is not None and not record.strip():
         raise UsageError("--record without a name", expected="the name of the session")
     the_scene = scene_with(scene, bus=bus, servo=servo)

@@ -175,12 +175,10 @@ def _in_folder(data: Path) -> list[dict[str, Any]]:
 
     if not data.is_dir():
         raise UsageError(f"no data folder {str(data)!r}")
-    folder = SessionFolder(data / "sessions")
-    found = []
-    sessions, unreadable = folder.load_all()
+    sessions, unreadable = SessionFolder(data / "sessions").load_all()
     for session_id, error in unreadable.items():
-        if any(folder.path(session_id).glob("[!.]*")):  # else it was never written down
-            remark(f"session {session_id} is left out: {error}")
+        remark(f"session {session_id} is left out: {printable(str(error))}")
+    found = []
     for session in sessions:
         ledger = session.ledger
         content = session.model_dump(mode="json", exclude=_LONG)

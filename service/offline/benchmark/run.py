@@ -10,9 +10,10 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -182,34 +183,47 @@ def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
         yield from map(run_draw, tasks)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_when_told) as pool:
-        with _interrupts_ignored():
+    with ExitStack() as stack:
+        with _interrupts_wait():
+            pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_when_told)
+            stack.enter_context(pool)
+            stack.push(partial(_end_early, pool))
             futures = {pool.submit(_run_draw, task): task for task in tasks}
-        try:
-            for future in as_completed(futures):
-                try:
-                    yield future.result()
-                except Exception as error:  # one that was killed breaks the pool: all draws left
-                    draw = futures[future].draw
-                    yield Drawn(draw, 0, {}, (Failure(f"draw {draw}", reason(error)),))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+        for future in as_completed(futures):
+            try:
+                yield future.result()
+            except Exception as error:  # one that was killed breaks the pool: all draws left
+                draw = futures[future].draw
+                yield Drawn(draw, 0, {}, (Failure(f"draw {draw}", reason(error)),))
+
+
+def _end_early(pool: ProcessPoolExecutor, kind: type[BaseException] | None, *_: object) -> None:
+    """After an error nobody waits for the draws that are left."""
+    if kind is not None:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.terminate()
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """Processes that are started meanwhile know no Ctrl-C: we tell them when to end."""
+def _interrupts_wait() -> Iterator[None]:
+    """Processes that are started meanwhile know no Ctrl-C: we tell them when to end.
+
+    One that comes meanwhile is not lost, and finds no process half-started.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    came: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit it
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 def _end_when_told() -> None:

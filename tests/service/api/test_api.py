@@ -128,6 +128,19 @@ def test_a_mistake_of_the_server_is_a_problem_without_its_inside(
     assert "secret" not in answer.text
 
 
+def test_a_recording_that_a_full_disk_did_not_take_was_never_begun(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as context:
+        context.setattr("storage.checked_json.write_whole", refusing(StorageError, "no space"))
+        answer = running.http.post("/sessions", json={"node": "bench", "name": "trial"})
+        assert_problem(answer, 507, "/api/v1/sessions")
+    assert running.sessions() == []
+    assert list((running.data / "sessions").glob("*")) == []
+    running.restart()
+    assert not running.server.sessions.has_unreadable
+
+
 def test_a_full_disk_is_a_problem_that_says_so(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:

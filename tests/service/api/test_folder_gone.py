@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import storage.sessions.folder
 from devices.errors import FolderGoneError, StorageError
 from service.server.data_folder import DataFolder
 from storage.durable import LOCK_NAME
@@ -19,6 +20,7 @@ from storage.intervals import Intervals
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, Play
 from tests.service.running import Running, assert_refused, closed
+from tests.storage.faulty_disk import refusing
 from tests.waiting import until
 
 
@@ -198,3 +200,15 @@ def test_a_disk_that_is_unmounted_takes_nothing_and_its_mount_point_neither(moun
         folder.check_writable()
     assert list(mounted.iterdir()) == []
     folder.close()
+
+
+def test_a_start_that_a_full_disk_refuses_leaves_nothing(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = refusing(StorageError, "No space left on device")
+    with monkeypatch.context() as patched:
+        patched.setattr(storage.sessions.folder, "write_checked", full)
+        assert_refused(running.http.post("/sessions", json={"node": "bench", "name": "x"}), 507)
+    assert list((running.data / "sessions").iterdir()) == []
+    assert running.sessions() == []
+    assert tared.finish(tared.record())["complete"] is True

@@ -200,11 +200,14 @@ def test_a_killed_node_has_lost_nothing_and_its_session_goes_on(
 
 
 def test_what_a_session_needs_waits_on_the_nodes_disk_until_both_are_back(
-    running: Running, leg: Callable[..., Any]
+    running: Running, leg: Callable[..., Any], tmp_path: Path
 ) -> None:
     process = leg()
     streaming(running)
     session = running.record("leg", name="apart")
+    # A server that is stopped before it has told the node leaves it with frames that nobody wants.
+    told = tmp_path / "node" / "journal" / "leg" / "wanted.json"
+    until(lambda: told.exists() and running.node("leg")["boot_id"] in told.read_text(), 20.0)
     running.stop()
     process.said("not connected to")
     process.process.send_signal(signal.SIGINT)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import re
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
@@ -23,7 +25,7 @@ from storage.sessions.folder import (
     SessionFolder,
     new_session_id,
 )
-from tests.storage.faulty_disk import NO_SPACE, refusing
+from tests.storage.faulty_disk import NO_SPACE, failing_if, refusing
 
 ID = "20200131T235959Z-0a1b2c"
 BOOT = "f" * 32
@@ -263,3 +265,48 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None
     (tmp_path / "sessions").write_bytes(b"a file")
     with pytest.raises(StorageError):
         SessionFolder(tmp_path / "sessions").save(session())
+
+
+@pytest.mark.parametrize("sync", range(4))
+def test_a_session_that_a_full_disk_did_not_take_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sync: int
+) -> None:
+    real, calls = os.fsync, itertools.count()
+    fails = failing_if(lambda _: next(calls) == sync, real, *NO_SPACE)
+    (tmp_path / "sessions").mkdir()
+    folder = SessionFolder(tmp_path / "sessions")
+    monkeypatch.setattr(os, "fsync", fails)
+    try:
+        folder.save(session())
+    except StorageError:
+        assert list((tmp_path / "sessions").iterdir()) == []
+    else:
+        assert sync == next(calls) == 3  # of the folder's name, the file, and the file's name
+    folder.save(session())
+    assert folder.load(ID) == session()
+
+
+def test_a_session_that_was_there_before_stays_when_the_disk_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = SessionFolder(tmp_path)
+    folder.save(session())
+    with monkeypatch.context() as context:
+        context.setattr(os, "fsync", refusing(*NO_SPACE))
+        with pytest.raises(StorageError):
+            folder.save(session(name="another"))
+    assert folder.load(ID) == session()
+
+
+def test_a_folder_in_which_nothing_was_written_whole_is_no_session(tmp_path: Path) -> None:
+    # As a kill leaves it between making the folder and writing into it.
+    folder = SessionFolder(tmp_path)
+    (tmp_path / ID).mkdir()
+    assert folder.load_all() == ([], {})
+    (tmp_path / ID / ".session.json.1.2.0123abcd.tmp").write_bytes(b"{")
+    assert folder.load_all() == ([], {})
+    (tmp_path / ID / "frames.parquet").write_bytes(b"")
+    assert list(folder.load_all()[1]) == [ID]
+    (tmp_path / ID[::-1]).write_bytes(b"")  # no id
+    (tmp_path / ID.replace("a", "b")).write_bytes(b"")  # no folder
+    assert sorted(folder.load_all()[1]) == sorted([ID, ID.replace("a", "b")])
