@@ -18,13 +18,19 @@ from pathlib import Path
 
 import numpy as np
 
-from devices.errors import DamagedFileError, DamagedFramesError, FileFormatError, StorageError
+from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
-from storage.durable import make_folder, put_aside, storage_errors
+from storage.durable import make_folder, storage_errors
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
 from storage.journal.instants import Instants
 from storage.journal.open_segments import OpenSegments
-from storage.journal.segment import SUFFIX, Segment, recover, unread_of
+from storage.journal.segment import (
+    SUFFIX,
+    Segment,
+    recover,
+    set_aside_no_files,
+    unread_of,
+)
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD, numbers, payload_of, read_header
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import array_info, wire_schema
@@ -59,12 +65,16 @@ class Journal:
         self._instants = Instants(lambda seq, is_upper: self.t_ns_near(seq, newest=is_upper))
         with storage_errors(folder):
             make_folder(folder)
-            self._set_aside_no_files()
+            self.problems += set_aside_no_files(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
+                index = path.with_suffix(INDEX_SUFFIX)
+                has_records = index.exists() and index.stat().st_size > 0
                 segment, damaged = recover(path, self._schema)
                 self.lost.add(damaged, CORRUPT)
                 if segment is not None:
                     self._take_in(segment)
+                elif has_records:  # else it was just begun when its process was killed
+                    self.problems.append(f"{path}: no frame in it is proven by its index")
             for path in folder.glob("*" + INDEX_SUFFIX):
                 # A power cut may take the name of a segment and leave that of its index. Nothing in
                 # it was promised then; but a person may have deleted it, so the index is set aside.
@@ -315,16 +325,6 @@ class Journal:
         """
         self._open.retire_all()
         self.sync()
-
-    def _set_aside_no_files(self) -> None:
-        """Set aside what has the name of a segment or index and is none, or may not be read."""
-        for path in sorted(
-            (*self.folder.glob("*" + SUFFIX), *self.folder.glob("*" + INDEX_SUFFIX))
-        ):
-            regular = stat.S_ISREG(path.lstat().st_mode)
-            if not regular or not os.access(path, os.R_OK):
-                what = "it cannot be read" if regular else "it is not a file"
-                self.problems.append(put_aside(path, DamagedFileError(what, where=str(path))))
 
     def _take_in(self, segment: Segment) -> None:
         """Take in a segment that was there; what was disowned once may be in two of them."""

@@ -13,6 +13,7 @@ import math
 import threading
 import time
 from collections import deque
+from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -270,12 +271,12 @@ class NodeJournal:
                     continue
                 if stream is not None:
                     streams.append(stream)
-        # A stream killed before its notes were written has no number yet: it is the newest.
-        streams.sort(key=lambda stream: stream.notes.number or math.inf)
-        for number, stream in enumerate(streams):
-            if not stream.notes.number:
-                before = streams[number - 1].notes.number if number else 0
-                stream.note(number=before + 1)
+        streams = _in_order(streams)
+        number = 0
+        for stream in streams:
+            number = max(number + 1, stream.notes.number)
+            if stream.notes.number != number:
+                stream.note(number=number)
         return streams
 
     def _lock_folder(self, folder: Path, *, is_shared: bool) -> None:
@@ -292,6 +293,27 @@ class NodeJournal:
         except StorageError as error:
             if error.errno is None:  # a disk that takes nothing has no second user either
                 raise
+
+
+def _in_order(found: Iterable[NodeStream]) -> list[NodeStream]:
+    """Streams by their numbers, oldest first.
+
+    One that was killed before its notes were written has none: it is the newest. One whose notes
+    are damaged has frames, whose instants say where it belongs.
+    """
+    order: list[NodeStream] = []
+    for stream in sorted(found, key=lambda stream: stream.notes.number or math.inf):
+        begin_t_ns = _begin_t_ns(stream)
+        later = [other for other in order if begin_t_ns < _begin_t_ns(other) < math.inf]
+        at = order.index(later[0]) if later and not stream.notes.number else len(order)
+        order.insert(at, stream)
+    return order
+
+
+def _begin_t_ns(stream: NodeStream) -> float:
+    journal = stream.journal
+    begin_t_ns = journal.t_ns_near(0, newest=False) if journal is not None else None
+    return math.inf if begin_t_ns is None else begin_t_ns
 
 
 def settle_left_over(root: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -19,8 +20,8 @@ from typing import Any, BinaryIO
 import numpy as np
 import pyarrow as pa
 
-from devices.errors import StorageError
-from storage.durable import write_whole
+from devices.errors import DamagedFileError, StorageError
+from storage.durable import put_aside, write_whole
 from storage.intervals import Intervals
 from storage.journal.segment_format import (
     INDEX_SUFFIX,
@@ -231,6 +232,21 @@ class SegmentWriter:
         self._index.close()
 
 
+def set_aside_no_files(folder: Path) -> list[str]:
+    """Set aside what has the name of a segment or index and is none, or may not be read.
+
+    Returns:
+        What was found, and what became of it, in words.
+    """
+    problems = []
+    for path in sorted((*folder.glob("*" + SUFFIX), *folder.glob("*" + INDEX_SUFFIX))):
+        is_file = stat.S_ISREG(path.lstat().st_mode)
+        if not is_file or not os.access(path, os.R_OK):
+            what = "it cannot be read" if is_file else "it is not a file"
+            problems.append(put_aside(path, DamagedFileError(what, where=str(path))))
+    return problems
+
+
 def unread_of(path: Path) -> Path:
     """A free name beside a segment for what of it could not be read."""
     taken = {each.name for each in path.parent.iterdir()}
@@ -259,9 +275,12 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
         batches = batches_in(index)
         was_closed = is_closed(index) and len(batches) == len(index) - 1 and end_of(batches) == size
     good = []
+    read: dict[int, EncodedBatch | None] = {}
     with path.open("rb") as file:
         for record in index:
-            found = record if was_closed else _checked(file.fileno(), path, record, end, schema)
+            if not was_closed and not is_whole(record) and end not in read:
+                read[end] = next(messages_from(path, end, schema), None)
+            found = record if was_closed else _checked(file.fileno(), record, end, read.get(end))
             if found is None and is_whole(record):
                 doubtful.add(*numbers(record))
             elif found is not None:
@@ -309,12 +328,11 @@ def _write_index(path: Path, records: Records) -> None:
     write_whole(path.with_suffix(INDEX_SUFFIX), content)
 
 
-def _checked(descriptor: int, path: Path, record: Any, end: int, schema: pa.Schema) -> Any | None:
+def _checked(descriptor: int, record: Any, end: int, message: EncodedBatch | None) -> Any | None:
     """The record if the batch's bytes agree with it; mended if only the record was damaged."""
     if is_whole(record):
         is_right = not record["count"] or payload_of(descriptor, record) is not None
         return record if is_right else None
-    message = next(messages_from(path, end, schema), None)
     if message is None or zlib.crc32(message.payload) != record["crc32"]:
         return None
     return record_of(message, end)[0]

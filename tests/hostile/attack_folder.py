@@ -77,12 +77,12 @@ def _record(folder: Path) -> None:
             event = {"label": "step"}
             assert running.http.post(f"{session.url}/events", json=event).status_code == 201
             node.finish(session)
-        left = nodes[0]
-        pending = left.record(name="pending")
-        left.deliver(100, 7.0)
-        left.leave()
-        pending.stop()
-        assert pending.now()["state"] == "pending"
+            if node is nodes[0]:
+                pending = node.record(name="pending")
+                node.deliver(100, 7.0)
+                node.leave()
+                pending.stop()
+                assert pending.now()["state"] == "pending"
     finally:
         for node in nodes:
             node.close()

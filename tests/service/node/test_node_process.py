@@ -199,6 +199,36 @@ def test_a_killed_node_has_lost_nothing_and_its_session_goes_on(
     assert again.ended(12.0) == 0, again.err
 
 
+def test_a_node_whose_own_files_are_damaged_starts_says_so_and_its_session_is_whole(
+    running: Running, leg: Callable[..., Any], tmp_path: Path
+) -> None:
+    process = leg()
+    before = streaming(running)
+    session = running.record("leg", name="damaged")
+    own = tmp_path / "node" / "journal" / "leg"
+    until((own / "wanted.json").exists, 10.0)
+    process.process.kill()
+    process.ended(5.0)
+    stream = own / before["boot_id"]
+    (own / "wanted.json").write_bytes(b"")
+    os.truncate(stream / "stream.json", 40)
+    (stream / "in_flight").unlink()
+    (stream / "in_flight").symlink_to("/dev/zero")
+    again = leg()
+    for name in ("wanted.json", "stream.json", "in_flight"):
+        again.said(f"{name}.damaged-1", 30.0)
+    until(lambda: running.node("leg")["boot_id"] != before["boot_id"], 30.0)
+    streaming(running)
+    until(lambda: "wanted.json" in " ".join(running.node("leg")["troubles"]))
+    session.stop()
+    found = session.sealed(40.0)
+    assert (found["state"], len(found["parts"])) == ("sealed", 2)
+    # What was in flight is lost, and how much that may be is said.
+    assert found["lost"] or found["tail_frames_max"] or found["complete"] is True
+    again.process.send_signal(signal.SIGTERM)
+    assert again.ended(12.0) == 0, again.err
+
+
 def test_what_a_session_needs_waits_on_the_nodes_disk_until_both_are_back(
     running: Running, leg: Callable[..., Any], tmp_path: Path
 ) -> None:

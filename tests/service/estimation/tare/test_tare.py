@@ -352,3 +352,16 @@ def test_a_recording_of_too_few_frames_for_a_window_is_refused() -> None:
     with pytest.raises(TareError, match="no interval can be recognised"):
         tare_of(loaded_frames(noise_counts(19, 2)))
     assert tare_of(loaded_frames(noise_counts(20, 2))).frames == 20
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_of_a_frame_or_two_there_is_no_tare_and_nothing_else_to_complain_of(n: int) -> None:
+    with pytest.raises(TareError):
+        tare_of(loaded_frames(np.zeros((n, 2))))
+
+
+def test_a_tile_that_never_answers_is_no_tare_and_nothing_else_to_complain_of() -> None:
+    status = np.zeros((60, 2))
+    status[:, 1] = TileStatus.NO_ANSWER
+    with pytest.raises(TareError):
+        tare_of(loaded_frames(noise_counts(60, 2), status=status))

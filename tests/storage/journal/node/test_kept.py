@@ -61,6 +61,28 @@ def test_the_ring_drops_what_no_session_needs_and_counts_what_no_server_has(
     until(lambda: "evicted" in stream.notes.lost)
 
 
+def test_if_it_is_not_known_what_servers_need_nothing_is_dropped_but_for_want_of_room(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention, "RING_NS", 200_000_000)
+    monkeypatch.setattr(node_journal, "_TIDY_S", 0.0)
+    monkeypatch.setattr("storage.journal.open_segments.SEGMENT_NS", 20_000_000)
+    folder = tmp_path / "journal" / "leg"
+    folder.mkdir(parents=True)
+    (folder / "wanted.json").write_bytes(b"damaged")
+    journal = start(budget_bytes=60_000)
+    assert "wanted.json.damaged-1" in " ".join(journal.problems)
+    stream = journal.begin(make_array())
+    store(journal, stream, 0, 299)
+    time.sleep(2 * node_journal.SYNC_S)  # for several looks at what is old
+    assert stream.stored == Intervals([(0, 299)])
+    monkeypatch.setattr(retention, "_WEIGH_S", 0.0)
+    store(journal, stream, 300, 1499)
+    until(lambda: stream.stored.first != 0)
+    assert stream.stored.last == 1499
+    assert journal.troubles == ()
+
+
 def test_over_its_budget_it_drops_the_ring_first_and_then_stops_and_counts(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:

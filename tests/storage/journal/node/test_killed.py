@@ -121,3 +121,22 @@ def test_what_acquisition_had_taken_when_it_was_killed_is_taken_over(
     assert journal.settle()
     assert stream.stored == Intervals([(0, 99)])
     assert (stream.next_seq, stream.lost.as_pairs()) == (100, {})
+
+
+@pytest.mark.parametrize("damaged", [0, 1, 2])
+def test_streams_are_in_order_even_if_the_notes_of_one_are_damaged(
+    start: Start, tmp_path: Path, damaged: int
+) -> None:
+    journal = start()
+    names = ["f" * 32, "a" * 32, "c" * 32]
+    for number, name in enumerate(names):
+        stream = journal.begin(make_array(boot_id=name))
+        fill(journal, stream, 1000 * number, 1000 * number + 99)  # later by their instants
+        until(lambda stream=stream: stream.stored.count == 100)  # type: ignore[misc]
+    journal.close()
+    (tmp_path / "journal" / "leg" / names[damaged] / "stream.json").write_bytes(b"{")
+    again = start()
+    assert [stream.boot_id for stream in again.streams] == names
+    numbers = [stream.notes.number for stream in again.streams]
+    assert numbers == sorted(set(numbers))
+    assert "stream.json.damaged-1" in " ".join(again.problems)
