@@ -59,8 +59,8 @@ _REASON_BYTES_MAX = 123
 _CHECK_BYTES = 4
 _CHECKED = re.compile(r'(\{.*),"crc32":"([0-9a-f]{8})"\}', re.DOTALL)
 
-_PAIRS_MAX = 1 << 15
-"""Intervals in a list: as many of a stream's gaps as a message has room for."""
+_PAIRS_MAX = 1 << 14
+"""Intervals in a list: a gap every ten seconds for two days."""
 _STREAMS_MAX = 256
 _REASONS_MAX = 32
 _TROUBLES_MAX = 1000

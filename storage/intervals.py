@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Mapping
-from heapq import merge
 from itertools import chain
 from operator import itemgetter
 
@@ -69,6 +68,13 @@ class Intervals:
         """
         if last < first:
             raise ValueError(f"interval {first} to {last} is empty")
+        if not self._intervals or first > self._intervals[-1][1] + 1:  # behind all, as most are
+            self._intervals.append((first, last))
+            return
+        begins, ends = self._intervals[-1]
+        if first >= begins:
+            self._intervals[-1] = (begins, max(last, ends))
+            return
         begin = bisect_left(self._intervals, first - 1, key=itemgetter(1))
         end = begin
         while end < len(self._intervals) and self._intervals[end][0] <= last + 1:
@@ -111,20 +117,47 @@ class Intervals:
 
     def __or__(self, other: Intervals) -> Intervals:
         """The numbers that are in either."""
-        return Intervals(merge(self, other))  # in order, so that each is added at the end
+        return union((self, other))
 
     def __and__(self, other: Intervals) -> Intervals:
         """The numbers that are in both."""
-        return Intervals(pair for a, b in self._intervals for pair in other.within(a, b))
+        both = Intervals()
+        ours, theirs = list(self._intervals), list(other._intervals)
+        i = j = 0
+        while i < len(ours) and j < len(theirs):
+            (a, b), (c, d) = ours[i], theirs[j]
+            if max(a, c) <= min(b, d):
+                both._intervals.append((max(a, c), min(b, d)))
+            if b < d:
+                i += 1
+            else:
+                j += 1
+        return both
 
     def __sub__(self, other: Intervals) -> Intervals:
         """The numbers of this set that are not in `other`."""
-        return Intervals(gap for a, b in self._intervals for gap in other.missing(a, b))
+        left = Intervals()
+        theirs = list(other._intervals)
+        j = 0
+        for first, last in list(self._intervals):
+            at = first
+            while j < len(theirs) and theirs[j][1] < first:
+                j += 1
+            k = j
+            while k < len(theirs) and theirs[k][0] <= last:
+                if at < theirs[k][0]:
+                    left._intervals.append((at, theirs[k][0] - 1))
+                at = max(at, theirs[k][1] + 1)
+                k += 1
+            j = max(j, k - 1)  # the last of these may reach into the next of ours
+            if at <= last:
+                left._intervals.append((at, last))
+        return left
 
 
 def union(sets: Iterable[Intervals]) -> Intervals:
     """The numbers that are in any of these."""
-    return Intervals(chain.from_iterable(sets))
+    return Intervals(sorted(chain.from_iterable(sets)))  # in order each is added at the end
 
 
 def closed(pairs: Iterable[tuple[int, int | None]]) -> Intervals:
