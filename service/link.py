@@ -156,6 +156,8 @@ class Hello(Facts):
     """The number of the next frame to be taken."""
     lost: PairsByReason = Field(default={})
     """Numbers of its present stream that it should have and does not have, by reason."""
+    t_ns_first: TNs = 0
+    """Instant of the oldest frame that it has of its present stream, in its UTC; 0: it has none."""
     scene: SceneContent
     """The scene file's content."""
     emulated: bool

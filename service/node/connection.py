@@ -165,6 +165,7 @@ def hello_of(options: NodeOptions, journal: NodeJournal, present: NodeStream) ->
         held=tuple(present.held),
         next_seq=next_seq,
         lost=present.lost.as_pairs(),
+        t_ns_first=_t_ns_first(present),
         scene=options.rig.scene.model_dump(mode="json"),
         emulated=options.rig.emulated,
         calibration=options.calibration,
@@ -174,17 +175,20 @@ def hello_of(options: NodeOptions, journal: NodeJournal, present: NodeStream) ->
     )
 
 
+def _t_ns_first(stream: NodeStream) -> int:
+    journal = stream.journal
+    return (journal.t_ns_near(0, newest=False) if journal is not None else None) or 0
+
+
 def _earlier(stream: NodeStream) -> EarlierStream:
-    held, journal = stream.held, stream.journal
-    t_ns_first = journal.t_ns_near(0, newest=False) if journal is not None else None
     return EarlierStream(
         array_info=stream.info,
-        held=tuple(held),
+        held=tuple(stream.held),
         next_seq=stream.next_seq,
         lost=stream.lost.as_pairs(),
         unsynced_tail_max=stream.notes.unsynced_tail_max,
         missed_slots=stream.missed_slots,
-        t_ns_first=t_ns_first or 0,
+        t_ns_first=_t_ns_first(stream),
     )
 
 

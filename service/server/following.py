@@ -23,9 +23,8 @@ from storage.intervals import NO_END, Intervals
 from storage.sessions.folder import Ledger, Part, Session
 from storage.sessions.ledger import ledger_of, numbers_of, states_of
 
-_UNHEARD_S = 1.0
-_SLOWEST = 1.5
-"""Upper limit of a stream's age, as a multiple of the time that its frames span."""
+_UNHEARD_NS = 1_000_000_000
+"""How long after a hello frames may come of which it did not know."""
 
 
 def streams_of(session: Session, node: ServerNode | None) -> dict[str, SessionStream]:
@@ -183,8 +182,8 @@ def _begin_t_ns(session: Session, node: ServerNode, boot_id: str) -> int:
 def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
     """Had a stream begun when the session was stopped? None: not known yet.
 
-    For an earlier stream the node says when its oldest frame was taken. For the present stream only
-    its frames say so, or the fact that it cannot be that old.
+    The node says when the oldest frame that it has was taken. That is when the stream began, unless
+    older ones are gone: then only the frames themselves say so.
     """
     stream, rate_hz = node.streams[boot_id], node.streams[boot_id].info.nominal_rate_hz
     stop_t_ns = session.stopped_t_ns or utc_ns()
@@ -192,10 +191,15 @@ def _has_begun(session: Session, node: ServerNode, boot_id: str) -> bool | None:
     if boot_id != node.boot_id:
         known = offset_ns is not None and stream.t_ns_first is not None
         return _begin_t_ns(session, node, boot_id) <= stop_t_ns if known else None
-    if node.greeted_t_ns is not None:
-        taken_s = node.hello.next_seq / rate_hz
-        age_s = _SLOWEST * taken_s + _UNHEARD_S if taken_s else 0.0
-        if node.greeted_t_ns - round(age_s * 1e9) > stop_t_ns:
+    said = node.hello
+    if node.greeted_t_ns is not None and not said.next_seq and not stream.held:
+        # Of frames that it has just taken it may not know yet; then they come at once.
+        is_settled = stop_t_ns < node.greeted_t_ns < utc_ns() - _UNHEARD_NS
+        return False if is_settled else None
+    if said.t_ns_first and said.held and offset_ns is not None:
+        if said.t_ns_first + offset_ns <= stop_t_ns:
+            return True
+        if said.held[0][0] == 0:
             return False
     journal = stream.journal
     oldest = next(iter(stream.held), None)

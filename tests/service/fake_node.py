@@ -116,6 +116,7 @@ class FakeNode:
         self.token = token
         self.calibration = calibration
         self.tiles = tiles
+        self.nominal_rate_hz = 1e9 / PERIOD_NS
         self.acked = Intervals()
         """Of the present stream."""
         self.acked_of: dict[str, Intervals] = {}
@@ -145,7 +146,11 @@ class FakeNode:
     @property
     def info(self) -> ArrayInfo:
         return make_array(
-            self.tiles, node=self.name, boot_id=self.boot_id, utc_offset_ns=self.utc_offset_ns
+            self.tiles,
+            node=self.name,
+            boot_id=self.boot_id,
+            utc_offset_ns=self.utc_offset_ns,
+            nominal_rate_hz=self.nominal_rate_hz,
         )
 
     def hello(self, **changes: Any) -> Hello:
@@ -157,6 +162,7 @@ class FakeNode:
             "array_info": self.info,
             "held": ((0, self.seq - 1),) if self.seq else (),
             "next_seq": self.seq,
+            "t_ns_first": int(self.sent[0].t_ns[0]) if self.sent else 0,
             "scene": {"name": "test"},
             "emulated": False,
             "calibration": calibration,

@@ -153,10 +153,26 @@ def test_a_stop_that_falls_into_the_present_stream_makes_it_a_part(
     tared.frames(10, now=True)
     [first] = tared.before
     tared.connect(earlier=(first.said(),))
-    # The newest first: from them alone nobody knows when the stream began.
-    tared.send_again(tared.sent[-1])
+    tared.send_again(tared.sent[-1])  # the newest first
     assert session.now()["state"] == "pending"
     tared.send_again(tared.sent[0])
+    sealed = session.sealed()
+    assert whole_parts_of(sealed) == [(first.boot_id, 70, 119), (tared.boot_id, 0, 39)]
+
+
+def test_frames_of_a_node_that_is_much_slower_than_its_rate_belong_to_it_too(
+    tared: FakeNode, session: Recording
+) -> None:
+    tared.reboot()
+    tared.nominal_rate_hz = 1e5  # its frames would be of the last millisecond
+    tared.frames(40)
+    session.stop()
+    time.sleep(1.1)  # a node may have taken frames in the last second that it does not know of
+    tared.frames(10, now=True)
+    [first] = tared.before
+    tared.connect(earlier=(first.said(),))
+    for frames in tared.sent:
+        tared.send_again(frames)
     sealed = session.sealed()
     assert whole_parts_of(sealed) == [(first.boot_id, 70, 119), (tared.boot_id, 0, 39)]
 
