@@ -27,6 +27,7 @@ from storage.journal.open_segments import OpenSegments
 from storage.journal.segment import (
     SUFFIX,
     Segment,
+    had_records,
     recover,
     set_aside_no_files,
     unread_of,
@@ -68,12 +69,12 @@ class Journal:
             self.problems += set_aside_no_files(folder)
             for path in sorted(folder.glob("*" + SUFFIX)):
                 index = path.with_suffix(INDEX_SUFFIX)
-                has_records = index.exists() and index.stat().st_size > 0
+                is_indexed = index.exists() and had_records(path, self._schema)
                 segment, damaged = recover(path, self._schema)
                 self.lost.add(damaged, CORRUPT)
                 if segment is not None:
                     self._take_in(segment)
-                elif has_records:  # else it was just begun when its process was killed
+                elif is_indexed:  # else it was just begun when its process was killed
                     self.problems.append(f"{path}: no frame in it is proven by its index")
             for path in folder.glob("*" + INDEX_SUFFIX):
                 # A power cut may take the name of a segment and leave that of its index. Nothing in

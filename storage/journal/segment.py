@@ -13,7 +13,7 @@ import stat
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -252,6 +252,18 @@ def unread_of(path: Path) -> Path:
     taken = {each.name for each in path.parent.iterdir()}
     names = (f"{path.stem}{f'.{n}' if n > 1 else ''}{UNREAD_SUFFIX}" for n in count(1))
     return path.with_name(next(name for name in names if name not in taken))
+
+
+def had_records(path: Path, schema: pa.Schema) -> bool:
+    """Are batches in a segment's index, or were there any? Only the newest one may lack its record.
+
+    Raises:
+        OSError: one of the two files cannot be read.
+    """
+    if path.with_suffix(INDEX_SUFFIX).stat().st_size > 0:
+        return True
+    _, begin = read_header(path)
+    return len(list(islice(messages_from(path, begin, schema), 2))) > 1
 
 
 def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:

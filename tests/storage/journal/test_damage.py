@@ -278,3 +278,23 @@ def test_a_damaged_record_of_the_index_gives_its_neighbours_instant_never_a_far_
     assert newest == (part(10 * record - 1, 10 * record - 1).t_ns[0] if record else None)
     index.write_bytes(b"")
     assert journal.t_ns_near(asked, newest=False) is None
+
+
+def test_an_index_that_was_emptied_is_said(tmp_path: Path) -> None:
+    filled(tmp_path, (0, 9), (10, 19)).close()
+    (path,) = segments(tmp_path)
+    index_of(path).write_bytes(b"")
+    journal = reopened(tmp_path)
+    assert_holds(journal, set())
+    (problem,) = journal.problems
+    assert path.name in problem
+    assert path.with_suffix(".unread").exists()
+
+
+def test_a_segment_that_was_just_begun_when_its_process_was_killed_is_no_problem(
+    tmp_path: Path,
+) -> None:
+    filled(tmp_path, (0, 9)).close()
+    (path,) = segments(tmp_path)
+    index_of(path).write_bytes(b"")
+    assert reopened(tmp_path).problems == []
