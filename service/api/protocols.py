@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
+from collections import deque
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
@@ -55,6 +56,8 @@ class Http(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """It waits now."""
         super().connection_made(transport)
+        self._asked: deque[RequestResponseCycle] = deque()
+        """Requests that are not answered yet, in their order; uvicorn knows but the newest."""
         self.config.doors.come(transport, self.client[0] if self.client else "")
         self._expect(self.config.doors.bounds.header_timeout_s)
 
@@ -62,6 +65,7 @@ class Http(HttpToolsProtocol):
         """It has gone."""
         self._expect(None)
         self.config.doors.go(self.transport)
+        self._forget_asked()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -74,7 +78,7 @@ class Http(HttpToolsProtocol):
             if self._fed_bytes > 2 * self.config.doors.bounds.max_header_bytes:
                 self._is_too_long = True
                 self.send_400_response("")
-        elif self._timer is None and not self._is_asked:
+        elif self._timer is None and not self._asked:
             self._expect(self.config.doors.bounds.header_timeout_s)  # empty lines, as it seems
 
     def on_message_begin(self) -> None:
@@ -102,7 +106,10 @@ class Http(HttpToolsProtocol):
             if not self.config.doors.admit(self.transport):
                 self.app = refuse
             self._expect(self.config.doors.bounds.body_timeout_s)
+        before: RequestResponseCycle | None = self.cycle  # None before the first one
         super().on_headers_complete()
+        if self.cycle is not before:
+            self._asked.append(self.cycle)
 
     def on_message_complete(self) -> None:
         """The body is there."""
@@ -112,6 +119,7 @@ class Http(HttpToolsProtocol):
     def on_response_complete(self) -> None:
         """It waits again, unless it has asked for more already."""
         is_last = not self.pipeline
+        self._asked.popleft()
         super().on_response_complete()
         if is_last:
             self.config.doors.rest(self.transport)
@@ -129,12 +137,6 @@ class Http(HttpToolsProtocol):
         else:
             self._end(HTTPStatus.BAD_REQUEST, "This is not HTTP/1.1")
 
-    @property
-    def _is_asked(self) -> bool:
-        """Is a request not answered yet?"""
-        cycle: RequestResponseCycle | None = self.cycle  # None before the first one
-        return cycle is not None and not cycle.response_complete
-
     def _count(self, more: int) -> None:
         self._head_bytes += more
         if self._head_bytes > self.config.doors.bounds.max_header_bytes:
@@ -149,7 +151,7 @@ class Http(HttpToolsProtocol):
 
     def _too_late(self) -> None:
         self._timer = None
-        if self._in_head or self._is_asked:
+        if self._in_head or self._asked:
             self._end(HTTPStatus.REQUEST_TIMEOUT, "The request did not come in time")
         else:
             self.transport.close()
@@ -157,12 +159,19 @@ class Http(HttpToolsProtocol):
     def _end(self, status: HTTPStatus, detail: str) -> None:
         if self.transport.is_closing():
             return
-        if not (self._is_asked and self.cycle.response_started):
+        if not (self._asked and self._asked[0].response_started):
             answer = problem("", status, detail, {"connection": "close"})
             head = [f"HTTP/1.1 {status.value} {status.phrase}".encode()]
             head += [name + b": " + value for name, value in answer.raw_headers]
             self.transport.write(b"\r\n".join([*head, b"", bytes(answer.body)]))
+        self._forget_asked()
         self.transport.close()
+
+    def _forget_asked(self) -> None:
+        """Nobody waits for the answers any more: to write one would be a mistake."""
+        for cycle in self._asked:
+            cycle.disconnected = True
+            cycle.message_event.set()
 
 
 class WebSocket(WebSocketsSansIOProtocol):

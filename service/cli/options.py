@@ -44,8 +44,13 @@ class _Output(Console):
         raise SystemExit(0)
 
 
+def _width() -> int | None:
+    # What reads from a pipe or a file has no edge at which a line or a cell would have to be broken.
+    return None if sys.stdout.isatty() or "COLUMNS" in os.environ else 500
+
+
 # Data goes to stdout; progress and remarks to stderr, progress only on a terminal.
-stdout = _Output()
+stdout = _Output(width=_width())
 stderr = Console(stderr=True)
 
 

@@ -1,7 +1,7 @@
 """The measurements of one stream's clock as they come: `clock.jsonl` in its journal folder.
 
-One JSON object a line, each with a CRC-32 of its own. A line is only ever appended, and a torn last
-one is cut off before the next. A line that is not to the letter what was written is left out: every
+One JSON object a line, each with a CRC-32 of its own. A line is only ever appended, and what a power
+cut left of the last ones is cut off before the next. A line that is not to the letter what was written is left out: every
 row only narrows the bounds of the offset, so without it they are wider, and still right.
 """
 
@@ -28,6 +28,8 @@ from storage.durable import (
 NAME = "clock.jsonl"
 _BYTES_MAX = 1 << 30
 """A stream of two years."""
+_WINDOW = 1024
+"""Bytes, of some lines."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,8 @@ class ClockLines:
 
     Attributes:
         rows: of the lines that are whole, in the order they came.
-        damaged: how many other lines there are.
-        is_torn: does the last one lack its end, as after a power cut, or while it is written?
+        damaged: how many other lines there are before the last whole one.
+        is_torn: does it end with something else, as after a power cut, or while it is written?
     """
 
     rows: tuple[ClockOffset, ...] = ()
@@ -69,9 +71,9 @@ class ClockLog:
                 make_folder(self.path.parent)
             descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
             try:
-                end = os.fstat(descriptor).st_size
-                if end > 0 and os.pread(descriptor, 1, end - 1) != b"\n":
-                    end = os.pread(descriptor, end, 0).rfind(b"\n") + 1
+                size = os.fstat(descriptor).st_size
+                end = _end_of_whole(descriptor, size)
+                if end < size:
                     os.ftruncate(descriptor, end)
                 try:
                     _write(descriptor, _line(row))
@@ -121,8 +123,33 @@ class ClockLog:
             raise StorageError(error.what, where=error.where) from error
         *lines, rest = content.split(b"\n")
         read = [_row(line) for line in lines]
+        is_torn = bool(rest)
+        while read and read[-1] is None:
+            is_torn = True
+            read.pop()
         rows = tuple(row for row in read if row is not None)
-        return ClockLines(rows, damaged=len(read) - len(rows), is_torn=bool(rest))
+        return ClockLines(rows, damaged=len(read) - len(rows), is_torn=is_torn)
+
+
+def _end_of_whole(descriptor: int, size: int) -> int:
+    """Where the last whole line ends; looks no further back than to it.
+
+    Of a log without one, whoever wrote it, only a line that has no end is cut.
+    """
+    window = _WINDOW
+    while True:
+        begin = max(0, size - window)
+        content = os.pread(descriptor, size - begin, begin)
+        first = 0 if begin == 0 else content.find(b"\n") + 1
+        end = content.rfind(b"\n") + 1
+        while end > first:
+            start = content.rfind(b"\n", first, end - 1) + 1 or first
+            if _row(content[start : end - 1]) is not None:
+                return begin + end
+            end = start
+        if begin == 0:
+            return content.rfind(b"\n") + 1
+        window *= 16
 
 
 def _line(row: ClockOffset) -> bytes:

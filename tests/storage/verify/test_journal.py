@@ -300,11 +300,13 @@ def test_a_damaged_clock_row_is_said_and_a_torn_last_one_is_no_damage(tmp_path: 
     path = with_clock(stream(tmp_path))
     whole = path.read_bytes()
     assert problems(path.parent) == ""
+    last = whole.rindex(b"\n", 0, -1)
     for at in range(0, len(whole) - 1, 11):
         damaged = bytearray(whole)
         damaged[at] ^= 4
         path.write_bytes(damaged)
-        assert "clock.jsonl" in problems(path.parent)
+        report = verify_stream(path.parent)  # a power cut may leave anything of the last line
+        assert "clock.jsonl" in " ".join(report.problems if at < last else report.remarks)
     path.write_bytes(whole[:-20])
     report = verify_stream(path.parent)
     assert (report.problems, "clock.jsonl" in report.remarks[-1]) == ([], True)

@@ -113,7 +113,7 @@ def test_sessions_lists_what_the_server_has_and_what_the_folder_has(
     found = json.loads(run("sessions", "--data", str(demo.data), "--json").stdout)["items"]
     assert [s["id"] for s in asked] == [s["id"] for s in found] == [session]
     assert asked[0]["complete"] is found[0]["complete"] is True
-    table = run("sessions", "--server", demo.url)
+    table = run("sessions", "--server", demo.url, COLUMNS="200")
     assert session in table.stdout
     assert "=1+1 [b]" in table.stdout
 
@@ -130,7 +130,8 @@ def test_pull_brings_the_file_verified_and_at_once_the_second_time(
     assert len(table) == pulled["frames"]
     folder = tmp_path / session
     assert {path.name for path in folder.iterdir()} == {
-        *("frames.parquet", "session.json", "events.json", "ledger.json", "clock.parquet")
+        *("frames.parquet", "session.json", "events.json", "ledger.json", "clock.parquet"),
+        "events.parquet",
     }
     before = (folder / "frames.parquet").stat().st_mtime_ns
     assert run("pull", session, "--server", demo.url, "--out", str(tmp_path)).returncode == 0
