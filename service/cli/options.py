@@ -45,7 +45,7 @@ class _Output(Console):
 
 
 def _width() -> int | None:
-    # What reads from a pipe or a file has no edge at which a line or a cell would have to be broken.
+    # A pipe or a file has no edge at which a line or a cell would have to be broken.
     return None if sys.stdout.isatty() or "COLUMNS" in os.environ else 500
 
 

@@ -1,8 +1,9 @@
 """The measurements of one stream's clock as they come: `clock.jsonl` in its journal folder.
 
-One JSON object a line, each with a CRC-32 of its own. A line is only ever appended, and what a power
-cut left of the last ones is cut off before the next. A line that is not to the letter what was written is left out: every
-row only narrows the bounds of the offset, so without it they are wider, and still right.
+One JSON object a line, each with a CRC-32 of its own. A line is only ever appended, and what a
+power cut left of the last ones is cut off before the next. A line that is not to the letter what
+was written is left out: every row only narrows the bounds of the offset, so without it they are
+wider, and still right.
 """
 
 from __future__ import annotations

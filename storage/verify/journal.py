@@ -195,7 +195,9 @@ def _check_clock(report: StreamReport, folder: Path) -> None:
             "the bounds of the server's time are wider"
         )
     if lines.is_torn:
-        report.remarks.append(f"{CLOCK_LOG}: it ends with what is no whole line, as after a power cut")
+        report.remarks.append(
+            f"{CLOCK_LOG}: it ends with what is no whole line, as after a power cut"
+        )
 
 
 def _segments(folder: Path) -> list[SegmentReport]:

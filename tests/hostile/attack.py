@@ -59,6 +59,8 @@ class Attack:
     tries: int
     soak_tries: int
     run: Callable[[Play], Outcome]
+    is_alone: bool = True
+    """Does it measure time or memory, so that nothing else may run beside it?"""
 
     def play(self, *, seed: int, is_soak: bool, folder: Path) -> Outcome:
         """Run it; the same seed draws the same."""
@@ -70,7 +72,7 @@ ATTACKS: dict[str, Attack] = {}
 
 
 def attack(
-    name: str, *, tries: int, soak_tries: int
+    name: str, *, tries: int, soak_tries: int, is_alone: bool = True
 ) -> Callable[[Callable[[Play], Outcome]], Attack]:
     """Put a function on the list.
 
@@ -78,12 +80,13 @@ def attack(
         name: in words; the row of the table.
         tries: how many in every test run; it should take seconds.
         soak_tries: how many with `--soak`; it may take minutes.
+        is_alone: does it measure time or memory, so that nothing else may run beside it?
     """
 
     def listed(run: Callable[[Play], Outcome]) -> Attack:
         if name in ATTACKS:
             raise ValueError(f"two attacks are called {name!r}")
-        ATTACKS[name] = Attack(name, tries, soak_tries, run)
+        ATTACKS[name] = Attack(name, tries, soak_tries, run, is_alone)
         return ATTACKS[name]
 
     return listed

@@ -46,7 +46,12 @@ FORMULAS = [
 ]
 
 
-@attack("labels of marks that a spreadsheet takes for formulas", tries=150, soak_tries=20_000)
+@attack(
+    "labels of marks that a spreadsheet takes for formulas",
+    tries=150,
+    soak_tries=20_000,
+    is_alone=False,
+)
 def labels_in_a_spreadsheet(play: Play) -> Outcome:
     """Drawn labels at frames with drawn forces, many negative, written as CSV, Arrow and Parquet.
 

@@ -38,7 +38,7 @@ class Root:
     """Every number that may depend on the file of this name, from a folder that is a copy."""
 
 
-@attack("a flip in every file of a data folder", tries=60, soak_tries=8500)
+@attack("a flip in every file of a data folder", tries=60, soak_tries=8500, is_alone=False)
 def flips(play: Play) -> Outcome:
     """One bit at a tenth byte of one file of a server's, a node's or a user's folder, drawn anew.
 
@@ -58,7 +58,7 @@ def flips(play: Play) -> Outcome:
     return _play(play, flipped)
 
 
-@attack("a file of a data folder, cut anywhere", tries=30, soak_tries=2000)
+@attack("a file of a data folder, cut anywhere", tries=30, soak_tries=2000, is_alone=False)
 def cuts(play: Play) -> Outcome:
     """The same with all cut off from a tenth byte on, the first included.
 

@@ -230,7 +230,7 @@ _NUMBERS = ("gauge_kpa", "force_n", "force_sigma_n", "grf_n", "grf_sigma_n", "co
 Numbers = Mapping[str, np.ndarray]
 
 
-@attack("a bit flipped in tares.json", tries=24, soak_tries=2_600)
+@attack("a bit flipped in tares.json", tries=24, soak_tries=2_600, is_alone=False)
 def flipped_tares(play: Play) -> Outcome:
     """A bit is flipped at every byte in turn; then forces are computed live, and a session sealed.
 
@@ -333,7 +333,12 @@ def node_folder(folder: Path) -> Path:
     return folder
 
 
-@attack("every file of a node's folder, damaged in every way", tries=30, soak_tries=2_000)
+@attack(
+    "every file of a node's folder, damaged in every way",
+    tries=30,
+    soak_tries=2_000,
+    is_alone=False,
+)
 def folder_of_a_node(play: Play) -> Outcome:
     """One file of a node's state is damaged, then its journal is opened, goes on and is tidied.
 

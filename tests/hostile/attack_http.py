@@ -11,7 +11,12 @@ from tests.waiting import until
 TOKEN = "hostile-token"  # noqa: S105  # of this test
 
 
-@attack("requests drawn from the API's description, `serve`", tries=24, soak_tries=12_000)
+@attack(
+    "requests drawn from the API's description, `serve`",
+    tries=24,
+    soak_tries=12_000,
+    is_alone=False,
+)
 def of_serve(play: Play) -> Outcome:
     """Every operation of a server on loopback, with drawn parameters and bodies, right and wrong.
 
@@ -24,7 +29,7 @@ def of_serve(play: Play) -> Outcome:
         return play_drawn(served, play)
 
 
-@attack("the same with a token, given or not", tries=24, soak_tries=12_000)
+@attack("the same with a token, given or not", tries=24, soak_tries=12_000, is_alone=False)
 def of_serve_with_token(play: Play) -> Outcome:
     """As for `serve`; half of the requests have the token, the others may change nothing.
 

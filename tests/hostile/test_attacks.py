@@ -16,8 +16,13 @@ for _path in sorted(Path(__file__).parent.glob("attack_*.py")):
 
 
 @pytest.mark.process
-@pytest.mark.real_time
-@pytest.mark.parametrize("attack", ATTACKS.values(), ids=list(ATTACKS))
+@pytest.mark.parametrize(
+    "attack",
+    [
+        pytest.param(attack, marks=[pytest.mark.real_time] if attack.is_alone else [], id=name)
+        for name, attack in ATTACKS.items()
+    ],
+)
 def test_an_attack_does_nothing_that_it_must_not(attack: Attack, tmp_path: Path) -> None:
     outcome = attack.play(seed=SEED, is_soak=False, folder=tmp_path)
     assert outcome.tries >= attack.tries
