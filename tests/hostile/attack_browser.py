@@ -48,7 +48,7 @@ FORM = """([url, name, value]) => new Promise((resolve) => {
 START = '{"node": "bench", "name": "of an attacker"}'
 
 
-@attack("an attacker's page in a browser", tries=30, soak_tries=400, is_alone=False)
+@attack("an attacker's page in a browser", tries=14, soak_tries=400, is_alone=False)
 def page_of_an_attacker(play: Play) -> Outcome:
     """Requests, forms, beacons and websockets of a foreign page, and of one rebound by its DNS.
 

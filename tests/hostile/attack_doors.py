@@ -130,7 +130,7 @@ def _is_refused(connection: socket.socket) -> bool:
     return (1013).to_bytes(2, "big") in said.partition(b"\r\n\r\n")[2][:4]
 
 
-@attack("requests that are too long, too slow or no requests", tries=14, soak_tries=600)
+@attack("requests that are too long, too slow or no requests", tries=7, soak_tries=600)
 def malformed(play: Play) -> Outcome:
     """Endless headers (400 MB if they were taken), bodies that stop, garbage, pipelines.
 

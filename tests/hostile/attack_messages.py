@@ -50,7 +50,7 @@ _CODES = (1007, 1008, 1009, 4001, 4002, 4004, 4009, 4010)
 """With which whoever says nonsense may be let go."""
 
 
-@attack("mutated and well-formed but wrong messages", tries=400, soak_tries=100_000)
+@attack("mutated and well-formed but wrong messages", tries=200, soak_tries=100_000)
 def messages(play: Play) -> Outcome:
     """Messages to `/api/v1/ingest` and `/api/v1/live` of a server that records, with a screen.
 

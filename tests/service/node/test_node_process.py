@@ -265,7 +265,7 @@ def test_a_node_alone_leaves_a_complete_session_that_proves_itself(
     assert again.ended(30.0) == 0, again.err
     assert "is complete" in again.said("session")
     proof = foottile("verify", tmp_path / "node", "--json")
-    assert proof.ended(20.0) == 0, proof.out
+    assert proof.ended(20.0) == 0, (proof.out, proof.err)
     (session,) = json.loads("".join(proof.out))["sessions"]
     assert (session["complete"], len(session["parts"])) == (True, 2)
 
