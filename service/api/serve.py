@@ -93,7 +93,7 @@ def token_for(host: str, given: str | None, data: Path) -> str | None:
     try:
         kept = read_whole(path).decode("ascii", "replace").strip()
         if not _TOKEN.fullmatch(kept):
-            raise DamagedFileError("it holds no token", where=str(path))  # noqa: TRY301
+            raise DamagedFileError("it holds no token", where=str(path))  # noqa: TRY301  # caught below
     except FileNotFoundError:
         pass
     except DamagedFileError as error:

@@ -1,10 +1,23 @@
-"""A scene in one line."""
+"""Scenes in one line, and the file of the smallest one."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from devices.scene.file import Scene
+
+ONE_TILE_FILE = """
+name = "one"
+calibration = "none"
+
+[[tile]]
+serial = "T01"
+mux = 0x70
+channel = 0
+x_m = 0.0
+y_m = 0.0
+z_m = -0.15
+"""
 
 
 def make_scene(

@@ -11,22 +11,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from tests.builders.scenes import ONE_TILE_FILE
 from tests.hostile.attack import Outcome, Play, attack
 from tests.service.process import Process
 from tests.service.running import Running
 
 _SOAK_TRIES = 12
-_ONE_TILE = """
-name = "one"
-calibration = "none"
-[[tile]]
-serial = "T01"
-mux = 0x70
-channel = 0
-x_m = 0.0
-y_m = 0.0
-z_m = -0.15
-"""
 _PATIENCE_S = 180.0
 """64 tiles are measured before the first frame, which takes its time on a busy machine."""
 _SAID_S = 4.0
@@ -43,7 +33,7 @@ def held_up(play: Play) -> Outcome:
     """
     outcome, is_soak = Outcome(), play.tries >= _SOAK_TRIES
     one_tile = play.folder / "one.toml"
-    one_tile.write_text(_ONE_TILE)
+    one_tile.write_text(ONE_TILE_FILE)
     running = Running(play.folder / "data")
     running.start()
     with ExitStack() as stack:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import uuid
+from abc import ABC, abstractmethod
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -43,7 +44,7 @@ from tests.hostile.wrong_messages import DEEP, checked_text, damaged, wrong_batc
 _SIDE_BY_SIDE = 4
 _GROWTH_MAX_MB = 20.0
 _GAP_MAX_S = 1.0
-_ANSWER_S = 30.0
+_ANSWER_S = 10.0
 _WARM_UP = 2000
 """Tries after which memory is measured first."""
 _CODES = (1007, 1008, 1009, 4001, 4002, 4004, 4009, 4010)
@@ -119,7 +120,7 @@ async def _hostile(served: Served, random: Random, number: int, outcome: Outcome
         await foreign.close()
 
 
-class _Foreign:
+class _Foreign(ABC):
     """A connection that is used until it is hung up on."""
 
     path = ""
@@ -167,14 +168,17 @@ class _Foreign:
             close_timeout=2.0,
         )
 
+    @abstractmethod
     async def opened(self) -> ClientConnection:
-        raise NotImplementedError
+        """A connection on which something can be said."""
 
+    @abstractmethod
     def wrong(self) -> Any:
-        raise NotImplementedError
+        """What it should not say."""
 
+    @abstractmethod
     async def answered(self) -> None:
-        raise NotImplementedError
+        """Return when the server has taken what was said before."""
 
     async def say(self, message: Any) -> None:
         assert self.socket is not None

@@ -37,7 +37,7 @@ _PARQUET = MEDIA_TYPES["parquet"]
 async def clock(
     session_id: str,
     server: ServerState,
-    format: Literal["json", "parquet"] = "json",  # noqa: A002
+    format: Literal["json", "parquet"] = "json",  # noqa: A002  # the query's name
 ) -> ClockSummary | Response:
     """Stretches between steps with offset and drift of every stream; while recording, so far.
 

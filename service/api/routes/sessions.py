@@ -232,7 +232,7 @@ async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventVi
 async def events(
     session_id: str,
     server: ServerState,
-    format: Literal["json", "parquet"] = "json",  # noqa: A002
+    format: Literal["json", "parquet"] = "json",  # noqa: A002  # the query's name
 ) -> Page[EventView] | Response:
     """In order of time; `format=parquet` is `events.parquet`, as it lies beside the frames."""
     session = server.sessions.get(session_id)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from service import server_clock
-from service.cli.main import main
 from service.client import Client
 from storage.checked_table import write_table
+from tests.service.command import command
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
@@ -68,15 +67,6 @@ def arrow_of(answer: httpx.Response) -> pa.Table:
 
 def csv_of(answer: httpx.Response) -> pa.Table:
     return pacsv.read_csv(io.BytesIO(answer.content))
-
-
-def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["foottile", "export", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
 
 
 def test_every_format_can_have_the_servers_time_beside_the_nodes(
@@ -243,18 +233,21 @@ def test_a_pulled_session_is_exported_with_the_servers_time_and_a_lone_file_is_n
     folder = tmp_path / session.id
     out = tmp_path / "out.parquet"
     options = ("--format", "parquet", "--clock", "server", "--out", out)
-    assert export(monkeypatch, folder, *options) == 0
+    assert command(monkeypatch, "export", folder, *options) == 0
     served = session.data(clock="server", marks="true").content
     assert pq.read_table(out).equals(pq.read_table(io.BytesIO(served)))
     out.unlink()
     lone = tmp_path / "lone.parquet"
     (folder / "frames.parquet").rename(lone)
     capsys.readouterr()
-    assert export(monkeypatch, lone, *options) == 2
+    assert command(monkeypatch, "export", lone, *options) == 2
     said = capsys.readouterr().err
     assert "clock.parquet" in said
     assert not out.exists()
-    assert export(monkeypatch, lone, "--clock", "mine", "--format", "csv", "--out", out) == 2
+    assert (
+        command(monkeypatch, "export", lone, "--clock", "mine", "--format", "csv", "--out", out)
+        == 2
+    )
     assert "node or server" in capsys.readouterr().err
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from devices.errors import StorageError
 from service.client import Client
 from storage.sessions.beside import read_events, write_events
 from storage.sessions.folder import Session
+from tests.service.command import command
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
@@ -210,17 +210,6 @@ def test_the_table_of_events_is_given_as_it_is_stored(session: Recording, node: 
 # --- from files -----------------------------------------------------------------------------------
 
 
-def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    from service.cli.main import main
-
-    monkeypatch.setattr(sys, "argv", ["foottile", "export", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
-
-
 @pytest.fixture
 def pulled(session: Recording, tmp_path: Path) -> Path:
     """The session's folder with two marks, one of them at no frame, pulled."""
@@ -241,12 +230,12 @@ def test_an_export_of_a_pulled_session_has_the_marks_and_names_those_it_has_not(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / f"out.{to}"
-    assert export(monkeypatch, pulled, "--format", to, "--out", out) == 0
+    assert command(monkeypatch, "export", pulled, "--format", to, "--out", out) == 0
     assert "'years ago' is not in it: no frame within a second" in capsys.readouterr().err
     asked = {} if to == "arrow" else {"marks": "true"}
     assert out.read_bytes() == session.data(format=to, **asked).content
     bare = tmp_path / f"bare.{to}"
-    assert export(monkeypatch, pulled, "--format", to, "--no-marks", "--out", bare) == 0
+    assert command(monkeypatch, "export", pulled, "--format", to, "--no-marks", "--out", bare) == 0
     assert bare.read_bytes() != out.read_bytes()
 
 
@@ -259,9 +248,9 @@ def test_an_export_of_a_file_without_its_folder_says_that_it_has_no_marks(
     alone = tmp_path / "alone.parquet"
     alone.write_bytes((pulled / "frames.parquet").read_bytes())
     arguments = (alone, "--format", "csv", "--out", tmp_path / "out.csv")
-    assert export(monkeypatch, *arguments) == 0
+    assert command(monkeypatch, "export", *arguments) == 0
     assert "without marks" in capsys.readouterr().err
-    assert export(monkeypatch, *arguments, "--marks") == 2
+    assert command(monkeypatch, "export", *arguments, "--marks") == 2
     assert "events.parquet" in capsys.readouterr().err
 
 
@@ -272,7 +261,10 @@ def test_marks_without_a_clock_table_are_at_no_frame_and_that_is_said(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (pulled / "clock.parquet").unlink()
-    assert export(monkeypatch, pulled, "--format", "csv", "--out", tmp_path / "out.csv") == 0
+    assert (
+        command(monkeypatch, "export", pulled, "--format", "csv", "--out", tmp_path / "out.csv")
+        == 0
+    )
     assert "'a stone' is not in it: there is no clock.parquet" in capsys.readouterr().err
 
 
@@ -285,7 +277,7 @@ def test_a_damaged_table_of_events_is_an_error_and_marks_can_be_left_out(
     path = pulled / "events.parquet"
     path.write_bytes(path.read_bytes()[:-9])
     arguments = (pulled, "--format", "csv", "--out", tmp_path / "out.csv")
-    assert export(monkeypatch, *arguments) == 1
+    assert command(monkeypatch, "export", *arguments) == 1
     assert "events.parquet" in capsys.readouterr().err
     assert not (tmp_path / "out.csv").exists()
-    assert export(monkeypatch, *arguments, "--no-marks") == 0
+    assert command(monkeypatch, "export", *arguments, "--no-marks") == 0

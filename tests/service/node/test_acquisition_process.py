@@ -16,31 +16,19 @@ import service.node.acquisition
 from devices.errors import FootTileError
 from devices.scene.file import load_scene
 from service.rig.rig import RigOptions
+from tests.builders.scenes import ONE_TILE_FILE
 from tests.service.process import Process, Start
 from tests.service.running import Running
 from tests.waiting import until
 
 pytestmark = pytest.mark.real_time
 
-SCENE = """
-name = "one"
-calibration = "none"
-
-[[tile]]
-serial = "T01"
-mux = 0x70
-channel = 0
-x_m = 0.0
-y_m = 0.0
-z_m = -0.15
-"""
-
 
 @pytest.fixture
 def process(running: Running, foottile: Start, tmp_path: Path) -> Process:
     """A node that streams."""
     path = tmp_path / "one.toml"
-    path.write_text(SCENE)
+    path.write_text(ONE_TILE_FILE)
     started = foottile("node", "--scene", path, "--server", running.url, "--name", "leg")
     started.said("connected to")
     until(lambda: (running.node("leg")["last_seq"] or 0) > 100, 30.0)
