@@ -2,6 +2,10 @@
 
     python -m tests.hostile --seed 1 [--soak] [--only WORD] [--out docs/results/hostile.md]
 
+With `--out` a row is written as soon as its attack has ended, and takes the place of the row of an
+earlier run of it: all of them take more than an hour, so they may be played one by one. A row says
+at which commit it was played.
+
 Exits with 1 if the product did what it must not do; each such try is said with its seed.
 """
 
@@ -11,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -34,7 +37,7 @@ def main() -> int:
     options = parser.parse_args()
     for path in sorted(Path(__file__).parent.glob("attack_*.py")):
         importlib.import_module(f"tests.hostile.{path.stem}")
-    rows: list[tuple[str, Outcome, float]] = []
+    failed = 0
     for attack in ATTACKS.values():
         if options.only not in attack.name:
             continue
@@ -42,48 +45,57 @@ def main() -> int:
         began = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="foottile-hostile-") as folder:
             outcome = attack.play(seed=options.seed, is_soak=options.soak, folder=Path(folder))
-        rows.append((attack.name, outcome, time.monotonic() - began))
-        print(f"  {_cells(outcome)}", flush=True)
+        row = _row(attack.name, outcome, time.monotonic() - began, options.seed)
+        print(row, flush=True)
         for failure in outcome.failures[:20]:
             print(f"  FAILED: {failure}", flush=True)
-    text = _table(rows)
-    print(text)
-    if options.out is not None:
-        options.out.write_text(text, "utf-8")
-    return 1 if any(outcome.failures for _, outcome, _ in rows) else 0
+        failed += len(outcome.failures)
+        if options.out is not None:
+            _write(options.out, attack.name, row)
+    return 1 if failed else 0
 
 
-def _table(rows: list[tuple[str, Outcome, float]]) -> str:
+def _write(path: Path, name: str, row: str) -> None:
+    """The table with this row, others as they were; in the order of the list."""
+    rows = {name: row}
+    if path.exists():
+        lines = path.read_text("utf-8").splitlines()
+        rows = {line.split(" | ")[0].removeprefix("| "): line for line in lines} | rows
+    path.write_text(_HEAD + "".join(f"{rows[each]}\n" for each in ATTACKS if each in rows), "utf-8")
+
+
+_HEAD = """# Attacks, and what came of them
+
+Made by `python -m tests.hostile --soak --seed SEED --out docs/results/hostile.md`. What each attack
+does, and what would count as a failure, is in the docstring of its function in `tests/hostile/`.
+What is defended and what is not: [security.md](../security.md).
+
+| attack | tries | what happened | measured beside it | failures | s | seed | day, commit |
+|---|--:|---|---|--:|--:|--:|---|
+"""
+
+
+def _row(name: str, outcome: Outcome, seconds: float, seed: int) -> str:
+    return (
+        f"| {name} | {outcome.tries} | {_cells(outcome)} | {len(outcome.failures)} | "
+        f"{seconds:.0f} | {seed} | {datetime.now(UTC):%Y-%m-%d}, {_commit()} |"
+    )
+
+
+def _commit() -> str:
+    """The one that is checked out; with a + if code was changed since."""
+    code = ("devices", "storage", "service", "web", "tests")
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=_ROOT, capture_output=True, text=True
-    ).stdout.strip()
-    lines = [
-        "# Attacks, and what came of them",
-        "",
-        f"{datetime.now(UTC):%Y-%m-%d}, commit {commit}, `{_command()}`. "
-        "What each attack does, and what would count as a failure, is in the docstring of its "
-        "function in `tests/hostile/`. What is defended and what is not: "
-        "[security.md](../security.md).",
-        "",
-        "| attack | tries | what happened | measured beside it | failures | s |",
-        "|---|--:|---|---|--:|--:|",
-        *(
-            f"| {name} | {outcome.tries} | {_cells(outcome)} | "
-            f"{len(outcome.failures)} | {seconds:.0f} |"
-            for name, outcome, seconds in rows
-        ),
-    ]
-    return "\n".join(lines) + "\n"
+    )
+    changed = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *code], cwd=_ROOT)
+    return commit.stdout.strip() + "+" * (changed.returncode != 0)
 
 
 def _cells(outcome: Outcome) -> str:
     happened = ", ".join(f"{what}: {times}" for what, times in outcome.outcomes.most_common())
     measured = ", ".join(f"{what}: {value}" for what, value in outcome.figures.items())
     return f"{happened} | {measured}"
-
-
-def _command() -> str:
-    return shlex.join(["python", "-m", "tests.hostile", *sys.argv[1:]])
 
 
 if __name__ == "__main__":
