@@ -22,8 +22,10 @@ from typing import BinaryIO
 
 from devices.errors import DamagedFileError, FolderGoneError, FootTileError, StorageError
 
-_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp")
-_OLDER_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
+_TEMPORARY = re.compile(
+    r"\.(?P<name>.+)\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp"
+)
+_OLDER_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
 _NO_LONGER = {"Z", "X"}
 _STARTED_FIELD = 19
 """Field of /proc/PID/stat, counted after the name: when the process started."""
@@ -277,6 +279,13 @@ def check_held(path: Path) -> None:
 
 
 ASIDE = ".damaged"
+
+
+def intended_name(name: str) -> str:
+    """The name that a file had before it was set aside, or has once it is written."""
+    if match := _TEMPORARY.fullmatch(name) or _OLDER_TEMPORARY.fullmatch(name):
+        return match["name"]
+    return name.partition(ASIDE)[0]
 
 
 def set_aside(path: Path) -> Path:

@@ -12,12 +12,15 @@ import errno
 import socket
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from http import HTTPStatus
 from typing import Any
 
 import uvicorn
 from starlette.types import Receive, Scope, Send
+from uvicorn._types import ASGIReceiveEvent
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
+from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.http11 import Request
 
@@ -202,11 +205,17 @@ class WebSocket(WebSocketsSansIOProtocol):
             self.app = refuse
         super().handle_connect(event)
 
-    def send_receive_event_to_app(self) -> None:
-        """A message; the first one of a node gets it its place."""
-        if self._is_node:
-            self.config.doors.admit_node(self.transport)
-        super().send_receive_event_to_app()
+    async def receive(self) -> ASGIReceiveEvent:
+        """A message, or the end; the first word of a node gets it its place, if there is one."""
+        event = await super().receive()
+        is_word = self._is_node and event["type"] == "websocket.receive"
+        if is_word and not self.config.doors.admit_node(self.transport):
+            with suppress(ClientDisconnected, RuntimeError):  # it has gone, or was told why
+                await self.send(
+                    {"type": "websocket.close", "code": Close.TRY_LATER, "reason": _TOO_MANY}
+                )
+            return {"type": "websocket.disconnect", "code": Close.TRY_LATER}
+        return event
 
     async def run_asgi(self) -> None:
         """Serve it; then it only has to go, which one that does not read does not do by itself."""
