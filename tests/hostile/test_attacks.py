@@ -1,8 +1,12 @@
-"""Every attack of the list, with few tries; with `--soak` as many as in docs/results/hostile.md."""
+"""Every attack of the list, with few tries; with `--soak` as many as in docs/results/hostile.md.
+
+FOOTTILE_TURN in the environment: a number that every run of all tests has to itself.
+"""
 
 from __future__ import annotations
 
 import importlib
+import os
 from pathlib import Path
 
 import pytest
@@ -11,6 +15,7 @@ from tests.hostile.__main__ import played
 from tests.hostile.attack import ATTACKS, Attack, Outcome, Play
 
 SEED = 1
+TURN = int(os.environ.get("FOOTTILE_TURN", "0"))
 
 for _path in sorted(Path(__file__).parent.glob("attack_*.py")):
     importlib.import_module(f"tests.hostile.{_path.stem}")
@@ -25,7 +30,7 @@ for _path in sorted(Path(__file__).parent.glob("attack_*.py")):
     ],
 )
 def test_an_attack_does_nothing_that_it_must_not(attack: Attack, tmp_path: Path) -> None:
-    outcome = attack.play(seed=SEED, is_soak=False, folder=tmp_path)
+    outcome = attack.play(seed=SEED, is_soak=False, folder=tmp_path, turn=TURN)
     assert outcome.tries >= attack.tries
     assert outcome.failures == []
 
