@@ -1,13 +1,15 @@
 """JSON files that prove themselves: the last key is a hash of all text before it.
 
 Every file of ours whose content can change a number, or what is asked of a node, is written and
-read here. Older versions wrote no hash: such a file is read and called unproven, and has one when
-it is next written. A file that had a hash and has none any more is damaged, not old.
+read here. Older versions wrote no hash: such a file is read if it is JSON, called unproven, and has
+one when it is next written. A file that lost part of its hash, or all of its end, is damaged, not
+old; who edits one by hand deletes the line with the hash.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +21,7 @@ CHECK = "check"
 _BEFORE, _AFTER = b',\n "check": "', b'"\n}'
 _END = re.compile(re.escape(_BEFORE) + rb"([0-9a-f]{64})" + re.escape(_AFTER) + rb"\Z")
 _TAIL_BYTES = len(_BEFORE) + 64 + len(_AFTER)
+_LAST_COMMA = re.compile(rb",\s*\}\s*\Z")
 _DIGITS_AT_END = re.compile(rb'"[0-9a-f]{64}"\s*\}\s*\Z')
 
 
@@ -27,7 +30,7 @@ class Checked:
     """What a file holds."""
 
     text: bytes
-    """A JSON object, without its hash."""
+    """A JSON object without its hash; of an older version perhaps a list."""
     is_proven: bool
     """False: it states no hash, so it may have changed since an older version wrote it."""
 
@@ -51,7 +54,9 @@ def read_checked(path: Path) -> Checked:
 
     Raises:
         FileNotFoundError: there is none.
-        DamagedFileError: its hash is of another text, or it is no file, or cannot be read.
+        DamagedFileError: its hash is of another text, or it states none and is no JSON, or it is no
+            file.
+        StorageError: it cannot be read now.
     """
     return checked(read_whole(path), where=str(path))
 
@@ -60,7 +65,7 @@ def checked(text: bytes, *, where: str) -> Checked:
     """The same for a text that was read already.
 
     Raises:
-        DamagedFileError: its hash is of another text.
+        DamagedFileError: its hash is of another text, or it states none and is no JSON.
     """
     found = is_unchanged(text)
     if found is False:
@@ -69,9 +74,30 @@ def checked(text: bytes, *, where: str) -> Checked:
             where=where,
             expected="the bytes as they were written",
         )
+    if found is True:
+        return Checked(without_check(text), is_proven=True)
+    # Who deletes the last line by hand leaves the comma before it.
+    text = _LAST_COMMA.sub(b"\n}", text)
+    _check_json(text, where=where)
+    return Checked(text, is_proven=False)
+
+
+def _check_json(text: bytes, *, where: str) -> None:
+    """A text without its end states no hash, and zeros do not: only JSON may be an old file."""
     if not text.strip():
         raise DamagedFileError("it is empty", where=where, expected="a JSON object")
-    return Checked(without_check(text), is_proven=found is True)
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError(
+            f"it is not whole: it states no hash and is no JSON ({error})",
+            where=where,
+            expected="a JSON object",
+        ) from error
+    if not isinstance(content, dict | list):
+        raise DamagedFileError(
+            f"it states no hash and holds {text[:40]!r}", where=where, expected="a JSON object"
+        )
 
 
 def with_check(text: bytes) -> bytes:

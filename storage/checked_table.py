@@ -16,11 +16,15 @@ import pyarrow.parquet as pq
 
 from devices.errors import DamagedFileError
 from storage.durable import read_whole, write_whole
-from storage.file_hash import FILE_HASH_KEY, NO_HASH, hashes_of, put_hash
-
-FORMAT_KEY = b"foottile.format"
-"""In the schema's metadata: what has it, and no hash, is damaged, not old."""
-_FORMAT = b"2"
+from storage.file_hash import (
+    FILE_HASH_KEY,
+    FORMAT,
+    FORMAT_KEY,
+    NO_HASH,
+    check_hash,
+    hashes_of,
+    put_hash,
+)
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ def write_table(path: Path, table: pa.Table) -> None:
     Raises:
         StorageError: the disk is full or not writable; nothing is left behind then.
     """
-    said = {**(table.schema.metadata or {}), FORMAT_KEY: _FORMAT}
+    said = {**(table.schema.metadata or {}), FORMAT_KEY: FORMAT}
     table = table.replace_schema_metadata(said)
     sink = io.BytesIO()
     with pq.ParquetWriter(sink, table.schema, compression="zstd", write_page_checksum=True) as file:
@@ -53,7 +57,8 @@ def read_table(path: Path) -> CheckedTable:
 
     Raises:
         FileNotFoundError: there is none.
-        DamagedFileError: its hash is of other bytes, or it is no table, or cannot be read.
+        DamagedFileError: its hash is of other bytes, or it is no table.
+        StorageError: it cannot be read now.
     """
     return table_of(read_whole(path), where=str(path))
 
@@ -65,12 +70,7 @@ def table_of(content: bytes, *, where: str) -> CheckedTable:
         DamagedFileError: its hash is of other bytes, or it is no table.
     """
     hashes = hashes_of(content)
-    if hashes is not None and hashes[0] != hashes[1]:
-        raise DamagedFileError(
-            "it was changed: its bytes are not those that its hash is of",
-            where=where,
-            expected="the bytes as they were written",
-        )
+    check_hash(hashes, {}, where=where)
     try:
         with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True) as file:
             table = file.read()
@@ -80,6 +80,5 @@ def table_of(content: bytes, *, where: str) -> CheckedTable:
         raise DamagedFileError(
             f"cannot be read as a table: {' '.join(str(error).split())[:300]}", where=where
         ) from error
-    if hashes is None and FORMAT_KEY in said:
-        raise DamagedFileError("it was changed: its hash is gone", where=where)
+    check_hash(hashes, said, where=where)
     return CheckedTable(table, is_proven=hashes is not None)

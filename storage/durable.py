@@ -255,10 +255,9 @@ def is_held(folder: Path) -> bool:
     what is written, and nobody will find it there.
     """
     try:
-        there = os.stat(folder / LOCK_NAME)
-    except OSError:
+        there, ours = os.stat(folder / LOCK_NAME), os.fstat(_held[folder])
+    except OSError:  # also of a lock that another thread has just changed for the new folder's
         return False
-    ours = os.fstat(_held[folder])
     return (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
 
 

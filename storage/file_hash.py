@@ -9,12 +9,18 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
-from devices.errors import FileFormatError
+from devices.errors import DamagedFileError, FileFormatError
 
 FILE_HASH_KEY = b"foottile.file_sha256"
+FORMAT_KEY = b"foottile.format"
+"""In the schema's metadata of what we write: frames, events and clocks."""
+FORMAT = b"2"
+FORMAT_WITHOUT_HASH = b"1"
+"""Files of older versions: the same, without any hash of their own. They are read, not written."""
 NO_HASH = b"0" * 64
 _BEFORE_HASH = FILE_HASH_KEY + b"\x18\x40"
 """The key, then Thrift's mark of a text of 64 bytes: in a footer this stands once."""
@@ -66,6 +72,38 @@ def file_hashes(path: Path) -> tuple[str, str] | None:
 def hashes_of(content: bytes) -> tuple[str, str] | None:
     """The same for a file's content."""
     return _hashes(io.BytesIO(content))
+
+
+def check_hash(hashes: tuple[str, str] | None, said: Mapping[bytes, bytes], *, where: str) -> None:
+    """Refuse a Parquet file that is not what was written.
+
+    Checksums of pages alone are not enough: a flip in the footer may give a column the name or the
+    place of another one. What never was a file of ours, and what is of an older version, states no
+    hash and no format that has one, and passes.
+
+    Args:
+        hashes: as of `file_hashes`.
+        said: the metadata of its schema.
+        where: for errors.
+
+    Raises:
+        DamagedFileError: its hash is of other bytes, or gone.
+    """
+    remedy = "`foottile verify` says more; pull it again, or use a copy"
+    if hashes is None and said.get(FORMAT_KEY, FORMAT_WITHOUT_HASH) != FORMAT_WITHOUT_HASH:
+        raise DamagedFileError(
+            "its hash is gone: it was changed, or another program has rewritten it",
+            where=where,
+            expected="the bytes as they were written",
+            remedy=f"{remedy}; export it to work on it with other programs",
+        )
+    if hashes is not None and hashes[0] != hashes[1]:
+        raise DamagedFileError(
+            "its bytes are not those that were sealed, by the hash in its footer",
+            where=where,
+            expected="the bytes as they were written",
+            remedy=remedy,
+        )
 
 
 def _hashes(file: BinaryIO) -> tuple[str, str] | None:

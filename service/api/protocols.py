@@ -28,6 +28,8 @@ from service.api.doors import Doors
 from service.api.problems import problem
 from service.link import INGEST_PATH, SUBPROTOCOL, Close
 
+OUTLET = "foottile.outlet"
+"""Of a websocket's scope, among the extensions: the connection, as an `Outlet` to write to."""
 _SAID_ON_LIVE_BYTES_MAX = 4096
 _UNREAD_BYTES_MAX = 1 << 20
 """What may wait for one who goes on asking and does not read."""
@@ -204,6 +206,22 @@ class WebSocket(WebSocketsSansIOProtocol):
         if doors.nodes_are_full if self._is_node else not doors.admit(self.transport):
             self.app = refuse
         super().handle_connect(event)
+        if not self.close_sent:
+            # An extension's content is a dict by the specification; its reader is our own route.
+            self.scope["extensions"] = {
+                **(self.scope["extensions"] or {}),
+                OUTLET: {"outlet": self},
+            }
+
+    @property
+    def is_ready(self) -> bool:
+        """Has what was written before gone, but for a few kilobytes?"""
+        return self.writable.is_set()
+
+    def write(self, framed: bytes) -> None:
+        """Write whole frames beside uvicorn's own `send`, which frames each message anew."""
+        if not (self.close_sent or self.disconnected or self.transport.is_closing()):
+            self.transport.write(framed)
 
     async def receive(self) -> ASGIReceiveEvent:
         """A message, or the end; the first word of a node gets it its place, if there is one."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,8 +25,6 @@ from storage.durable import make_folder, set_aside
 
 BENCH = "bench"
 BENCH_REFERENCE = "emulated mill, 12 bit over 100 N"
-
-_LAST_COMMA = re.compile(rb",\s*\}\s*\Z")
 
 Progress = Callable[[str], None]
 
@@ -85,8 +82,6 @@ def read_calibration(path: Path) -> Calibration:
         raise CalibrationError(
             f"not a calibration: {what}", where=str(path), remedy=EDITED
         ) from error
-    # Who deletes the last line, as the error says, leaves the comma before it.
-    text = _LAST_COMMA.sub(b"\n}", text)
     return Calibration.from_json(text.decode("utf-8", "replace"), where=str(path))
 
 

@@ -18,8 +18,9 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from devices.emulation.ground.load_trace import LoadTrace
-from devices.errors import LoadTraceError
+from devices.errors import DamagedFileError, LoadTraceError
 from devices.inputs import check_file
+from storage.file_hash import check_hash, file_hashes
 from storage.formats.session_load import SESSION_COLUMN, as_load, is_session
 
 CSV_BYTES_MAX = 256 << 20
@@ -39,8 +40,8 @@ def read_load_trace(path: Path) -> LoadTrace:
     """Read a load trace.
 
     Raises:
-        LoadTraceError: unreadable, a column is missing or in another unit, times do not rise, or a
-            force is not a number.
+        LoadTraceError: unreadable, a session whose bytes are not those that were sealed, a column
+            is missing or in another unit, times do not rise, or a force is not a number.
     """
     where = str(path)
     columns, names = _read(path)
@@ -111,7 +112,8 @@ def _read(path: Path) -> tuple[Columns, list[str]]:
         is_parquet = path.suffix.lower() == ".parquet"
         check_file(path, bytes_max=None if is_parquet else CSV_BYTES_MAX)
         if is_parquet:
-            with pyarrow.parquet.ParquetFile(path) as file:
+            with pyarrow.parquet.ParquetFile(path, page_checksum_verification=True) as file:
+                check_hash(file_hashes(path), file.schema_arrow.metadata or {}, where=where)
                 names, rows = file.schema_arrow.names, file.metadata.num_rows
                 wanted = _wanted(names, where)
                 _check_size(rows, len(wanted), where)
@@ -123,6 +125,8 @@ def _read(path: Path) -> tuple[Columns, list[str]]:
             convert = pyarrow.csv.ConvertOptions(include_columns=wanted)
             table = pyarrow.csv.read_csv(path, convert_options=convert)
             _check_size(len(table), len(wanted), where)
+    except DamagedFileError as error:
+        raise LoadTraceError(error.what, where=where, remedy=error.remedy) from error
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         raise LoadTraceError(
             f"cannot be read: {error}",

@@ -19,11 +19,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from devices.errors import DamagedFileError, FileFormatError
+from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.inputs import check_file
 from storage.durable import storage_errors, sync_folder, temporary_of
-from storage.file_hash import FILE_HASH_KEY, file_hashes, write_file_hash
+from storage.file_hash import (
+    FILE_HASH_KEY,
+    FORMAT,
+    FORMAT_KEY,
+    FORMAT_WITHOUT_HASH,
+    check_hash,
+    file_hashes,
+    write_file_hash,
+)
 from storage.schema import (
     ARRAY_INFO_KEY,
     FRAMES,
@@ -35,10 +43,6 @@ from storage.schema import (
 )
 from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, ContentDigest, content_hash
 
-FORMAT_KEY = b"foottile.format"
-FORMAT = b"2"
-FORMAT_WITHOUT_HASH = b"1"
-"""Files of older versions: the same, without any hash of their own. They are read, not written."""
 NOTES_KEY = b"foottile.notes"
 EXPORT_KEY = b"foottile.export"
 """Only in what was made from a session: of which one, and what of it."""
@@ -194,9 +198,6 @@ class SessionReader:
     def __init__(self, path: Path, *, is_checked: bool = False) -> None:
         """Open a sealed session, whose every byte is held against the file's hash.
 
-        Checksums of pages alone are not enough: a flip in the footer may give a column the name or
-        the place of another one.
-
         Args:
             path: the file.
             is_checked: its bytes were held against the hash already.
@@ -223,7 +224,7 @@ class SessionReader:
                 remedy="Update foottile" if version else "",
             )
         if not is_checked:
-            self._check_bytes()
+            self._check_bytes(metadata)
         self.info = array_info(schema, where=str(path))
         self.notes = _notes(metadata.get(NOTES_KEY), where=str(path))
         self.format = version
@@ -238,19 +239,12 @@ class SessionReader:
         if not self.frame_count:
             raise FileFormatError("the session has no frames", where=str(path))
 
-    def _check_bytes(self) -> None:
+    def _check_bytes(self, said: Mapping[bytes, bytes]) -> None:
         try:
             hashes = file_hashes(self.path)
         except OSError as error:
             raise FileFormatError(f"cannot be read: {error}", where=str(self.path)) from error
-        # Another program that writes the file anew leaves out all three hashes, not one.
-        is_gone = hashes is None and CONTENT_KEY in (self._file.metadata.metadata or {})
-        if is_gone or (hashes is not None and hashes[0] != hashes[1]):
-            raise DamagedFileError(
-                "its bytes are not those that were sealed, by the hash in its footer",
-                where=str(self.path),
-                remedy="`foottile verify` says more; pull it again, or use a copy",
-            )
+        check_hash(hashes, said, where=str(self.path))
 
     def _content(self, metadata: Mapping[bytes, bytes]) -> tuple[str | None, dict[str, Any] | None]:
         """What the file says of its content; None if another program wrote it last."""

@@ -12,9 +12,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from storage.file_hash import FORMAT_KEY
 from storage.schema import ARRAY_INFO_KEY, KNOWN
 from storage.sessions.content_hash import CONTENT_KEY
-from storage.sessions.file import EXPORT_KEY, FORMAT_KEY
+from storage.sessions.file import EXPORT_KEY
 
 _HEADER_MAX = 1 << 20
 _TILE_NUMBER = re.compile(r"_[0-9]+$")

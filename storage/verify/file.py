@@ -13,10 +13,10 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import FileFormatError
-from storage.file_hash import file_hashes
+from storage.file_hash import FORMAT_WITHOUT_HASH, file_hashes
 from storage.intervals import AsPairs, Intervals, Losses, union
 from storage.sessions.content_hash import ContentDigest
-from storage.sessions.file import FORMAT_WITHOUT_HASH, SessionReader
+from storage.sessions.file import SessionReader
 from storage.sessions.folder import Ledger, Part, PartLedger
 from storage.sessions.frame_order import PartFrames
 

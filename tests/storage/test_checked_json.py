@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError
 from storage.checked_json import (
+    checked,
     is_unchanged,
     read_checked,
     with_check,
@@ -59,14 +60,14 @@ def test_a_byte_less_or_more_is_seen(content: dict[str, object], data: st.DataOb
 
 
 @given(objects, st.data())
-def test_what_was_cut_is_damaged_or_no_json(
+def test_what_was_cut_or_has_zeros_at_its_end_is_damaged(
     content: dict[str, object], data: st.DataObject
 ) -> None:
     whole = with_check(json.dumps(content, indent=1).encode())
     cut = whole[: data.draw(st.integers(0, len(whole) - 1))]
-    if is_unchanged(cut) is not False:
-        with pytest.raises(ValueError, match=r"Expecting|Unterminated|Extra data|Invalid"):
-            json.loads(cut)
+    for text in (cut, cut + bytes(len(whole) - len(cut))):
+        with pytest.raises(DamagedFileError, match=r"a\.json"):
+            checked(text, where="a.json")
 
 
 def test_an_object_without_is_left_as_it_is() -> None:
@@ -88,6 +89,21 @@ def test_a_file_of_an_older_version_is_read_and_called_unproven(tmp_path: Path) 
     found = read_checked(path)
     assert json.loads(found.text) == {"a": 1}
     assert not found.is_proven
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b" \n", bytes(300), b"\xff" * 300, b"3", b"null", b'"a"', b"[" * 100_000, b"{},"]
+)
+def test_what_states_no_hash_and_is_no_json_is_damaged_and_not_old(text: bytes) -> None:
+    with pytest.raises(DamagedFileError, match=r"a\.json"):
+        checked(text, where="a.json")
+
+
+def test_a_hash_may_be_deleted_by_hand_with_or_without_the_comma_before_it() -> None:
+    line = with_check(b'{"a": 1}').split(b"\n")[1]
+    for text in (with_check(b'{"a": 1}').replace(line, b""), b'{"a": 1\n}'):
+        found = checked(text, where="a.json")
+        assert (json.loads(found.text), found.is_proven) == ({"a": 1}, False)
 
 
 def test_a_missing_file_is_missing_and_not_damaged(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from devices.emulation.ground.load_trace import LoadTrace
@@ -126,4 +127,22 @@ def test_a_session_in_which_nothing_is_known_is_refused(tmp_path: Path) -> None:
 def test_forces_of_some_tiles_only_are_refused(tmp_path: Path) -> None:
     path = exported(tmp_path, "csv", ESTIMATES, "t_ns", "force_n_2")
     with pytest.raises(LoadTraceError, match=re.escape("forces of tiles 2 only")):
+        read_load_trace(path)
+
+
+def test_a_damaged_session_is_not_pressed(tmp_path: Path) -> None:
+    whole = written(tmp_path / "s.parquet", ESTIMATES | TRUTH).read_bytes()
+    path = tmp_path / "damaged.parquet"
+    for at in range(0, len(whole), 97):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << at % 8
+        path.write_bytes(damaged)
+        with pytest.raises(LoadTraceError, match=r"damaged\.parquet"):
+            read_load_trace(path)
+
+
+def test_a_session_that_another_program_has_rewritten_is_not_pressed(tmp_path: Path) -> None:
+    path = written(tmp_path / "s.parquet", ESTIMATES)
+    pq.write_table(pq.read_table(path), path)
+    with pytest.raises(LoadTraceError, match="another program has rewritten it"):
         read_load_trace(path)

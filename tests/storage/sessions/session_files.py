@@ -13,6 +13,7 @@ from devices.errors import FileFormatError
 from devices.frames import (
     FrameBatch,
 )
+from storage.file_hash import FORMAT_WITHOUT_HASH
 from storage.sessions.file import SessionReader, SessionWriter
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
@@ -50,8 +51,12 @@ def read(path: Path) -> FrameBatch:
 
 
 def rewritten(path: Path, table: pa.Table, **metadata: bytes | None) -> Path:
-    """The table as a Parquet file with these metadata changed; None takes an entry out."""
-    said = {f"foottile.{key}".encode(): value for key, value in metadata.items()}
+    """The table as an older version wrote it, without hashes, with these metadata changed.
+
+    None takes an entry out.
+    """
+    changed = {"format": FORMAT_WITHOUT_HASH, **metadata}
+    said = {f"foottile.{key}".encode(): value for key, value in changed.items()}
     merged = {**table.schema.metadata, **said}
     kept = {key: value for key, value in merged.items() if value is not None}
     pq.write_table(table.replace_schema_metadata(kept), path)

@@ -176,7 +176,7 @@ def test_a_changed_note_is_seen_whenever_the_file_is_opened(tmp_path: Path) -> N
     said = metadata_of(path)
     kept = {key: said[key] for key in said if key.startswith(b"foottile.content")}
     pq.write_table(table.replace_schema_metadata({**changed, **kept}), path)
-    with pytest.raises(FileFormatError, match="are not those that were sealed"):
+    with pytest.raises(FileFormatError, match="its hash is gone"):
         SessionReader(path)
     path.write_bytes(whole)
     SessionReader(path).close()

@@ -15,8 +15,9 @@ from devices.errors import FileFormatError
 from devices.frames import (
     FrameBatch,
 )
+from storage.file_hash import FORMAT_KEY
 from storage.schema import ARRAY_INFO_KEY
-from storage.sessions.file import FORMAT_KEY, NOTES_KEY, SessionReader
+from storage.sessions.file import NOTES_KEY, SessionReader
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits
 from tests.storage.sessions.session_files import frames, read, refused, rewritten, write
@@ -177,8 +178,18 @@ def test_a_column_that_was_asked_for_and_is_not_there_is_refused(tmp_path: Path)
         next(session.batches("grf_n"))
 
 
-def test_a_file_with_more_columns_than_ours_is_read(tmp_path: Path) -> None:
-    # people add their own in pandas
+def test_a_file_that_another_program_has_rewritten_is_refused_and_says_what_to_do(
+    tmp_path: Path,
+) -> None:
+    # Nobody knows what else it has changed.
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(5)))
+    refused(
+        rewritten(tmp_path / "other.parquet", table, format=b"2"),
+        "another program has rewritten it.*pull it again, or use a copy; export it",
+    )
+
+
+def test_an_older_file_with_more_columns_than_ours_is_read(tmp_path: Path) -> None:
     batch = frames(5)
     table = pq.read_table(write(tmp_path / "s.parquet", batch))
     table = table.append_column("my_filter_n", pa.array(np.arange(5.0)))

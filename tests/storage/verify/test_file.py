@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
-from storage.sessions.file import FORMAT_KEY, SessionReader, SessionWriter
+from storage.file_hash import FORMAT_KEY
+from storage.sessions.file import SessionReader, SessionWriter
 from storage.sessions.folder import Ledger, Part, PartLedger
 from storage.verify.file import ledger_problems, verify_file
 from tests.builders.arrays import UTC_NS, make_array

@@ -240,6 +240,9 @@ def test_every_other_file_of_a_data_folder_is_looked_at(run: Run, data: Path) ->
     assert found.code == 0
     assert "not proven: nodes/bench/hello.json" in found.err
     assert "nodes/bench/tares.json.damaged-1: set aside" in found.out
+    (node / "hello.json").write_text('{"older": 1')  # without its end it states no hash either
+    found = run("verify", data)
+    assert (found.code, "damaged: nodes/bench/hello.json" in found.out) == (1, True)
     content = bytearray((node / "tares.json").read_bytes())
     content[5] ^= 1
     (node / "tares.json").write_bytes(content)
