@@ -42,7 +42,7 @@ class DataFolder:
         path: made if absent.
 
     Raises:
-        StorageError: it cannot be written, or another server has it.
+        StorageError: it or its id cannot be read or written, or another server has it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -66,7 +66,7 @@ class DataFolder:
 
         Raises:
             FolderGoneError: it is not, and what is in its place.
-            StorageError: it is back, but another server has it.
+            StorageError: it is back, but another server has it, or its id cannot be read.
         """
         with self._checking:
             if is_held(self.path):
@@ -122,7 +122,11 @@ class DataFolder:
         return stack
 
     def _known_id(self) -> str | None:
-        """The id, written anew if it states no checksum; None if there is none, or not any more."""
+        """The id, written anew if it states no checksum; None if there is none, or not any more.
+
+        Raises:
+            StorageError: it cannot be read or written now; nobody is given a new name for that.
+        """
         try:
             kept, is_proven = self._kept_id()
         except DamagedFileError as error:
@@ -137,6 +141,7 @@ class DataFolder:
 
         Raises:
             DamagedFileError: it is not what was written.
+            StorageError: it cannot be read now.
         """
         path = self.path / _ID_NAME
         try:

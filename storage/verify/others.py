@@ -10,7 +10,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from devices.errors import DamagedFileError
+from devices.errors import DamagedFileError, StorageError
 from storage.checked_json import read_checked
 from storage.durable import ASIDE
 
@@ -66,7 +66,7 @@ def check_json(path: Path, name: str, found: Others) -> None:
             found.unproven.append(f"{name}: it states no hash of itself")
     except FileNotFoundError:
         return  # replaced or deleted meanwhile
-    except DamagedFileError as error:
+    except (DamagedFileError, StorageError) as error:
         found.problems.append(f"{name}: {error.what}")
 
 
