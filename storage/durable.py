@@ -22,8 +22,10 @@ from typing import BinaryIO
 
 from devices.errors import DamagedFileError, FolderGoneError, FootTileError, StorageError
 
-_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp")
-_OLDER_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
+_TEMPORARY = re.compile(
+    r"\.(?P<name>.+)\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp"
+)
+_OLDER_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
 _NO_LONGER = {"Z", "X"}
 _STARTED_FIELD = 19
 """Field of /proc/PID/stat, counted after the name: when the process started."""
@@ -265,10 +267,9 @@ def is_held(folder: Path) -> bool:
     what is written, and nobody will find it there.
     """
     try:
-        there = os.stat(folder / LOCK_NAME)
-    except OSError:
+        there, ours = os.stat(folder / LOCK_NAME), os.fstat(_held[folder])
+    except OSError:  # also of a lock that another thread has just changed for the new folder's
         return False
-    ours = os.fstat(_held[folder])
     return (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
 
 
@@ -289,6 +290,13 @@ def check_held(path: Path) -> None:
 
 
 ASIDE = ".damaged"
+
+
+def intended_name(name: str) -> str:
+    """The name that a file had before it was set aside, or has once it is written."""
+    if match := _TEMPORARY.fullmatch(name) or _OLDER_TEMPORARY.fullmatch(name):
+        return match["name"]
+    return name.partition(ASIDE)[0]
 
 
 def set_aside(path: Path) -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import logging
 import re
-import threading
 import uuid
 import zlib
 from contextlib import ExitStack, suppress
@@ -30,13 +29,17 @@ _PROBE_NAME = ".writable"
 _ID = re.compile(r"([0-9a-f]{32})(?: ([0-9a-f]{8}))?")
 """The id and its CRC-32, which older versions did not write."""
 _PROBE_BYTES = 64 << 10
+_COMES_BACK = (
+    "Move it back or mount it: the server then goes on by itself, and nodes send again what is "
+    "missing"
+)
 
 
 class DataFolder:
     """Held by one server until it is closed.
 
-    A folder that was moved or unmounted is waited for: when it is back, which its id proves, it is
-    used again. Meanwhile nothing is written under its name.
+    A folder that was moved or unmounted is waited for; meanwhile nothing is written under its name.
+    It may come back mounted anew, or as a copy, which its id proves: `take_again`.
 
     Args:
         path: made if absent.
@@ -47,7 +50,6 @@ class DataFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._checking = threading.Lock()
         with storage_errors(path, "Choose another folder with --data"):
             make_folder(path)
         self._lock = self._locked()
@@ -62,38 +64,40 @@ class DataFolder:
             raise
 
     def check(self) -> None:
-        """Whether it is there; from any thread.
+        """Whether the folder that is in use is there; from any thread.
 
         Raises:
             FolderGoneError: it is not, and what is in its place.
-            StorageError: it is back, but another server has it, or its id cannot be read.
+            StorageError: that cannot be seen, or its id not be read.
         """
-        with self._checking:
-            if is_held(self.path):
-                return
-            found: str | None = None
-            with suppress(DamagedFileError):
-                found, _ = self._kept_id()
-            if found == self.id:  # mounted anew, or a copy in its place
-                lock = self._locked()
-                self._lock.close()
-                self._lock = lock
-                return
-            place = (
-                "there is nothing" if not self.path.is_dir() else "there is an empty mount point"
-            )
-            if found is not None:
-                place = "there is the data folder of another server"
-            elif self.path.is_dir() and any(self.path.iterdir()):
-                place = "there is another folder"
-            raise FolderGoneError(
-                "the data folder was moved, deleted or unmounted, and nothing is kept: "
-                f"{place} in its place",
-                where=str(self.path),
-                remedy="Move it back or mount it: the server then goes on by itself, and nodes "
-                "send again what is missing",
-                errno=errno.ENOENT,
-            )
+        if is_held(self.path):
+            return
+        with storage_errors(self.path, _COMES_BACK):
+            place = self._place()
+        raise FolderGoneError(
+            f"the data folder was moved, deleted or unmounted, and nothing is kept: {place}",
+            where=str(self.path),
+            remedy=_COMES_BACK,
+            errno=errno.ENOENT,
+        )
+
+    def take_again(self) -> None:
+        """Use what is in its place and has its id: the folder, mounted anew, or a copy.
+
+        What is open in the one before takes what is written and keeps it for nobody: the caller has
+        closed all of that.
+
+        Raises:
+            FolderGoneError: nothing there has its id.
+            StorageError: another server has it.
+        """
+        if is_held(self.path) or self._id_there() != self.id:
+            self.check()
+            return
+        lock = self._locked()
+        self._lock.close()
+        self._lock = lock
+        log.warning("%s: the data folder was mounted anew or copied; it is used again", self.path)
 
     def check_writable(self) -> None:
         """Whether it is there, and something can be written.
@@ -109,6 +113,30 @@ class DataFolder:
     def close(self) -> None:
         """Let another server have it."""
         self._lock.close()
+
+    def _place(self) -> str:
+        """What is in its place, in words.
+
+        Raises:
+            OSError: that cannot be seen.
+        """
+        found = self._id_there()
+        if found is not None:
+            is_ours = found == self.id
+            what = (
+                "it, or a copy, not used yet," if is_ours else "the data folder of another server"
+            )
+        elif not self.path.is_dir():
+            what = "nothing"
+        else:
+            what = "another folder" if any(self.path.iterdir()) else "an empty mount point"
+        return f"there is {what} in its place"
+
+    def _id_there(self) -> str | None:
+        """The id of what is in its place; None if it has none."""
+        with suppress(DamagedFileError):
+            return self._kept_id()[0]
+        return None
 
     def _locked(self) -> ExitStack:
         stack = ExitStack()

@@ -14,7 +14,7 @@ from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
 from service.server.book import SessionBook, Trash, destroy
 from service.server.data_folder import DataFolder
-from service.server.live import Hub
+from service.server.fan_out import Hub
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
@@ -134,19 +134,22 @@ class Server:
     async def _check_folder(self) -> None:
         """While the folder is away nothing is settled or deleted, and every node says so.
 
+        Only here another one is taken for it, when nothing is open in the one before.
+
         Raises:
             StorageError: it is away.
         """
         try:
             self.folder.check()
         except StorageError as error:
-            for node in self.nodes:
-                if self._cannot_keep(node, error):
-                    for stream in node.streams.values():
-                        stream.let_go()
-                        with suppress(StorageError):
-                            await asyncio.to_thread(stream.sync)
-            raise
+            for node in list(self.nodes):
+                self._cannot_keep(node, error)
+                for stream in [each for each in node.streams.values() if each.is_open]:
+                    stream.let_go()
+                    with suppress(StorageError):
+                        await asyncio.to_thread(stream.sync)
+            # Not before: frames that are synced where nobody looks must not be acknowledged.
+            self.folder.take_again()
 
     async def close(self) -> None:
         """End the links and wait for what is being sealed."""
@@ -192,7 +195,7 @@ class Server:
 
     def tell_node(self, node: ServerNode) -> None:
         """Tell every screen how a node is."""
-        if (view := self.node_as_json(node)) is not None:
+        if self.hub.subscribers and (view := self.node_as_json(node)) is not None:
             self.hub.notice({"type": "node", "node": view})
 
     def _tell_wanted(self, link: Link) -> None:
@@ -233,10 +236,13 @@ class Server:
             link.end(Close.RESTART, "frames are damaged here; send what the server lacks")
 
     def _tell_session(self, session: Session) -> None:
-        view = SessionView.of(session, self.recorder).model_dump(mode="json")
-        self.hub.notice({"type": "session", "session": view})
+        if self.hub.subscribers:
+            view = SessionView.of(session, self.recorder).model_dump(mode="json")
+            self.hub.notice({"type": "session", "session": view})
 
     def _heartbeat(self) -> None:
+        if not self.hub.subscribers:
+            return
         last = [node.last_seq for node in self.nodes if node.last_seq is not None]
         self.hub.notice(
             {
@@ -275,11 +281,13 @@ class Server:
         try:
             await asyncio.to_thread(stream.sync)
             self.folder.check()
-        except StorageError as error:
+        except Exception as error:
             self._cannot_keep(node, error)
             # The kernel may forget what it could not write: the node has to send it again.
             stream.disown(stream.unsynced | unsynced)
             stream.unsynced, stream.owed = Intervals(), Intervals()
+            if not isinstance(error, StorageError):
+                raise
             return
         link = self.links.get(node.name)
         if link is not None and owed:
@@ -300,16 +308,10 @@ class Server:
                 Close.RESTART, "the server can write again; send what it lacks"
             )
 
-    def _cannot_keep(self, node: ServerNode, error: StorageError) -> bool:
-        """What a node sends is not kept: say it once, here and on every screen.
-
-        Returns:
-            Whether it is news.
-        """
-        is_news = node.name not in self._unkept
+    def _cannot_keep(self, node: ServerNode, error: Exception) -> None:
+        """What a node sends is not kept: say it once, here and on every screen."""
         node.storage_problem = str(error)
-        if is_news:
+        if node.name not in self._unkept:
             self._unkept.add(node.name)
             log.warning("node %s: nothing of it is kept: %s", node.name, error)
             self.tell_node(node)
-        return is_news

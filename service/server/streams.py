@@ -305,6 +305,11 @@ class ServerStream:
         unsaved = self._notes_to_keep != self._notes_on_disk and self.journal is not None
         return bool(self.unsynced or self.owed or unsaved or self._clock_unsynced)
 
+    @property
+    def is_open(self) -> bool:
+        """Is a file of it open?"""
+        return self.journal is not None and self.journal.is_open
+
     def disown(self, doubtful: Intervals, *, corrupt: bool = False) -> None:
         """Stop holding these frames: the disk may not have what was written."""
         if self.journal is None:

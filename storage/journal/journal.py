@@ -110,6 +110,11 @@ class Journal:
         """What it takes on the disk, nearly."""
         return sum(segment.size_bytes for segment in self._segments)
 
+    @property
+    def is_open(self) -> bool:
+        """Is a segment open, or not closed yet?"""
+        return bool(self._open.paths)
+
     def misplaced(self, frames: FrameBatch) -> str:
         """Why frames cannot stand among those that are held, in words; empty if they can.
 

@@ -22,7 +22,7 @@ import pyarrow as pa
 
 from devices.errors import DamagedFileError, StorageError
 from storage.durable import put_aside, write_whole
-from storage.intervals import Intervals
+from storage.intervals import Intervals, union
 from storage.journal.segment_format import (
     INDEX_SUFFIX,
     RECORD,
@@ -100,18 +100,15 @@ class Segment:
         return found[np.argsort(found["seq_first"], kind="stable")]
 
     def disown(self, doubtful: Intervals) -> None:
-        """Stop holding batches within these numbers."""
-        try:
-            records = self.records()
-        except (
-            StorageError
-        ):  # gone, or no descriptor is left: what is doubtful is whole batches anyway
-            self.held = self.held - doubtful
-            return
-        for record in records:
-            batch = Intervals([numbers(record)])
-            if not (batch - doubtful):
-                self.held = self.held - batch
+        """Stop holding batches within these numbers, also those that the index does not know.
+
+        The file under its name may be a copy that was made before they were written.
+        """
+        known: Records | tuple[()] = ()
+        with suppress(StorageError):  # gone, or no descriptor is left
+            known = self.records()
+        batches = [Intervals([numbers(record)]) for record in known]
+        self.held = (self.held - doubtful) | union(b for b in batches if b - doubtful)
 
     def rewrite_index(self) -> None:
         """Write an index of only the batches that count, marked as closed.

@@ -176,7 +176,7 @@ class Running:
         self.open_journals = []
         for node in self.server.nodes:
             for journal in node.journals.values():
-                if journal._open.paths:
+                if journal.is_open:
                     self.open_journals.append(journal.folder)
                     journal.close()
         self._left_over = await _left_over()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from operator import eq
 from pathlib import Path
 
 import pytest
@@ -18,14 +22,24 @@ from service.server.data_folder import DataFolder
 from storage.durable import LOCK_NAME
 from storage.intervals import Intervals
 from tests.builders.frames import assert_same_bits
-from tests.service.fake_node import FakeNode, Play
+from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.running import Running, assert_refused, closed
-from tests.storage.faulty_disk import refusing
+from tests.storage.faulty_disk import failing_if, failing_once, refusing
 from tests.waiting import until
 
 
 def files_in(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def open_below(folder: Path) -> set[str]:
+    """Names of files below it that this process has open."""
+    found = set()
+    for each in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):
+            if (path := Path(os.readlink(each))).is_relative_to(folder):
+                found.add(path.name)
+    return found
 
 
 def delete(folder: Path) -> None:
@@ -153,6 +167,73 @@ def test_a_copy_with_the_same_id_is_the_folder(running: Running, tared: FakeNode
     assert_same_bits(running.held(tared.boot_id), tared.all_sent())
 
 
+def test_a_copy_that_took_its_place_between_sync_and_acknowledgement_is_promised_nothing(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Frames are on the disk in the old folder, and not in the copy, which was made before.
+    data, folder = running.data, running.server.folder
+    copy, away = data.with_name("copy"), data.with_name("away")
+    shutil.copytree(data, copy)
+    node, check = running.server.nodes.get("bench"), folder.check
+
+    def swap_and_check() -> None:
+        if node.last_seq == 99 and copy.exists():
+            data.rename(away)
+            copy.rename(data)
+        check()
+
+    monkeypatch.setattr(folder, "check", swap_and_check)
+    sent = tared.send(30, 20.0)
+    assert closed(tared.socket)[0] == 1012
+    assert away.exists()
+    until(lambda: not running.node()["connected"])
+    assert tared.connect() == [(70, None)]
+    tared.send_again(sent)
+    tared.acknowledged(99)
+    assert_same_bits(running.held(tared.boot_id), tared.all_sent())
+    assert open_below(away) == set()
+
+
+def test_nothing_stays_open_in_a_folder_whose_copy_is_used(
+    running: Running, tared: FakeNode, node_of: NodeOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A stream that has ended, and a node of which was said before that nothing of it is kept.
+    node, other = tared, node_of(running, "other")
+    node.leave()
+    node.reboot()
+    node.connect(earlier=(node.before[0].said(),))
+    node.deliver(10)
+    other.connect()
+    other.deliver(10)
+    with monkeypatch.context() as patched:
+        full = refusing(StorageError, "No space left on device")
+        patched.setattr(running.server.nodes.get("other").present, "sync", full)
+        patched.setattr(running.server, "check_storage", full)
+        other.send(10)
+        until(lambda: running.node("other")["storage_problem"])
+    away = running.data.with_name("away")
+    running.data.rename(away)
+    until(lambda: open_below(away) == {LOCK_NAME})
+    shutil.copytree(away, running.data)
+    assert closed(node.socket)[0] == closed(other.socket)[0] == 1012
+    assert open_below(away) == set()
+
+
+def test_a_folder_is_not_used_before_what_is_open_in_the_one_before_is_closed(
+    tmp_path: Path,
+) -> None:
+    data, away = tmp_path / "data", tmp_path / "away"
+    folder = DataFolder(data)
+    data.rename(away)
+    shutil.copytree(away, data)
+    for _ in range(2):
+        with pytest.raises(FolderGoneError, match="not used yet"):
+            folder.check()
+    folder.take_again()
+    folder.check()
+    folder.close()
+
+
 def test_a_copy_that_another_server_has_is_not_taken_from_it(tmp_path: Path) -> None:
     data, away = tmp_path / "data", tmp_path / "away"
     folder = DataFolder(data)
@@ -162,9 +243,41 @@ def test_a_copy_that_another_server_has_is_not_taken_from_it(tmp_path: Path) -> 
     with (data / LOCK_NAME).open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(StorageError, match="another foottile server"):
-            folder.check()
-    folder.check()
+            folder.take_again()
+    folder.take_again()
     folder.close()
+
+
+def test_a_place_that_cannot_be_seen_is_a_folder_that_is_gone(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    away, denied = running.data.with_name("away"), (PermissionError, errno.EACCES, "not for you")
+    running.data.rename(away)
+    with monkeypatch.context() as patched:
+        is_it = partial(eq, running.data)
+        patched.setattr(Path, "is_dir", failing_if(is_it, Path.is_dir, *denied))
+        sent = tared.send(30, 20.0)
+        until(lambda: "not for you" in (running.node()["storage_problem"] or ""))
+    away.rename(running.data)
+    assert closed(tared.socket)[0] == 1012
+    until(lambda: not running.node()["connected"])
+    assert tared.connect() == [(70, None)]
+    tared.send_again(sent)
+    tared.acknowledged(99)
+
+
+def test_a_bug_on_the_way_to_the_disk_costs_no_frame(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = running.server.nodes.get("bench").present
+    monkeypatch.setattr(stream, "sync", failing_once(stream.sync, ZeroDivisionError, "a bug"))
+    sent = tared.send(30, 20.0)
+    assert closed(tared.socket)[0] == 1012
+    until(lambda: not running.node()["connected"])
+    assert tared.connect() == [(70, None)]
+    tared.send_again(sent)
+    tared.acknowledged(99)
+    assert_same_bits(running.held(tared.boot_id), tared.all_sent())
 
 
 def test_the_log_says_it_once(

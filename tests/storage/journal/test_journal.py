@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, StorageError
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.open_segments import SEGMENT_NS
@@ -311,6 +312,21 @@ def test_what_was_disowned_is_asked_for_again_and_held_once(tmp_path: Path) -> N
     assert_holds(journal, set(range(20)))
     journal.close()
     assert_holds(reopened(tmp_path), set(range(20)))
+
+
+def test_what_the_file_under_its_name_never_had_is_disowned_as_well(tmp_path: Path) -> None:
+    journal = filled(tmp_path / "data", (0, 9))
+    journal.sync()
+    shutil.copytree(tmp_path / "data", tmp_path / "copy")
+    journal.append(part(10, 19))
+    (tmp_path / "data").rename(tmp_path / "away")
+    (tmp_path / "copy").rename(tmp_path / "data")
+    journal.disown(Intervals([(10, 19)]))
+    assert journal.held == Intervals([(0, 9)])
+    journal.append(part(10, 19))
+    assert_holds(journal, set(range(20)))
+    with pytest.raises(StorageError, match="another file is in its place"):
+        journal.close()
 
 
 def test_a_doubtful_copy_is_forgotten_when_its_segment_is_closed(tmp_path: Path) -> None:
