@@ -46,6 +46,8 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
         file.write(content)
 
 
+_NO_FILE = (errno.ELOOP, errno.EIO, errno.EBADMSG)
+"""What is said of a file that is none, or that its disk has lost; it says so again next time."""
 BYTES_MAX = 64 << 20
 """No file that is read at once is longer; what is, is not read into memory."""
 
@@ -59,7 +61,9 @@ def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
 
     Raises:
         FileNotFoundError: there is none.
-        DamagedFileError: it is no file, too long for one of ours, or cannot be read.
+        DamagedFileError: it is no file, too long for one of ours, or its disk has lost it.
+        StorageError: it may be whole and cannot be read now: it is another user's, or memory or
+            descriptors are used up. Nobody may set it aside, or write another in its place.
     """
     try:
         # A link may lead anywhere, and a pipe would be waited for.
@@ -75,7 +79,15 @@ def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
     except FileNotFoundError:
         raise
     except OSError as error:
-        raise DamagedFileError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        what = f"cannot be read: {error.strerror}"
+        if error.errno in _NO_FILE:
+            raise DamagedFileError(what, where=str(path)) from error
+        raise StorageError(
+            what,
+            where=str(path),
+            remedy="It is left as it is: let this user read it, or try again",
+            errno=error.errno,
+        ) from error
 
 
 def _without_following(name: str, flags: int) -> int:

@@ -29,6 +29,7 @@ def read_server_id(path: Path) -> ServerId:
     Raises:
         FileNotFoundError: there is none.
         DamagedFileError: it is not what was written.
+        StorageError: it cannot be read now.
     """
     text = read_whole(path).decode("ascii", "replace").strip()
     found = _FORM.fullmatch(text)

@@ -40,7 +40,7 @@ class DataFolder:
         path: made if absent.
 
     Raises:
-        StorageError: it cannot be written, or another server has it.
+        StorageError: it or its id cannot be read or written, or another server has it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -63,7 +63,7 @@ class DataFolder:
 
         Raises:
             FolderGoneError: it is not, and what is in its place.
-            StorageError: that cannot be seen.
+            StorageError: that cannot be seen, or its id not be read.
         """
         if is_held(self.path):
             return
@@ -145,7 +145,11 @@ class DataFolder:
         return stack
 
     def _known_id(self) -> str | None:
-        """The id, written anew if it states no checksum; None if there is none, or not any more."""
+        """The id, written anew if it states no checksum; None if there is none, or not any more.
+
+        Raises:
+            StorageError: it cannot be read or written now; nobody is given a new name for that.
+        """
         path = self.path / SERVER_ID_NAME
         try:
             kept = read_server_id(path)

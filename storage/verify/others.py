@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from devices.errors import DamagedFileError
+from devices.errors import DamagedFileError, StorageError
 from storage.checked_json import Checked, read_checked
 from storage.durable import ASIDE
 from storage.server_id import SERVER_ID_NAME, ServerId, read_server_id
@@ -78,7 +78,7 @@ def _check(
             found.unproven.append(f"{name}: it states no hash of itself")
     except FileNotFoundError:
         return  # replaced or deleted meanwhile
-    except DamagedFileError as error:
+    except (DamagedFileError, StorageError) as error:
         found.problems.append(f"{name}: {error.what}")
 
 

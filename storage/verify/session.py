@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, StorageError
 from storage.clock.file import CLOCK_NAME, StoredClock, read_clock
 from storage.file_hash import sha256_of
 from storage.intervals import NO_END, Intervals
@@ -255,7 +255,7 @@ def _stored(
         if not may_lack:
             report.problems.append(f"{path.name} is missing")
         return None
-    except FileFormatError as error:
+    except (FileFormatError, StorageError) as error:
         report.problems.append(f"{path.name}: {error.what}")
         return None
     if not stored.is_proven:
