@@ -22,7 +22,7 @@
      +-- FileFormatError       (ValueError)    a file is not what it should be
      |    +-- DamagedFileError                 a file is not what was written
      |    +-- DamagedFramesError               frames on disk are not those that were written
-     +-- StorageError          (OSError)       a file cannot be written: disk full, read-only
+     +-- StorageError          (OSError)       a file cannot be written or read: disk full, not ours
      |    +-- FolderGoneError                  the folder that it writes to is not there any more
      +-- CalibrationError      (ValueError)    a calibration is absent, unphysical or does not fit
      +-- TareError             (ValueError)    no interval to tare on
@@ -223,7 +223,11 @@ class DamagedFramesError(FileFormatError):
 
 
 class StorageError(_SystemError):
-    """A file cannot be written: the disk is full, read-only, or gone; `errno` is the system's."""
+    """A file cannot be written, or not be read now, for what it is not itself to blame.
+
+    The disk is full, read-only, or gone; it is another user's; memory or descriptors are used up.
+    `errno` is the system's.
+    """
 
 
 class FolderGoneError(StorageError):

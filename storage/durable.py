@@ -22,8 +22,10 @@ from typing import BinaryIO
 
 from devices.errors import DamagedFileError, FolderGoneError, FootTileError, StorageError
 
-_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp")
-_OLDER_TEMPORARY = re.compile(r"\..+\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
+_TEMPORARY = re.compile(
+    r"\.(?P<name>.+)\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp"
+)
+_OLDER_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<process>[0-9]+)(-[0-9a-f]{8})?\.tmp")
 _NO_LONGER = {"Z", "X"}
 _STARTED_FIELD = 19
 """Field of /proc/PID/stat, counted after the name: when the process started."""
@@ -44,6 +46,8 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o666) -> None:
         file.write(content)
 
 
+_NO_FILE = (errno.ELOOP, errno.EIO, errno.EBADMSG)
+"""What is said of a file that is none, or that its disk has lost; it says so again next time."""
 BYTES_MAX = 64 << 20
 """No file that is read at once is longer; what is, is not read into memory."""
 
@@ -57,7 +61,9 @@ def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
 
     Raises:
         FileNotFoundError: there is none.
-        DamagedFileError: it is no file, too long for one of ours, or cannot be read.
+        DamagedFileError: it is no file, too long for one of ours, or its disk has lost it.
+        StorageError: it may be whole and cannot be read now: it is another user's, or memory or
+            descriptors are used up. Nobody may set it aside, or write another in its place.
     """
     try:
         # A link may lead anywhere, and a pipe would be waited for.
@@ -73,7 +79,15 @@ def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
     except FileNotFoundError:
         raise
     except OSError as error:
-        raise DamagedFileError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        what = f"cannot be read: {error.strerror}"
+        if error.errno in _NO_FILE:
+            raise DamagedFileError(what, where=str(path)) from error
+        raise StorageError(
+            what,
+            where=str(path),
+            remedy="It is left as it is: let this user read it, or try again",
+            errno=error.errno,
+        ) from error
 
 
 def _without_following(name: str, flags: int) -> int:
@@ -276,6 +290,13 @@ def check_held(path: Path) -> None:
 
 
 ASIDE = ".damaged"
+
+
+def intended_name(name: str) -> str:
+    """The name that a file had before it was set aside, or has once it is written."""
+    if match := _TEMPORARY.fullmatch(name) or _OLDER_TEMPORARY.fullmatch(name):
+        return match["name"]
+    return name.partition(ASIDE)[0]
 
 
 def set_aside(path: Path) -> Path:

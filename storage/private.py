@@ -7,7 +7,13 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
-from storage.durable import LOCK_NAME, make_folder, storage_errors
+from storage.durable import LOCK_NAME, intended_name, make_folder, storage_errors
+
+_OURS = {
+    *(LOCK_NAME, ".writable", "journal", "nodes", "server_id", "sessions", "token", "trash"),
+    "demo",  # a data folder of its own, within the user's
+}
+"""All that servers and nodes write in their folder."""
 
 
 def keep_private(folder: Path) -> None:
@@ -36,6 +42,4 @@ def keep_private(folder: Path) -> None:
 
 def _is_ours(folder: Path) -> bool:
     """Is there nothing in it but what we wrote? Somebody's home is not ours to close."""
-    known = {"server_id", LOCK_NAME, "journal", "nodes", "sessions", "state.json"}
-    names = {path.name for path in folder.iterdir()}
-    return not names or bool(names & known)
+    return {intended_name(path.name) for path in folder.iterdir()} <= _OURS

@@ -27,7 +27,7 @@ from service.cli.main import app
 from service.estimation.calibration import TileCalibration
 from service.estimation.estimates import EstimateStatus
 from service.link import Close
-from service.server.live import Encoder, sum_up
+from service.server.live import Summary, sum_up
 from service.server.server import Server
 from storage.schema import KNOWN
 from tests.builders.frames import make_frames
@@ -192,8 +192,10 @@ def test_every_route_is_documented() -> None:
 
 
 def test_every_live_message_field_is_documented() -> None:
-    piece = sum_up(None, make_frames(1, 1), {})
-    frame = json.loads(Encoder().encode("node", piece, 1.0))
+    summary = Summary()
+    summary.add("node", sum_up("0" * 32, None, make_frames(1, 1), {}))
+    (text,) = summary.take().texts({"node": 1.0})
+    frame = json.loads(text)
     for name in frame:
         assert f"`{name}`" in API, name
 

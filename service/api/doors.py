@@ -116,11 +116,16 @@ class Doors:
         self._busy[visitor] = address
         return True
 
-    def admit_node(self, visitor: Visitor) -> None:
-        """A node has said its first word."""
+    def admit_node(self, visitor: Visitor) -> bool:
+        """A node, from one that waited and has said its first word; False: there are too many."""
+        if visitor in self._nodes:
+            return True
+        if self.nodes_are_full:
+            return False
         address = self._waiting.pop(visitor, None)
         if address is not None:
             self._nodes[visitor] = address
+        return True
 
     def rest(self, visitor: Visitor) -> None:
         """What it asked for is done: it waits again."""

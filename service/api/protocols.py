@@ -13,12 +13,15 @@ import logging
 import socket
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from http import HTTPStatus
 from typing import Any
 
 import uvicorn
 from starlette.types import Receive, Scope, Send
+from uvicorn._types import ASGIReceiveEvent
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
+from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.http11 import Request
 
@@ -28,6 +31,8 @@ from service.link import INGEST_PATH, SUBPROTOCOL, Close
 
 log = logging.getLogger("foottile.doors")
 
+OUTLET = "foottile.outlet"
+"""Of a websocket's scope, among the extensions: the connection, as an `Outlet` to write to."""
 _SAID_ON_LIVE_BYTES_MAX = 4096
 _UNREAD_BYTES_MAX = 1 << 20
 """What may wait for one who goes on asking and does not read."""
@@ -221,12 +226,34 @@ class WebSocket(WebSocketsSansIOProtocol):
         if doors.nodes_are_full if self._is_node else not doors.admit(self.transport):
             self.app = refuse
         super().handle_connect(event)
+        if not self.close_sent:
+            # An extension's content is a dict by the specification; its reader is our own route.
+            self.scope["extensions"] = {
+                **(self.scope["extensions"] or {}),
+                OUTLET: {"outlet": self},
+            }
 
-    def send_receive_event_to_app(self) -> None:
-        """A message; the first one of a node gets it its place."""
-        if self._is_node:
-            self.config.doors.admit_node(self.transport)
-        super().send_receive_event_to_app()
+    @property
+    def is_ready(self) -> bool:
+        """Has what was written before gone, but for a few kilobytes?"""
+        return self.writable.is_set()
+
+    def write(self, framed: bytes) -> None:
+        """Write whole frames beside uvicorn's own `send`, which frames each message anew."""
+        if not (self.close_sent or self.disconnected or self.transport.is_closing()):
+            self.transport.write(framed)
+
+    async def receive(self) -> ASGIReceiveEvent:
+        """A message, or the end; the first word of a node gets it its place, if there is one."""
+        event = await super().receive()
+        is_word = self._is_node and event["type"] == "websocket.receive"
+        if is_word and not self.config.doors.admit_node(self.transport):
+            with suppress(ClientDisconnected, RuntimeError):  # it has gone, or was told why
+                await self.send(
+                    {"type": "websocket.close", "code": Close.TRY_LATER, "reason": _TOO_MANY}
+                )
+            return {"type": "websocket.disconnect", "code": Close.TRY_LATER}
+        return event
 
     async def run_asgi(self) -> None:
         """Serve it; then it only has to go, which one that does not read does not do by itself."""

@@ -85,7 +85,7 @@ def token_for(host: str, given: str | None, data: Path) -> str | None:
     """The token to ask for: the one given; off loopback one that is kept in the data folder.
 
     Raises:
-        StorageError: it cannot be kept.
+        StorageError: it cannot be read or kept.
     """
     if given or is_loopback(host):
         return given or None

@@ -69,6 +69,7 @@ def read_calibration(path: Path) -> Calibration:
 
     Raises:
         CalibrationError: there is none, it is not one, or not what its hashes are of.
+        StorageError: it cannot be read now.
     """
     try:
         text = read_checked(path.resolve()).text  # a user may keep links to it
@@ -77,7 +78,7 @@ def read_calibration(path: Path) -> Calibration:
             f"no calibration {str(path)!r}",
             expected=f"a file, {BENCH!r}, or a preset: {', '.join(PRESETS)}",
         ) from error
-    except (DamagedFileError, OSError, RuntimeError) as error:  # these two: links in a circle
+    except (DamagedFileError, RuntimeError) as error:  # the second: links in a circle
         what = error.what if isinstance(error, DamagedFileError) else str(error)
         raise CalibrationError(
             f"not a calibration: {what}", where=str(path), remedy=EDITED
@@ -130,6 +131,9 @@ def _kept_in(kept: Path, serial: str, progress: Progress) -> Calibration | None:
         calibration = read_calibration(kept)
         calibration.of(serial)
         what = "it states no hash" if calibration.name.endswith(UNPROVEN) else ""
+    except StorageError as error:
+        progress(f"{kept} is left out: {error.what}")
+        return None
     except CalibrationError as error:
         what = error.what
     if not what:

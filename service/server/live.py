@@ -1,13 +1,12 @@
-"""The live picture for screens: each subscriber gets the newest frame, and what lay between.
+"""What screens are told: the newest frame of each node, the peaks of all since, and what was not.
 
-A subscriber is asked for a message at its own pace; until then everything is summed up in one
-summary per node, so a client that never reads delays nobody and grows nothing. Minimum and maximum
-of what was skipped go with every message, so that no peak hides.
+Until it is told, everything is summed up in one piece per node: who is told rarely, or never, costs
+no more than who is told often. Minimum and maximum of what was skipped go with every message, so
+that no peak hides.
 """
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
 from collections import deque
@@ -21,7 +20,6 @@ import numpy.typing as npt
 from devices.arrays import Floats
 from devices.frames import FrameBatch
 from service.estimation.foot.contact import UNKNOWN
-from service.server.node import Estimated, ServerNode
 from storage.intervals import Intervals
 
 SUMMARY_NS = 1_000_000_000
@@ -39,11 +37,12 @@ _PER_FRAME = (
 
 @dataclass(frozen=True)
 class Piece:
-    """Some consecutive frames of one node, summed up once for all subscribers.
+    """Some consecutive frames of one stream, summed up once for all screens.
 
     Arrays are over tiles; NaN where nothing is known.
     """
 
+    boot_id: str
     seq_first: int
     seq_last: int
     n: int
@@ -60,6 +59,7 @@ class Piece:
     def joined(self, later: Piece) -> Piece:
         """This piece and a later one as one."""
         return Piece(
+            boot_id=self.boot_id,
             seq_first=self.seq_first,
             seq_last=later.seq_last,
             n=self.n + later.n,
@@ -75,11 +75,39 @@ class Piece:
         )
 
 
-class Subscriber:
-    """What one client is still to be sent.
+@dataclass(frozen=True)
+class News:
+    """What is to be told at one time."""
+
+    notices: tuple[str, ...]
+    counted: Mapping[str, Mapping[str, Any]]
+    dropped: Mapping[str, Intervals]
+    pieces: Mapping[str, Piece]
+
+    def texts(self, ages_ms: Mapping[str, float]) -> list[str]:
+        """As messages.
+
+        Args:
+            ages_ms: how old the newest frame is, by node, where that is known.
+        """
+        texts = []
+        if self.counted:  # before a session is told as sealed, with its final numbers
+            texts.append(dumps({"type": "counted", "sessions": self.counted}))
+        texts += self.notices
+        for node, dropped in self.dropped.items():
+            for first, last in dropped:
+                message = {"type": "dropped", "node": node, "from_seq": first, "to_seq": last}
+                texts.append(dumps(message))
+        for node, piece in self.pieces.items():
+            texts.append(dumps(_frame(node, piece, ages_ms.get(node))))
+        return texts
+
+
+class Summary:
+    """What is still to be told; it does not grow with time.
 
     Args:
-        only: the node it wants to see; None: all.
+        only: the node that is of interest; None: all.
     """
 
     def __init__(self, only: str | None = None) -> None:
@@ -89,154 +117,87 @@ class Subscriber:
         self._dropped: dict[str, Intervals] = {}
         self._notices: deque[str] = deque(maxlen=_NOTICES_MAX)
         self._counted: dict[str, Mapping[str, Any]] = {}
-        self.news = asyncio.Event()
+
+    def __bool__(self) -> bool:
+        """Is there anything?"""
+        return bool(self._pieces or self._notices or self._counted or self._dropped)
 
     def notice(self, message: str) -> None:
-        """A message for every client; the oldest are forgotten by one that never reads."""
+        """A message for everybody; the oldest are forgotten if nobody takes them."""
         self._notices.append(message)
-        self.news.set()
 
-    def add(self, node: ServerNode, piece: Piece) -> None:
+    def add(self, node: str, piece: Piece) -> None:
         """More frames of a node."""
-        key = node.name
-        if self._only not in (None, key):
+        if self._only not in (None, node):
             return
-        boot_id, last_seq = self._last_seq.get(key, (node.boot_id, piece.seq_first - 1))
-        if boot_id == node.boot_id and piece.seq_first > last_seq + 1:
-            self._drop(key, last_seq + 1, piece.seq_first - 1)
-        self._last_seq[key] = (node.boot_id, piece.seq_last)
-        before = self._pieces.get(key)
+        boot_id, last_seq = self._last_seq.get(node, (piece.boot_id, piece.seq_first - 1))
+        if boot_id == piece.boot_id and piece.seq_first > last_seq + 1:
+            self._drop(node, last_seq + 1, piece.seq_first - 1)
+        self._last_seq[node] = (piece.boot_id, piece.seq_last)
+        before = self._pieces.get(node)
         if before is not None:
             short = 0 <= piece.t_ns - before.t_ns_first < SUMMARY_NS
-            if short and boot_id == node.boot_id:
+            if short and before.boot_id == piece.boot_id:
                 piece = before.joined(piece)
             else:
-                self._drop(key, before.seq_first, before.seq_last)
-        self._pieces[key] = piece
-        self.news.set()
+                self._drop(node, before.seq_first, before.seq_last)
+        self._pieces[node] = piece
 
     def count(self, node: str, counted: Mapping[str, Mapping[str, Any]]) -> None:
         """What sessions of a node have come to, by id; of each only the newest word is told."""
         if self._only in (None, node):
             self._counted |= counted
-            self.news.set()
 
-    def answer(self, message: Mapping[str, Any]) -> None:
-        """A message for this client only."""
-        self.notice(dumps(message))
-
-    def take(self, ages_ms: Mapping[str, float], encoder: Encoder) -> list[str]:
-        """Everything there is to tell now, as texts.
-
-        Args:
-            ages_ms: age of the newest frame by node, where it is known.
-            encoder: makes frame messages.
-        """
-        self.news.clear()
-        texts = list(self._notices)
+    def take(self) -> News:
+        """All there is, which is then told."""
+        news = News(tuple(self._notices), self._counted, self._dropped, self._pieces)
         self._notices.clear()
-        if self._counted:
-            texts.append(dumps({"type": "counted", "sessions": self._counted}))
-            self._counted = {}
-        for node, dropped in self._dropped.items():
+        self._counted, self._dropped, self._pieces = {}, {}, {}
+        return news
+
+    def join(self, news: News) -> None:
+        """What was taken, and could not be told."""
+        self._notices.extend(news.notices)
+        self._counted |= news.counted
+        for node, dropped in news.dropped.items():
             for first, last in dropped:
-                message = {"type": "dropped", "node": node, "from_seq": first, "to_seq": last}
-                texts.append(dumps(message))
-        self._dropped.clear()
-        for name, piece in self._pieces.items():
-            texts.append(encoder.encode(name, piece, ages_ms.get(name)))
-        self._pieces.clear()
-        return texts
+                self._drop(node, first, last)
+        for node, piece in news.pieces.items():
+            self.add(node, piece)
 
     def _drop(self, node: str, seq_first: int, seq_last: int) -> None:
-        # What a client misses for hours is one interval, not a list that grows.
+        # What a screen misses for hours is one interval, not a list that grows.
         self._dropped.setdefault(node, Intervals()).add(seq_first, seq_last)
-        self.news.set()
 
 
-class Encoder:
-    """Frame messages as text; subscribers that are told the same share one text."""
-
-    def __init__(self) -> None:
-        self._last: dict[str, tuple[tuple[object, ...], str]] = {}
-
-    def encode(self, node: str, piece: Piece, age_ms: float | None) -> str:
-        """One frame message."""
-        age = None if age_ms is None else round(age_ms, 1)
-        key = (piece.seq_first, piece.seq_last, piece.t_ns, age)
-        known = self._last.get(node)
-        if known is not None and known[0] == key:
-            return known[1]
-        text = dumps(
-            {
-                "type": "frame",
-                "node": node,
-                "seq": piece.seq_last,
-                "t_ns": piece.t_ns,
-                "n": piece.n,
-                **piece.newest,
-                "gauge_min_kpa": rounded(piece.gauge_min_kpa, "kpa"),
-                "gauge_max_kpa": rounded(piece.gauge_max_kpa, "kpa"),
-                "force_min_n": rounded(piece.force_min_n, "n"),
-                "force_max_n": rounded(piece.force_max_n, "n"),
-                "grf_min_n": one(piece.grf_min_n, "n"),
-                "grf_max_n": one(piece.grf_max_n, "n"),
-                "age_ms": age,
-            }
-        )
-        self._last[node] = (key, text)
-        return text
-
-
-class Hub:
-    """All subscribers of a server."""
-
-    def __init__(self) -> None:
-        self.encoder = Encoder()
-        self._subscribers: set[Subscriber] = set()
-
-    @property
-    def subscribers(self) -> int:
-        """How many there are."""
-        return len(self._subscribers)
-
-    def join(self, only: str | None = None) -> Subscriber:
-        """A new subscriber, told what happens from now on, on all nodes or `only` one."""
-        subscriber = Subscriber(only)
-        self._subscribers.add(subscriber)
-        return subscriber
-
-    def leave(self, subscriber: Subscriber) -> None:
-        """Forget a subscriber."""
-        self._subscribers.discard(subscriber)
-
-    def notice(self, message: Mapping[str, Any]) -> None:
-        """Tell everybody."""
-        if self._subscribers:
-            text = dumps(message)
-            for subscriber in self._subscribers:
-                subscriber.notice(text)
-
-    def count(self, node: str, counted: Mapping[str, Mapping[str, Any]]) -> None:
-        """Tell everybody what sessions of a node have come to, by id."""
-        for subscriber in self._subscribers:
-            subscriber.count(node, counted)
-
-    def publish(self, node: ServerNode, due: list[Estimated]) -> None:
-        """Frames of a node with their estimates."""
-        for frames, columns in due:
-            node.shown_t_ns = int(frames.t_ns[-1])
-            piece = sum_up(node.live.range_kpa, frames, columns)
-            for subscriber in self._subscribers:
-                subscriber.add(node, piece)
+def _frame(node: str, piece: Piece, age_ms: float | None) -> dict[str, Any]:
+    return {
+        "type": "frame",
+        "node": node,
+        "seq": piece.seq_last,
+        "t_ns": piece.t_ns,
+        "n": piece.n,
+        **piece.newest,
+        "gauge_min_kpa": rounded(piece.gauge_min_kpa, "kpa"),
+        "gauge_max_kpa": rounded(piece.gauge_max_kpa, "kpa"),
+        "force_min_n": rounded(piece.force_min_n, "n"),
+        "force_max_n": rounded(piece.force_max_n, "n"),
+        "grf_min_n": one(piece.grf_min_n, "n"),
+        "grf_max_n": one(piece.grf_max_n, "n"),
+        "age_ms": None if age_ms is None else round(age_ms, 1),
+    }
 
 
 def sum_up(
-    range_kpa: Floats | None, frames: FrameBatch, columns: Mapping[str, npt.NDArray[Any]]
+    boot_id: str,
+    range_kpa: Floats | None,
+    frames: FrameBatch,
+    columns: Mapping[str, npt.NDArray[Any]],
 ) -> Piece:
     """Frames and their estimates, which may be none, as a piece.
 
     Args:
+        boot_id: the stream that they are of.
         range_kpa: end of each tile's calibrated range, above which it is saturated.
         frames: n frames.
         columns: their estimates by name.
@@ -266,6 +227,7 @@ def sum_up(
     force_n = columns.get("force_n", unknown)
     grf_n = columns.get("grf_n", unknown[:, 0])
     return Piece(
+        boot_id=boot_id,
         seq_first=int(frames.seq[0]),
         seq_last=int(frames.seq[-1]),
         n=len(frames),

@@ -13,6 +13,7 @@ from devices.errors import (
     FileFormatError,
     FootTileError,
     LinkError,
+    StorageError,
     UnknownError,
 )
 from service.link import PROTOCOL, Hello
@@ -56,6 +57,9 @@ class ServerNodes:
                 continue
             except FileFormatError as error:
                 self._problem(f"node {folder.name}: {error}")
+                continue
+            except StorageError as error:
+                self._problem(f"node {folder.name} is left out until it connects: {error}")
                 continue
             try:
                 self._nodes[folder.name] = self._make(hello)
@@ -131,6 +135,7 @@ def _read_hello(path: Path) -> Hello:
         FileNotFoundError: nothing.
         DamagedFileError: that is damaged, or was said by another node.
         FileFormatError: it was said to another version.
+        StorageError: it cannot be read now.
     """
     text = read_checked(path).text
     again = "it is known again when it connects"

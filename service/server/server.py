@@ -14,7 +14,7 @@ from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
 from service.server.book import SessionBook, Trash, destroy
 from service.server.data_folder import DataFolder
-from service.server.live import Hub
+from service.server.fan_out import Hub
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
@@ -195,7 +195,7 @@ class Server:
 
     def tell_node(self, node: ServerNode) -> None:
         """Tell every screen how a node is."""
-        if (view := self.node_as_json(node)) is not None:
+        if self.hub.subscribers and (view := self.node_as_json(node)) is not None:
             self.hub.notice({"type": "node", "node": view})
 
     def _tell_wanted(self, link: Link) -> None:
@@ -236,10 +236,13 @@ class Server:
             link.end(Close.RESTART, "frames are damaged here; send what the server lacks")
 
     def _tell_session(self, session: Session) -> None:
-        view = SessionView.of(session, self.recorder).model_dump(mode="json")
-        self.hub.notice({"type": "session", "session": view})
+        if self.hub.subscribers:
+            view = SessionView.of(session, self.recorder).model_dump(mode="json")
+            self.hub.notice({"type": "session", "session": view})
 
     def _heartbeat(self) -> None:
+        if not self.hub.subscribers:
+            return
         last = [node.last_seq for node in self.nodes if node.last_seq is not None]
         self.hub.notice(
             {

@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
-from devices.errors import DamagedFileError, FileFormatError
+from devices.errors import DamagedFileError, FileFormatError, StorageError
 from storage.checked_json import read_checked
 from storage.clock.file import CLOCK_NAME, read_clock
 from storage.durable import set_aside
@@ -35,10 +35,11 @@ def restore(sessions: SessionFolder, session_id: str) -> Session | None:
         session_id: of a session that cannot be read.
 
     Returns:
-        The session; None if nothing proves what it was, or if it is of another version.
+        The session; None if nothing proves what it was, if it is of another version, or if its
+        `session.json` cannot be read now.
 
     Raises:
-        StorageError: the disk is full or not writable.
+        StorageError: a file beside it cannot be read now, or the disk is full or not writable.
     """
     folder = sessions.path(session_id)
     path = folder / SESSION_NAME
@@ -47,6 +48,8 @@ def restore(sessions: SessionFolder, session_id: str) -> Session | None:
             return None  # whole, and written by another version
     except FileNotFoundError:
         what = f"its {SESSION_NAME} was gone"
+    except StorageError:
+        return None
     except DamagedFileError:
         what = f"its {SESSION_NAME} was damaged"
     else:

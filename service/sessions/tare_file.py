@@ -84,7 +84,11 @@ def chips_of(info: ArrayInfo) -> tuple[tuple[int, ...], ...]:
 
 
 def read_tares(path: Path) -> TaresFound:
-    """Whatever can be proven in a file, and a `LostTares` wherever something else was."""
+    """Whatever can be proven in a file, and a `LostTares` wherever something else was.
+
+    Raises:
+        StorageError: it cannot be read now.
+    """
     try:
         text = read_whole(path)
     except FileNotFoundError:

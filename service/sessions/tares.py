@@ -42,6 +42,10 @@ class TareHistory:
 
     Args:
         path: file to keep them in.
+
+    Raises:
+        StorageError: it cannot be read now, or is damaged and not set aside: it may hold what is
+            nowhere else, so nothing is written in its place.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,10 +58,8 @@ class TareHistory:
             self._mend(found.problem, is_damaged=found.is_damaged)
 
     def _mend(self, problem: str, *, is_damaged: bool) -> None:
-        done = "it is written anew"
+        done = f"it is kept as {set_aside(self._path).name}" if is_damaged else "it is written anew"
         try:
-            if is_damaged:
-                done = f"it is kept as {set_aside(self._path).name}"
             self._keep(self._entries)
         except StorageError as error:
             done = f"that cannot be mended: {error}"

@@ -93,7 +93,8 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     from the newest frame, the frames end where the first one is missing.
 
     Raises:
-        DamagedFileError: it is not what was written, or cannot be read.
+        DamagedFileError: it is not what was written.
+        StorageError: it cannot be read now.
     """
     path = folder / IN_FLIGHT_FILE
     try:

@@ -25,19 +25,20 @@ class Instants:
 
     def __init__(self, look_up: Callable[[int, bool], int | None]) -> None:
         self._look_up = look_up
-        self._known: dict[int, int | None] = {}
+        self._known: dict[tuple[int, bool], int | None] = {}
+        """By number and whether it is an upper end: a batch of one frame is both."""
 
     def note(self, message: EncodedBatch, held: Intervals) -> None:
         """A message was written, and is among what is held."""
         known, first, last = self._known, message.seq_first, message.seq_last
-        known[first], known[last] = message.t_ns_first, message.t_ns_last
+        known[first, False], known[last, True] = message.t_ns_first, message.t_ns_last
         before, after = held.neighbours(first, last)
         if before == first - 1:  # joined to it: neither is an end any more
-            known.pop(first - 1, None)
-            known.pop(first, None)
+            known.pop((first - 1, True), None)
+            known.pop((first, False), None)
         if after == last + 1:
-            known.pop(last + 1, None)
-            known.pop(last, None)
+            known.pop((last + 1, False), None)
+            known.pop((last, True), None)
 
     def forget(self) -> None:
         """Some of what was held is not any more: look again."""
@@ -68,6 +69,7 @@ class Instants:
         return ""
 
     def _at(self, seq: int, *, is_upper: bool) -> int | None:
-        if seq not in self._known:
-            self._known[seq] = self._look_up(seq, is_upper)
-        return self._known[seq]
+        end = seq, is_upper
+        if end not in self._known:
+            self._known[end] = self._look_up(*end)
+        return self._known[end]

@@ -11,7 +11,7 @@ from storage.intervals import DISK_SLOW
 from storage.journal.in_flight import IN_FLIGHT_FILE, kernel_boot_id, read_in_flight
 from storage.journal.journal import Journal
 from storage.journal.node_stream import NodeStream
-from storage.journal.stream_notes import StreamNotes, unsynced_tail_max
+from storage.journal.stream_notes import StreamNotes
 from storage.wire import messages_of
 
 
@@ -24,6 +24,7 @@ def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
     have been: those taken since the last sync, by the slowest sync of this disk.
 
     Raises:
+        FileFormatError: another version wrote its notes.
         StorageError: it cannot be read.
     """
     try:
@@ -41,8 +42,8 @@ def recover_stream(folder: Path, problems: list[str]) -> NodeStream | None:
     if stream.has_ended:
         return stream
     if left is None:
-        rate_hz, slowest_s = stream.info.nominal_rate_hz, stream.notes.sync_max_s
-        stream.end(unsynced_tail_max=unsynced_tail_max(rate_hz, slowest_s))
+        stream.end()
+        stream.lose_in_flight()
         return stream
     frames = left[1]
     if frames is not None:
@@ -60,6 +61,7 @@ def _open(folder: Path, problems: list[str]) -> NodeStream | None:
     """Open a stream that is on disk; None if nothing of it can be read.
 
     Raises:
+        FileFormatError: another version wrote its notes.
         StorageError: it cannot be read.
     """
     notes = StreamNotes.load_whole(folder, problems)

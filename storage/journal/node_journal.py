@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from devices.errors import StorageError
+from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo
 from storage.durable import locked, make_folder, storage_errors
 from storage.intervals import DISK_FULL, DISK_SLOW, READ_ONLY, Intervals
@@ -86,7 +86,7 @@ class NodeJournal:
             self.wanted = Wanted(self.folder / "wanted.json")
             self._wants_changed = not self.wanted.is_proven
             self.problems = list(self.wanted.problems)
-            """What was found damaged when it was opened, and what became of it, in words."""
+            """What was found damaged, and what became of it, in words."""
             self._retention = Retention(
                 self.folder, self.wanted, budget_bytes=budget_bytes, may_drop=not is_recovery
             )
@@ -212,7 +212,7 @@ class NodeJournal:
             self._synced_s = now_s
             for stream in self.streams:
                 stream.sync()
-                stream.settle(self.wanted)
+                stream.settle(self.wanted, self.problems)
         if now_s - self._tidied_s >= _TIDY_S or (self._wants_changed and not self._trouble):
             self._tidied_s = now_s
             self._tidy()
@@ -266,7 +266,7 @@ class NodeJournal:
             for folder in folders:
                 try:
                     stream = recover_stream(folder, self.problems)
-                except StorageError as error:
+                except (FileFormatError, StorageError) as error:
                     self.problems.append(f"a stream is left out: {error}")
                     continue
                 if stream is not None:

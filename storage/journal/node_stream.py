@@ -17,10 +17,11 @@ from itertools import takewhile
 from pathlib import Path
 
 from devices.errors import DamagedFileError, StorageError
+from storage.durable import put_aside
 from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, union
-from storage.journal.in_flight import delete_in_flight, read_in_flight
+from storage.journal.in_flight import IN_FLIGHT_FILE, delete_in_flight, read_in_flight
 from storage.journal.journal import Journal
-from storage.journal.stream_notes import PROMISE_S, StreamNotes
+from storage.journal.stream_notes import PROMISE_S, StreamNotes, unsynced_tail_max
 from storage.journal.wanted import Wanted
 from storage.wire import EncodedBatch, messages_of
 
@@ -228,6 +229,11 @@ class NodeStream:
             now = {"lost": self._lost.as_pairs(), "missed_slots": self.missed_slots, **changes}
             self.notes = self.notes.model_copy(update=now)
 
+    def lose_in_flight(self) -> None:
+        """What was in flight cannot be known: note how many frames that may have been."""
+        rate_hz, slowest_s = self.info.nominal_rate_hz, self.notes.sync_max_s
+        self.note(unsynced_tail_max=unsynced_tail_max(rate_hz, slowest_s))
+
     def save_notes(self, **changes: object) -> None:
         """Write down what is known of it.
 
@@ -301,13 +307,18 @@ class NodeStream:
             with suppress(StorageError):
                 self.save_notes(sync_max_s=took_s)
 
-    def settle(self, wanted: Wanted) -> None:
-        """Note where it has ended, once all of it is on disk; if that fails, next time."""
+    def settle(self, wanted: Wanted, problems: list[str]) -> None:
+        """Note where it has ended, once all of it is on disk; if that fails, next time.
+
+        Args:
+            wanted: what sessions need.
+            problems: told what was found damaged and what became of it.
+        """
         if self.is_settled or not self.has_ended or not self.is_synced:
             return
-        if self._take_over_in_flight():  # it is written first
-            return
         try:
+            if self._take_over_in_flight(problems):  # it is written first
+                return
             if self.journal is not None:
                 self.journal.close()
             # A stream that ended before its first frame is remembered if a server asks for it.
@@ -351,11 +362,17 @@ class NodeStream:
             self.lose(gone, EVICTED, wanted)
         return bool(gone)
 
-    def _take_over_in_flight(self) -> bool:
-        """Take over the frames that acquisition had in flight when it was killed; False if none."""
+    def _take_over_in_flight(self, problems: list[str]) -> bool:
+        """Take over the frames that acquisition had in flight when it was killed; False if none.
+
+        Raises:
+            StorageError: they cannot be read now.
+        """
         try:
             left = read_in_flight(self.folder)
-        except DamagedFileError:
+        except DamagedFileError as error:
+            problems.append(put_aside(self.folder / IN_FLIGHT_FILE, error))
+            self.lose_in_flight()
             return False
         if left is None or left[1] is None or int(left[1].seq[-1]) < self.next_seq:
             return False

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from devices.errors import FileFormatError
+from devices.errors import DamagedFileError, FileFormatError
 from devices.frames import ArrayInfo
 from storage.checked_json import read_checked, write_checked
 from storage.durable import put_aside
@@ -70,7 +70,7 @@ class StreamNotes(BaseModel):
         """Read it; None if there is none.
 
         Raises:
-            FileFormatError: it is damaged.
+            As `load_checked`.
         """
         notes, _ = cls.load_checked(folder)
         return notes
@@ -80,30 +80,42 @@ class StreamNotes(BaseModel):
         """Read it, and say whether it proves itself; an older version's does not.
 
         Raises:
-            FileFormatError: it is damaged.
+            DamagedFileError: it is not what was written.
+            FileFormatError: it is, by another version.
+            StorageError: it cannot be read now.
         """
         path = folder / NOTES_FILE
         try:
             read = read_checked(path)
-            return cls.model_validate_json(read.text), read.is_proven
         except FileNotFoundError:
             return None, True
+        try:
+            return cls.model_validate_json(read.text), read.is_proven
         except ValidationError as error:
+            what = f"not a stream's notes: {' '.join(str(error).split())[:300]}"
+            if not read.is_proven:
+                raise DamagedFileError(what, where=str(path)) from error
             # A field that is not known here is not dropped in silence: it may bound what is lost.
-            newer = [e["loc"][0] for e in error.errors() if e["type"] == "extra_forbidden"]
-            other = f" of another version, with {newer[0]!r}" if newer else f": {error}"
-            raise FileFormatError(f"not a stream's notes{other}", where=str(path)) from error
+            raise FileFormatError(
+                f"{what}; another version wrote it, and it is left as it is",
+                where=str(path),
+                remedy="Update foottile",
+            ) from error
 
     @classmethod
     def load_whole(cls, folder: Path, problems: list[str]) -> StreamNotes | None:
-        """As `load`, and what cannot be read is set aside.
+        """As `load`, and what is damaged is set aside.
 
         Args:
             folder: the stream's own.
             problems: told what was found damaged and what became of it.
+
+        Raises:
+            FileFormatError: another version wrote it.
+            StorageError: it cannot be read now.
         """
         try:
             return cls.load(folder)
-        except FileFormatError as error:
+        except DamagedFileError as error:
             problems.append(put_aside(folder / NOTES_FILE, error))
             return None

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from devices.errors import DamagedFileError
+from devices.errors import DamagedFileError, StorageError
 from storage.checked_json import read_checked, write_checked
 from storage.durable import ASIDE, put_aside
 from storage.intervals import NO_END, Intervals, OpenPairs, closed, union
@@ -50,7 +50,8 @@ class _File(BaseModel):
 class Wanted:
     """All that is wanted of one node.
 
-    A damaged file is set aside. As long as it lies there, any server may want any frame.
+    A damaged file is set aside. As long as it lies there, any server may want any frame; so it is
+    if the file cannot be read now, which is then not written before it was read.
 
     Args:
         path: where it is kept.
@@ -64,15 +65,12 @@ class Wanted:
         """Was its file written by a version that writes a hash?"""
         self.problems: list[str] = []
         """What was found damaged, and what became of it, in words."""
+        self._is_read = True
         try:
-            found = read_checked(path)
-            self.is_proven = found.is_proven
-            self._servers = _File.model_validate_json(found.text).servers
-        except FileNotFoundError:
-            pass
-        except (DamagedFileError, ValidationError) as error:
-            damage = DamagedFileError(f"what servers need cannot be read: {error}", where=str(path))
-            self.problems.append(put_aside(path, damage))
+            self._servers = self._read()
+        except StorageError as error:
+            self._is_read = False
+            self.problems.append(f"frames are kept as long as there is room: {error}")
         aside = sorted(each.name for each in path.parent.glob(path.name + ASIDE + "*"))
         self.may_be_all = bool(aside or self.problems)
         """Is it not known what servers need? Then nothing is deleted for its age alone."""
@@ -81,6 +79,24 @@ class Wanted:
                 f"what servers need was damaged, so frames are kept as long as there is room: "
                 f"delete {path.with_name(aside[-1])} when servers have all they need"
             )
+
+    def _read(self) -> dict[str, ServerWants]:
+        """What is written down.
+
+        Raises:
+            StorageError: it cannot be read now.
+        """
+        path = self._path
+        try:
+            found = read_checked(path)
+            self.is_proven = found.is_proven
+            return _File.model_validate_json(found.text).servers
+        except FileNotFoundError:
+            pass
+        except (DamagedFileError, ValidationError) as error:
+            damage = DamagedFileError(f"what servers need cannot be read: {error}", where=str(path))
+            self.problems.append(put_aside(path, damage))
+        return {}
 
     def numbers(self, boot_id: str) -> Intervals:
         """What servers and the node's own session need of a stream."""
@@ -122,6 +138,9 @@ class Wanted:
         """Write it down.
 
         Raises:
-            StorageError: the disk is full or not writable.
+            StorageError: the disk is full or not writable, or what is there could not be read yet.
         """
+        if not self._is_read:
+            self._servers = {**self._read(), **self._servers}
+            self._is_read = True
         write_checked(self._path, _File(servers=self._servers).model_dump_json().encode())

@@ -48,6 +48,7 @@ def read_events(path: Path) -> StoredEvents:
     Raises:
         FileNotFoundError: there is none.
         DamagedFileError: it is not what was written, or no table of events.
+        StorageError: it cannot be read now.
     """
     read = read_table(path)
     try:

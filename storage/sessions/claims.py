@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from devices.errors import DamagedFileError
+from devices.errors import DamagedFileError, StorageError
 from storage.checked_json import is_unchanged, read_checked, without_check
 from storage.durable import read_whole
 from storage.sessions.folder import Ledger, Part, Session
@@ -38,7 +39,7 @@ def claims_in(
 
     Args:
         folder: the session's.
-        text: of its `session.json`; None if that is missing.
+        text: of its `session.json`; None if that is missing, or cannot be read.
         problems: what is wrong is added here.
         unproven: and here what the text cannot show.
 
@@ -46,7 +47,8 @@ def claims_in(
         None if it is not readable.
     """
     if text is None:
-        problems.append(f"{SESSION_NAME} is missing")
+        is_there = os.path.lexists(folder / SESSION_NAME)
+        problems.append(f"{SESSION_NAME} {'cannot be read' if is_there else 'is missing'}")
         return None
     unchanged = is_unchanged(text)
     if unchanged is False:
@@ -87,7 +89,7 @@ def _beside(path: Path, problems: list[str], unproven: list[str]) -> bytes | Non
         read = read_checked(path)
     except FileNotFoundError:
         return None
-    except DamagedFileError as error:
+    except (DamagedFileError, StorageError) as error:
         problems.append(f"{path.name}: {error.what}")
         return None
     if not read.is_proven:

@@ -192,6 +192,7 @@ class SessionFolder:
         Raises:
             UnknownError: there is no such session.
             FileFormatError: it is damaged.
+            StorageError: it cannot be read now.
         """
         path = self.path(session_id) / "session.json"
         try:

@@ -117,7 +117,7 @@ def verify_stream(folder: Path) -> StreamReport:
         report.notes, is_proven = StreamNotes.load_checked(folder)
         if not is_proven:
             report.unproven.append(f"{NOTES_FILE}: it states no hash of itself")
-    except FileFormatError as error:
+    except (FileFormatError, StorageError) as error:
         report.problems.append(f"{NOTES_FILE}: {error.what}")
     if report.notes is not None:
         report.info, report.lost = report.notes.array_info, Losses(report.notes.lost)

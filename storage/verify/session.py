@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from devices.errors import FileFormatError
+from devices.errors import FileFormatError, StorageError
 from storage.clock.file import CLOCK_NAME, StoredClock, read_clock
 from storage.file_hash import sha256_of
 from storage.intervals import NO_END, Intervals
@@ -255,7 +255,7 @@ def _stored(
         if not may_lack:
             report.problems.append(f"{path.name} is missing")
         return None
-    except FileFormatError as error:
+    except (FileFormatError, StorageError) as error:
         report.problems.append(f"{path.name}: {error.what}")
         return None
     if not stored.is_proven:
@@ -271,7 +271,7 @@ def _count(report: SessionReport, data: Path, session: Session, streams: Streams
     reports: dict[str, StreamReport] = {}
     for part in session.parts:
         folder = data / "journal" / session.node / part.boot_id
-        if part.boot_id not in reports and folder.is_dir():
+        if part.boot_id not in reports and folder.is_dir() and not folder.is_symlink():
             reports[part.boot_id] = found = streams(folder)
             report.problems += [f"journal {part.boot_id}: {problem}" for problem in found.problems]
         reports.setdefault(part.boot_id, StreamReport(session.node, part.boot_id))

@@ -6,7 +6,8 @@ With `--out` a row is written as soon as its attack has ended, and takes the pla
 earlier run of it: all of them take more than an hour, so they may be played one by one. A row says
 at which commit it was played.
 
-Exits with 1 if the product did what it must not do; each such try is said with its seed.
+Exits with 1 if the product did what it must not do, each such try is said with its seed, or if an
+attack could not be played.
 """
 
 # ruff: noqa: T201
@@ -19,10 +20,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from datetime import UTC, datetime
 from pathlib import Path
 
-from tests.hostile.attack import ATTACKS, Outcome
+import pytest
+
+from tests.hostile.attack import ATTACKS, Attack, Outcome
 
 _ROOT = Path(__file__).resolve().parents[2]
 
@@ -43,8 +47,7 @@ def main() -> int:
             continue
         print(f"{attack.name} ...", flush=True)
         began = time.monotonic()
-        with tempfile.TemporaryDirectory(prefix="foottile-hostile-") as folder:
-            outcome = attack.play(seed=options.seed, is_soak=options.soak, folder=Path(folder))
+        outcome = played(attack, seed=options.seed, is_soak=options.soak)
         row = _row(attack.name, outcome, time.monotonic() - began, options.seed)
         print(row, flush=True)
         for failure in outcome.failures[:20]:
@@ -53,6 +56,18 @@ def main() -> int:
         if options.out is not None:
             _write(options.out, attack.name, row)
     return 1 if failed else 0
+
+
+def played(attack: Attack, *, seed: int, is_soak: bool) -> Outcome:
+    """What came of an attack; one that could not be played has failed, and others follow it."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="foottile-hostile-") as folder:
+            return attack.play(seed=seed, is_soak=is_soak, folder=Path(folder))
+    # What pytest raises where a test fails or is skipped is no Exception.
+    except (Exception, pytest.fail.Exception, pytest.skip.Exception) as error:
+        said = " ".join(str(error).split()).replace("|", "/")
+        why = f"not played: {said[:200] or type(error).__name__}"
+        return Outcome(outcomes=Counter({why: 1}), failures=[why])
 
 
 def _write(path: Path, name: str, row: str) -> None:

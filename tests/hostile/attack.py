@@ -25,6 +25,8 @@ class Play:
     random: Random
     folder: Path
     """Empty; for its files."""
+    turn: int = 0
+    """Which run it is: few tries may be other ones in each, so that in time all are made."""
 
 
 @dataclass
@@ -62,10 +64,11 @@ class Attack:
     is_alone: bool = True
     """Does it measure time or memory, so that nothing else may run beside it?"""
 
-    def play(self, *, seed: int, is_soak: bool, folder: Path) -> Outcome:
-        """Run it; the same seed draws the same."""
+    def play(self, *, seed: int, is_soak: bool, folder: Path, turn: int = 0) -> Outcome:
+        """Run it; the same seed and turn draw the same."""
         tries = self.soak_tries if is_soak else self.tries
-        return self.run(Play(tries, Random(f"{self.name}/{seed}"), folder))  # noqa: S311
+        random = Random(f"{self.name}/{seed}")  # noqa: S311
+        return self.run(Play(tries, random, folder, turn))
 
 
 ATTACKS: dict[str, Attack] = {}

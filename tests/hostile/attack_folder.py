@@ -7,7 +7,8 @@ import hashlib
 import shutil
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -120,7 +121,7 @@ def _views(now: Served) -> str:
 
 
 def _digest(batch: FrameBatch) -> str:
-    columns = (batch.seq, batch.t_ns, batch.padc, batch.tadc, batch.status)
+    columns = [getattr(batch, column.name) for column in fields(batch)]
     return hashlib.sha256(b"".join(column.tobytes() for column in columns)).hexdigest()
 
 
@@ -342,9 +343,9 @@ def node_folder(folder: Path) -> Path:
 def folder_of_a_node(play: Play) -> Outcome:
     """One file of a node's state is damaged, then its journal is opened, goes on and is tidied.
 
-    Failures: it does not open; a frame is other than it was; frames of the other stream are gone;
-    what says what is wanted, or of a stream, is damaged and no problem names it; a new stream is
-    not kept.
+    Failures: it does not open; a frame is other than it was; a frame of a stream that is not
+    damaged is gone; what says what is wanted, or of a stream, is damaged and no problem names it; a
+    new stream is not kept.
     """
     outcome = Outcome()
     data = node_folder(play.folder / "node")
@@ -355,7 +356,7 @@ def folder_of_a_node(play: Play) -> Outcome:
         is_same = (copy / path).is_file() and _sha(copy / path) == _sha(data / path)
         is_same = is_same and not (copy / path).is_symlink()
         try:
-            wrong, said = _goes_on(copy, BOOTS[1] if BOOTS[0] in path.parts else BOOTS[0])
+            wrong, said = _goes_on(copy, [boot for boot in BOOTS if boot not in path.parts])
         except FootTileError as error:
             outcome.failed(f"{what}: {error}")
             continue
@@ -369,7 +370,7 @@ def folder_of_a_node(play: Play) -> Outcome:
     return outcome
 
 
-def _goes_on(root: Path, other: str) -> tuple[str, list[str]]:
+def _goes_on(root: Path, undamaged: Sequence[str]) -> tuple[str, list[str]]:
     """What is wrong with a node's journal that is opened now, and what it says."""
     journal = NodeJournal(root, "leg")
     journal.start()
@@ -380,17 +381,22 @@ def _goes_on(root: Path, other: str) -> tuple[str, list[str]]:
             journal.put(stream, message)
         until(lambda: stream.stored.last == 9)
         known = {each.boot_id: each for each in journal.streams}
-        if other not in known or known[other].held != Intervals([(0, 199)]):
-            return "the other stream is not whole", journal.problems
+        for boot_id in undamaged:
+            if boot_id not in known or known[boot_id].held != Intervals([(0, 199)]):
+                return f"stream {boot_id} is not whole", journal.problems
         for each in known.values():
-            for first, last in each.stored:
-                try:
-                    for batch in each.journal.read(first, last) if each.journal else ():
-                        taken = make_frames(batch.seq.astype(np.int64))
-                        if _digest(batch) != _digest(taken):
-                            return "other frames", journal.problems
-                except FootTileError:
-                    pass
+            read = 0
+            try:
+                for batch in each.journal.read(0, 199) if each.journal else ():
+                    taken = make_frames(batch.seq.astype(np.int64))
+                    if _digest(batch) != _digest(taken):
+                        return "other frames", journal.problems
+                    read += len(batch)
+            except FootTileError as error:
+                if each.boot_id in undamaged:
+                    return f"stream {each.boot_id}: {error}", journal.problems
+            if each.boot_id in undamaged and read != 200:
+                return f"of stream {each.boot_id} only {read} are read", journal.problems
         return "", list(journal.problems)
     finally:
         journal.close()

@@ -27,7 +27,7 @@ from tests.hostile.stage import Served, traces
 
 _REFUSED = (HTTPStatus.BAD_REQUEST, HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN, 413)
 _AT_ONCE = 8
-"""Requests of one kind; to begin with a kind costs as much as these."""
+"""Requests of one kind, if there are tries enough; to begin with a kind costs as much as these."""
 AnyCase = Case[Any]
 CHECKS: list[CheckFunction] = [
     not_a_server_error,
@@ -38,6 +38,9 @@ CHECKS: list[CheckFunction] = [
 
 
 def play_drawn(served: Served, play: Play, *, token: str | None = None) -> Outcome:
+    """Requests of every kind, an operation and right or wrong data for it; of few tries, each of
+    another kind, and those of the next turn of the kinds that follow.
+    """
     schema = schemathesis.openapi.from_url(served.url + "/api/v1/openapi.json")
     operations = [result.ok() for result in schema.get_all_operations() if isinstance(result, Ok)]
     outcome = Outcome()
@@ -45,12 +48,14 @@ def play_drawn(served: Served, play: Play, *, token: str | None = None) -> Outco
     modes = (GenerationMode.POSITIVE, GenerationMode.NEGATIVE)
     kinds = [(operation, mode) for operation in operations for mode in modes]
     play.random.shuffle(kinds)
+    first = play.turn * play.tries % len(kinds)
+    at_once = min(_AT_ONCE, max(1, play.tries // len(kinds)))
     with requests.Session() as session:
         session.trust_env = False
         ask = partial(_ask, served, session, token, outcome)
         while outcome.tries < play.tries:
-            for operation, mode in kinds:
-                n = min(_AT_ONCE, play.tries - outcome.tries)
+            for operation, mode in kinds[first:] + kinds[:first]:
+                n = min(at_once, play.tries - outcome.tries)
                 if n > 0:
                     _play(operation, mode, n, play.random.randrange(2**32), ask)
     if found := traces(served):

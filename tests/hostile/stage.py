@@ -83,7 +83,7 @@ class Served(Running):
 
 
 class Screen:
-    """A viewer that notes the longest pause between two frames."""
+    """A viewer that notes the longest pause before a frame, the first one included."""
 
     def __init__(self, served: Served) -> None:
         self._sockets = ExitStack()
@@ -111,8 +111,7 @@ class Screen:
                 self.is_gone = True
                 return
             now_s = time.monotonic()
-            if self.frames:
-                self.gap_s = max(self.gap_s, now_s - last_s)
+            self.gap_s = max(self.gap_s, now_s - last_s)
             if message.get("type") == "frame":
                 self.frames += 1
                 last_s = now_s
@@ -122,8 +121,8 @@ class Screen:
 def recording(served: Served, outcome: Outcome, *, token: str | None = None) -> Iterator[FakeNode]:
     """While the block runs a node records at 500 frames/s and a screen watches.
 
-    Then the recording is stopped and has to be complete; that it is not, or that its node was cut
-    off, is a failure of the outcome.
+    Then the recording is stopped and has to be complete; that it is not, that its node was cut
+    off, or that the screen saw nothing, is a failure of the outcome.
     """
     node = FakeNode(served, token=token)
     try:
@@ -144,6 +143,8 @@ def recording(served: Served, outcome: Outcome, *, token: str | None = None) -> 
             finally:
                 screen.close()
         outcome.figures["frames recorded"] = str(sealed["frames"])
+        if not screen.frames:
+            outcome.failures.append("the screen that watched saw no frame")
         if play.problem is not None:
             outcome.failures.append(f"the node was cut off: {play.problem}")
         if sealed["complete"] is not True or sealed["lost"]:

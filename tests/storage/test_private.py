@@ -37,7 +37,17 @@ def test_a_folder_that_is_made_is_its_users(tmp_path: Path) -> None:
     assert written(tmp_path / "a" / "data") == (0o700, 0o600)
 
 
-@pytest.mark.parametrize("found", [(), ("server_id", "journal"), (".lock",)])
+@pytest.mark.parametrize(
+    "found",
+    [
+        (),
+        ("server_id", "journal"),
+        (".lock",),
+        (".lock", ".writable", "journal", "nodes", "server_id", "sessions", "token", "trash"),
+        (".lock", "server_id.damaged-1", ".server_id.4711.815.0123abcd.tmp"),
+    ],
+    ids=str,
+)
 def test_a_folder_of_ours_that_all_could_read_is_closed(
     tmp_path: Path, found: tuple[str, ...]
 ) -> None:
@@ -48,12 +58,19 @@ def test_a_folder_of_ours_that_all_could_read_is_closed(
     assert mode_of(tmp_path) == 0o700
 
 
-def test_somebodys_home_stays_as_it_is_but_what_we_write_there_is_closed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["journal", "nodes", "sessions", "Documents"])
+def test_somebodys_home_stays_as_it_is_but_what_we_write_there_is_closed(
+    tmp_path: Path, name: str
+) -> None:
     (tmp_path / "thesis.tex").touch()
+    (tmp_path / name).mkdir()
     tmp_path.chmod(0o755)
-    keep_private(tmp_path)
-    assert mode_of(tmp_path) == 0o755
-    assert written(tmp_path) == (0o700, 0o600)
+    for _ in range(2):
+        keep_private(tmp_path)
+        assert mode_of(tmp_path) == 0o755
+        assert written(tmp_path) == (0o700, 0o600)
+        for ours in (".lock", "server_id"):  # what a start leaves is there at the second one
+            (tmp_path / ours).touch()
 
 
 @pytest.mark.parametrize("mode", [0o750, 0o770, 0o2750])

@@ -9,8 +9,10 @@ from contextlib import suppress
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from service.api.protocols import OUTLET
 from service.link import SUBPROTOCOL, Close, HangUp, close_reason
-from service.server.live import Subscriber, dumps
+from service.server.fan_out import RATES_HZ, Outlet, framed
+from service.server.live import dumps
 from service.server.server import Server
 from service.server.views import SessionView
 from service.server_clock import utc_ns
@@ -20,10 +22,7 @@ log = logging.getLogger("foottile.live")
 
 PROTOCOL = 1
 """Of this socket; the nodes' link counts its own."""
-RATES_HZ = (1.0, 60.0)
 RATE_HZ = 30.0
-SEND_TIMEOUT_S = 10.0
-"""A client that does not read for so long is let go; it may come back."""
 _PARAMETERS = {"node", "rate_hz", "format", "policy"}
 _TEXT_MAX = 1000
 
@@ -32,22 +31,22 @@ async def live(socket: WebSocket, server: Server) -> None:
     """Serve one screen until it leaves."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
-    subscriber: Subscriber | None = None
     try:
         node, rate_hz = _query(socket, server)
-        await socket.send_text(dumps(_hello(server, node)))
-        subscriber = server.hub.join(node)
-        sending = asyncio.create_task(_send(socket, server, subscriber, rate_hz))
-        reading = asyncio.create_task(_read(socket, subscriber))
+        outlet: Outlet = socket.scope["extensions"][OUTLET]["outlet"]
+        outlet.write(framed([dumps(_hello(server, node))]))
+        viewer = server.hub.join(outlet, rate_hz, node)
+        reading = asyncio.create_task(_read(socket))
         try:
-            await asyncio.wait({sending, reading}, return_when=asyncio.FIRST_COMPLETED)
-            for task in (sending, reading):
-                if task.done():
-                    task.result()
+            ends: tuple[asyncio.Future[None], ...] = (viewer.over, reading)
+            await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+            for end in ends:
+                if end.done():
+                    end.result()
         finally:
-            sending.cancel()
+            server.hub.leave(viewer)
             reading.cancel()
-            await asyncio.gather(sending, reading, return_exceptions=True)
+            await asyncio.gather(reading, return_exceptions=True)
     except HangUp as end:
         if socket.application_state is not WebSocketState.DISCONNECTED:
             with suppress(RuntimeError, WebSocketDisconnect, TimeoutError):
@@ -57,9 +56,6 @@ async def live(socket: WebSocket, server: Server) -> None:
         pass
     except Exception:
         log.exception("this is a bug; one screen's connection ends, the server goes on")
-    finally:
-        if subscriber is not None:
-            server.hub.leave(subscriber)
 
 
 def _query(socket: WebSocket, server: Server) -> tuple[str | None, float]:
@@ -73,8 +69,8 @@ def _query(socket: WebSocket, server: Server) -> tuple[str | None, float]:
         rate_hz = float(given.get("rate_hz", RATE_HZ))
     except ValueError:
         rate_hz = float("nan")
-    if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
-        raise HangUp(Close.POLICY, f"rate_hz has to be {RATES_HZ[0]:g} to {RATES_HZ[1]:g}")
+    if not RATES_HZ[0] <= rate_hz <= RATES_HZ[-1]:
+        raise HangUp(Close.POLICY, f"rate_hz has to be {RATES_HZ[0]:g} to {RATES_HZ[-1]:g}")
     node = given.get("node")
     if node is not None and all(known.name != node for known in server.nodes):
         raise HangUp(Close.POLICY, f"no node {node[:60]!r}")
@@ -102,29 +98,7 @@ def _hello(server: Server, node: str | None) -> dict[str, object]:
     }
 
 
-async def _send(socket: WebSocket, server: Server, subscriber: Subscriber, rate_hz: float) -> None:
-    loop = asyncio.get_running_loop()
-    due_s = loop.time()
-    while True:
-        await subscriber.news.wait()
-        due_s = max(due_s + 1.0 / rate_hz, loop.time())
-        now_t_ns = utc_ns()
-        ages_ms = {
-            known.name: (now_t_ns - known.server_t_ns(known.shown_t_ns)) * 1e-6
-            for known in server.nodes
-            if known.clock is not None and known.shown_t_ns is not None
-        }
-        texts = subscriber.take(ages_ms, server.hub.encoder)
-        try:
-            async with asyncio.timeout(SEND_TIMEOUT_S):
-                for text in texts:
-                    await socket.send_text(text)
-        except TimeoutError as error:
-            raise HangUp(Close.TOO_SLOW, "this client does not read") from error
-        await asyncio.sleep(due_s - loop.time())
-
-
-async def _read(socket: WebSocket, subscriber: Subscriber) -> None:
+async def _read(socket: WebSocket) -> None:
     while True:
         message = await socket.receive()
         if message["type"] == "websocket.disconnect":
@@ -139,4 +113,4 @@ async def _read(socket: WebSocket, subscriber: Subscriber) -> None:
         t_ms = said.get("t_ms")
         if isinstance(t_ms, bool) or not isinstance(t_ms, int | float) or not abs(t_ms) < 1e18:
             raise HangUp(Close.POLICY, "ping needs t_ms, a number")
-        subscriber.answer({"type": "pong", "t_ms": t_ms, "t_ns": utc_ns()})
+        await socket.send_text(dumps({"type": "pong", "t_ms": t_ms, "t_ns": utc_ns()}))

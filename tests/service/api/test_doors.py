@@ -15,11 +15,12 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from websockets.exceptions import ConnectionClosed
 
 from service.api.doors import OWN_FILES, RESERVE, Bounds, Doors
 from service.api.protocols import accept
 from service.link import INGEST_PATH, LIVE_PATH, Close
-from tests.service.fake_node import NodeOf, Play
+from tests.service.fake_node import NodeOf, Play, Spoken
 from tests.service.running import Running, ServeWith, closed
 from tests.waiting import in_a_loop, until
 
@@ -80,10 +81,21 @@ def test_nobody_takes_a_nodes_place() -> None:
     node, *flood = guests(doors, 10 * RESERVE)
     assert node.is_out  # it said nothing before all these came
     node = flood[-1]
-    doors.admit_node(node)
+    assert doors.admit_node(node)
     guests(doors, 10 * RESERVE)
     assert not node.is_out
     assert not doors.nodes_are_full
+
+
+def test_nodes_beyond_the_bound_are_refused_until_one_has_gone() -> None:
+    doors = Doors(Bounds(max_nodes=2), PLENTY)
+    first, second, third = guests(doors, 3)
+    assert doors.admit_node(first)
+    assert doors.admit_node(second)
+    assert not doors.admit_node(third)
+    assert doors.admit_node(first), "it speaks again: it is inside already"
+    doors.go(first)
+    assert doors.admit_node(third)
 
 
 def test_what_recording_needs_is_not_given_to_connections(caplog: Any) -> None:
@@ -113,17 +125,27 @@ def test_whatever_they_do_there_are_never_more_than_descriptors_for_them(
             guest = inside[which % len(inside)]
             if what == 2:
                 doors.admit(guest)
-            elif what == 3 and not doors.nodes_are_full:
+            elif what == 3:
                 doors.admit_node(guest)
             elif what == 4:
                 doors.rest(guest)
             else:
                 doors.go(guest)
                 inside.remove(guest)
-        for guest in [guest for guest in inside if guest.is_out]:
-            inside.remove(guest)  # as its transport does, which was aborted
-            doors.go(guest)
+        gone(doors, inside)
         assert len(inside) <= 8 + 4 + RESERVE
+        while doors.is_full:  # there is somebody to turn out, or nobody would ever get in again
+            doors.turn_out()
+            assert gone(doors, inside)
+
+
+def gone(doors: Doors, inside: list[Guest]) -> list[Guest]:
+    """Those who were turned out, and have left."""
+    out = [guest for guest in inside if guest.is_out]
+    for guest in out:
+        inside.remove(guest)  # as its transport does, which was aborted
+        doors.go(guest)
+    return out
 
 
 @pytest.fixture
@@ -383,7 +405,30 @@ def test_more_nodes_than_may_be_are_told_to_come_later(
     node.deliver(10)
 
 
-def test_a_websocket_has_no_time_for_headers_to_come(strict: Running, node_of: NodeOf) -> None:
+def test_more_nodes_than_may_be_that_speak_at_once_are_told_to_come_later(
+    serve_with: ServeWith, node_of: NodeOf
+) -> None:
+    running = serve_with(bounds=Bounds(max_nodes=2))
+    nodes = [node_of(running, f"leg{number}") for number in range(6)]
+    with ExitStack() as sockets:
+        dialled = [Spoken(sockets.enter_context(running.socket(INGEST_PATH))) for _ in nodes]
+        for node, spoken in zip(nodes, dialled, strict=True):
+            spoken.send(node.hello().model_dump_json())
+        told = [first_word(spoken) for spoken in dialled]
+    assert sorted(map(str, told)) == ["1013"] * 4 + ["welcome"] * 2
+    until(lambda: not any(node["connected"] for node in running.http.get("/nodes").json()["items"]))
+    nodes[-1].connect()
+
+
+def first_word(spoken: Spoken) -> int | str:
+    """What the first message of the server is, or with which code it closes."""
+    try:
+        return str(json.loads(spoken.recv(timeout=5.0))["type"])
+    except ConnectionClosed as end:
+        return int(end.rcvd.code) if end.rcvd is not None else "cut off"
+
+
+def test_a_webspokenhas_no_time_for_headers_to_come(strict: Running, node_of: NodeOf) -> None:
     node = node_of(strict)
     node.connect()
     with strict.socket(LIVE_PATH) as live, Play(node) as play:

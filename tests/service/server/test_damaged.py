@@ -109,8 +109,9 @@ def test_a_lead_that_was_seen_before_does_not_come_back_in_place_of_a_lost_tare(
     assert running.http.get("/nodes/bench/tares").json()["items"] == []
 
 
-def test_a_session_from_before_the_loss_is_sealed_as_if_nothing_had_happened(
-    running: Running, tared: FakeNode
+@pytest.mark.parametrize("is_one_between", [False, True])
+def test_a_session_has_forces_if_a_proven_tare_was_taken_between_it_and_a_lost_one(
+    running: Running, tared: FakeNode, *, is_one_between: bool
 ) -> None:
     pending = tared.record()
     tared.deliver(100, 5.0)
@@ -121,13 +122,26 @@ def test_a_session_from_before_the_loss_is_sealed_as_if_nothing_had_happened(
     running.stop()
     path = running.data / "nodes" / "bench" / "tares.json"
     info, by_lead = tared.info, TareHistory(path).all[0].tare
-    TareHistory(path).add(replace(by_lead, t_ns=by_lead.t_ns + 10**11, source="unloaded"), info)
+    for later_s in (100, 200) if is_one_between else (200,):
+        t_ns = by_lead.t_ns + later_s * 10**9
+        TareHistory(path).add(replace(by_lead, t_ns=t_ns, source="unloaded"), info)
     flip(path, b'"undone": false', b'"undone": true ')
     running.start()
     assert "1 tare is lost" in problems(running)
     tared.connect()
     tared.send(10, now=True)
-    assert "lost" in pending.sealed()["problem"], "it may have been taken right after the lead"
+    problem = pending.sealed()["problem"]
+    is_lost = (pending.column("estimate_status") & LOST) != 0
+    grf_n = pending.column("grf_n").astype(float)
+    assert len(grf_n) == 100
+    if is_one_between:
+        assert problem is None
+        assert not is_lost.any()
+        assert grf_n == pytest.approx(10.0, abs=0.1)
+    else:  # it may have been taken right after the lead
+        assert "a tare is damaged and lost" in problem
+        assert is_lost.all()
+        assert np.isnan(grf_n).all()
 
 
 @pytest.mark.parametrize("damage", ["flip", "folder", "of another node", "another version"])

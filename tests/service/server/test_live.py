@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate, pairwise
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +14,7 @@ from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
 from service.estimation.foot.contact import UNKNOWN
-from service.server.live import SUMMARY_NS, Encoder, Hub, Piece, Subscriber, min_of, sum_up
-from service.server.node import ServerNode
+from service.server.live import SUMMARY_NS, Piece, Summary, min_of, sum_up
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 
@@ -24,17 +22,6 @@ TILES = 2
 RANGE_KPA = np.array([15.0, 15.0])
 
 Columns = dict[str, np.ndarray]
-
-
-def fake_node(name: str = "bench", boot_id: str = "0" * 32) -> ServerNode:
-    node = SimpleNamespace(
-        name=name,
-        boot_id=boot_id,
-        info=SimpleNamespace(tiles=("T01", "T02"), nominal_rate_hz=1e9 / PERIOD_NS),
-        live=SimpleNamespace(range_kpa=RANGE_KPA),
-        shown_t_ns=None,
-    )
-    return cast(ServerNode, node)
 
 
 def frames(first: int, rows: int, *, period_ns: int = PERIOD_NS) -> FrameBatch:
@@ -66,17 +53,23 @@ def estimates(first: int, rows: int, *, silent: float = 0.2) -> Columns:
     }
 
 
-def piece(first: int, rows: int, *, period_ns: int = PERIOD_NS) -> Piece:
-    return sum_up(RANGE_KPA, frames(first, rows, period_ns=period_ns), estimates(first, rows))
+def piece(
+    first: int,
+    rows: int,
+    *,
+    period_ns: int = PERIOD_NS,
+    boot_id: str = "0" * 32,
+    silent: float = 0.2,
+) -> Piece:
+    columns = estimates(first, rows, silent=silent)
+    return sum_up(boot_id, RANGE_KPA, frames(first, rows, period_ns=period_ns), columns)
 
 
-def taken(
-    subscriber: Subscriber, ages_ms: Mapping[str, float] | None = None
-) -> list[dict[str, Any]]:
+def taken(summary: Summary, ages_ms: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
     def refuse(constant: str) -> None:
         pytest.fail(f"{constant} is no JSON")
 
-    texts = subscriber.take(ages_ms or {}, Encoder())
+    texts = summary.take().texts(ages_ms or {})
     return [json.loads(text, parse_constant=refuse) for text in texts]
 
 
@@ -102,14 +95,12 @@ def extremes(values: np.ndarray, digits: int) -> tuple[list[float | None], list[
 def test_minimum_and_maximum_of_all_that_was_skipped_go_with_the_newest(
     sizes: list[int], silent: float
 ) -> None:
-    node, subscriber = fake_node(), Subscriber()
+    summary = Summary()
     for a, b in pairwise(accumulate(sizes, initial=0)):
-        subscriber.add(
-            node, sum_up(RANGE_KPA, frames(a, b - a), estimates(a, b - a, silent=silent))
-        )
+        summary.add("bench", piece(a, b - a, silent=silent))
     total = sum(sizes)
     columns = estimates(0, total, silent=silent)
-    (message,) = taken(subscriber)
+    (message,) = taken(summary)
     assert (message["type"], message["node"]) == ("frame", "bench")
     assert (message["seq"], message["n"]) == (total - 1, total)
     assert message["t_ns"] == 10**18 + (total - 1) * PERIOD_NS
@@ -122,7 +113,7 @@ def test_minimum_and_maximum_of_all_that_was_skipped_go_with_the_newest(
     newest = [None if np.isnan(v) else round(v, 4) for v in columns["force_n"][-1].tolist()]
     assert message["force_n"] == newest
     assert message["estimate_status"] == total - 1
-    assert taken(subscriber) == []
+    assert taken(summary) == []
 
 
 @given(st.lists(st.integers(1, 9), min_size=3, max_size=3))
@@ -161,7 +152,7 @@ def test_every_number_is_in_a_message_or_reported_as_dropped(
     runs: list[tuple[int, int]], takes: set[int], period_ns: int
 ) -> None:
     """Runs of lost frames and frames; a client that takes now and then."""
-    node, subscriber, seq = fake_node(), Subscriber(), 0
+    summary, seq = Summary(), 0
     begin: int | None = None
     messages: list[dict[str, Any]] = []
     sent, lost = set[int](), set[int]()
@@ -169,12 +160,12 @@ def test_every_number_is_in_a_message_or_reported_as_dropped(
         lost |= set(range(seq, seq + gap)) if begin is not None else set()
         seq += gap
         begin = seq if begin is None else begin
-        subscriber.add(node, piece(seq, rows, period_ns=period_ns))
+        summary.add("bench", piece(seq, rows, period_ns=period_ns))
         sent |= set(range(seq, seq + rows))
         seq += rows
         if at in takes:
-            messages += taken(subscriber)
-    messages += taken(subscriber)
+            messages += taken(summary)
+    messages += taken(summary)
     told = sum(message["n"] for message in of_type(messages, "frame"))
     dropped = [
         n for m in of_type(messages, "dropped") for n in range(m["from_seq"], m["to_seq"] + 1)
@@ -189,16 +180,16 @@ def test_every_number_is_in_a_message_or_reported_as_dropped(
 
 
 def test_the_first_piece_says_nothing_of_what_was_before() -> None:
-    subscriber = Subscriber()
-    subscriber.add(fake_node(), piece(1000, 10))
-    assert [m["type"] for m in taken(subscriber)] == ["frame"]
+    summary = Summary()
+    summary.add("bench", piece(1000, 10))
+    assert [m["type"] for m in taken(summary)] == ["frame"]
 
 
 def test_a_summary_is_of_a_second_at_most_and_older_frames_are_dropped() -> None:
-    node, subscriber = fake_node(), Subscriber()
+    summary = Summary()
     for first in range(0, 2000, 10):  # 4 s
-        subscriber.add(node, piece(first, 10))
-    messages = taken(subscriber)
+        summary.add("bench", piece(first, 10))
+    messages = taken(summary)
     (frame,), (dropped,) = of_type(messages, "frame"), of_type(messages, "dropped")
     assert frame["n"] <= SUMMARY_NS // PERIOD_NS + 10
     assert (dropped["node"], dropped["from_seq"]) == ("bench", 0)
@@ -207,23 +198,23 @@ def test_a_summary_is_of_a_second_at_most_and_older_frames_are_dropped() -> None
 
 
 def test_a_summary_is_of_a_second_at_most_although_frames_come_slower_than_they_should() -> None:
-    node, subscriber, period_ns = fake_node(), Subscriber(), 10 * PERIOD_NS
+    summary, period_ns = Summary(), 10 * PERIOD_NS
     for first in range(0, 400, 5):  # 8 s
-        subscriber.add(node, piece(first, 5, period_ns=period_ns))
-    (frame,) = of_type(taken(subscriber), "frame")
+        summary.add("bench", piece(first, 5, period_ns=period_ns))
+    (frame,) = of_type(taken(summary), "frame")
     assert (frame["n"] - 1) * period_ns <= SUMMARY_NS + 5 * period_ns
 
 
 @pytest.mark.parametrize("frames_sent", [1000, 20_000])
 def test_a_client_that_never_takes_stays_bounded(frames_sent: int) -> None:
     """Of three frames two are lost, and there are notices: what is kept does not grow with time."""
-    node, subscriber, period_ns = fake_node(), Subscriber(), 10_000_000
+    summary, period_ns = Summary(), 10_000_000
     one = vars(piece(0, 1))
     for at in range(0, 3 * frames_sent, 3):
         t_ns = at * period_ns
-        subscriber.add(node, Piece(**one | {"seq_first": at, "seq_last": at, "t_ns": t_ns}))
-        subscriber.notice('{"type":"node"}')
-    messages = taken(subscriber)
+        summary.add("bench", Piece(**one | {"seq_first": at, "seq_last": at, "t_ns": t_ns}))
+        summary.notice('{"type":"node"}')
+    messages = taken(summary)
     assert len(of_type(messages, "node")) == 256
     assert len(of_type(messages, "frame")) == 1
     # One interval for what was dropped, and the gaps of the present summary.
@@ -231,22 +222,21 @@ def test_a_client_that_never_takes_stays_bounded(frames_sent: int) -> None:
 
 
 def test_a_node_that_begins_anew_has_lost_nothing_by_that() -> None:
-    subscriber = Subscriber()
-    subscriber.add(fake_node(), piece(100, 10))
-    taken(subscriber)
-    again = fake_node(boot_id="1" * 32)
-    subscriber.add(again, piece(0, 5))
-    subscriber.add(again, piece(7, 5))
-    messages = taken(subscriber)
+    summary = Summary()
+    summary.add("bench", piece(100, 10))
+    taken(summary)
+    summary.add("bench", piece(0, 5, boot_id="1" * 32))
+    summary.add("bench", piece(7, 5, boot_id="1" * 32))
+    messages = taken(summary)
     assert [(m["from_seq"], m["to_seq"]) for m in of_type(messages, "dropped")] == [(5, 6)]
     assert [(m["seq"], m["n"]) for m in of_type(messages, "frame")] == [(11, 10)]
 
 
 def test_frames_of_before_a_restart_that_were_not_told_are_dropped() -> None:
-    subscriber = Subscriber()
-    subscriber.add(fake_node(), piece(100, 10))
-    subscriber.add(fake_node(boot_id="1" * 32), piece(0, 5))
-    messages = taken(subscriber)
+    summary = Summary()
+    summary.add("bench", piece(100, 10))
+    summary.add("bench", piece(0, 5, boot_id="1" * 32))
+    messages = taken(summary)
     assert [(m["seq"], m["n"]) for m in of_type(messages, "frame")] == [(4, 5)]
     assert [(m["from_seq"], m["to_seq"]) for m in of_type(messages, "dropped")] == [(100, 109)]
 
@@ -254,12 +244,11 @@ def test_frames_of_before_a_restart_that_were_not_told_are_dropped() -> None:
 # --- who is told what -----------------------------------------------------------------------------
 
 
-def test_nodes_do_not_mix_and_a_client_may_look_at_one_only() -> None:
-    everything, only = Subscriber(), Subscriber("right")
+def test_nodes_do_not_mix_and_one_may_look_at_one_only() -> None:
+    everything, only = Summary(), Summary("right")
     for name, first in (("left", 0), ("right", 50), ("left", 10), ("right", 60)):
-        node = fake_node(name)
-        for subscriber in (everything, only):
-            subscriber.add(node, piece(first, 10))
+        for summary in (everything, only):
+            summary.add(name, piece(first, 10))
     assert [(m["node"], m["seq"], m["n"]) for m in taken(everything)] == [
         ("left", 19, 20),
         ("right", 69, 20),
@@ -267,94 +256,94 @@ def test_nodes_do_not_mix_and_a_client_may_look_at_one_only() -> None:
     assert [(m["node"], m["seq"]) for m in taken(only)] == [("right", 69)]
 
 
-def test_there_is_news_until_it_is_taken() -> None:
-    subscriber = Subscriber("left")
-    assert not subscriber.news.is_set()
-    subscriber.add(fake_node("right"), piece(0, 1))
-    assert not subscriber.news.is_set()
-    subscriber.add(fake_node("left"), piece(0, 1))
-    assert subscriber.news.is_set()
-    taken(subscriber)
-    assert not subscriber.news.is_set()
-    subscriber.answer({"type": "answer"})
-    assert subscriber.news.is_set()
-    assert taken(subscriber) == [{"type": "answer"}]
+def test_there_is_something_to_tell_until_it_is_taken() -> None:
+    summary = Summary("left")
+    assert not summary
+    summary.add("right", piece(0, 1))
+    summary.count("right", {"session": {"frames": 1}})
+    assert not summary
+    changes: list[Callable[[], None]] = [
+        lambda: summary.add("left", piece(0, 1)),
+        lambda: summary.count("left", {"session": {"frames": 1}}),
+        lambda: summary.notice('{"type":"notice"}'),
+    ]
+    for change in changes:
+        change()
+        assert summary
+        assert len(taken(summary)) == 1
+        assert not summary
 
 
 def test_notices_come_first_in_their_order_and_the_oldest_are_forgotten() -> None:
-    subscriber = Subscriber()
-    subscriber.add(fake_node(), piece(0, 1))
+    summary = Summary()
+    summary.add("bench", piece(0, 1))
     for n in range(1000):
-        subscriber.answer({"type": "notice", "n": n})
-    messages = taken(subscriber)
+        summary.notice(json.dumps({"type": "notice", "n": n}))
+    messages = taken(summary)
     assert messages[-1]["type"] == "frame"
     assert [m["n"] for m in messages[:-1]] == list(range(1000 - len(messages) + 1, 1000))
     assert len(messages) > 100
 
 
-def test_clients_that_are_told_the_same_share_one_text() -> None:
-    hub, node = Hub(), fake_node()
-    one, two = hub.join(), hub.join()
-    hub.publish(node, [(frames(0, 10), estimates(0, 10)), (frames(10, 5), estimates(10, 5))])
-    (first,), (second,) = (s.take({"bench": 3.2}, hub.encoder) for s in (one, two))
-    assert first is second
-    assert json.loads(first)["n"] == 15
-    assert node.shown_t_ns == 10**18 + 14 * PERIOD_NS
-
-
-def test_clients_that_are_told_different_things_have_texts_of_their_own() -> None:
-    hub, node = Hub(), fake_node()
-    slow, quick = hub.join(), hub.join()
-    hub.publish(node, [(frames(0, 10), estimates(0, 10))])
-    quick.take({}, hub.encoder)
-    hub.publish(node, [(frames(10, 10), estimates(10, 10))])
-    ((behind,), (level,)) = (s.take({}, hub.encoder) for s in (slow, quick))
-    assert [json.loads(text)["n"] for text in (behind, level)] == [20, 10]
-    assert json.loads(behind)["seq"] == json.loads(level)["seq"] == 19
-
-
-def test_a_text_of_before_a_restart_is_not_given_again() -> None:
-    encoder = Encoder()
-    before = sum_up(RANGE_KPA, frames(0, 5), estimates(0, 5))
-    after = sum_up(RANGE_KPA, frames(0, 5, period_ns=2 * PERIOD_NS), estimates(100, 5))
-    told = [json.loads(encoder.encode("bench", one, None)) for one in (before, after)]
-    assert told[0]["t_ns"] == before.t_ns
-    assert told[1]["t_ns"] == after.t_ns
-    assert told[0]["force_n"] != told[1]["force_n"]
+def test_a_session_is_not_told_as_smaller_after_it_is_told_as_sealed() -> None:
+    summary = Summary()
+    summary.count("bench", {"session": {"frames": 10}})
+    summary.notice('{"type":"session"}')
+    assert [m["type"] for m in taken(summary)] == ["counted", "session"]
 
 
 @pytest.mark.parametrize(("age_ms", "told"), [(None, None), (0.0, 0.0), (12.34, 12.3)])
-@pytest.mark.parametrize("before", [None, 0.0, 500.0])
-def test_the_age_goes_with_it_if_it_is_known(
-    age_ms: float | None, told: float | None, before: float | None
+def test_the_age_goes_with_it_if_it_is_known(age_ms: float | None, told: float | None) -> None:
+    summary = Summary()
+    summary.add("bench", piece(0, 5))
+    (message,) = taken(summary, {} if age_ms is None else {"bench": age_ms})
+    assert message["age_ms"] == told
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    runs=st.lists(st.tuples(st.integers(0, 3), st.integers(1, 30)), min_size=1, max_size=25),
+    ticks=st.sets(st.integers(0, 24)),
+    period_ns=st.sampled_from([PERIOD_NS, SUMMARY_NS // 40]),
+)
+def test_what_was_taken_and_not_told_is_told_later_as_if_it_had_not_been_taken(
+    runs: list[tuple[int, int]], ticks: set[int], period_ns: int
 ) -> None:
-    encoder, one = Encoder(), piece(0, 5)
-    encoder.encode("bench", one, before)
-    assert json.loads(encoder.encode("bench", one, age_ms))["age_ms"] == told
+    """One is told now and then; for the other what was taken at each tick is put together again."""
+    told_once, feed, missed, seq = Summary(), Summary(), Summary(), 0
+    for at, (gap, rows) in enumerate(runs):
+        seq += gap if at else 0
+        for summary in (told_once, feed):
+            summary.add("bench", piece(seq, rows, period_ns=period_ns))
+            summary.notice(json.dumps({"type": "notice", "n": at}))
+            summary.count("bench", {"session": {"frames": seq}})
+        seq += rows
+        if at in ticks:
+            missed.join(feed.take())
+    missed.join(feed.take())
+    once, again = taken(told_once), taken(missed)
+    assert set(numbers(once)) == set(numbers(again))
+    if period_ns == PERIOD_NS and seq < SUMMARY_NS // PERIOD_NS:
+        assert once == again  # within a second, so nothing is dropped
 
 
-def test_only_who_has_joined_is_told_and_nobody_after_leaving() -> None:
-    hub, node = Hub(), fake_node()
-    hub.notice({"type": "early"})
-    one, two = hub.join(), hub.join(only="other")
-    assert hub.subscribers == 2
-    hub.publish(node, [(frames(0, 5), {})])
-    hub.notice({"type": "late"})
-    hub.leave(one)
-    hub.leave(one)
-    hub.publish(node, [(frames(5, 5), {})])
-    assert hub.subscribers == 1
-    assert [(m["type"], m.get("n")) for m in taken(one)] == [("late", None), ("frame", 5)]
-    assert [m["type"] for m in taken(two)] == ["late"]
+def numbers(messages: Sequence[dict[str, Any]]) -> list[int]:
+    """All that are told or reported as dropped."""
+    found: list[int] = []
+    for message in of_type(messages, "frame"):
+        found += range(message["seq"] - message["n"] + 1, message["seq"] + 1)
+    for message in of_type(messages, "dropped"):
+        found += range(message["from_seq"], message["to_seq"] + 1)
+    return found
 
 
 # --- what is not known ----------------------------------------------------------------------------
 
 
 def test_without_estimates_everything_estimated_is_null() -> None:
-    subscriber = Subscriber()
-    subscriber.add(fake_node(), sum_up(RANGE_KPA, frames(0, 5), {}))
-    (message,) = taken(subscriber)
+    summary = Summary()
+    summary.add("bench", sum_up("0" * 32, RANGE_KPA, frames(0, 5), {}))
+    (message,) = taken(summary)
     for name in ("gauge_kpa", "force_n", "force_sigma_n", "gauge_min_kpa", "force_max_n"):
         assert message[name] == [None, None], name
     for name in ("grf_n", "grf_min_n", "grf_max_n", "cop_x_m", "angle_rad", "contact", "age_ms"):
@@ -372,12 +361,12 @@ def test_contact_and_saturation_are_those_of_the_newest_frame() -> None:
         "gauge_kpa": np.array([[50.0, 50.0], [10.0, 10.1]]),
         "contact": np.array([UNKNOWN, 1], dtype=np.uint8),
     }
-    newest = sum_up(high_kpa, frames(0, 2), columns).newest
+    newest = sum_up("0" * 32, high_kpa, frames(0, 2), columns).newest
     assert newest["saturated"] == [False, True]
     assert newest["contact"] is True
-    assert sum_up(None, frames(0, 2), columns).newest["saturated"] == [False, False]
+    assert sum_up("0" * 32, None, frames(0, 2), columns).newest["saturated"] == [False, False]
     for value, told in ((0, False), (UNKNOWN, None)):
         columns["contact"][-1] = value
-        assert sum_up(high_kpa, frames(0, 2), columns).newest["contact"] is told
+        assert sum_up("0" * 32, high_kpa, frames(0, 2), columns).newest["contact"] is told
     columns["gauge_kpa"][-1] = np.nan
-    assert sum_up(high_kpa, frames(0, 2), columns).newest["saturated"] == [False, False]
+    assert sum_up("0" * 32, high_kpa, frames(0, 2), columns).newest["saturated"] == [False, False]

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import time
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from devices.errors import StorageError
 from devices.frames import TileStatus
+from storage.checked_json import read_checked, write_checked
 from storage.intervals import Intervals
-from storage.journal import in_flight, node_journal, retention
+from storage.journal import in_flight, node_journal, node_stream, retention
 from storage.journal.journal import Journal
 from storage.journal.node_journal import NodeJournal
 from storage.journal.node_stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from tests.builders.arrays import make_array
-from tests.storage.faulty_disk import before_each_sync_of_frames
+from tests.storage.faulty_disk import before_each_sync_of_frames, refusing
 from tests.storage.journal.node.leg import Start, fill, killed, store
 from tests.storage.stream import frames, take_in_flight
 from tests.waiting import until
@@ -121,6 +124,56 @@ def test_what_acquisition_had_taken_when_it_was_killed_is_taken_over(
     assert journal.settle()
     assert stream.stored == Intervals([(0, 99)])
     assert (stream.next_seq, stream.lost.as_pairs()) == (100, {})
+
+
+def test_frames_in_flight_that_cannot_be_read_are_set_aside_and_bounded_while_the_node_lives_on(
+    journal: NodeJournal, stream: NodeStream
+) -> None:
+    fill(journal, stream, 0, 89)
+    take_in_flight(stream.folder, frames(0, 99))
+    path = stream.folder / in_flight.IN_FLIGHT_FILE
+    damaged = b"X" + path.read_bytes()[1:]
+    path.write_bytes(damaged)
+    stream.end()
+    assert journal.settle()
+    notes = StreamNotes.load(stream.folder)
+    assert notes is not None
+    assert (notes.next_seq, notes.unsynced_tail_max) == (90, 0.5 * 500 + 17)
+    assert path.with_name("in_flight.damaged-1").read_bytes() == damaged
+    assert "in_flight.damaged-1" in " ".join(journal.problems)
+
+
+def test_frames_in_flight_that_cannot_be_read_now_are_waited_for(
+    journal: NodeJournal, stream: NodeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(journal, stream, 0, 89)
+    take_in_flight(stream.folder, frames(0, 99))
+    with monkeypatch.context() as patched:
+        refuse = refusing(StorageError, "cannot be read: Too many open files")
+        patched.setattr(node_stream, "read_in_flight", refuse)
+        stream.end()
+        assert not journal.settle(0.2)
+    assert journal.settle()
+    assert stream.stored == Intervals([(0, 99)])
+
+
+def test_notes_of_a_later_version_stay_and_their_stream_is_left_out(
+    start: Start, tmp_path: Path
+) -> None:
+    journal = start()
+    fill(journal, journal.begin(make_array()), 0, 99)
+    journal.close()
+    path = tmp_path / "journal" / "leg" / ("0" * 32) / "stream.json"
+    said = json.loads(read_checked(path).text) | {"clock_steps": 3}
+    write_checked(path, json.dumps(said).encode())
+    before = path.read_bytes()
+    again = start()
+    assert again.streams == []
+    assert "another version wrote it" in again.problems[0]
+    assert "Update foottile" in again.problems[0]
+    again.close()
+    assert [each.name for each in path.parent.glob("stream.json*")] == ["stream.json"]
+    assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize("damaged", [0, 1, 2])

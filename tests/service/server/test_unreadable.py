@@ -1,0 +1,194 @@
+"""What cannot be read now, however whole it is, is neither set aside nor written over."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from devices.errors import StorageError
+from service.api.serve import token_for
+from service.offline.calibrations import read_calibration, write_calibration
+from service.server.data_folder import DataFolder
+from service.server.nodes import ServerNodes
+from service.server.server import Server
+from service.sessions.tares import TareHistory
+from storage import durable
+from storage.journal.in_flight import IN_FLIGHT_FILE, InFlight
+from storage.journal.node_journal import NodeJournal
+from storage.journal.stream_notes import StreamNotes
+from storage.journal.wanted import ServerWants, Wanted
+from tests.builders.arrays import make_array
+from tests.builders.calibrations import make_calibration, make_tare
+from tests.service.fake_node import FakeNode
+from tests.service.running import Running
+
+INFO = make_array()
+NEEDED = ServerWants(streams={"a": ((0, 9),)})
+
+
+@contextmanager
+def unreadable(monkeypatch: pytest.MonkeyPatch, number: int) -> Iterator[None]:
+    """No file of ours can be opened to be read: descriptors or memory are used up, or another's."""
+
+    def refuse(*_: object) -> int:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(durable, "_without_following", refuse)
+        yield
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def _tares(folder: Path) -> None:
+    TareHistory(folder / "tares.json").add(make_tare(2), INFO)
+
+
+def _wanted(folder: Path) -> None:
+    wanted = Wanted(folder / "wanted.json")
+    wanted.say("other", NEEDED)
+    wanted.save()
+
+
+def _server_id(folder: Path) -> None:
+    DataFolder(folder).close()
+
+
+def _token(folder: Path) -> None:
+    token_for("0.0.0.0", None, folder)  # noqa: S104  # not listened on
+
+
+def _calibration(folder: Path) -> None:
+    path = folder / "mine.json"
+    if not path.exists():
+        write_calibration(path, make_calibration("T01"))
+    read_calibration(path)
+
+
+def _stream(folder: Path) -> None:
+    stream = folder / "journal" / "bench" / INFO.boot_id
+    if not stream.exists():
+        stream.mkdir(parents=True)
+        StreamNotes(array_info=INFO, number=1).save(stream)
+        InFlight(stream, INFO).close()
+        assert (stream / IN_FLIGHT_FILE).exists()
+    journal = NodeJournal(folder, "bench")
+    try:
+        assert journal.problems == [] or "It is left as it is" in journal.problems[0]
+        assert bool(journal.problems) is not bool(journal.streams)
+    finally:
+        journal.close()
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENOMEM, errno.EACCES, errno.ESTALE])
+@pytest.mark.parametrize("use", [_tares, _wanted, _server_id, _token, _calibration, _stream])
+def test_a_file_that_cannot_be_read_stays_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[[Path], None], number: int
+) -> None:
+    use(tmp_path)
+    before = contents(tmp_path)
+    with unreadable(monkeypatch, number):
+        if use is _stream:
+            use(tmp_path)
+        else:
+            with pytest.raises(StorageError, match="let this user read it, or try again") as caught:
+                use(tmp_path)
+            assert caught.value.errno == number
+    assert contents(tmp_path) == before
+
+
+def test_a_node_goes_on_and_writes_what_servers_need_only_once_it_was_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _wanted(tmp_path)
+    with unreadable(monkeypatch, errno.EACCES):
+        wanted = Wanted(tmp_path / "wanted.json")
+        assert wanted.may_be_all
+        assert "frames are kept" in wanted.problems[0]
+        assert wanted.say("laptop", NEEDED)
+        with pytest.raises(StorageError):
+            wanted.save()
+    wanted.save()
+    again = Wanted(tmp_path / "wanted.json")
+    assert not again.say("other", NEEDED)
+    assert not again.say("laptop", NEEDED)
+
+
+def test_tares_that_are_damaged_and_cannot_be_set_aside_are_not_written_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _tares(tmp_path)
+    path = tmp_path / "tares.json"
+    path.write_bytes(path.read_bytes()[:-1])
+    before = contents(tmp_path)
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "rename", refuse)
+        with pytest.raises(StorageError, match="Move it away by hand"):
+            TareHistory(path)
+    assert contents(tmp_path) == before
+    assert len(TareHistory(path).all) == 1
+
+
+@pytest.mark.parametrize("name", ["hello.json", "tares.json"])
+def test_a_node_whose_files_cannot_be_read_is_left_out_until_it_connects(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    running.stop()
+    folder = running.data / "nodes" / "bench"
+    before = contents(folder)
+    really = durable._without_following
+
+    def refuse(path: str, flags: int) -> int:
+        if path == str(folder / name):
+            raise OSError(errno.EACCES, "Permission denied")
+        return really(path, flags)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(durable, "_without_following", refuse)
+        found = ServerNodes(running.data)
+    assert (list(found), contents(folder)) == ([], before)
+    assert name in found.problems[0]
+    running.start()
+    tared.connect()
+    assert running.node()["tare"] is not None
+
+
+def test_a_session_that_cannot_be_read_stays_as_it_is_and_is_named(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = tared.record()
+    tared.deliver(100, 5.0)
+    tared.finish(recording)
+    running.stop()
+    before = contents(running.data / "sessions")
+    really = durable._without_following
+
+    def refuse(path: str, flags: int) -> int:
+        if path.endswith("session.json"):
+            raise OSError(errno.ENFILE, "Too many open files in system")
+        return really(path, flags)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(durable, "_without_following", refuse)
+        server = Server(running.data)
+        said = " ".join(server.sessions.problems)
+        server.folder.close()
+    assert "Too many open files" in said
+    assert contents(running.data / "sessions") == before
+    running.start()
+    assert len(running.http.get("/sessions").json()["items"]) == 1

@@ -1,0 +1,52 @@
+"""What a message has to fit between is known from the messages before, without reading a file."""
+
+from __future__ import annotations
+
+from itertools import accumulate, pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from storage.intervals import Intervals
+from storage.journal.instants import Instants
+from storage.wire import EncodedBatch
+from tests.builders.arrays import PERIOD_NS
+from tests.builders.frames import make_frames, with_columns
+
+
+@given(st.lists(st.integers(1, 4), min_size=1, max_size=12), st.randoms(use_true_random=False))
+def test_messages_of_any_size_in_any_order_are_judged_without_a_look_at_the_disk(
+    sizes: list[int], random: object
+) -> None:
+    held = Intervals()
+    instants = Instants(lambda seq, is_upper: pytest.fail(f"{seq} was looked up"))
+    spans = list(pairwise(accumulate(sizes, initial=0)))
+    random.shuffle(spans)  # type: ignore[attr-defined]
+    for begin, end in spans:
+        frames = make_frames(np.arange(begin, end))
+        before, after = held.neighbours(begin, end - 1)
+        assert instants.misplaced(frames, held) == ""
+        for neighbour, side in ((before, -1), (after, 1)):
+            if neighbour is not None:
+                leap_ns = (neighbour - begin + side * len(spans) * 5) * PERIOD_NS
+                moved = with_columns(frames, t_ns=frames.t_ns + leap_ns)
+                assert "time runs back" in instants.misplaced(moved, held)
+        held.add(begin, end - 1)
+        instants.note(EncodedBatch.of(frames, b""), held)
+
+
+def test_when_something_is_not_held_any_more_the_disk_is_asked_once() -> None:
+    asked: list[tuple[int, bool]] = []
+
+    def look_up(seq: int, is_upper: bool) -> int:
+        asked.append((seq, is_upper))
+        return int(make_frames([seq]).t_ns[0])
+
+    instants, held = Instants(look_up), Intervals([(0, 9)])
+    instants.note(EncodedBatch.of(make_frames(10), b""), held)
+    instants.forget()
+    for _ in range(3):
+        assert instants.misplaced(make_frames(np.arange(10, 12)), held) == ""
+    assert asked == [(9, True)]
