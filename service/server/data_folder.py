@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
-import re
 import uuid
-import zlib
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -16,18 +14,15 @@ from storage.durable import (
     locked,
     make_folder,
     put_aside,
-    read_whole,
     set_aside,
     storage_errors,
     write_whole,
 )
+from storage.server_id import SERVER_ID_NAME, read_server_id, write_server_id
 
 log = logging.getLogger("foottile.server")
 
-_ID_NAME = "server_id"
 _PROBE_NAME = ".writable"
-_ID = re.compile(r"([0-9a-f]{32})(?: ([0-9a-f]{8}))?")
-"""The id and its CRC-32, which older versions did not write."""
 _PROBE_BYTES = 64 << 10
 _COMES_BACK = (
     "Move it back or mount it: the server then goes on by itself, and nodes send again what is "
@@ -134,8 +129,8 @@ class DataFolder:
 
     def _id_there(self) -> str | None:
         """The id of what is in its place; None if it has none."""
-        with suppress(DamagedFileError):
-            return self._kept_id()[0]
+        with suppress(DamagedFileError, FileNotFoundError):
+            return read_server_id(self.path / SERVER_ID_NAME).id
         return None
 
     def _locked(self) -> ExitStack:
@@ -155,36 +150,17 @@ class DataFolder:
         Raises:
             StorageError: it cannot be read or written now; nobody is given a new name for that.
         """
+        path = self.path / SERVER_ID_NAME
         try:
-            kept, is_proven = self._kept_id()
+            kept = read_server_id(path)
+        except FileNotFoundError:
+            return None
         except DamagedFileError as error:
-            problem = put_aside(self.path / _ID_NAME, error)
-            self.problems.append(f"{problem}; nodes get to know this server anew")
+            self.problems.append(f"{put_aside(path, error)}; nodes get to know this server anew")
             log.warning("%s", self.problems[-1])
             return None
-        return kept if kept is None or is_proven else self._new_id(kept)
-
-    def _kept_id(self) -> tuple[str | None, bool]:
-        """The id, and whether it proves itself.
-
-        Raises:
-            DamagedFileError: it is not what was written.
-            StorageError: it cannot be read now.
-        """
-        path = self.path / _ID_NAME
-        try:
-            text = read_whole(path).decode("ascii", "replace").strip()
-        except FileNotFoundError:
-            return None, False
-        found = _ID.fullmatch(text)
-        if found is None or found[2] not in (None, _check_of(found[1])):
-            raise DamagedFileError("it is not the id that was written", where=str(path))
-        return found[1], found[2] is not None
+        return kept.id if kept.is_proven else self._new_id(kept.id)
 
     def _new_id(self, made: str) -> str:
-        write_whole(self.path / _ID_NAME, f"{made} {_check_of(made)}\n".encode())
+        write_server_id(self.path / SERVER_ID_NAME, made)
         return made
-
-
-def _check_of(made: str) -> str:
-    return f"{zlib.crc32(made.encode()):08x}"

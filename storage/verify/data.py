@@ -149,12 +149,18 @@ def verify_folder(path: Path) -> FolderReport:
 def _folders(
     data: Path, places: str, form: re.Pattern[str], report: FolderReport
 ) -> Iterator[Path]:
-    """Folders with a name of this form; what has such a name and is none is a problem."""
+    """Folders with a name of this form; what has such a name and is none is a problem.
+
+    A link that a person put in the place of all sessions, or all journals, is followed.
+    """
     for path in sorted(data.glob(f"{places}/*")):
         if ASIDE in path.name or not form.fullmatch(path.name):
             continue
         with _told(report, path, data):
-            if path.is_dir():
+            if path.is_symlink() or (path.parent.is_symlink() and path.parent.parent != data):
+                what = "it is a link, or in one, which is not followed"
+                report.problems.append(f"{path.relative_to(data)}: {what}")
+            elif path.is_dir():
                 yield path
             else:
                 report.problems.append(f"{path.relative_to(data)}: it is not a folder")

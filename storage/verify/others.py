@@ -1,18 +1,20 @@
 """Proves what lies in a data folder beside sessions and journals, file by file.
 
-Whatever it is called: a JSON file of ours has its own hash (`storage.checked_json`), and what has
-`.damaged-N` behind its name was set aside and counts no more.
+Whatever it is called, a JSON file of ours has its own hash (`storage.checked_json`), `server_id` a
+CRC-32. What has `.damaged-N` behind its name was set aside and counts no more.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from devices.errors import DamagedFileError, StorageError
-from storage.checked_json import read_checked
+from storage.checked_json import Checked, read_checked
 from storage.durable import ASIDE
+from storage.server_id import SERVER_ID_NAME, ServerId, read_server_id
 
 
 @dataclass
@@ -31,7 +33,9 @@ class Others:
 
 
 def verify_others(data: Path, proven: set[Path]) -> Others:
-    """Look at every file of a data folder but those below folders that are proven elsewhere.
+    """Prove every JSON file of a data folder but those in folders that are proven elsewhere.
+
+    And `server_id`. Token, locks and whatever else lies there have nothing that proves them.
 
     Args:
         data: the data folder.
@@ -50,6 +54,8 @@ def verify_others(data: Path, proven: set[Path]) -> Others:
             path = here / name
             if ASIDE in name:
                 found.set_aside.append(_name(path, data))
+            elif path == data / SERVER_ID_NAME:
+                _check(path, name, read_server_id, found)
             elif name.endswith(".json") and not name.startswith(".") and not is_proven:
                 check_json(path, _name(path, data), found)
         # A folder that was set aside, or that has the name of a file, is not looked into.
@@ -61,8 +67,14 @@ def verify_others(data: Path, proven: set[Path]) -> Others:
 
 def check_json(path: Path, name: str, found: Others) -> None:
     """Prove one JSON file, and note under this name what is wrong with it."""
+    _check(path, name, read_checked, found)
+
+
+def _check(
+    path: Path, name: str, read: Callable[[Path], Checked | ServerId], found: Others
+) -> None:
     try:
-        if not read_checked(path).is_proven:
+        if not read(path).is_proven:
             found.unproven.append(f"{name}: it states no hash of itself")
     except FileNotFoundError:
         return  # replaced or deleted meanwhile

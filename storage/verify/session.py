@@ -271,7 +271,7 @@ def _count(report: SessionReport, data: Path, session: Session, streams: Streams
     reports: dict[str, StreamReport] = {}
     for part in session.parts:
         folder = data / "journal" / session.node / part.boot_id
-        if part.boot_id not in reports and folder.is_dir():
+        if part.boot_id not in reports and folder.is_dir() and not folder.is_symlink():
             reports[part.boot_id] = found = streams(folder)
             report.problems += [f"journal {part.boot_id}: {problem}" for problem in found.problems]
         reports.setdefault(part.boot_id, StreamReport(session.node, part.boot_id))

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from storage.journal.segment import SUFFIX
+from storage.journal.segment_format import INDEX_SUFFIX
 from storage.verify.data import FolderReport, Report, verify
 from tests.hostile.attack import Outcome, Play, attack
 from tests.hostile.folders import (
@@ -141,7 +143,9 @@ def _try(
     try:
         report = verify(copy)
         said, unproven = _said(report), "\n".join(report.as_dict().get("unproven", ()))
-        is_named, is_unproven = name.name in said or name.stem in said, name.name in unproven
+        # Of a segment and its index either may be named.
+        named = name.stem if name.suffix in (SUFFIX, INDEX_SUFFIX) else name.name
+        is_named, is_unproven = named in said, name.name in unproven
         after = root.read(copy, str(name))
     except Exception as error:  # whatever it is, it must not
         outcome.failed(f"{where}: {type(error).__name__}: {error}")
@@ -153,8 +157,8 @@ def _try(
     if silent and is_unproven:
         outcome.saw("called unproven by verify, and read")
     elif silent:
-        named = "named by verify" if is_named else "unnoticed"
-        outcome.failed(f"{where}: {named}, and other numbers in {', '.join(silent)}")
+        noticed = "named by verify" if is_named else "unnoticed"
+        outcome.failed(f"{where}: {noticed}, and other numbers in {', '.join(silent)}")
     elif changed and not is_named:
         outcome.failed(f"{where}: verify does not name it, and refused are {changed}")
     elif changed:

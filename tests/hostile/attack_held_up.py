@@ -8,12 +8,11 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 from tests.builders.scenes import ONE_TILE_FILE
 from tests.hostile.attack import Outcome, Play, attack
-from tests.service.process import Process
+from tests.service.process import Process, acquisition_of
 from tests.service.running import Running
 
 _SOAK_TRIES = 12
@@ -55,13 +54,13 @@ def held_up(play: Play) -> Outcome:
         for _ in range(play.tries):
             stopped_s = play.random.choice([0.3, 3.0, 12.0, 60.0]) if is_soak else _SAID_S
             before = running.node("leg")
-            pid = _acquisition_of(node)
+            pid = acquisition_of(node)
             os.kill(pid, signal.SIGSTOP)
             time.sleep(stopped_s)
             during = running.node("leg")
             os.kill(pid, signal.SIGCONT)
             begun_s = time.monotonic()
-            went_on = _grows(running, before["last_seq"] + 20)
+            went_on = _grows(running, during["last_seq"] + 20)
             longest_s = max(longest_s, time.monotonic() - begun_s)
             after = running.node("leg")
             said = stopped_s < _SAID_S or any("held up" in text for text in during["troubles"])
@@ -87,13 +86,3 @@ def _grows(running: Running, beyond: int) -> bool:
             return True
         time.sleep(0.05)
     return False
-
-
-def _acquisition_of(node: Process) -> int:
-    text = Path(f"/proc/{node.pid}/task/{node.pid}/children").read_text()
-    (found,) = (
-        pid
-        for pid in map(int, text.split())
-        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    )
-    return found

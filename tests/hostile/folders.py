@@ -18,6 +18,7 @@ from service.sessions.tares import TareHistory
 from storage.checked_json import write_checked
 from storage.clock.log import ClockLog, ClockOffset
 from storage.journal.wanted import ServerWants, Wanted
+from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import FRAMES_NAME, Event, Part, SessionFolder
@@ -50,7 +51,7 @@ def make_server(data: Path) -> None:
         calibration_problem=None,
     )
     write_checked(node / "hello.json", hello.model_dump_json().encode())
-    (data / "server_id").write_text("5" * 32 + "\n")
+    write_server_id(data / SERVER_ID_NAME, "5" * 32)
     (data / "token").write_text("a token that nobody has\n")
     folder = _journal(data, info)
     log = ClockLog(folder)

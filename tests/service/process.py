@@ -89,3 +89,14 @@ class Process:
     def _read(self, stream: Any, lines: list[str]) -> None:
         with contextlib.suppress(ValueError):  # closed
             lines.extend(line.rstrip("\n") for line in iter(stream.readline, ""))
+
+
+def acquisition_of(node: Process) -> int:
+    """Id of the process that takes a node's frames."""
+    text = Path(f"/proc/{node.pid}/task/{node.pid}/children").read_text()
+    (found,) = (
+        pid
+        for pid in map(int, text.split())
+        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    )
+    return found

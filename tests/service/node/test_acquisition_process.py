@@ -17,7 +17,7 @@ from devices.errors import FootTileError
 from devices.scene.file import load_scene
 from service.rig.rig import RigOptions
 from tests.builders.scenes import ONE_TILE_FILE
-from tests.service.process import Process, Start
+from tests.service.process import Process, Start, acquisition_of
 from tests.service.running import Running
 from tests.waiting import until
 
@@ -33,15 +33,6 @@ def process(running: Running, foottile: Start, tmp_path: Path) -> Process:
     started.said("connected to")
     until(lambda: (running.node("leg")["last_seq"] or 0) > 100, 30.0)
     return started
-
-
-def acquisition_of(process: Process) -> int:
-    """The process that takes the frames."""
-    text = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text()
-    for pid in map(int, text.split()):
-        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
-            return pid
-    raise AssertionError(f"{process.pid} has no acquisition")
 
 
 def test_acquisition_that_is_held_up_is_said_everywhere_and_goes_on_in_the_same_stream(

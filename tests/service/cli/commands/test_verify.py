@@ -19,6 +19,7 @@ import pytest
 from storage.checked_json import write_checked
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
+from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.file import SessionReader, SessionWriter
 from storage.sessions.folder import Part, Session, SessionFolder
 from tests.builders.arrays import UTC_NS, make_array
@@ -250,6 +251,21 @@ def test_every_other_file_of_a_data_folder_is_looked_at(run: Run, data: Path) ->
     assert (found.code, "damaged: nodes/bench/tares.json" in found.out) == (1, True)
 
 
+def test_a_server_id_is_held_against_its_checksum(run: Run, data: Path) -> None:
+    run("recover", data)
+    path = data / SERVER_ID_NAME
+    for at in range(41):
+        write_server_id(path, "5" * 32)
+        content = bytearray(path.read_bytes())
+        content[at] ^= 1
+        path.write_bytes(content)
+        found = run("verify", data)
+        assert (found.code, f"damaged: {SERVER_ID_NAME}" in found.out) == (1, True), at
+    path.write_text("5" * 32 + "\n")  # as older versions wrote it
+    found = run("verify", data)
+    assert (found.code, f"not proven: {SERVER_ID_NAME}" in found.err) == (0, True)
+
+
 def _a_folder(path: Path) -> None:
     path.mkdir()
 
@@ -279,13 +295,16 @@ def test_verify_names_whatever_stands_in_the_place_of_a_file(
     run("recover", data)
     (data / "nodes" / "bench").mkdir(parents=True)
     write_checked(data / "nodes" / "bench" / "hello.json", b'{"older": 1}')
+    write_server_id(data / SERVER_ID_NAME, "5" * 32)
     paths = [path for path in data.rglob("*") if path.is_file() and path.name != ".lock"]
-    assert len(paths) == 8
+    assert len(paths) == 9
     for path in paths:
         aside = path.rename(data.parent / "aside")
         replaced_by(path)
         found = run("verify", data)
-        assert path.name in found.out or path.stem in found.out, path
+        # Of a segment and its index either may be named.
+        named = path.stem if path.suffix in (".arrows", ".idx") else path.name
+        assert named in found.out, path
         # An index that is lost with the power is no damage: what it lacks was never promised.
         assert (found.code == 1) is not (path.suffix == ".idx" and replaced_by is _nothing_in_it)
         if path.is_dir() and not path.is_symlink():
@@ -305,6 +324,18 @@ def test_verify_goes_on_behind_a_folder_that_is_none(run: Run, data: Path) -> No
     found = json.loads(run("verify", data, "--json").out)
     assert [one["id"] for one in found["sessions"]] == [OTHER_ID]
     assert len(found["problems"]) == 2
+
+
+@pytest.mark.parametrize("place", [f"sessions/{ID}", f"journal/bench/{BOOT}", "journal/bench"])
+def test_verify_does_not_follow_a_link_in_the_place_of_a_folder(
+    run: Run, data: Path, place: str
+) -> None:
+    elsewhere = (data / place).rename(data.parent / "elsewhere")
+    (data / place).symlink_to(elsewhere)
+    found = run("verify", data)
+    assert found.code == 1
+    assert f"damaged: {place}" in found.out
+    assert "which is not followed" in found.out
 
 
 def test_a_list_of_sessions_goes_on_behind_a_damaged_one(run: Run, data: Path) -> None:

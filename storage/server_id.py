@@ -1,0 +1,55 @@
+"""`server_id`: the name that a server gives its data folder, with a CRC-32 that proves it."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from devices.errors import DamagedFileError
+from storage.durable import read_whole, write_whole
+
+SERVER_ID_NAME = "server_id"
+_FORM = re.compile(r"([0-9a-f]{32})(?: ([0-9a-f]{8}))?")
+
+
+@dataclass(frozen=True)
+class ServerId:
+    """What the file holds."""
+
+    id: str
+    is_proven: bool
+    """False: it states no CRC-32, since an older version wrote it."""
+
+
+def read_server_id(path: Path) -> ServerId:
+    """Read it.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DamagedFileError: it is not what was written.
+        StorageError: it cannot be read now.
+    """
+    text = read_whole(path).decode("ascii", "replace").strip()
+    found = _FORM.fullmatch(text)
+    if found is None or found[2] not in (None, _check_of(found[1])):
+        raise DamagedFileError("it is not the id that was written", where=str(path))
+    return ServerId(found[1], is_proven=found[2] is not None)
+
+
+def write_server_id(path: Path, made: str) -> None:
+    """Write it, whole or not at all.
+
+    Args:
+        path: the file; one that is there is replaced.
+        made: 32 hexadecimal digits.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    write_whole(path, f"{made} {_check_of(made)}\n".encode())
+
+
+def _check_of(made: str) -> str:
+    return f"{zlib.crc32(made.encode()):08x}"
