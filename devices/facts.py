@@ -15,6 +15,8 @@ T_NS_END = 7_258_118_400_000_000_000
 """1 January 2200: no frame is taken then. The first instant is in 1970, where clocks begin."""
 T_MONO_NS_END = 2**60
 """36 years since a machine was started; sums and differences with `T_NS_END` fit 64 bits."""
+OFFSET_NS_END = T_MONO_NS_END + T_NS_END
+"""No two instants are further apart."""
 SEQ_END = 2**53
 """No stream has so many frames; below it every reader of JSON is exact, browsers too (RFC 8259)."""
 TILES_MAX = 64
@@ -55,7 +57,7 @@ TNs = Annotated[int, Field(ge=0, lt=T_NS_END)]
 """UTC in ns since 1970."""
 TMonoNs = Annotated[int, Field(gt=-T_MONO_NS_END, lt=T_MONO_NS_END)]
 """CLOCK_MONOTONIC in ns."""
-OffsetNs = Annotated[int, Field(gt=-T_MONO_NS_END - T_NS_END, lt=T_MONO_NS_END + T_NS_END)]
+OffsetNs = Annotated[int, Field(gt=-OFFSET_NS_END, lt=OFFSET_NS_END)]
 """Difference of two instants."""
 
 

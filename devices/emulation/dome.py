@@ -113,12 +113,20 @@ class Domes:
             raise ValueError(f"dome pressure at {t_s} s was asked for too late") from None
         return low + (position - index) * (high - low)
 
-    def be_ready(self, t_s: float) -> None:
-        """Compute the pressures until a moment after `t_s`; samples from there on are next."""
+    def be_ready(self, t_s: float) -> bool:
+        """Compute the pressures until a moment after `t_s`; samples from there on are next.
+
+        Returns:
+            Whether anything was lacking: then time has passed meanwhile.
+        """
         self._asked = max(self._asked, int(t_s / GRID_S))
+        needed = self._asked + _MOMENT
+        # Before the lock is asked for, which another thread holds while it computes a block ahead.
+        if needed < self._next:
+            return False
         self._leap(self._asked // _BLOCK - 1)
-        if self._asked + _MOMENT >= self._next:
-            self._extend(self._asked + _MOMENT)
+        self._extend(needed)
+        return True
 
     def foresee(self, t_s: float) -> bool:
         """Compute a block ahead, so that no sample up to `t_s` has to wait for it.

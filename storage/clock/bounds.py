@@ -194,7 +194,7 @@ class ClockMap:
         The truth is within plus or minus the bound, which is no standard deviation.
 
         Args:
-            t_mono_ns: int64[n], in any order, absolute value below 2^62.
+            t_mono_ns: int64[n], in any order, absolute value below `T_MONO_NS_END`.
         """
         begun = np.searchsorted(self._begins_ns, t_mono_ns, side="right")
         ended = np.searchsorted(self._ends_ns, t_mono_ns, side="left")
@@ -216,10 +216,17 @@ class ClockMap:
 
 def _intervals(rows: Rows) -> tuple[Float64, Float64]:
     """Lowest and highest offset at each row, relative to the first row's."""
-    offset = (rows.offset_ns - rows.offset_ns[0]).astype(np.float64)
+    offset = _since(rows.offset_ns, rows.offset_ns[0])
     # The server read its clock at some instant of the round trip; the row is about the middle.
     half = rows.uncertainty_ns.astype(np.float64) * (1 + FAST) + _READING_NS
     return offset - half, offset + half
+
+
+def _since(values: Int64, first: np.int64) -> Float64:
+    """Differences: exact, or, where they wrap in 64 bits, to a microsecond."""
+    steps = values - first
+    does_wrap = ((values ^ first) & (values ^ steps)) < 0
+    return np.where(does_wrap, values.astype(np.float64) - float(first), steps.astype(np.float64))
 
 
 def _reach(rows: Rows, limit: float) -> int:

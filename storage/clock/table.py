@@ -12,17 +12,17 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from devices.errors import FileFormatError
+from devices.facts import OFFSET_NS_END, T_MONO_NS_END, T_NS_END
 from storage.clock.bounds import ClockMap, Int64, Rows, Stretch
 from storage.clock.log import ClockOffset
 from storage.schema import NO_INSTANT, Array
 
-INSTANT_END_NS = 2**62
-"""The year 2116: a sum of an instant and an offset beyond it is nonsense."""
-UNCERTAINTY_END_NS = 2**60
-"""36 years."""
+UNCERTAINTY_END_NS = 2**59
+"""18 years; with `OFFSET_NS_END` it fits 64 bits. What comes from a node is far below."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,7 @@ class ClockTable:
         """
         t_server_ns = np.full(len(t_ns), NO_INSTANT, dtype=np.int64)
         uncertainty_ns = t_server_ns.copy()
-        sane = (np.abs(t_mono_ns >> 1) < INSTANT_END_NS >> 1) & (
-            np.abs(t_ns >> 1) < INSTANT_END_NS >> 1
-        )
+        sane = _is_within(t_mono_ns, T_MONO_NS_END) & _is_within(t_ns, T_NS_END)
         for number, boot_id in enumerate(self._parts):
             clock = self._maps.get(boot_id)
             here = np.flatnonzero(sane if part is None else sane & (part == number))
@@ -144,9 +142,8 @@ def check_rows(rows: Rows, boot_id: str, where: str) -> None:
         FileFormatError: a row is out of range.
     """
     sane = {
-        "t_mono_ns": (rows.t_mono_ns >= 0) & (rows.t_mono_ns < INSTANT_END_NS),
-        "server_minus_node_ns": (rows.offset_ns > -INSTANT_END_NS)
-        & (rows.offset_ns < INSTANT_END_NS),
+        "t_mono_ns": _is_within(rows.t_mono_ns, T_MONO_NS_END),
+        "server_minus_node_ns": _is_within(rows.offset_ns, OFFSET_NS_END),
         "uncertainty_ns": (rows.uncertainty_ns >= 0) & (rows.uncertainty_ns < UNCERTAINTY_END_NS),
     }
     for (name, good), values in zip(
@@ -156,9 +153,13 @@ def check_rows(rows: Rows, boot_id: str, where: str) -> None:
             raise FileFormatError(
                 f"a clock row of stream {boot_id} has {name} = {values[~good][0]}",
                 where=where,
-                expected="instants from 0 to 2^62 ns, offsets within that, uncertainties from 0 to "
-                "2^60 ns",
+                expected=f"t_mono_ns within {T_MONO_NS_END} ns, an offset within {OFFSET_NS_END}, "
+                f"an uncertainty from 0 to {UNCERTAINTY_END_NS}",
             )
+
+
+def _is_within(values: Int64, end: int) -> npt.NDArray[np.bool_]:
+    return (values > -end) & (values < end)
 
 
 def _stretch(stretch: Stretch, stream: StreamFacts) -> StretchSummary:

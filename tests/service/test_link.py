@@ -6,13 +6,16 @@ import json
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError, LinkError
+from devices.facts import OFFSET_NS_END, T_MONO_NS_END
 from service.link import (
     PROTOCOL,
+    UNCERTAINTY_MAX_NS,
     Ack,
     ClockRow,
     EarlierStream,
@@ -33,10 +36,13 @@ from service.link import (
     understood,
     with_check,
 )
+from storage.clock.log import ClockOffset
+from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
 from tests.builders.arrays import make_array, make_servo
 from tests.builders.calibrations import make_calibration, make_effects, newton_tile
 from tests.builders.odd_values import ODD_VALUES, places, with_value
 
+CLOCK_ENDS = (T_MONO_NS_END - 1, OFFSET_NS_END - 1, UNCERTAINTY_MAX_NS)
 ACK = Ack(boot_id="0" * 32, seq_first=100, seq_last=199)
 WANTED = Wanted(
     streams=(StreamNumbers(boot_id="a" * 32, numbers=((5, 9), (0, 3), (20, None))),), recording=True
@@ -210,3 +216,35 @@ def test_a_flipped_bit_of_frames_is_noticed_wherever_it_is(
 def test_what_is_too_short_is_damaged(message: bytes) -> None:
     with pytest.raises(FileFormatError):
         checked(message)
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(
+        st.tuples(
+            *(st.one_of(st.integers(-end, end), st.sampled_from([-end, end])) for end in CLOCK_ENDS)
+        ),
+        min_size=1,
+        max_size=4,
+        unique_by=lambda row: row[0],
+    )
+)
+def test_every_clock_row_that_is_taken_in_can_be_read_again(
+    measured: list[tuple[int, int, int]],
+) -> None:
+    rows = []
+    for t_mono_ns, offset_ns, uncertainty_ns in measured:
+        taken_in = ClockRow(
+            t_mono_ns=t_mono_ns,
+            server_minus_node_ns=offset_ns,
+            uncertainty_ns=abs(uncertainty_ns),
+        )
+        rows.append(ClockOffset(boot_id="b", **taken_in.model_dump(exclude={"type"})))
+    table = ClockTable(rows_by_stream(rows), [StreamFacts("b", 0)], ["b"])
+    table.summary().model_dump_json()
+    for row in rows:
+        columns = table.columns(np.array([row.t_mono_ns]), np.array([0]), None)
+        away_ns = abs(int(columns["t_server_ns"][0]) - row.server_minus_node_ns)
+        # The truth is within the bounds of both; the rates of decades round to a nanosecond.
+        bound_ns = int(columns["t_server_uncertainty_ns"][0]) + 1.001 * row.uncertainty_ns
+        assert away_ns <= bound_ns + 2

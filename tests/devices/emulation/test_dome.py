@@ -280,6 +280,31 @@ def test_however_late_a_driver_is_it_reads_what_the_dome_was_like_at_that_instan
             )
 
 
+def test_a_transfer_whose_pressures_are_there_does_not_wait_for_those_that_are_computed() -> None:
+    is_computing, may_go_on = threading.Event(), threading.Event()
+
+    def slow(t_s: Floats) -> Floats:
+        if t_s[0] > 0.5:
+            is_computing.set()
+            assert may_go_on.wait(10.0)
+        return rising(t_s)
+
+    domes = domes_of(slow)
+    ahead = threading.Thread(target=domes.foresee, args=(1.4,))
+    ahead.start()
+    try:
+        assert is_computing.wait(10.0)
+        transfer = threading.Thread(target=domes.be_ready, args=(0.9,))
+        transfer.start()
+        transfer.join(5.0)
+        assert not transfer.is_alive()
+    finally:
+        may_go_on.set()
+        ahead.join()
+    assert not domes.be_ready(1.9)
+    assert domes.be_ready(2.0)
+
+
 def test_what_is_computed_ahead_for_a_driver_that_asks_nothing_is_bounded() -> None:
     domes = domes_of(rising)
     for _ in range(200):

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
+from devices.facts import OFFSET_NS_END, T_MONO_NS_END, T_NS_END
 from storage.clock.bounds import Rows
 from storage.clock.log import ClockOffset
 from storage.clock.table import ClockTable, StreamFacts, rows_by_stream
@@ -164,12 +165,15 @@ def test_an_unsynchronised_node_that_was_measured_is_measured() -> None:
 
 
 def test_instants_that_are_none_get_no_servers_time() -> None:
-    rows = {"b": Rows(np.array([0]), np.array([2**62 - 1]), np.array([0]))}
+    rows = {"b": Rows(np.array([0]), np.array([2**60 - 1]), np.array([0]))}
     table = ClockTable(rows, [StreamFacts("b")], ["b"])
-    ends = np.array([-(2**63), 2**63 - 1, 2**62, -(2**62), 2**62 - 1, 0])
+    end = T_NS_END
+    ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
     columns = table.columns(np.zeros(6, dtype=np.int64), ends, None)
     assert (columns["t_server_ns"] == NO_INSTANT).tolist() == [True] * 4 + [False] * 2
-    assert columns["t_server_ns"][-1] == 2**62 - 1
+    assert columns["t_server_ns"][-1] == 2**60 - 1
+    end = T_MONO_NS_END
+    ends = np.array([-(2**63), 2**63 - 1, end, -end, end - 1, 0])
     columns = table.columns(ends, np.zeros(6, dtype=np.int64), None)
     assert (columns["t_server_ns"] == NO_INSTANT).tolist() == [True] * 4 + [False] * 2
 
@@ -179,7 +183,7 @@ def test_a_sum_that_is_no_instant_is_none() -> None:
     rows = Rows(np.array([0, 10**14]), begin_ns + np.array([0, 2 * 10**9]), np.array([0, 0]))
     table = ClockTable({"b": rows}, [StreamFacts("b")], ["b"])
     t_ns = np.array([2**62 - 1, 0])
-    columns = table.columns(np.array([2**61, 2**61]), t_ns, None)
+    columns = table.columns(np.array([2**59, 2**59]), t_ns, None)
     assert (columns["t_server_ns"] == NO_INSTANT).tolist() == [True, False]
     assert (columns["t_server_uncertainty_ns"] == NO_INSTANT).tolist() == [True, False]
 
@@ -194,10 +198,11 @@ def test_frames_without_parts_are_of_the_first() -> None:
 @pytest.mark.parametrize(
     ("t_mono_ns", "offset_ns", "uncertainty_ns", "named"),
     [
-        (-1, 0, 0, "t_mono_ns"),
+        (-T_MONO_NS_END, 0, 0, "t_mono_ns"),
+        (T_MONO_NS_END, 0, 0, "t_mono_ns"),
         (2**63 - 1, 0, 0, "t_mono_ns"),
         (0, -(2**63), 0, "server_minus_node_ns"),
-        (0, 2**62, 0, "server_minus_node_ns"),
+        (0, OFFSET_NS_END, 0, "server_minus_node_ns"),
         (0, 0, -1, "uncertainty_ns"),
         (0, 0, 2**63 - 1, "uncertainty_ns"),
         (0, 2**63, 0, "out of range"),
