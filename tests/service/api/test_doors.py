@@ -420,6 +420,31 @@ def test_more_nodes_than_may_be_that_speak_at_once_are_told_to_come_later(
     nodes[-1].connect()
 
 
+def test_one_that_was_let_go_and_goes_on_sending_takes_no_nodes_place(
+    serve_with: ServeWith, node_of: NodeOf
+) -> None:
+    running = serve_with(bounds=Bounds(max_nodes=1))
+    word = b"\x81\x81" + bytes(4) + b"x"
+    with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as connection:
+        connection.sendall(upgrade(INGEST_PATH) + word)
+        said = b""
+        while b"\x88" not in said.partition(b"\r\n\r\n")[2]:  # a close frame, never answered
+            said += connection.recv(65536)
+        for _ in range(3):
+            connection.sendall(word)
+            time.sleep(0.05)
+        node_of(running).connect()
+
+
+def upgrade(path: str) -> bytes:
+    """A request for a websocket."""
+    return (
+        f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
+        "Upgrade: websocket\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+        "Sec-WebSocket-Version: 13\r\n\r\n"
+    ).encode()
+
+
 def first_word(spoken: Spoken) -> int | str:
     """What the first message of the server is, or with which code it closes."""
     try:
@@ -440,11 +465,7 @@ def test_a_webspokenhas_no_time_for_headers_to_come(strict: Running, node_of: No
 def test_one_that_pings_and_does_not_read_is_let_go(serve_with: ServeWith) -> None:
     running = serve_with()
     with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as connection:
-        connection.sendall(
-            b"GET /api/v1/live HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
-            b"Upgrade: websocket\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
-            b"Sec-WebSocket-Version: 13\r\n\r\n"
-        )
+        connection.sendall(upgrade(LIVE_PATH))
         ping = b"\x89\xfd" + bytes(4) + bytes(125)
         with pytest.raises(OSError, match=r"reset|pipe"):
             connection.sendall(ping * 500_000)
