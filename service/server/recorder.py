@@ -51,9 +51,9 @@ class Recorder:
             book.note(self._with_clock(session))
 
     def know(self, node: ServerNode) -> None:
-        """A node has said hello: if it was not known before, its sessions lack what is kept of it.
+        """A node has said hello: its sessions get what they lack of its clock measurements.
 
-        Those are the clock measurements since their last change.
+        They lack those of a node that was not known before, and of streams in which they went on.
         """
         for session in self._book.of_node(node.name):
             if session.state != "sealing":
@@ -278,7 +278,14 @@ class Recorder:
             return session
         try:
             for boot_id in dict.fromkeys(part.boot_id for part in session.parts):
-                if (stream := node.streams.get(boot_id)) is not None:
+                stream = node.streams.get(boot_id)
+                known = [row.t_mono_ns for row in session.clock if row.boot_id == boot_id]
+                # A log may be long: it is read for what is in it and not in the session.
+                if (
+                    stream is not None
+                    and stream.clock is not None
+                    and (stream.clock.t_mono_ns > max(known, default=-1))
+                ):
                     session = session.with_clock(stream.all_clock_rows())
         except StorageError as error:  # its frames are worth more than its clock
             log.warning("session %s: %s", session.id, error)

@@ -78,6 +78,8 @@ def _session_of(folder: Path, what: str) -> Session | None:
     if events is None:
         lost.append("marks")
     clock = _beside(read_clock, folder / CLOCK_NAME)
+    if clock is None:
+        lost.append("clock measurements")
     content = {
         **file.session,
         "state": "sealed",

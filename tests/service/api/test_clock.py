@@ -18,10 +18,12 @@ import pytest
 from service import server_clock
 from service.client import Client
 from storage.checked_table import write_table
+from storage.clock.log import ClockLog
 from tests.service.command import command
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
+from tests.storage.faulty_disk import refusing
 from tests.waiting import until
 
 HOUR_NS = 3_600_000_000_000
@@ -329,3 +331,18 @@ def test_a_measurement_that_has_the_servers_clock_elsewhere_is_not_kept(
     assert running.node()["clock"]["server_minus_node_ns"] == 5
     rows = running.call(lambda: list(running.server.nodes.get("bench").present.clock_rows))
     assert [row.server_minus_node_ns for row in rows] == [0, 5]
+
+
+def test_a_node_that_connects_again_costs_no_reading_of_what_its_sessions_have(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = tared.record()
+    for _ in range(3):
+        tared.deliver(10)
+        tared.say_clock(0)
+    tared.deliver(10)
+    with monkeypatch.context() as patched:
+        patched.setattr(ClockLog, "rows", refusing(AssertionError, "the log is read"))
+        tared.leave()
+        tared.connect()
+    assert tared.finish(recording)["complete"] is True

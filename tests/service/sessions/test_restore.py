@@ -91,6 +91,15 @@ def test_one_that_is_gone_is_made_again_and_lost_marks_are_said(data: Path) -> N
     assert verdict_of(verify(data)) == "complete"
 
 
+def test_a_lost_clock_is_said_as_well(data: Path) -> None:
+    folder = data / "sessions" / ID
+    (folder / "session.json").unlink()
+    (folder / "clock.parquet").unlink()
+    (one,) = book(data)
+    assert one.clock == ()
+    assert str(one.problem).endswith("lost are subject, notes and tags, clock measurements")
+
+
 def test_one_that_nothing_proves_is_named_and_its_files_stay(data: Path) -> None:
     frames = data / "sessions" / ID / "frames.parquet"
     content = bytearray(frames.read_bytes())
