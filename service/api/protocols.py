@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import logging
 import socket
 from collections import deque
 from collections.abc import Callable
@@ -28,6 +29,8 @@ from service.api.doors import Doors
 from service.api.problems import problem
 from service.link import INGEST_PATH, SUBPROTOCOL, Close
 
+log = logging.getLogger("foottile.doors")
+
 OUTLET = "foottile.outlet"
 """Of a websocket's scope, among the extensions: the connection, as an `Outlet` to write to."""
 _SAID_ON_LIVE_BYTES_MAX = 4096
@@ -35,7 +38,7 @@ _UNREAD_BYTES_MAX = 1 << 20
 """What may wait for one who goes on asking and does not read."""
 _STARVED = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 _STARVED_PAUSE_S = 0.1
-_FULL_PAUSE_S = 0.01
+_PAUSE_S = 0.01
 _RETRY_AFTER_S = 5
 _TOO_MANY = "There are too many connections; try again in some seconds"
 
@@ -52,9 +55,11 @@ class Http(HttpToolsProtocol):
     config: DoorsConfig
     _timer: asyncio.TimerHandle | None = None
     _in_head = False
-    _fed_bytes = 0
-    """Since the request began: one endless header reaches no callback before it ends."""
+    _unseen_bytes = 0
+    """Since something came of which a request consists: one endless header, be it behind the body,
+    and an endless name of a chunk reach no callback before they end."""
     _head_bytes = 0
+    """With the headers behind the body."""
     _is_too_long = False
     _is_upgraded = False
 
@@ -75,23 +80,20 @@ class Http(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse, unless it is more than headers may be."""
+        self._unseen_bytes += len(data)
         super().data_received(data)
         if self.transport.is_closing() or self._is_upgraded:
             return
-        if self._in_head:
-            self._fed_bytes += len(data)
-            if self._fed_bytes > 2 * self.config.doors.bounds.max_header_bytes:
-                self._is_too_long = True
-                self.send_400_response("")
-        elif self._timer is None and not self._asked:
-            self._expect(self.config.doors.bounds.header_timeout_s)  # empty lines, as it seems
+        if self._unseen_bytes > 2 * self.config.doors.bounds.max_header_bytes:
+            self._is_too_long = True
+            self.send_400_response("")
+        elif self._timer is None and not self._asked:  # of a request, or empty lines
+            self._expect(self.config.doors.bounds.header_timeout_s)
 
     def on_message_begin(self) -> None:
         """A request begins."""
         super().on_message_begin()
-        self._in_head, self._fed_bytes, self._head_bytes = True, 0, 0
-        if self._timer is None:
-            self._expect(self.config.doors.bounds.header_timeout_s)
+        self._in_head, self._unseen_bytes, self._head_bytes = True, 0, 0
 
     def on_url(self, url: bytes) -> None:
         """A piece of the request line."""
@@ -99,32 +101,44 @@ class Http(HttpToolsProtocol):
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """A header."""
+        """A header; those behind the body are nobody's."""
         self._count(len(name) + len(value) + 4)
-        super().on_header(name, value)
+        if self._in_head:
+            super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
         """It asks for something: is there room?"""
         self._in_head = False
         self._expect(None)
-        if not (self.parser.should_upgrade() and self._should_upgrade()):
-            if not self.config.doors.admit(self.transport):
-                self.app = refuse
-            self._expect(self.config.doors.bounds.body_timeout_s)
+        is_websocket = self.parser.should_upgrade() and self._should_upgrade()
+        if not is_websocket and not self.config.doors.admit(self.transport):
+            self.app = refuse
         before: RequestResponseCycle | None = self.cycle  # None before the first one
         super().on_headers_complete()
         if self.cycle is not before:
             self._asked.append(self.cycle)
+            self._expect_more()
+
+    def on_chunk_header(self) -> None:
+        """A piece of the body begins."""
+        self._unseen_bytes = 0
+
+    def on_body(self, body: bytes) -> None:
+        """A piece of the body."""
+        self._unseen_bytes = 0
+        super().on_body(body)
 
     def on_message_complete(self) -> None:
         """The body is there."""
         self._expect(None)
+        self._unseen_bytes = 0
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
         """It waits again, unless it has asked for more already."""
         is_last = not self.pipeline
         self._asked.popleft()
+        self._expect_more()
         super().on_response_complete()
         if is_last:
             self.config.doors.rest(self.transport)
@@ -154,17 +168,23 @@ class Http(HttpToolsProtocol):
         late = self._too_late
         self._timer = self.loop.call_later(within_s, late) if within_s is not None else None
 
+    def _expect_more(self) -> None:
+        """Time runs for the request whose turn it is: those behind it are perhaps not even read."""
+        if not self._asked:
+            if self._in_head:
+                self._expect(self.config.doors.bounds.header_timeout_s)
+        elif self._asked[0].more_body:
+            self._expect(self.config.doors.bounds.body_timeout_s)
+
     def _too_late(self) -> None:
         self._timer = None
-        if self._in_head or self._asked:
-            self._end(HTTPStatus.REQUEST_TIMEOUT, "The request did not come in time")
-        else:
-            self.transport.close()
+        self._end(HTTPStatus.REQUEST_TIMEOUT, "The request did not come in time")
 
     def _end(self, status: HTTPStatus, detail: str) -> None:
         if self.transport.is_closing():
             return
-        if not (self._asked and self._asked[0].response_started):
+        waits = not self._asked[0].response_started if self._asked else self._in_head
+        if waits:
             answer = problem("", status, detail, {"connection": "close"})
             head = [f"HTTP/1.1 {status.value} {status.phrase}".encode()]
             head += [name + b": " + value for name, value in answer.raw_headers]
@@ -270,18 +290,21 @@ async def accept(listening: socket.socket, make: Callable[[], Any], doors: Doors
     while True:
         if doors.is_full:
             doors.turn_out()
-            await asyncio.sleep(_FULL_PAUSE_S)
+            await asyncio.sleep(_PAUSE_S)
             continue
         try:
             connection, _ = await loop.sock_accept(listening)
         except OSError as error:
-            if error.errno in _STARVED:
+            is_starved = error.errno in _STARVED  # or it has gone already
+            if is_starved:
                 doors.say("starved", f"no connection can be taken in for now: {error}")
                 doors.turn_out()
-                await asyncio.sleep(_STARVED_PAUSE_S)
-            continue  # or it has gone already
+            await asyncio.sleep(_STARVED_PAUSE_S if is_starved else _PAUSE_S)
+            continue
         try:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             await loop.connect_accepted_socket(make, connection)
-        except OSError:
+        except Exception as error:
+            if not isinstance(error, OSError):
+                log.exception("a connection is closed: this is a bug; others are taken in")
             connection.close()

@@ -153,9 +153,9 @@ def _answer_to(connection: socket.socket) -> str:
     return f"answered with {said[:200]!r}"
 
 
-@attack("requests that are too long, too slow or no requests", tries=7, soak_tries=600)
+@attack("requests that are too long, too slow or no requests", tries=8, soak_tries=600)
 def malformed(play: Play) -> Outcome:
-    """Endless headers (400 MB if they were taken), bodies that stop, garbage, pipelines.
+    """Endless headers and trailers (400 MB if they were taken), stopped bodies, garbage, pipelines.
 
     Meanwhile a node records and a screen watches. It fails if the server takes more than 4 MB of a
     request, keeps one open for more than 5 s beyond its time, answers what is no request with
@@ -194,8 +194,8 @@ def malformed(play: Play) -> Outcome:
 
 
 _KINDS = (
-    *("many headers", "one header", "long address", "slow headers", "slow body", "garbage"),
-    "pipeline",
+    *("many headers", "one header", "long address", "one trailer", "slow headers", "slow body"),
+    *("garbage", "pipeline"),
 )
 _STATUS = re.compile(rb"HTTP/1\.1 ([0-9]{3}) ")
 _HANGS_UP_S = 8.0
@@ -212,6 +212,10 @@ def _play(port: int, kind: str, random: Random) -> tuple[int, bytes]:
                 return _endless(one, HEAD + b"X-Filler: ", b"y" * (64 << 10))
             case "long address":
                 return _endless(one, b"GET /", b"y" * (64 << 10))
+            case "one trailer":
+                head = b"POST /api/v1/sessions HTTP/1.1\r\nHost: localhost\r\n"
+                head += b"Transfer-Encoding: chunked\r\n\r\n0\r\nX: "
+                return _endless(one, head, b"y" * (64 << 10))
             case "slow headers":
                 return _slow(one, HEAD, b"X: y\r\n")
             case "slow body":

@@ -50,7 +50,7 @@ def of_demo(play: Play) -> Outcome:
     """As for `serve`, where there are a node, tares and sessions: one is begun before."""
     with Served(play.folder, "demo") as served:
         nodes = f"{served.url}/api/v1/nodes"
-        until(lambda: any(each["tare"] for each in httpx.get(nodes).json()["items"]), 30.0)
+        until(lambda: any(each["tare"] for each in httpx.get(nodes).json()["items"]), 90.0)
         served.record("demo")
         from tests.hostile.drawn import play_drawn
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import errno
 import json
 import re
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -15,13 +18,15 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed
 
 from service.api.doors import OWN_FILES, RESERVE, Bounds, Doors
+from service.api.protocols import accept
 from service.link import INGEST_PATH, LIVE_PATH, Close
 from tests.service.fake_node import NodeOf, Play, Spoken
 from tests.service.running import Running, ServeWith, closed
-from tests.waiting import until
+from tests.waiting import in_a_loop, until
 
 PLENTY = 10_000
 """Of descriptors."""
+TOKEN = "secret"  # noqa: S105  # of these tests
 
 
 class Guest:
@@ -231,6 +236,121 @@ def test_headers_that_are_too_long_are_refused(raw: socket.socket, piece: bytes)
     assert said == b"" or problem_of(said)[0] == 431  # a reset may overtake it
 
 
+def head(asked: str, *headers: str) -> bytes:
+    """A request without its body."""
+    lines = (f"{asked} HTTP/1.1", "Host: localhost", *headers, "", "")
+    return "\r\n".join(lines).encode()
+
+
+HEALTH = head("GET /api/v1/health")
+CHUNKED = head("POST /api/v1/sessions", "Transfer-Encoding: chunked")
+
+
+@pytest.mark.parametrize(
+    ("begun", "piece"),
+    [
+        (CHUNKED + b"0\r\nX: ", b"y" * 1000),
+        (CHUNKED + b"0\r\n", b"X: " + b"y" * 60 + b"\r\n"),
+        (CHUNKED + b"0\r\n", b"Y" * 1000),
+        (CHUNKED + b"1;x=", b"y" * 1000),
+        (HEALTH, b"\r\n" * 500),
+    ],
+    ids=["one trailer", "trailers", "name of a trailer", "words of a chunk", "empty lines"],
+)
+@pytest.mark.parametrize("token", [None, TOKEN], ids=["waited for", "refused already"])
+def test_what_is_neither_request_nor_body_has_an_end(
+    serve_with: ServeWith, begun: bytes, piece: bytes, token: str | None
+) -> None:
+    running = serve_with(bounds=Bounds(max_header_bytes=4096), token=token)
+    with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as raw:
+        raw.sendall(begun)
+        if token is not None:
+            assert raw.recv(65536).startswith((b"HTTP/1.1 401 ", b"HTTP/1.1 200 "))
+        with pytest.raises(OSError, match=r"reset|pipe"):
+            raw.sendall(piece * (16_000_000 // len(piece)))
+
+
+def test_a_token_behind_the_body_opens_nothing(serve_with: ServeWith) -> None:
+    running = serve_with(token=TOKEN)
+    with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as raw:
+        asked = head("POST /api/v1/sessions", "Connection: close", "Transfer-Encoding: chunked")
+        raw.sendall(asked + f"0\r\nAuthorization: Bearer {TOKEN}\r\n\r\n".encode())
+        assert problem_of(all_of(raw))[0] == 401
+
+
+@pytest.mark.parametrize(
+    "behind",
+    [head("POST /api/v1/sessions", "Content-Length: 9"), HEALTH[:-2]],
+    ids=["body", "head"],
+)
+def test_a_request_that_does_not_come_waits_for_the_answer_to_the_one_before(
+    strict: Running, raw: socket.socket, behind: bytes, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(strict.server, "check_storage", lambda: time.sleep(1.0))
+    raw.sendall(head("GET /api/v1/ready") + behind)
+    first, _, second = all_of(raw).partition(b"HTTP/1.1 408 ")
+    assert first.startswith(b"HTTP/1.1 200 ")
+    assert problem_of(b"HTTP/1.1 408 " + second)[1]["detail"] == "The request did not come in time"
+
+
+@in_a_loop
+async def test_a_bug_while_one_is_taken_in_does_not_keep_out_the_next(caplog: Any) -> None:
+    makes = iter([ZeroDivisionError("a bug")])
+
+    def make() -> asyncio.Protocol:
+        for error in makes:
+            raise error
+        return Greeting()
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        taking = asyncio.create_task(accept(listening, make, Doors(Bounds(), PLENTY)))
+        said = []
+        for _ in range(2):
+            reader, writer = await asyncio.open_connection(*listening.getsockname())
+            said.append(await asyncio.wait_for(reader.read(), 5.0))
+            writer.close()
+        taking.cancel()
+    assert said == [b"", b"welcome"]
+    assert "a bug" in caplog.text
+
+
+@in_a_loop
+async def test_a_socket_that_goes_on_failing_does_not_take_the_loop(monkeypatch: Any) -> None:
+    loop, tries = asyncio.get_running_loop(), 0
+
+    async def fail(_: socket.socket) -> None:
+        nonlocal tries
+        tries += 1
+        raise OSError(errno.EPERM, "a firewall")
+
+    monkeypatch.setattr(loop, "sock_accept", fail)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        taking = asyncio.create_task(accept(listening, asyncio.Protocol, Doors(Bounds(), PLENTY)))
+        await asyncio.sleep(0.1)
+        taking.cancel()
+    assert 0 < tries < 50
+
+
+class Greeting(asyncio.Protocol):
+    """Says a word and goes."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.WriteTransport)
+        transport.write(b"welcome")
+        transport.close()
+
+
+def test_a_body_in_very_small_pieces_is_no_header(running: Running) -> None:
+    def pieces() -> Iterator[bytes]:
+        for byte in json.dumps({"node": "x", "name": "y" * 60_000}).encode():
+            yield bytes([byte])
+
+    answer = running.http.post(
+        "/sessions", content=pieces(), headers={"content-type": "application/json"}
+    )
+    assert answer.status_code in (404, 422), answer.text
+
+
 def test_headers_that_are_nearly_too_long_pass_in_whatever_pieces(raw: socket.socket) -> None:
     head = b"GET /api/v1/health HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * 3900 + b"\r\n\r\n"
     for begin in range(0, len(head), 600):
@@ -300,6 +420,31 @@ def test_more_nodes_than_may_be_that_speak_at_once_are_told_to_come_later(
     nodes[-1].connect()
 
 
+def test_one_that_was_let_go_and_goes_on_sending_takes_no_nodes_place(
+    serve_with: ServeWith, node_of: NodeOf
+) -> None:
+    running = serve_with(bounds=Bounds(max_nodes=1))
+    word = b"\x81\x81" + bytes(4) + b"x"
+    with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as connection:
+        connection.sendall(upgrade(INGEST_PATH) + word)
+        said = b""
+        while b"\x88" not in said.partition(b"\r\n\r\n")[2]:  # a close frame, never answered
+            said += connection.recv(65536)
+        for _ in range(3):
+            connection.sendall(word)
+            time.sleep(0.05)
+        node_of(running).connect()
+
+
+def upgrade(path: str) -> bytes:
+    """A request for a websocket."""
+    return (
+        f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
+        "Upgrade: websocket\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+        "Sec-WebSocket-Version: 13\r\n\r\n"
+    ).encode()
+
+
 def first_word(spoken: Spoken) -> int | str:
     """What the first message of the server is, or with which code it closes."""
     try:
@@ -320,11 +465,7 @@ def test_a_webspokenhas_no_time_for_headers_to_come(strict: Running, node_of: No
 def test_one_that_pings_and_does_not_read_is_let_go(serve_with: ServeWith) -> None:
     running = serve_with()
     with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as connection:
-        connection.sendall(
-            b"GET /api/v1/live HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n"
-            b"Upgrade: websocket\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
-            b"Sec-WebSocket-Version: 13\r\n\r\n"
-        )
+        connection.sendall(upgrade(LIVE_PATH))
         ping = b"\x89\xfd" + bytes(4) + bytes(125)
         with pytest.raises(OSError, match=r"reset|pipe"):
             connection.sendall(ping * 500_000)
