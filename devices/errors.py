@@ -43,6 +43,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Literal, TypedDict, Unpack
 
+from devices.words import printable
+
 Extra = Literal["server", "emulation", "plot", "gpio", "rig"]
 
 _OURS = ("devices", "storage", "service")
@@ -79,7 +81,7 @@ class _Facts(TypedDict, total=False):
 
 
 class FootTileError(Exception):
-    """Base of all errors; composes its text from the facts it keeps.
+    """Base of all errors; composes its text, which can be shown, from the facts it keeps.
 
     `exit_code` is what the command line returns for it (1 failed, 2 usage).
     """
@@ -100,7 +102,7 @@ class FootTileError(Exception):
             text += f"; expected {self.expected}"
         if self.remedy:
             text += f"{'' if text.endswith(('.', '?', '!')) else '.'} {self.remedy}"
-        return text
+        return printable(text)
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword-only facts must survive pickling between processes.

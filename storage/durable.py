@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from devices.errors import DamagedFileError, FolderGoneError, FootTileError, StorageError
+from devices.words import printable
 
 _TEMPORARY = re.compile(
     r"\.(?P<name>.+)\.(?P<process>[0-9]+)\.(?P<started>[0-9]+)\.[0-9a-f]{8}\.tmp"
@@ -320,6 +321,6 @@ def set_aside(path: Path) -> Path:
 def put_aside(path: Path, why: FootTileError) -> str:
     """Set aside what turned out to be damaged, if that can be; what happened, in words."""
     try:
-        return f"{why}; it is kept as {set_aside(path).name}"
+        return printable(f"{why}; it is kept as {set_aside(path).name}")
     except StorageError as error:
         return f"{why}; it cannot be set aside: {error.what}"

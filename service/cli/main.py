@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from devices.errors import FootTileError
+from devices.words import printable
 from service.cli.commands.bench import bench_command
 from service.cli.commands.calibrate import calibrate_command
 from service.cli.commands.demo import demo_command
@@ -21,7 +22,7 @@ from service.cli.commands.serve import serve_command
 from service.cli.commands.sessions import export_command, pull_command, sessions_command
 from service.cli.commands.simulate import simulate_command
 from service.cli.commands.verify import verify_command
-from service.cli.options import printable, with_finite_numbers
+from service.cli.options import with_finite_numbers
 from service.version import SOFTWARE
 
 INTERRUPTED = 130
@@ -71,7 +72,7 @@ def main() -> None:
     try:
         app()
     except FootTileError as error:
-        sys.stderr.write(f"foottile: {printable(str(error))}\n")
+        sys.stderr.write(f"foottile: {error}\n")
         sys.exit(error.exit_code)
     except SystemExit as end:
         if end.code == INTERRUPTED:

@@ -144,12 +144,6 @@ def progress(message: str) -> Iterator[Callable[[str], None]]:
         yield status.update
 
 
-def printable(text: str) -> str:
-    """Text of files and other people as one line that a terminal shows and does not obey."""
-    line = " ".join(text.split())
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
-
-
 def say(message: str) -> None:
     """A line of the result on stdout, as it is."""
     stdout.print(message, highlight=False, soft_wrap=True, markup=False)

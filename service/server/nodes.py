@@ -16,6 +16,7 @@ from devices.errors import (
     StorageError,
     UnknownError,
 )
+from devices.words import printable
 from service.link import PROTOCOL, Hello
 from service.server.node import HELLO_FILE, IS_BOOT_ID, ServerNode
 from storage.checked_json import read_checked
@@ -71,7 +72,8 @@ class ServerNodes:
         """What was found damaged of what is kept of nodes, and what became of it, in words."""
         return self._problems + [text for node in self for text in node.problems]
 
-    def _problem(self, text: str) -> None:
+    def _problem(self, what: str) -> None:
+        text = printable(what)
         log.warning("%s", text)
         self._problems.append(text)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from devices.errors import DamagedFramesError, FileFormatError
+from devices.words import printable
 from service.sessions.ends import SessionStream, around_in
 from storage.checked_json import read_checked
 from storage.durable import ASIDE, remove_stale_temporaries
@@ -127,14 +128,14 @@ def open_streams(
             (folder / NOTES_FILE).exists() or any(folder.glob("*" + SUFFIX))
         ):
             continue
-        tell(f"journal {folder.parent.name}/{folder.name}")
+        tell(printable(f"journal {folder.parent.name}/{folder.name}"))
         remove_stale_temporaries(folder)
         try:
             journal = Journal.open(folder)
             problems += journal.problems
             notes = StreamNotes.load_whole(folder, problems)
         except FileFormatError as error:
-            problems.append(f"journal {folder.parent.name}/{folder.name}: {error}")
+            problems.append(printable(f"journal {folder.parent.name}/{folder.name}: {error}"))
             continue
         stream = OpenedStream(journal, notes, journal.lost.all, is_local)
         stream.note_losses()

@@ -20,6 +20,7 @@ import numpy as np
 
 from devices.errors import DamagedFramesError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
+from devices.words import printable
 from storage.durable import make_folder, storage_errors
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
 from storage.journal.instants import Instants
@@ -75,7 +76,9 @@ class Journal:
                 if segment is not None:
                     self._take_in(segment)
                 elif is_indexed:  # else it was just begun when its process was killed
-                    self.problems.append(f"{path}: no frame in it is proven by its index")
+                    self.problems.append(
+                        printable(f"{path}: no frame in it is proven by its index")
+                    )
             for path in folder.glob("*" + INDEX_SUFFIX):
                 # A power cut may take the name of a segment and leave that of its index. Nothing in
                 # it was promised then; but a person may have deleted it, so the index is set aside.

@@ -33,7 +33,7 @@ def of_serve(play: Play) -> Outcome:
         return play_drawn(served, play)
 
 
-@attack("the same with a token, given or not", tries=8, soak_tries=12_000, is_alone=False)
+@attack("the same with a token, given or not", tries=4, soak_tries=12_000, is_alone=False)
 def of_serve_with_token(play: Play) -> Outcome:
     """As for `serve`; half of the requests have the token, the others may change nothing.
 
@@ -45,7 +45,7 @@ def of_serve_with_token(play: Play) -> Outcome:
         return play_drawn(served, play, token=TOKEN)
 
 
-@attack("the same, `demo` while its node records", tries=8, soak_tries=12_000, is_alone=False)
+@attack("the same, `demo` while its node records", tries=4, soak_tries=12_000, is_alone=False)
 def of_demo(play: Play) -> Outcome:
     """As for `serve`, where there are a node, tares and sessions: one is begun before."""
     with Served(play.folder, "demo") as served:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from devices.errors import UsageError, needs_extra
+from devices.words import printable
 from service.cli.options import (
     JsonOption,
     data_folder,
     output_path,
     print_json,
-    printable,
     progress,
     remark,
     say,
@@ -177,7 +177,7 @@ def _in_folder(data: Path) -> list[dict[str, Any]]:
         raise UsageError(f"no data folder {str(data)!r}")
     sessions, unreadable = SessionFolder(data / "sessions").load_all()
     for session_id, error in unreadable.items():
-        remark(f"session {session_id} is left out: {printable(str(error))}")
+        remark(printable(f"session {session_id} is left out: {error}"))
     found = []
     for session in sessions:
         ledger = session.ledger

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
+from devices.errors import CalibrationError
+from service.link import Status
 from service.node.connection import hello_of
 from service.node.options import NodeOptions
 from service.rig.rig import RigOptions
 from storage.journal.node_journal import NodeJournal
 from tests.builders.arrays import make_array
 from tests.builders.scenes import make_scene
+from tests.storage.journal.journals import filled
 
 
 def test_a_stream_that_begins_while_a_node_greets_is_not_said_to_have_ended(tmp_path: Path) -> None:
@@ -21,3 +26,25 @@ def test_a_stream_that_begins_while_a_node_greets_is_not_said_to_have_ended(tmp_
     assert not newer.has_ended
     assert [each.array_info.boot_id for each in hello.earlier] == [before.boot_id]
     assert not hello.has_more
+
+
+@pytest.mark.parametrize("odd", ["\x1b[31mred", "\udcff", "two\nlines"])
+def test_whatever_its_files_are_called_a_server_can_be_told_of_them(
+    tmp_path: Path, odd: str
+) -> None:
+    journal = NodeJournal(tmp_path, "leg")
+    stream = journal.begin(make_array())
+    journal.close()
+    filled(stream.folder, (0, 9)).close()
+    (stream.folder / f"{odd}.arrows").mkdir()
+    again = NodeJournal(tmp_path, "leg")
+    why = str(CalibrationError("cannot be read", where=f"{odd}.toml"))
+    options = NodeOptions(
+        RigOptions(make_scene(), "leg"), journal=tmp_path, server=None, calibration_problem=why
+    )
+    said = Status(missed_slots=0, troubles=tuple(again.problems))
+    hello = hello_of(options, again, again.begin(make_array(boot_id="b" * 32)))
+    again.close()
+    assert "it is not a file" in " ".join(said.troubles)
+    for message in (said, hello):
+        assert type(message).model_validate_json(message.model_dump_json()) == message

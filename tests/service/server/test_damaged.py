@@ -215,3 +215,21 @@ def test_a_lock_or_probe_that_is_no_file_keeps_nobody_from_starting(
     (running.data / ".writable").mkdir()
     running.start()
     assert running.http.get("/ready").status_code == 200
+
+
+@pytest.mark.parametrize("odd", ["\x1b[31mred", "\udcff", "two\nlines", "\u202eoverridden"])
+def test_whatever_a_file_is_called_everybody_can_be_told_of_it(
+    running: Running, tared: FakeNode, odd: str
+) -> None:
+    running.stop()
+    journal = running.data / "journal" / "bench" / tared.boot_id
+    (journal / f"{odd}.arrows").mkdir()
+    (running.data / "nodes" / odd).mkdir()
+    (running.data / "nodes" / odd / "hello.json").write_text("{}")
+    running.start()
+    said = problems(running)
+    assert "it is not a file" in said
+    assert "not what this node said last" in said
+    assert said.isprintable()
+    with running.socket("/api/v1/live") as live:
+        assert json.loads(live.recv(timeout=5.0))["problems"]
