@@ -21,6 +21,9 @@ SEQ_END = 2**53
 """No stream has so many frames; below it every reader of JSON is exact, browsers too (RFC 8259)."""
 TILES_MAX = 64
 """Eight multiplexers of eight channels."""
+MODELS_MAX = 64
+RATE_HZ_MIN = 1e-3
+"""A frame in a quarter of an hour."""
 
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")

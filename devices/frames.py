@@ -16,7 +16,16 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from devices.arrays import Arrays, Times
-from devices.facts import TILES_MAX, Facts, Label, Metres, OffsetNs, Word
+from devices.facts import (
+    MODELS_MAX,
+    RATE_HZ_MIN,
+    TILES_MAX,
+    Facts,
+    Label,
+    Metres,
+    OffsetNs,
+    Word,
+)
 
 NOT_READ = 65535
 NO_SERVO_COUNTS = -(2**31)
@@ -173,13 +182,13 @@ class ArrayInfo(Facts):
     tiles: Annotated[tuple[TileInfo, ...], Field(max_length=TILES_MAX)]
     servo: ServoInfo | None
     schedule: Label
-    nominal_rate_hz: Annotated[float, Field(ge=1e-3, le=1e5)]
+    nominal_rate_hz: Annotated[float, Field(ge=RATE_HZ_MIN, le=1e5)]
     utc_offset_ns: OffsetNs
     """`t_ns` minus `t_mono_ns` of every frame of this stream."""
     clock_set: bool
     software: Label
     scene: Label
-    models: Annotated[tuple[Label, ...], Field(max_length=TILES_MAX)]
+    models: Annotated[tuple[Label, ...], Field(max_length=MODELS_MAX)]
 
     @model_validator(mode="after")
     def _tiles_differ(self) -> Self:

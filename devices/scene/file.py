@@ -16,20 +16,23 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from devices.errors import SceneError
+from devices.facts import MODELS_MAX, RATE_HZ_MIN, Label
 from devices.inputs import read_text
 from devices.scene.emulated import EmulationScene, FaultScene, GroundScene, MudGround, NoGround
 from devices.scene.hardware import ArrayScene, RecoveryScene, ReferenceScene, ServoScene, TileScene
-from devices.scene.quantities import NotNegative, Section
+from devices.scene.quantities import Name, NotNegative, Section
 
 
 class Scene(Section):
     """One scene. See the module's text for what a file looks like."""
 
-    name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9._-]+$")]
-    models: tuple[str, ...] = Field(default=("unwrap", "static"), strict=False)
+    name: Name
+    models: tuple[Label, ...] = Field(
+        default=("unwrap", "static"), max_length=MODELS_MAX, strict=False
+    )
     """The models that an estimate of this scene needs, in any order."""
     rate_hz: NotNegative = 0.0
     """Frame rate; 0: as fast as the schedule allows."""
@@ -45,6 +48,13 @@ class Scene(Section):
     ground: GroundScene = NoGround(kind="none")
     emulation: EmulationScene = EmulationScene()
     fault: tuple[FaultScene, ...] = Field(default=(), strict=False)
+
+    @field_validator("rate_hz")
+    @classmethod
+    def _rate_can_be_stated(cls, rate_hz: float) -> float:
+        if 0.0 < rate_hz < RATE_HZ_MIN:
+            raise ValueError(f"is below {RATE_HZ_MIN:g} Hz; 0 is as fast as the schedule allows")
+        return rate_hz
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:

@@ -8,7 +8,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from devices.chips.dynamixel.models import FIRMWARES
 from devices.chips.tca9548a import ADDRESSES, CHANNELS
-from devices.scene.quantities import GpioLine, Number, Position, Positive, Section
+from devices.scene.quantities import GpioLine, Name, Number, Position, Positive, Section
 
 EMULATED = "emulated"
 """Name of a bus or port that is emulated."""
@@ -41,7 +41,7 @@ class ArrayScene(Section):
 class TileScene(Section):
     """`[[tile]]`: one tile, where it is plugged in and where it sits in the foot frame."""
 
-    serial: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9._-]+$")]
+    serial: Name
     mux: int
     channel: int
     x_m: Position

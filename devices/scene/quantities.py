@@ -6,6 +6,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from devices.facts import Label
+
 # No quantity here is meant beyond a million; what is, is a slip of the keyboard or of the unit.
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
@@ -13,6 +15,7 @@ Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 LoadN = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
 Kelvin = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
 GpioLine = Annotated[int, Field(ge=0, le=511)]
+Name = Annotated[Label, Field(min_length=1, pattern=r"^[A-Za-z0-9._-]+$")]
 Position = Annotated[float, Field(gt=-1.0, lt=1.0)]  # a tile 50 m away was meant in millimetres
 
 

@@ -16,7 +16,8 @@ from service.server_clock import utc_ns
 from service.sessions.restore import restore
 from storage.durable import storage_errors
 from storage.sessions.beside import write_events
-from storage.sessions.folder import DOOMED_PREFIX, Event, Session, SessionFolder
+from storage.sessions.file import CheckedFiles, SessionReader
+from storage.sessions.folder import DOOMED_PREFIX, FRAMES_NAME, Event, Session, SessionFolder
 
 log = logging.getLogger("foottile.book")
 
@@ -137,6 +138,15 @@ class SessionBook:
         self.has_unreadable = bool(self.problems)
         """Is a session unreadable? Then it is not known which frames it needs."""
         self._sessions = {session.id: session for session in found}
+        self._files = CheckedFiles()
+
+    def frames(self, session_id: str) -> SessionReader:
+        """The sealed file of a session, opened; from any thread.
+
+        Raises:
+            FileFormatError: there is none, or it is damaged.
+        """
+        return self._files.open(self.folder.path(session_id) / FRAMES_NAME)
 
     def __iter__(self) -> Iterator[Session]:
         return iter(list(self._sessions.values()))

@@ -337,6 +337,43 @@ class SessionReader:
         return FrameBatch.concatenate([frames for frames, _ in self.batches()])
 
 
+class CheckedFiles:
+    """Sealed sessions that are opened often: each is held against its hash once, not every time.
+
+    One whose stamps say that it is another file by now is held against its hash again; checksums
+    of pages are looked at whenever they are read. May be used from several threads.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, ...], None] = {}
+
+    def open(self, path: Path) -> SessionReader:
+        """Open a sealed session.
+
+        Raises:
+            FileFormatError: as for `SessionReader`.
+        """
+        stamps = _stamps(path)
+        reader = SessionReader(path, is_checked=stamps in self._known)
+        if stamps and stamps == _stamps(path):  # not replaced meanwhile
+            while len(self._known) >= _KNOWN_MAX:
+                self._known.pop(next(iter(self._known)), None)
+            self._known[stamps] = None
+        return reader
+
+
+_KNOWN_MAX = 1000
+
+
+def _stamps(path: Path) -> tuple[int, ...]:
+    """What changes if a file does; empty if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+
+
 def _notes(text: bytes | None, *, where: str) -> dict[str, Any]:
     try:
         notes = json.loads(text or b"")

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal
 
 from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
 
 from service.api.routes.access import ServerState, present, problems, stored_table
+from service.server.server import Server
 from storage.clock.file import CLOCK_NAME
 from storage.clock.table import ClockSummary
 from storage.formats.export import MEDIA_TYPES
 from storage.sessions.beside import clock_beside
-from storage.sessions.file import SessionReader
 from storage.sessions.folder import FRAMES_NAME
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
@@ -49,10 +48,11 @@ async def clock(
     if session.sha256 is None:
         table = server.recorder.sources(session_id).clock_table()
         return await run_in_threadpool(table.summary)
-    return await run_in_threadpool(_sealed, server.sessions.folder.path(session_id) / FRAMES_NAME)
+    return await run_in_threadpool(_sealed, session_id, server)
 
 
-def _sealed(path: Path) -> ClockSummary:
-    present(path.with_name(CLOCK_NAME))
-    with SessionReader(present(path)) as reader:
+def _sealed(session_id: str, server: Server) -> ClockSummary:
+    for name in (CLOCK_NAME, FRAMES_NAME):
+        present(server.sessions.folder.path(session_id) / name)
+    with server.sessions.frames(session_id) as reader:
         return clock_beside(reader).summary()

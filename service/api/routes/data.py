@@ -28,7 +28,6 @@ from storage.formats.export import MEDIA_TYPES, ClockName, Format, export
 from storage.formats.marks import TIMES, Marks, place
 from storage.formats.sealed import export_file, marks_of
 from storage.formats.slice import SECONDS_MAX, Slice
-from storage.sessions.file import SessionReader
 from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])
@@ -231,11 +230,11 @@ def _clocks_hash(session: Session, server: Server) -> str:
 
 
 def _marks(session: Session, query: DataQuery, server: Server) -> Marks:
-    if session.sha256 is not None:
-        with SessionReader(server.sessions.folder.path(session.id) / FRAMES_NAME) as reader:
-            return marks_of(reader, session.events, query.slice)
     if not session.events:
         return Marks(())
+    if session.sha256 is not None:
+        with server.sessions.frames(session.id) as reader:
+            return marks_of(reader, session.events, query.slice)
     sources = server.recorder.sources(session.id)
     times = (
         {name: getattr(frames, name) for name in TIMES} | {"part": columns["part"]}
@@ -254,7 +253,7 @@ def _chunks(
         pieces, source = SessionFrames(sources), {"session": session.id, "state": session.state}
         yield from export(pieces, sources.info, {}, to, part, clock, marks, source)
         return
-    with SessionReader(server.sessions.folder.path(session.id) / FRAMES_NAME) as reader:
+    with server.sessions.frames(session.id) as reader:
         yield from export_file(reader, to, part, clock=query.clock, marks=marks)
 
 

@@ -396,3 +396,29 @@ def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
 def test_a_folder_is_no_scene(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=re.escape(str(tmp_path))):
         load_scene(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("head", "serial", "key"),
+    [
+        ("rate_hz = 1e-4", "T01", "rate_hz = 0.0001"),
+        (f"models = ['{'m' * 201}']", "T01", "models.0"),
+        (f"models = {['static'] * 65}", "T01", "models"),
+        ("", "T" * 201, "tile.0.serial"),
+    ],
+)
+def test_what_could_not_be_said_of_a_stream_is_refused_where_it_is_read(
+    head: str, serial: str, key: str
+) -> None:
+    assert f"my.toml: {key}" in refused(head, tile(serial))
+
+
+def test_a_name_that_could_not_be_said_of_a_stream_is_refused() -> None:
+    text = f"name = '{'n' * 200}'\n" + tile()
+    assert parse_scene(text, where="my.toml").name == "n" * 200
+    with pytest.raises(SceneError, match=r"name = .*200 characters"):
+        parse_scene(text.replace("'n", "'nn"), where="my.toml")
+
+
+def test_the_slowest_rate_that_can_be_said_of_a_stream_is_read() -> None:
+    assert scene("rate_hz = 0.001").rate_hz == 0.001
