@@ -117,7 +117,8 @@ def test_measured_walking_is_pressed_cell_by_cell(
 ) -> None:
     outcome = run(
         *("simulate", "--scene", "insole", "--load", recording("insole_walk_left.csv")),
-        *("--load-scale", 0.05, "--truth", "--seconds", 6, "--json", "--out", "walk.parquet"),
+        *("--load-scale", 0.05, "--truth", "--no-estimates"),
+        *("--seconds", 6, "--out", "walk.parquet"),
     )
     assert outcome.code == 0, outcome.err
     table = pq.read_table(tmp_path / "walk.parquet")
