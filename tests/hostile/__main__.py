@@ -1,6 +1,6 @@
 """All attacks, and the table of what came of them.
 
-    python -m tests.hostile --seed 1 [--soak] [--only WORD] [--out docs/results/hostile.md]
+    python -m tests.hostile --seed 1 [--soak] [--tries N] [--only WORD] [--out docs/results/hostile.md]
 
 With `--out` a row is written as soon as its attack has ended, and takes the place of the row of an
 earlier run of it: all of them take more than an hour, so they may be played one by one. A row says
@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -36,17 +37,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.hostile", description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--soak", action="store_true", help="as many tries as --soak tests make")
+    parser.add_argument("--tries", type=int, help="of each attack, instead of its own number")
     parser.add_argument("--only", default="", help="attacks with this word in their name")
     parser.add_argument("--out", type=Path, help="write the table here")
     options = parser.parse_args()
     for path in sorted(Path(__file__).parent.glob("attack_*.py")):
         importlib.import_module(f"tests.hostile.{path.stem}")
     failed = 0
-    for attack in ATTACKS.values():
+    for listed in ATTACKS.values():
+        attack = listed
         if options.only not in attack.name:
             continue
         print(f"{attack.name} ...", flush=True)
         began = time.monotonic()
+        if options.tries is not None:
+            attack = replace(attack, tries=options.tries, soak_tries=options.tries)
         outcome = played(attack, seed=options.seed, is_soak=options.soak)
         row = _row(attack.name, outcome, time.monotonic() - began, options.seed)
         print(row, flush=True)
