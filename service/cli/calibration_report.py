@@ -105,6 +105,11 @@ def _effects(calibration: Calibration) -> Table:
         [
             "each with half its 95 % interval; creep: parts of the force, and their times",
             *(
+                f"{tile.serial}: sampled {_interval(late_s, 0, 1e6)} us later than assumed"
+                for tile in calibration.tiles
+                if (late_s := tile.effects.late_s) is not None
+            ),
+            *(
                 f"{tile.serial}: no {name}: {reason}"
                 for tile in calibration.tiles
                 for name, reason in tile.effects.refused.items()
@@ -115,15 +120,14 @@ def _effects(calibration: Calibration) -> Table:
                 for name in tile.effects.at_bound
             ),
         ],
-        *("tile", "late\nus", "gas\ngamma", "gas tau\nms", "creep\n%", "creep\ns"),
-        *("half loop\nN", "warmth\nkPa/K", "gas lag\ns"),
+        *("tile", "gas\ngamma", "gas tau\nms", "creep\n%", "creep\ns", "half loop\nN"),
+        *("warmth\nkPa/K", "gas lag\ns"),
     )
     for tile in calibration.tiles:
         effects = tile.effects
         gas, rubber, warm = effects.gas, effects.rubber, effects.temperature
         table.add_row(
             tile.serial,
-            _interval(effects.late_s, 0, 1e6) if effects.late_s else "-",
             _interval(gas.gamma, 2) if gas else "-",
             _interval(gas.tau_s, 1, 1e3) if gas else "-",
             "\n".join(_interval(part, 1, 100.0) for part in rubber.part) if rubber else "-",

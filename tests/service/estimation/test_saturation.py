@@ -1,4 +1,4 @@
-"""What is called saturated: the chip's range by what was read, the calibrated one behind the gas."""
+"""What is saturated: the chip's range by what was read, the calibrated one behind the gas."""
 
 from __future__ import annotations
 
