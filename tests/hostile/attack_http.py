@@ -45,9 +45,12 @@ def of_serve_with_token(play: Play) -> Outcome:
         return play_drawn(served, play, token=TOKEN)
 
 
-@attack("the same, `demo` while its node records", tries=4, soak_tries=12_000, is_alone=False)
+@attack("the same, `demo` while its node records", tries=4, soak_tries=4_000, is_alone=False)
 def of_demo(play: Play) -> Outcome:
-    """As for `serve`, where there are a node, tares and sessions: one is begun before."""
+    """As for `serve`, where there are a node, tares and sessions: one is begun before.
+
+    Fewer than there, since its node and its estimates take most of the machine.
+    """
     with Served(play.folder, "demo") as served:
         nodes = f"{served.url}/api/v1/nodes"
         until(lambda: any(each["tare"] for each in httpx.get(nodes).json()["items"]), 90.0)
