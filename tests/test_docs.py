@@ -193,7 +193,7 @@ def test_every_route_is_documented() -> None:
 
 def test_every_live_message_field_is_documented() -> None:
     summary = Summary()
-    summary.add("node", sum_up("0" * 32, None, make_frames(1, 1), {}))
+    summary.add("node", sum_up("0" * 32, make_frames(1, 1), {}))
     (text,) = summary.take().texts({"node": 1.0})
     frame = json.loads(text)
     for name in frame:

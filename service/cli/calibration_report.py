@@ -105,9 +105,19 @@ def _effects(calibration: Calibration) -> Table:
         [
             "each with half its 95 % interval; creep: parts of the force, and their times",
             *(
+                f"{tile.serial}: sampled {_interval(late_s, 0, 1e6)} us later than assumed"
+                for tile in calibration.tiles
+                if (late_s := tile.effects.late_s) is not None
+            ),
+            *(
                 f"{tile.serial}: no {name}: {reason}"
                 for tile in calibration.tiles
                 for name, reason in tile.effects.refused.items()
+            ),
+            *(
+                f"{tile.serial}: {name} is at the end of what is possible"
+                for tile in calibration.tiles
+                for name in tile.effects.at_bound
             ),
         ],
         *("tile", "gas\ngamma", "gas tau\nms", "creep\n%", "creep\ns", "half loop\nN"),
@@ -172,6 +182,7 @@ def _tile_json(tile: TileCalibration) -> dict[str, object]:
         **tile.model_dump(mode="json", include=_OF_A_TILE),
         "student_t_95": student_t_95(tile.repeats) if tile.repeats > 1 else None,
         "effects": {
+            "late_us": _parameter(effects.late_s, 1e6),
             "gamma": _parameter(gamma),
             "gas_tau_ms": _parameter(tau, 1e3),
             "creep_part": [_parameter(part) for part in rubber.part] if rubber else None,
@@ -179,6 +190,7 @@ def _tile_json(tile: TileCalibration) -> dict[str, object]:
             "loop_half_width_n": _parameter(loop_half_width_n(effects)),
             "kpa_per_k": _parameter(kpa_per_k),
             "gas_lag_s": _parameter(lag),
+            "at_bound": list(effects.at_bound),
             "refused": dict(effects.refused),
         },
     }

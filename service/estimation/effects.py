@@ -126,6 +126,11 @@ class Effects(CalibrationPart):
     rubber: RubberEffect | None = None
     hysteresis: HysteresisEffect | None = None
     temperature: TemperatureEffect | None = None
+    late_s: Parameter | None = None
+    """How much later the tile is sampled than its frames say: where in a conversion the chip does
+    so is not documented. None: no fast loads told."""
+    at_bound: Annotated[tuple[Text, ...], Some] = ()
+    """Parameters that were found at the end of what is possible."""
     refused: dict[EffectName, Text] = Field(default={})
 
     @property

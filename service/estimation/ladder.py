@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats
+from devices.arrays import Bools, Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
@@ -55,6 +55,8 @@ class Ladder:
         temperature: of the baseline.
         ambient: what the domes pass on.
         gas: of the bubbles.
+        gas_known: does a tile's bench tell of its gas? Others have that of a median tile, for
+            their uncertainty.
         gas_misfit: part of the gas' correction that is uncertain.
         curves: static curves; those beneath creep and loop if `rubber` is there.
         skew: are tiles taken to the frame's instant?
@@ -68,6 +70,7 @@ class Ladder:
     temperature: Temperature | None
     ambient: Ambient | None
     gas: Gas | None
+    gas_known: Bools
     gas_misfit: Floats
     curves: StaticCurves
     skew: bool
@@ -92,7 +95,7 @@ def make_ladder(
     columns = np.array([i for i, tile in enumerate(info.tiles) if not tile.reference])
     for name in ("temperature", "ambient", "gas", "rubber", "hysteresis"):
         if name in models:
-            _refuse_undetermined(name, tiles, calibration)
+            _refuse_undetermined(name, tiles, calibration, every=name in _OF_ALL)
     if "ambient" in models and len(bearing) == len(info.tiles):
         raise UsageError(
             "model 'ambient' needs a bare reference tile, and the array has none",
@@ -105,13 +108,14 @@ def make_ladder(
         temperature=_temperature(tiles, tare, columns) if "temperature" in models else None,
         ambient=_ambient(tiles, baseline_kpa) if "ambient" in models else None,
         gas=_gas(tiles, baseline_kpa) if "gas" in models else None,
-        gas_misfit=_misfit([tile.effects.gas for tile in tiles]),
+        gas_known=np.array([tile.effects.gas is not None for tile in tiles]),
+        gas_misfit=_misfit([tile.effects.gas for tile in tiles], unknown=1.0),
         curves=StaticCurves(tiles, lasting="rubber" in models),
         skew="skew" in models,
         denoise="denoise" in models,
         hysteresis=_hysteresis(tiles) if "hysteresis" in models else None,
         rubber=_rubber(tiles) if "rubber" in models else None,
-        rubber_misfit=_misfit([tile.effects.rubber for tile in tiles]),
+        rubber_misfit=_misfit([tile.effects.rubber for tile in tiles], unknown=0.0),
     )
 
 
@@ -128,12 +132,18 @@ def check_models(models: Sequence[str]) -> None:
         raise UsageError("without the model 'static' there is no force", remedy="Add it")
 
 
+_OF_ALL = frozenset({"temperature", "ambient"})
+"""Models that every tile has to have: what they correct is as great as any load. Of the others a
+tile may go without one, alone; its uncertainty says so."""
+
+
 def _refuse_undetermined(
-    name: EffectName, tiles: Sequence[TileCalibration], calibration: Calibration
+    name: EffectName, tiles: Sequence[TileCalibration], calibration: Calibration, *, every: bool
 ) -> None:
     needed = "temperature" if name == "ambient" else name
-    for tile in tiles:
-        if getattr(tile.effects, needed) is None:
+    lacks = [getattr(tile.effects, needed) is None for tile in tiles]
+    for tile, is_lacking in zip(tiles, lacks, strict=True):
+        if is_lacking and (every or all(lacks)):
             reason = tile.effects.refused.get(name, "its calibration does not know of it")
             raise CalibrationError(
                 f"model {name!r} is not offered for tile {tile.serial}: {reason}",
@@ -146,16 +156,13 @@ def _refuse_undetermined(
 def _refuse_mixed(
     tiles: Sequence[TileCalibration], models: Sequence[str], calibration: Calibration
 ) -> None:
-    """All tiles have as many creep terms, and the plays that are modelled."""
-    terms = {len(tile.effects.rubber.part) for tile in tiles if tile.effects.rubber is not None}
+    """All tiles have the plays that are modelled."""
     plays = {len(e.part) for tile in tiles if (e := tile.effects.hysteresis) is not None}
-    if ("rubber" in models and len(terms) > 1) or (
-        "hysteresis" in models and plays != {len(WIDTHS_N)}
-    ):
+    if "hysteresis" in models and plays != {len(WIDTHS_N)}:
         raise CalibrationError(
-            f"its tiles have {sorted(terms)} creep terms and {sorted(plays)} plays",
+            f"its tiles have {sorted(plays)} plays",
             where=f"calibration {calibration.name} ({calibration.id})",
-            expected=f"the same number of terms in all tiles, and {len(WIDTHS_N)} plays",
+            expected=f"{len(WIDTHS_N)} plays",
             remedy="Calibrate all of them with this version",
         )
 
@@ -175,30 +182,40 @@ def _temperature(
 
 
 def _gas(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> Gas:
-    found = [effect for tile in tiles if (effect := tile.effects.gas) is not None]
+    found = [tile.effects.gas for tile in tiles]
+    known = [effect for effect in found if effect is not None]
+    gamma, tau_s = (
+        float(np.median(values(each)))
+        for each in ([e.gamma for e in known], [e.tau_s for e in known])
+    )
     return Gas(
-        gamma=values(effect.gamma for effect in found),
-        tau_s=values(effect.tau_s for effect in found),
+        gamma=np.array([gamma if effect is None else effect.gamma.value for effect in found]),
+        tau_s=np.array([tau_s if effect is None else effect.tau_s.value for effect in found]),
         wall_per_kpa=np.array([tile.effects.wall_per_kpa for tile in tiles]),
         baseline_kpa=baseline_kpa,
     )
 
 
 def _hysteresis(tiles: Sequence[TileCalibration]) -> Hysteresis:
-    found = [effect for tile in tiles if (effect := tile.effects.hysteresis) is not None]
-    return Hysteresis(np.array([values(effect.part) for effect in found]))
+    found = [tile.effects.hysteresis for tile in tiles]
+    none = np.zeros(len(WIDTHS_N))
+    return Hysteresis(np.array([none if e is None else values(e.part) for e in found]))
 
 
 def _rubber(tiles: Sequence[TileCalibration]) -> Rubber:
-    found = [effect for tile in tiles if (effect := tile.effects.rubber) is not None]
-    return Rubber(
-        part=np.array([values(effect.part) for effect in found]),
-        tau_s=np.array([values(effect.tau_s) for effect in found]),
-    )
+    """With as many terms as the tile that has most; what a tile lacks is nothing, at any time."""
+    found = [tile.effects.rubber for tile in tiles]
+    terms = max(len(effect.part) for effect in found if effect is not None)
+    part, tau_s = np.zeros((len(tiles), terms)), np.ones((len(tiles), terms))
+    for i, effect in enumerate(found):
+        if effect is not None:
+            part[i, : len(effect.part)] = values(effect.part)
+            tau_s[i, : len(effect.part)] = values(effect.tau_s)
+    return Rubber(part=part, tau_s=tau_s)
 
 
-def _misfit(effects: Sequence[GasEffect | RubberEffect | None]) -> Floats:
-    return np.array([0.0 if e is None else max(e.misfit, MISFIT_MIN) for e in effects])
+def _misfit(effects: Sequence[GasEffect | RubberEffect | None], *, unknown: float) -> Floats:
+    return np.array([unknown if e is None else max(e.misfit, MISFIT_MIN) for e in effects])
 
 
 def _ambient(tiles: Sequence[TileCalibration], baseline_kpa: Floats) -> Ambient:

@@ -102,7 +102,7 @@ class ApparentForces(Arrays):
         gas_n: standard uncertainty that the gas' correction leaves, with the correction's sign: all
             tiles err to the same side.
         sampled_ns: when each tile was sampled, on the monotonic clock.
-        beyond: beyond the calibrated range: a lower bound.
+        beyond: beyond the calibrated range, or the chip's: a lower bound.
         t_mono_ns: (n,), instants of the frames.
         run: (n,), number of the unbroken run that each frame belongs to.
         status: (n,), bits of `EstimateStatus` that these frames have by themselves.
@@ -128,8 +128,8 @@ class LowerState:
     ambient: ambient.AmbientState = ambient.AT_REST
     gas: gas.GasState | None = None
     skew: skew.SkewState | None = None
-    bound_ns: Times | None = None
-    """When each tile was last beyond its range."""
+    hidden_ns: Times | None = None
+    """When each tile's pressure was last beyond its chip's range."""
 
 
 def tile_kpa(plan: EstimationPlan, frames: FrameBatch) -> Floats:
@@ -168,7 +168,7 @@ def apparent_forces(
     # Owned, in row order: what is compiled is compiled for that.
     t_mono_ns = np.array(frames.t_mono_ns)
     offset_ns = 1000 * frames.sample_offset_us[:, columns].astype(np.int64, order="C")
-    sampled_ns = t_mono_ns[:, None] + offset_ns
+    sampled_ns = t_mono_ns[:, None] + offset_ns + plan.late_ns
     gauge_kpa = kpa - plan.tare.baseline_kpa
     bearing_kpa = np.ascontiguousarray(kpa[:, columns])
     baseline_variance = np.broadcast_to(plan.baseline_sigma_kpa**2, bearing_kpa.shape)
@@ -193,24 +193,29 @@ def apparent_forces(
     if ladder.temperature is not None or ladder.ambient is not None:
         gauge_kpa = gauge_kpa.copy()
         gauge_kpa[:, columns] = bearing_kpa - plan.baseline_kpa
-    settled_kpa, uncertain = bearing_kpa, np.zeros(bearing_kpa.shape, dtype=bool)
+    # The chip's range is judged by what was read, the calibrated one by what the gas settles at.
+    hidden = kpa[:, columns] > plan.chip_end_kpa
+    settled_kpa, gas_kpa = bearing_kpa, np.zeros(bearing_kpa.shape)
+    uncertain = np.zeros(bearing_kpa.shape, dtype=bool)
     if ladder.gas is not None:
-        # A reading beyond the range is only a bound: the gas model must not take it as a value.
-        bound = bearing_kpa - plan.baseline_kpa > ladder.curves.high_kpa
+        # What the chip cannot tell is only a bound: the gas model must not take it as a value.
         settled_kpa, warm = ladder.gas.settled(
-            np.where(bound, np.nan, bearing_kpa),
+            np.where(hidden, np.nan, bearing_kpa),
             sampled_ns,
             state.gas or gas.at_rest(len(columns)),
         )
-        settled_kpa = np.where(bound, bearing_kpa, settled_kpa)
-        uncertain, last_ns = _since(bound, sampled_ns, state.bound_ns, ladder.gas.memory_ns)
-        state = replace(state, gas=warm, bound_ns=last_ns)
+        uncertain, last_ns = _since(hidden, sampled_ns, state.hidden_ns, ladder.gas.memory_ns)
+        state = replace(state, gas=warm, hidden_ns=last_ns)
+        gas_kpa = settled_kpa - bearing_kpa
+        # A tile whose bench does not tell of its gas goes without, and is that uncertain.
+        settled_kpa = np.where(ladder.gas_known, settled_kpa, bearing_kpa)
+    settled_kpa = np.where(hidden, plan.hidden_kpa, settled_kpa)
     static_kpa = settled_kpa - plan.baseline_kpa
     static = ladder.curves.force(static_kpa)
     unknown = np.isnan(kpa[:, columns] if plan.tare.is_lost else static.force_n)
     status[unknown.any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
-    # After a bound the gas' temperature is unknown until it has cooled.
-    beyond = (static_kpa > ladder.curves.high_kpa) | uncertain
+    # After what was hidden the gas' temperature is unknown until it has cooled.
+    beyond = (static_kpa > ladder.curves.high_kpa) | hidden | uncertain
     status[beyond.any(axis=1)] |= np.uint16(EstimateStatus.SATURATED)
     low_kpa = ladder.curves.low_kpa - SIGMAS * plan.still_kpa
     status[(static_kpa < low_kpa).any(axis=1)] |= np.uint16(EstimateStatus.EXTRAPOLATED)
@@ -231,7 +236,7 @@ def apparent_forces(
         apparent_n=apparent_n,
         noise_n=np.abs(static.slope_n_per_kpa) * plan.noise_kpa,
         sigma_n=np.sqrt(static.slope_n_per_kpa**2 * baseline_variance + static.fit_sigma_n**2),
-        gas_n=static.slope_n_per_kpa * ladder.gas_misfit * (settled_kpa - bearing_kpa),
+        gas_n=static.slope_n_per_kpa * ladder.gas_misfit * gas_kpa,
         sampled_ns=sampled_ns,
         beyond=beyond,
         t_mono_ns=t_mono_ns,

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats
+from devices.arrays import Floats, Ints
 from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
-from service.estimation.calibration import Calibration
+from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.foot.contact import ContactRule
 from service.estimation.foot.geometry import grid_indices, hull
 from service.estimation.ladder import MODELS, Ladder, make_ladder
@@ -53,6 +54,13 @@ class EstimationPlan:
     baseline_kpa: Floats
     baseline_sigma_kpa: Floats
     noise_kpa: Floats
+    late_ns: Ints
+    """How much later a tile is sampled than its frames say."""
+    chip_end_kpa: Floats
+    """Absolute pressure above which a chip is not known to tell the pressure: the end of its rated
+    range, or of what it told on the bench if that is more, or less because it told no more."""
+    hidden_kpa: Floats
+    """Absolute pressure that the gas settles at, at least, if it is read above `chip_end_kpa`."""
     still_kpa: Floats
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
@@ -117,6 +125,10 @@ def make_plan(
                 remedy="Press this tile on the bench and calibrate it, or correct the serial",
             )
     positions_m = np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in info.tiles])
+    baseline_kpa = tare.baseline_kpa[bearing]
+    chip_end_kpa = np.array(
+        [_chip_end_kpa(*each) for each in zip(entries, baseline_kpa.tolist(), strict=True)]
+    )
     still_kpa = np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)[bearing]
     unloaded_n = float(np.sqrt(((ladder.curves.slope_at_zero_n_per_kpa * still_kpa) ** 2).sum()))
     return EstimationPlan(
@@ -129,9 +141,20 @@ def make_plan(
         ladder=ladder,
         bearing=bearing,
         references=np.flatnonzero([tile.reference for tile in info.tiles]),
-        baseline_kpa=tare.baseline_kpa[bearing],
+        baseline_kpa=baseline_kpa,
         baseline_sigma_kpa=tare.baseline_sigma_kpa[bearing],
         noise_kpa=tare.noise_kpa[bearing],
+        late_ns=np.array(
+            [
+                round(1e9 * late.value) if (late := e.effects.late_s) is not None else 0
+                for e in entries
+            ],
+            dtype=np.int64,
+        ),
+        chip_end_kpa=chip_end_kpa,
+        hidden_kpa=chip_end_kpa
+        if ladder.gas is None
+        else ladder.gas.settled_at_least(chip_end_kpa),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
         hull=hull(positions_m[bearing, :2]),
@@ -144,3 +167,12 @@ def make_plan(
         assumed_scale=any(entry.absolute_scale == "assumed" for entry in entries),
         gap_ns=round(GAP * 1e9 / info.nominal_rate_hz),
     )
+
+
+def _chip_end_kpa(entry: TileCalibration, baseline_kpa: float) -> float:
+    facts = entry.bench
+    if facts is None:
+        return max(PRESSURE_MAX_KPA, baseline_kpa + entry.range_kpa[1])
+    if facts.ended_by == "chip":
+        return facts.end_absolute_kpa
+    return max(PRESSURE_MAX_KPA, facts.end_absolute_kpa)

@@ -174,7 +174,7 @@ class Hub:
         for frames, columns in due:
             node.shown_t_ns = int(frames.t_ns[-1])
             if self._feeds:
-                piece = sum_up(node.boot_id, node.live.range_kpa, frames, columns)
+                piece = sum_up(node.boot_id, frames, columns)
                 for summary in self._changing():
                     summary.add(node.name, piece)
 

@@ -190,7 +190,6 @@ def _frame(node: str, piece: Piece, age_ms: float | None) -> dict[str, Any]:
 
 def sum_up(
     boot_id: str,
-    range_kpa: Floats | None,
     frames: FrameBatch,
     columns: Mapping[str, npt.NDArray[Any]],
 ) -> Piece:
@@ -198,7 +197,6 @@ def sum_up(
 
     Args:
         boot_id: the stream that they are of.
-        range_kpa: end of each tile's calibrated range, above which it is saturated.
         frames: n frames.
         columns: their estimates by name.
     """
@@ -218,13 +216,11 @@ def sum_up(
     newest["estimate_status"] = (
         int(columns["estimate_status"][-1]) if "estimate_status" in columns else 0
     )
-    newest["saturated"] = (
-        (columns["gauge_kpa"][-1] > range_kpa).tolist()
-        if range_kpa is not None and "gauge_kpa" in columns
-        else [False] * tiles
-    )
     gauge_kpa = columns.get("gauge_kpa", unknown)
     force_n = columns.get("force_n", unknown)
+    # A lower bound is a force without an uncertainty.
+    sigma_n = columns.get("force_sigma_n", np.zeros((1, tiles)))
+    newest["saturated"] = (np.isfinite(force_n[-1]) & np.isnan(sigma_n[-1])).tolist()
     grf_n = columns.get("grf_n", unknown[:, 0])
     return Piece(
         boot_id=boot_id,

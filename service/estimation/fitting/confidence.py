@@ -19,10 +19,16 @@ from service.estimation.calibration import BASIS, TileCalibration, loop_share
 _UPPER_95 = 0.975
 
 
-def fit_covariance(jacobian: Any) -> Floats:
-    """Covariance of the parameters of a least-squares fit whose residuals have unit variance."""
-    j = np.asarray(jacobian)
-    return np.asarray(np.linalg.pinv(j.T @ j))
+def fit_covariance(jacobian: Any, known: Floats) -> Floats:
+    """Covariance of the parameters of a least-squares fit whose residuals have unit variance.
+
+    Args:
+        jacobian: (residuals, parameters).
+        known: (parameters,), standard uncertainties before any residual: what the residuals do not
+            tell, as the time of a part that is zero, is not known better than that.
+    """
+    j = np.asarray(jacobian) * known
+    return np.asarray(np.linalg.inv(j.T @ j + np.eye(len(known))) * np.outer(known, known))
 
 
 def student_t_95(repeats: int) -> float:

@@ -115,7 +115,10 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
     # The slow strokes' mean curve has creep and loop in it already.
     static_curve = curve_over_range(tile.coefficients)
 
-    static = DomeModel(static_curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa)
+    late_s = 0.0 if effects.late_s is None else effects.late_s.value
+    static = DomeModel(
+        static_curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa, late_s=late_s
+    )
     model = replace(static, curve=curve)
     if gas is not None:
         model = replace(model, gamma=gas.gamma.value, tau_s=gas.tau_s.value)

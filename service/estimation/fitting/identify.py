@@ -17,7 +17,7 @@ from service.estimation.effects import (
     TemperatureEffect,
 )
 from service.estimation.fitting.model import DomeModel
-from service.estimation.fitting.output_error import Fit, OutputErrorProblem
+from service.estimation.fitting.output_error import Fit, Fitted, OutputErrorProblem
 from service.estimation.fitting.press import Presses
 from service.estimation.models.hysteresis import WIDTHS_N
 
@@ -25,8 +25,6 @@ _CLEAR = 3.0
 """An effect is determined if it differs from zero by this many standard uncertainties."""
 _LN_SIGMA_MAX = 0.7
 """A time constant is determined within a factor of two."""
-_GAMMA_MAX = 1.45
-"""Air has 1.40; a single time constant for a sphere makes it less, never more."""
 _FAST_MIN = 50
 """Least number of readings of holds, releases and taps that determine fast effects."""
 
@@ -57,9 +55,9 @@ def identify(
     wall_per_kpa = Effects(temperature=temperature).wall_per_kpa
     static = DomeModel(first_curve, scale_kpa, baseline_kpa, wall_per_kpa)
     problem = OutputErrorProblem(points, static)
-    free: frozenset[EffectName] = frozenset({"gas", "rubber", "hysteresis"})
+    free: frozenset[Fitted] = frozenset({"late", "gas", "rubber", "hysteresis"})
     if int(points.fast.sum()) < _FAST_MIN:
-        free -= {"gas"}
+        free -= {"gas", "late"}
         refused["gas"] = "no holds, releases or taps in the recording"
     while True:
         fit = problem.fit(free)
@@ -89,23 +87,27 @@ def identify(
         )
     if "hysteresis" in free:
         hysteresis = HysteresisEffect(part=_parameters(model.loop, sigma["loop"]))
+    late_s = None
+    if "late" in free:
+        (late_s,) = _parameters([model.late_s], sigma["late_s"])
     return Effects(
-        gas=gas, rubber=rubber, hysteresis=hysteresis, temperature=temperature, refused=refused
+        gas=gas,
+        rubber=rubber,
+        hysteresis=hysteresis,
+        temperature=temperature,
+        late_s=late_s,
+        at_bound=fit.at_bound,
+        refused=refused,
     )
 
 
-def _undetermined(fit: Fit, free: frozenset[EffectName]) -> dict[EffectName, str]:
+def _undetermined(fit: Fit, free: frozenset[Fitted]) -> dict[EffectName, str]:
     """Why a fitted effect cannot be told from zero."""
     model, sigmas = fit.model, fit.sigma
     reasons: dict[EffectName, str] = {}
     if "gas" in free:
         sigma, ln_sigma = float(sigmas["gamma"][0]), float(sigmas["ln_tau"][0])
-        if model.gamma > _GAMMA_MAX:
-            reasons["gas"] = (
-                f"gamma {model.gamma:.2f} is more than a gas can have: tile and reference are not "
-                "of the same instants, or the spindle slipped"
-            )
-        elif model.gamma - 1.0 < _CLEAR * sigma or ln_sigma > _LN_SIGMA_MAX:
+        if model.gamma - 1.0 < _CLEAR * sigma or ln_sigma > _LN_SIGMA_MAX:
             reasons["gas"] = (
                 f"gamma {model.gamma:.3f} +- {sigma:.3f}, tau {model.tau_s * 1e3:.1f} ms within a "
                 f"factor of {np.exp(ln_sigma):.1f}: not determined"

@@ -38,6 +38,7 @@ class DomeModel:
         part: (terms,) of the creep.
         creep_s: (terms,) its times.
         loop: (plays,) parts of the plays of half widths `WIDTHS_N`.
+        late_s: how much later than its instant says the tile is sampled.
     """
 
     curve: Floats
@@ -49,12 +50,13 @@ class DomeModel:
     part: Floats = field(default_factory=lambda: np.zeros(0))
     creep_s: Floats = field(default_factory=lambda: np.zeros(0))
     loop: Floats = field(default_factory=lambda: np.zeros(0))
+    late_s: float = 0.0
 
     def pressed(self, t_s: Floats, force_n: Floats) -> Floats:
-        """What `pressed` gives for these parameters."""
+        """What `pressed` gives for these parameters, under forces that are of the instants."""
         return pressed(
             t_s,
-            force_n,
+            np.interp(t_s + self.late_s, t_s, force_n),
             self.curve,
             self.scale_kpa,
             self.baseline_kpa,

@@ -8,6 +8,7 @@ force. Every loading may have a gain of its own about one, because loadings do n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import least_squares, nnls
@@ -30,11 +31,18 @@ _OPENS_N = 0.1
 """A tile with less force is at rest."""
 
 
+Fitted = EffectName | Literal["late"]
+"""What is fitted beside the curve."""
+_LATE_S = 0.00025
+"""How well it is known beforehand when a tile is sampled: somewhere in the first part of a
+conversion of 1.6 ms (DS table 7), of which a quarter is assumed."""
+
+
 @dataclass(frozen=True)
 class _Unknowns:
     """Unknowns of an effect: where the search begins, and its bounds."""
 
-    effect: EffectName
+    effect: Fitted
     name: str
     start: tuple[float, ...]
     least: tuple[float, ...]
@@ -42,7 +50,9 @@ class _Unknowns:
 
 
 _UNKNOWNS = (
-    _Unknowns("gas", "gamma", (1.3,), (1.001,), (1.6,)),
+    _Unknowns("late", "late_s", (0.0,), (-0.0006,), (0.0006,)),
+    # No gas has more than air, which has 1.40; a single time for a sphere's many makes it less.
+    _Unknowns("gas", "gamma", (1.3,), (1.001,), (1.4,)),
     _Unknowns("gas", "ln_tau", (np.log(0.012),), (-6.5,), (-2.0,)),
     _Unknowns("rubber", "part", (0.04,) * TERMS, (0.0,) * TERMS, (0.4,) * TERMS),
     # A fast and a slow time, whose ranges meet: two times that may change places are not unique.
@@ -66,10 +76,11 @@ class Fit:
         gains: (loadings,), of each loading.
         scatter: standard deviation of the gains.
         modelled: (m, 3), as `pressed` gives it.
-        sigma: standard uncertainties by the name of the unknown: "gamma", "ln_tau", "part",
-            "ln_creep", "loop", as far as they were fitted; and of what neighbouring terms trade
-            with one another only the sum: "part_sum", "loop_n".
+        sigma: standard uncertainties by the name of the unknown: "late_s", "gamma", "ln_tau",
+            "part", "ln_creep", "loop", as far as they were fitted; and of what neighbouring terms
+            trade with one another only the sum: "part_sum", "loop_n".
         curve_covariance: (3, 3), of the curve's coefficients.
+        at_bound: unknowns that are at the end of what is possible.
     """
 
     model: DomeModel
@@ -78,6 +89,7 @@ class Fit:
     modelled: Floats
     sigma: dict[str, Floats]
     curve_covariance: Floats
+    at_bound: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -107,7 +119,7 @@ class OutputErrorProblem:
         self._weight = np.where(self._usable, points.weight, 0.0)
         self._gauge_kpa = np.where(self._usable, gauge_kpa, 0.0)
 
-    def fit(self, free: frozenset[EffectName]) -> Fit:
+    def fit(self, free: frozenset[Fitted]) -> Fit:
         """Fit the curve and the effects that are `free`."""
         curve = self._static.curve
         low, high = np.full(3, -_NO_LIMIT), np.full(3, _NO_LIMIT)
@@ -134,7 +146,8 @@ class OutputErrorProblem:
             # Gains scatter about their mean, which the curve should have taken: not quite, and
             # there are few of them.
             scatter = max(_SCATTER[0], float(np.sqrt(np.mean((gains - 1.0) ** 2))))
-        covariance = fit_covariance(found.jac)
+        # What readings hardly tell is known as well as its bounds say.
+        covariance = fit_covariance(found.jac, (high - low) / np.sqrt(12.0))
         every = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         sigma = {name: every[where] for name, where in at.items()}
         for name, total, weights in (
@@ -144,7 +157,9 @@ class OutputErrorProblem:
             if name in at:
                 variance = float(weights @ covariance[at[name], at[name]] @ weights)
                 sigma[total] = np.array([np.sqrt(max(0.0, variance))])
-        return Fit(model, gains, scatter, modelled, sigma, covariance[at["curve"], at["curve"]])
+        at_bound = tuple(name for name, where in at.items() if found.active_mask[where].any())
+        curve_covariance = covariance[at["curve"], at["curve"]]
+        return Fit(model, gains, scatter, modelled, sigma, curve_covariance, at_bound)
 
     def misfits(self, fit: Fit) -> Misfits:
         """What the fit leaves of the measured pressures, as parts of what was corrected."""
@@ -170,6 +185,8 @@ class OutputErrorProblem:
 
     def _model(self, x: Floats, at: dict[str, slice]) -> DomeModel:
         model = replace(self._static, curve=x[at["curve"]])
+        if "late_s" in at:
+            model = replace(model, late_s=float(x[at["late_s"]][0]))
         if "gamma" in at:
             gamma, tau_s = float(x[at["gamma"]][0]), float(np.exp(x[at["ln_tau"]][0]))
             model = replace(model, gamma=gamma, tau_s=tau_s)
@@ -192,7 +209,7 @@ class OutputErrorProblem:
         gains, modelled = self._gains(model, scatter)
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
         off = (gains[self._points.loading] * gauge_kpa - self._gauge_kpa) * self._weight
-        return np.concatenate([off, (gains - 1.0) / scatter])
+        return np.concatenate([off, (gains - 1.0) / scatter, [model.late_s / _LATE_S]])
 
 
 def _systematic_n(residual_n: Floats, force_n: Floats, fast: Bools) -> float:

@@ -66,15 +66,17 @@ def fit_soak(soak: Soak) -> TemperatureEffect | str:
         return np.asarray((base_kpa + kpa_per_k * gas_k - kpa) / sigma_kpa)
 
     low, high = np.log(_LAG_S)
+    least, most = np.array([0.0, -2.0, low]), np.array([200.0, 2.0, high])
     found = least_squares(
         residual,
         [float(kpa[0]), 0.3, np.log(3.0)],
-        bounds=([0.0, -2.0, low], [200.0, 2.0, high]),
+        bounds=(least, most),
         x_scale=[1.0, 0.1, 1.0],
         loss="soft_l1",
     )
     # Where readings scatter more than their noise says, so do the parameters.
-    sigma = np.sqrt(np.diag(fit_covariance(found.jac))) * max(1.0, np.sqrt(np.mean(found.fun**2)))
+    covariance = fit_covariance(found.jac, (most - least) / np.sqrt(12.0))
+    sigma = np.sqrt(np.diag(covariance)) * max(1.0, np.sqrt(np.mean(found.fun**2)))
     base_kpa, kpa_per_k, ln_lag = (float(x) for x in found.x)
     if not kpa_per_k > 0.0 or sigma[1] > _SIGMA_MAX * kpa_per_k:
         return f"baseline per kelvin is {kpa_per_k:.3f} +- {sigma[1]:.3f} kPa: not determined"

@@ -62,6 +62,17 @@ class Gas:
         """How long each tile's gas remembers what was before."""
         return np.asarray(RESTART * self.gamma * self.tau_s * 1e9)
 
+    def settled_at_least(self, kpa: Floats) -> Floats:
+        """Least pressure that the gas can settle at from one that it has now, or had more of.
+
+        None of its heat has gone: p (p0/p)^k. Heat that has gone before only leaves it colder.
+
+        Args:
+            kpa: absolute pressures over tiles, above the baseline.
+        """
+        k = (self.gamma - 1.0) / self.gamma
+        return np.asarray(kpa * (self.baseline_kpa / kpa) ** k)
+
     def settled(self, kpa: Floats, t_ns: Times, state: GasState) -> tuple[Floats, GasState]:
         """Pressures that measured ones would settle at.
 

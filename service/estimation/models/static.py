@@ -14,10 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from devices.errors import CalibrationError
 from service.estimation.calibration import BASIS, CURVE_OPENS_N, LOOP_OPENS_N, TileCalibration
 from service.estimation.compiled import compiled
-from service.estimation.effects import RubberEffect
 
 
 @dataclass(frozen=True)
@@ -36,26 +34,16 @@ class StaticCurves:
     Args:
         tiles: their calibrations.
         lasting: take the curves of forces that have lasted, which lie beneath creep and loop, for
-            the model `rubber`; all tiles have it then.
+            the model `rubber`; a tile that does not have it keeps its own, which slow strokes gave.
     """
 
     def __init__(self, tiles: Sequence[TileCalibration], *, lasting: bool = False) -> None:
         scatter = curve_misfit_n = np.zeros(len(tiles))
         if lasting:
-            rubbers = [_rubber(tile) for tile in tiles]
-            scatter = np.array([rubber.scatter for rubber in rubbers])
-            curve_misfit_n = np.array([rubber.curve_misfit_n for rubber in rubbers])
-            tiles = [
-                tile.model_copy(
-                    update={
-                        "coefficients": rubber.coefficients,
-                        "covariance": rubber.covariance,
-                        "relative_misfit": 0.0,
-                        "loop_misfit_n": 0.0,
-                    }
-                )
-                for tile, rubber in zip(tiles, rubbers, strict=True)
-            ]
+            rubbers = [tile.effects.rubber for tile in tiles]
+            scatter = np.array([0.0 if r is None else r.scatter for r in rubbers])
+            curve_misfit_n = np.array([0.0 if r is None else r.curve_misfit_n for r in rubbers])
+            tiles = [_lasting(tile) for tile in tiles]
         offset_kpa = np.array([t.p_offset_kpa for t in tiles])
         scale_kpa = np.array([t.p_scale_kpa for t in tiles])
         c1, c2, c3 = (np.array([t.coefficients[k] * t.f_scale_n for t in tiles]) for k in (1, 2, 3))
@@ -133,10 +121,18 @@ def _curve(
     return force, slope, sigma
 
 
-def _rubber(tile: TileCalibration) -> RubberEffect:
-    if tile.effects.rubber is None:
-        raise CalibrationError(f"tile {tile.serial} has no curve of forces that have lasted")
-    return tile.effects.rubber
+def _lasting(tile: TileCalibration) -> TileCalibration:
+    rubber, loop = tile.effects.rubber, tile.effects.hysteresis
+    if rubber is None:
+        return tile
+    return tile.model_copy(
+        update={
+            "coefficients": rubber.coefficients,
+            "covariance": rubber.covariance,
+            "relative_misfit": 0.0,
+            "loop_misfit_n": tile.loop_misfit_n if loop is None else 0.0,
+        }
+    )
 
 
 def _horner(tile: TileCalibration, u: float) -> float:

@@ -53,7 +53,6 @@ def fake_node(name: str = "bench", *, has_clock: bool = False) -> ServerNode:
     node = SimpleNamespace(
         name=name,
         boot_id="0" * 32,
-        live=SimpleNamespace(range_kpa=np.array([15.0, 15.0])),
         shown_t_ns=None,
         clock=object() if has_clock else None,
         server_t_ns=lambda t_ns: t_ns,

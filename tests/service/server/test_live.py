@@ -62,7 +62,7 @@ def piece(
     silent: float = 0.2,
 ) -> Piece:
     columns = estimates(first, rows, silent=silent)
-    return sum_up(boot_id, RANGE_KPA, frames(first, rows, period_ns=period_ns), columns)
+    return sum_up(boot_id, frames(first, rows, period_ns=period_ns), columns)
 
 
 def taken(summary: Summary, ages_ms: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
@@ -342,7 +342,7 @@ def numbers(messages: Sequence[dict[str, Any]]) -> list[int]:
 
 def test_without_estimates_everything_estimated_is_null() -> None:
     summary = Summary()
-    summary.add("bench", sum_up("0" * 32, RANGE_KPA, frames(0, 5), {}))
+    summary.add("bench", sum_up("0" * 32, frames(0, 5), {}))
     (message,) = taken(summary)
     for name in ("gauge_kpa", "force_n", "force_sigma_n", "gauge_min_kpa", "force_max_n"):
         assert message[name] == [None, None], name
@@ -356,17 +356,16 @@ def test_without_estimates_everything_estimated_is_null() -> None:
 
 
 def test_contact_and_saturation_are_those_of_the_newest_frame() -> None:
-    high_kpa = np.array([10.0, 10.0])
     columns = {
-        "gauge_kpa": np.array([[50.0, 50.0], [10.0, 10.1]]),
+        "force_n": np.array([[50.0, 50.0], [10.0, 10.1]]),
+        "force_sigma_n": np.array([[np.nan, np.nan], [0.1, np.nan]]),  # none of a lower bound
         "contact": np.array([UNKNOWN, 1], dtype=np.uint8),
     }
-    newest = sum_up("0" * 32, high_kpa, frames(0, 2), columns).newest
+    newest = sum_up("0" * 32, frames(0, 2), columns).newest
     assert newest["saturated"] == [False, True]
     assert newest["contact"] is True
-    assert sum_up("0" * 32, None, frames(0, 2), columns).newest["saturated"] == [False, False]
     for value, told in ((0, False), (UNKNOWN, None)):
         columns["contact"][-1] = value
-        assert sum_up("0" * 32, high_kpa, frames(0, 2), columns).newest["contact"] is told
-    columns["gauge_kpa"][-1] = np.nan
-    assert sum_up("0" * 32, high_kpa, frames(0, 2), columns).newest["saturated"] == [False, False]
+        assert sum_up("0" * 32, frames(0, 2), columns).newest["contact"] is told
+    columns["force_n"][-1] = np.nan
+    assert sum_up("0" * 32, frames(0, 2), columns).newest["saturated"] == [False, False]

@@ -97,13 +97,15 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         gauge[i] = [None if p is None else p - base[i] for p in dry]
         hot = effects[i].gas
         entry = plan.calibration.of(plan.info.tiles[i].serial)
-        # A reading beyond the range is a bound, which the gas is not told of.
-        bound = [p is not None and p - base[i] > mpf(entry.range_kpa[1]) for p in dry]
-        told = [None if b else p for p, b in zip(dry, bound, strict=True)]
+        # What was read beyond the chip's end is a bound, which the gas is not told of.
+        end = max(mpf(115), base[i] + mpf(entry.range_kpa[1]))
+        hidden = [p is not None and p > end for p in kpa[i]]
+        told = [None if h else p for p, h in zip(dry, hidden, strict=True)]
         settled = equations.gas(
             told, t_ns[i], mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i]
         )
-        settled = [p if b else s for p, b, s in zip(dry, bound, settled, strict=True)]
+        least = end * (base[i] / end) ** ((mpf(hot.gamma.value) - 1) / mpf(hot.gamma.value))
+        settled = [least if h else s for h, s in zip(hidden, settled, strict=True)]
         memory_ns = 5 * mpf(hot.gamma.value) * mpf(hot.tau_s.value) * 10**9
         apparent: list[Exact] = []
         single: list[Exact] = []
@@ -121,8 +123,8 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             force, slope, fit = _static(entry, p - base[i])
             apparent.append(force)
             single.append(abs(slope) * noise[i])
-            lately = any(bound[m] and t_ns[i][k] - t_ns[i][m] < memory_ns for m in range(k))
-            beyond.append(p - base[i] > mpf(entry.range_kpa[1]) or lately)
+            lately = any(hidden[m] and t_ns[i][k] - t_ns[i][m] < memory_ns for m in range(k))
+            beyond.append(p - base[i] > mpf(entry.range_kpa[1]) or hidden[k] or lately)
             heat_n[k] = slope * mpf(hot.misfit) * (p - dry[k])
             own.append(slope**2 * variance[k] + fit)
         averaged: list[Any] = equations.denoised(

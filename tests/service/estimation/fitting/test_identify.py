@@ -91,19 +91,24 @@ def recorded(
     holds: int = 5,
     taps: int = 15,
     soak_s: float = 0.0,
+    late_s: float = 0.0,
 ) -> Indentation:
-    """A tile pressed by the mill: white noise, and every loading with a gain of its own."""
+    """A tile pressed by the mill: white noise, and every loading with a gain of its own.
+
+    Its chip samples so much later than the instants say.
+    """
     rng = np.random.default_rng(seed)
     steps = programme(strokes=strokes, holds=holds, taps=taps, soak_s=soak_s)
     ends_s = np.array([end for end, _, _ in steps])
     t_s = np.arange(0.0, ends_s[-1], STEP_S)
-    force_n = np.interp(t_s, [0.0, *ends_s], [0.0, *(force for _, force, _ in steps)])
+    turns_s, turns_n = [0.0, *ends_s], [0.0, *(force for _, force, _ in steps)]
+    force_n = np.interp(t_s, turns_s, turns_n)
     index = np.minimum(np.searchsorted(ends_s, t_s, side="right"), len(steps) - 1)
     phase = np.array([phase for _, _, phase in steps])[index]
     active = ~np.isin(phase, ("rest", "soak"))
     loading = np.cumsum(np.diff(active.astype(int), prepend=0) == 1)
     gain = 1.0 + scatter * rng.standard_normal(loading[-1] + 1)
-    kpa = press(t_s, force_n)
+    kpa = press(t_s, np.interp(t_s + late_s, turns_s, turns_n))
     return Indentation(
         serial="T01",
         where="here",
@@ -155,6 +160,15 @@ def test_taps_and_releases_tell_the_gas_to_a_few_percent(known: list[Effects]) -
         assert effects.gas.tau_s.sigma < 0.1 * TAU_S
         low, high = effects.gas.tau_s.interval_95
         assert high - low == pytest.approx(2 * 1.96 * effects.gas.tau_s.sigma)
+
+
+@pytest.mark.parametrize("late_s", [-300e-6, 0.0, 233e-6])
+def test_how_late_a_tile_is_sampled_is_found_and_spoils_nothing_else(late_s: float) -> None:
+    effects = found_in(recorded(late_s=late_s))
+    assert effects.late_s is not None
+    assert effects.late_s.sigma < 80e-6
+    assert effects.late_s.value == pytest.approx(late_s, abs=4.0 * effects.late_s.sigma)
+    assert np.abs(off_by_sigmas(effects)).max() < 4.5
 
 
 def test_how_loadings_scatter_is_found(known: list[Effects]) -> None:
@@ -240,6 +254,20 @@ def test_of_an_emulated_dome_all_effects_are_found_about_as_great_as_they_are() 
     assert effects.hysteresis is not None
     width_n = sum(p.value * w for p, w in zip(effects.hysteresis.part, WIDTHS_N, strict=True))
     assert width_n == pytest.approx(part.loop_n, rel=0.35)
+
+
+@pytest.mark.parametrize("late_s", [-300e-6, 233e-6])
+@pytest.mark.parametrize("serial", ["T01", "T03", "T04", "T05"])
+def test_a_dome_that_is_sampled_at_another_instant_keeps_its_gas(
+    serial: str, late_s: float
+) -> None:
+    press = pressed_by_dome(serial, gas=True, rubber=True, hysteresis=True)
+    effects = found_in(recorded(press, scatter=0.0, late_s=late_s))
+    assert set(effects.refused) == {"temperature", "ambient"}
+    assert effects.gas is not None
+    assert effects.gas.gamma.value <= 1.4
+    assert effects.late_s is not None
+    assert effects.late_s.value == pytest.approx(late_s, abs=200e-6)
 
 
 @pytest.mark.parametrize("missing", ["gas", "rubber", "hysteresis"])
