@@ -1,6 +1,6 @@
 """All attacks, and the table of what came of them.
 
-    python -m tests.hostile --seed 1 [--soak] [--tries N] [--only WORD] [--out docs/results/hostile.md]
+    python -m tests.hostile --seed 1 [--soak | --tries N] [--only WORD] [--out FILE]
 
 With `--out` a row is written as soon as its attack has ended, and takes the place of the row of an
 earlier run of it: all of them take more than an hour, so they may be played one by one. A row says
