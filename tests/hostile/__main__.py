@@ -87,8 +87,8 @@ def _write(path: Path, name: str, row: str) -> None:
 _HEAD = """# Attacks, and what came of them
 
 Made by `python -m tests.hostile --soak --seed SEED --out docs/results/hostile.md`, some rows with
-`--tries N` in place of `--soak`. What each attack does, and what would count as a failure, is in the
-docstring of its function in `tests/hostile/`. What is defended and what is not:
+`--tries N` in place of `--soak`. What each attack does, and what would count as a failure, is in
+the docstring of its function in `tests/hostile/`. What is defended and what is not:
 [security.md](../security.md).
 
 | attack | tries | what happened | measured beside it | failures | s | seed | day, commit |
