@@ -235,7 +235,7 @@ class WebSocket(WebSocketsSansIOProtocol):
 
     @property
     def is_ready(self) -> bool:
-        """Has what was written before gone, but for a few kilobytes?"""
+        """Has what was written before gone, but for what a transport holds (64 KiB)?"""
         return self.writable.is_set()
 
     def write(self, framed: bytes) -> None:

@@ -209,7 +209,12 @@ def apparent_forces(
         gas_kpa = settled_kpa - bearing_kpa
         # A tile whose bench does not tell of its gas goes without, and is that uncertain.
         settled_kpa = np.where(ladder.gas_known, settled_kpa, bearing_kpa)
-    settled_kpa = np.where(hidden, plan.hidden_kpa, settled_kpa)
+    if hidden.any():
+        # As if the chip's end had been read, with what warmth and surroundings have put into it.
+        least_kpa = bearing_kpa - (kpa[:, columns] - plan.chip_end_kpa)
+        if ladder.gas is not None:
+            least_kpa = ladder.gas.settled_at_least(least_kpa)
+        settled_kpa = np.where(hidden, least_kpa, settled_kpa)
     static_kpa = settled_kpa - plan.baseline_kpa
     static = ladder.curves.force(static_kpa)
     unknown = np.isnan(kpa[:, columns] if plan.tare.is_lost else static.force_n)

@@ -59,8 +59,6 @@ class EstimationPlan:
     chip_end_kpa: Floats
     """Absolute pressure above which a chip is not known to tell the pressure: the end of its rated
     range, or of what it told on the bench if that is more, or less because it told no more."""
-    hidden_kpa: Floats
-    """Absolute pressure that the gas settles at, at least, if it is read above `chip_end_kpa`."""
     still_kpa: Floats
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
@@ -152,9 +150,6 @@ def make_plan(
             dtype=np.int64,
         ),
         chip_end_kpa=chip_end_kpa,
-        hidden_kpa=chip_end_kpa
-        if ladder.gas is None
-        else ladder.gas.settled_at_least(chip_end_kpa),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
         hull=hull(positions_m[bearing, :2]),

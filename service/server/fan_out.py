@@ -31,7 +31,7 @@ class Outlet(Protocol):
 
     @property
     def is_ready(self) -> bool:
-        """Has what was written before gone, but for a few kilobytes?"""
+        """Has what was written before gone, but for what a transport holds (64 KiB)?"""
 
     def write(self, framed: bytes) -> None:
         """Write whole frames of the websocket protocol; nothing, if it is closed."""

@@ -104,8 +104,11 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         settled = equations.gas(
             told, t_ns[i], mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i]
         )
-        least = end * (base[i] / end) ** ((mpf(hot.gamma.value) - 1) / mpf(hot.gamma.value))
-        settled = [least if h else s for h, s in zip(hidden, settled, strict=True)]
+        part = (mpf(hot.gamma.value) - 1) / mpf(hot.gamma.value)
+        for k in range(n):
+            if hidden[k]:
+                least = dry[k] - (kpa[i][k] - end)
+                settled[k] = least * (base[i] / least) ** part
         memory_ns = 5 * mpf(hot.gamma.value) * mpf(hot.tau_s.value) * 10**9
         apparent: list[Exact] = []
         single: list[Exact] = []
