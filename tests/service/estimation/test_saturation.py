@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.arrays import Floats
+from devices.chips.mpl115a2 import TADC_PER_KELVIN, Coefficients, compensate_kpa, padc_of_kpa
 from devices.errors import CalibrationError
 from service.estimation.calibration import TileCalibration
 from service.estimation.effects import Effects, GasEffect, Parameter
@@ -17,7 +20,7 @@ from service.estimation.models.gas import Gas
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import estimate, newton_plan
-from tests.builders.frames import loaded_frames
+from tests.builders.frames import loaded_frames, make_frames
 
 BASE_KPA, SCALE_KPA, STEP_S = 100.0, 16.0, 0.002
 CURVE = np.array([22.0, 5.0, 5.0])  # newtons at the end of the range: 32
@@ -118,6 +121,31 @@ def test_what_the_chip_cannot_tell_is_saturated_whatever_the_gas_says_and_a_boun
     assert (e.force_n[hidden, 0] <= true_n[hidden]).all()
     assert (e.force_n[hidden, 0] > 0.75 * true_n[hidden]).all()  # and not an idle one
     assert np.isnan(e.force_sigma_n[hidden, 0]).all()
+
+
+@pytest.mark.parametrize("warmer_k", [-6.0, 10.0])
+def test_a_bound_holds_for_a_dome_that_is_warmer_or_colder_than_at_its_tare(
+    warmer_k: float,
+) -> None:
+    """What warmth puts into the pressure is no load, also where only the chip's end is known."""
+    info, true_n = make_array(2), 98.0
+    warm_kpa = warmer_k * 0.3
+    tadc = round(480 + warmer_k * TADC_PER_KELVIN)
+    chip = Coefficients.from_words(info.tiles[0].coefficient_words)
+    # Slow, so that no heat of the squeeze is left; warmth acts on all of the gas.
+    kpa = (UNLOADED_KPA + true_n * COUNT_KPA) * (1.0 + warm_kpa / UNLOADED_KPA)
+    padc = round(float(padc_of_kpa(kpa, tadc, chip)))
+    seen_kpa = float(compensate_kpa(padc, tadc, chip.a0, chip.b1, chip.b2, chip.c12))
+    # A gas that hardly heats, so that the bound is near.
+    gamma = Parameter(value=1.02, sigma=0.0)
+    cool = GAS.model_copy(update={"gas": GasEffect(gamma=gamma, tau_s=gamma, misfit=0.1)})
+    tiles = [tile(serial, cool) for serial in info.serials]
+    plan = newton_plan(info, tiles=tiles, models=("unwrap", "temperature", "gas", "static"))
+    plan = replace(plan, chip_end_kpa=np.full(2, seen_kpa - 0.05))
+    e = estimate(plan, make_frames(20, 2, padc=padc, tadc=tadc))
+    assert ((e.estimate_status & EstimateStatus.SATURATED) > 0).all()
+    assert (e.force_n <= true_n).all()
+    assert (e.force_n > 0.95 * true_n).all()  # and not an idle one
 
 
 def test_a_tile_without_gas_goes_without_alone_and_its_uncertainty_says_so() -> None:
