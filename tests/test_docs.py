@@ -27,7 +27,7 @@ from service.cli.main import app
 from service.estimation.calibration import TileCalibration
 from service.estimation.estimates import EstimateStatus
 from service.link import Close
-from service.server.live import Summary, sum_up
+from service.server.screens.picture import Summary, sum_up
 from service.server.server import Server
 from storage.schema import KNOWN
 from tests.builders.frames import make_frames

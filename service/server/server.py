@@ -14,13 +14,13 @@ from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
 from service.server.book import SessionBook, Trash, destroy
 from service.server.data_folder import DataFolder
-from service.server.fan_out import Hub
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
+from service.server.screens.fan_out import Hub
+from service.server.screens.views import Counted, NodeView, SessionView
 from service.server.settling import Settling
 from service.server.streams import ServerStream
-from service.server.views import Counted, NodeView, SessionView
 from service.server_clock import utc_ns
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals

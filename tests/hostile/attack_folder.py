@@ -24,8 +24,8 @@ from service.link import Hello
 from service.server.following import sources_now
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
+from service.server.screens.views import NodeView, SessionView
 from service.server.server import Server
-from service.server.views import NodeView, SessionView
 from service.sessions.frames import SessionFrames
 from storage.intervals import Intervals, OpenPairs
 from storage.journal.in_flight import InFlight

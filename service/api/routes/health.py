@@ -7,7 +7,7 @@ from pydantic import Field
 
 from service.api.routes.access import ServerState, problems
 from service.link import SUBPROTOCOL
-from service.server.views import View
+from service.server.screens.views import View
 from service.version import SOFTWARE
 
 router = APIRouter(tags=["server"])

@@ -11,10 +11,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from service.api.protocols import OUTLET
 from service.link import SUBPROTOCOL, Close, HangUp, close_reason
-from service.server.fan_out import RATES_HZ, Outlet, framed
-from service.server.live import dumps
+from service.server.screens.fan_out import RATES_HZ, Outlet, framed
+from service.server.screens.picture import dumps
+from service.server.screens.views import SessionView
 from service.server.server import Server
-from service.server.views import SessionView
 from service.server_clock import utc_ns
 from service.version import SOFTWARE
 

@@ -9,7 +9,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.api.routes.access import ServerState, problems
-from service.server.views import DriftView, NodeView, Page, TaresPage, TareView
+from service.server.screens.views import DriftView, NodeView, Page, TaresPage, TareView
 from service.sessions.tares import REASON_LENGTH_MAX
 
 router = APIRouter(prefix="/nodes", tags=["nodes"])

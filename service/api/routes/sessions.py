@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from service.api.routes.access import ServerState, problems, stored_table
-from service.server.views import EventView, Page, SessionView
+from service.server.screens.views import EventView, Page, SessionView
 from storage.formats.export import MEDIA_TYPES
 from storage.sessions.beside import EVENTS_NAME
 from storage.sessions.folder import Ledger

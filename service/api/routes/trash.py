@@ -6,7 +6,7 @@ from fastapi import APIRouter
 from pydantic import Field
 
 from service.api.routes.access import ServerState, problems
-from service.server.views import Page, SessionView, View
+from service.server.screens.views import Page, SessionView, View
 
 router = APIRouter(prefix="/trash", tags=["trash"])
 

@@ -14,7 +14,7 @@ import pytest
 from devices.frames import FrameBatch
 from service.server.live_estimates import LiveEstimates
 from service.server.node import ServerNode
-from service.server.views import NodeView
+from service.server.screens.views import NodeView
 from storage.verify.journal import verify_stream
 from tests.builders.frames import with_columns
 from tests.builders.odd_values import with_value

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-import service.server.fan_out
+import service.server.screens.fan_out
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.running import Running, closed
 from tests.waiting import until
@@ -204,7 +204,7 @@ def test_a_screen_that_never_reads_is_let_go_and_delays_nobody(
     tared: FakeNode,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(service.server.fan_out, "TOO_SLOW_S", 1.0)
+    monkeypatch.setattr(service.server.screens.fan_out, "TOO_SLOW_S", 1.0)
     slow = sockets.socket()
     slow.setsockopt(sockets.SOL_SOCKET, sockets.SO_RCVBUF, 2048)
     slow.connect(("127.0.0.1", running.port))

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 from websockets.frames import Frame, Opcode
 
 from service.link import Close, HangUp
-from service.server.live import Summary, dumps, sum_up
 from service.server.node import Estimated, ServerNode
+from service.server.screens.picture import Summary, dumps, sum_up
 from service.server_clock import utc_ns
 
 RATES_HZ = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0)

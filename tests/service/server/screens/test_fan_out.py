@@ -15,8 +15,8 @@ from websockets.protocol import State
 from websockets.uri import parse_uri
 
 from service.link import Close, HangUp
-from service.server.fan_out import RATES_HZ, Hub, framed
 from service.server.node import ServerNode
+from service.server.screens.fan_out import RATES_HZ, Hub, framed
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 from tests.waiting import in_a_loop
