@@ -94,7 +94,7 @@ async def _side_by_side(play: Play, served: Served, outcome: Outcome, tries: int
     end = outcome.tries + tries
     await asyncio.gather(
         *(
-            _hostile(served, Random(play.random.random()), number, outcome, end)  # noqa: S311
+            _hostile(served, Random(play.random.random()), number, outcome, end)  # noqa: S311  # drawn again from the seed, no secret
             for number in range(_SIDE_BY_SIDE)
         )
     )
@@ -320,7 +320,7 @@ def _hello(info: ArrayInfo) -> Hello:
 
 
 async def _name_is_free(served: Served, number: int, outcome: Outcome) -> None:
-    node = _Node(served, Random(f"after/{number}"), number)  # noqa: S311
+    node = _Node(served, Random(f"after/{number}"), number)  # noqa: S311  # drawn again from the seed, no secret
     node._begins_wrong = False
     try:
         async with asyncio.timeout(_ANSWER_S):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import accumulate, pairwise
+from random import Random
 
 import numpy as np
 import pytest
@@ -18,12 +19,12 @@ from tests.builders.frames import make_frames, with_columns
 
 @given(st.lists(st.integers(1, 4), min_size=1, max_size=12), st.randoms(use_true_random=False))
 def test_messages_of_any_size_in_any_order_are_judged_without_a_look_at_the_disk(
-    sizes: list[int], random: object
+    sizes: list[int], random: Random
 ) -> None:
     held = Intervals()
     instants = Instants(lambda seq, is_upper: pytest.fail(f"{seq} was looked up"))
     spans = list(pairwise(accumulate(sizes, initial=0)))
-    random.shuffle(spans)  # type: ignore[attr-defined]
+    random.shuffle(spans)
     for begin, end in spans:
         frames = make_frames(np.arange(begin, end))
         before, after = held.neighbours(begin, end - 1)
