@@ -1,4 +1,4 @@
-"""What all tests share: one emulated bench, and hypothesis without a stopwatch."""
+"""What all tests share: one emulated bench, and hypothesis with neither stopwatch nor dice."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from hypothesis import settings
 # What a builder asserts is explained as in a test.
 pytest.register_assert_rewrite("tests.builders")
 
-# Beside other tests on the same cores the time that an example takes says nothing.
-settings.register_profile("foottile", settings(), deadline=None)
+# Beside other tests on the same cores the time that an example takes says nothing. A run tells of
+# the change that it tests, so its examples are the same each time; chance has a run of its own.
+settings.register_profile("chance", deadline=None)
+settings.register_profile("foottile", deadline=None, derandomize=True)
 settings.load_profile("foottile")
 
 

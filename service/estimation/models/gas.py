@@ -68,10 +68,10 @@ class Gas:
         None of its heat has gone: p (p0/p)^k. Heat that has gone before only leaves it colder.
 
         Args:
-            kpa: absolute pressures over tiles, above the baseline.
+            kpa: absolute pressures over tiles; below the baseline it may have settled already.
         """
         k = (self.gamma - 1.0) / self.gamma
-        return np.asarray(kpa * (self.baseline_kpa / kpa) ** k)
+        return np.asarray(kpa * (self.baseline_kpa / np.maximum(kpa, self.baseline_kpa)) ** k)
 
     def settled(self, kpa: Floats, t_ns: Times, state: GasState) -> tuple[Floats, GasState]:
         """Pressures that measured ones would settle at.

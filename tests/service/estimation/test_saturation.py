@@ -62,6 +62,13 @@ def test_the_bound_is_reached_by_the_fastest_squeeze() -> None:
     assert settled_kpa[-1] == pytest.approx(gas.settled_at_least(read_kpa[-1:])[0], abs=0.01)
 
 
+@pytest.mark.parametrize("kpa", [-20.0, 0.0, 60.0, BASE_KPA])
+def test_below_the_baseline_nothing_is_known_of_heat_that_has_gone_already(kpa: float) -> None:
+    gas = Gas(np.array([1.4]), np.array([10.0]), np.array([0.0]), np.array([BASE_KPA]))
+    assert gas.settled_at_least(np.array([kpa])).tolist() == [kpa]
+    assert np.isnan(gas.settled_at_least(np.array([np.nan]))).all()
+
+
 # --- in an estimate -------------------------------------------------------------------------------
 
 GAMMA, TAU_S = 1.3, 0.012
