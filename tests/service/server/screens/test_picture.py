@@ -332,7 +332,8 @@ def told_or_dropped(messages: Sequence[dict[str, Any]]) -> int:
     dropped: set[int] = set()
     for message in of_type(messages, "dropped"):
         dropped |= set(range(message["from_seq"], message["to_seq"] + 1))
-    return len(dropped) + sum(message["n"] for message in of_type(messages, "frame"))
+    told: list[int] = [message["n"] for message in of_type(messages, "frame")]
+    return len(dropped) + sum(told)
 
 
 # --- what is not known ----------------------------------------------------------------------------
