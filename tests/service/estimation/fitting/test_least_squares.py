@@ -93,7 +93,7 @@ def test_a_tiles_fit_is_that_of_a_long_search_within_a_small_part_of_its_sigma()
         return problem.residual(model, fit.scatter)
 
     other = scipy.optimize.least_squares(
-        residual, np.zeros(len(x)), ftol=1e-12, xtol=1e-12, gtol=1e-12, diff_step=np.full(len(x), 1e-4),
-        x_scale=1.0, max_nfev=40,
+        residual, np.zeros(len(x)), ftol=1e-12, xtol=1e-12, gtol=1e-12,
+        diff_step=np.full(len(x), 1e-4), max_nfev=40,
     )  # fmt: skip
     assert np.abs(other.x).max() < 0.1
