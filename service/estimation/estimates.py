@@ -45,6 +45,12 @@ class EstimateStatus(IntFlag):
     """A tile is above the chip's 115 kPa, but within its calibration."""
     TARE_LOST = 512
     """The tare that was in force is damaged on disk: no pressure and no force is known."""
+    STUCK = 2048
+    """A tile repeats itself for longer than its noise allows: nothing is known of its force."""
+    CLIPPED = 4096
+    """A tile's readings end at an edge within its chip's range: force and GRF are lower bounds."""
+    BASELINE_LOST = 8192
+    """A tile reads less than without a load, or has warmed or cooled and no model corrects it."""
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ from service.estimation.models.outliers import despiked
 from service.estimation.models.unwrap import unwrap
 from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
 from service.estimation.tare.tare import has_warmed
+from service.estimation.watch.baseline import LOST_KPA
+from service.estimation.watch.watch import WatchState
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,7 @@ class ApparentForces(Arrays):
         sigma_n: standard uncertainty from all else but the gas; does not.
         gas_n: standard uncertainty that the gas' correction leaves, with the correction's sign: all
             tiles err to the same side.
+        warm_n: what warmth that no model corrects makes of the force, signed; likewise.
         sampled_ns: when each tile was sampled, on the monotonic clock.
         beyond: beyond the calibrated range, or the chip's: a lower bound.
         t_mono_ns: (n,), instants of the frames.
@@ -113,6 +116,7 @@ class ApparentForces(Arrays):
     noise_n: Floats
     sigma_n: Floats
     gas_n: Floats
+    warm_n: Floats
     sampled_ns: Times
     beyond: Bools
     t_mono_ns: Times
@@ -130,6 +134,7 @@ class LowerState:
     skew: skew.SkewState | None = None
     hidden_ns: Times | None = None
     """When each tile's pressure was last beyond its chip's range."""
+    watch: WatchState = WatchState()  # noqa: RUF009  # frozen, so one for all is safe
 
 
 def tile_kpa(plan: EstimationPlan, frames: FrameBatch) -> Floats:
@@ -162,6 +167,9 @@ def apparent_forces(
     """
     ladder, columns = plan.ladder, plan.bearing
     status = _frame_status(plan, frames, kpa, broken)
+    stuck, edge_kpa, watched = plan.watch.readings(frames, kpa, state.watch)
+    status[stuck.any(axis=1)] |= np.uint16(EstimateStatus.STUCK)
+    kpa = np.where(stuck, np.nan, kpa)
     if ladder.denoise and neighbours is not None:
         kpa, replaced = despiked(kpa, *neighbours, plan.tare.noise_kpa)
         status[replaced[:, columns].any(axis=1)] |= np.uint16(EstimateStatus.OUTLIER_REPLACED)
@@ -194,7 +202,9 @@ def apparent_forces(
         gauge_kpa = gauge_kpa.copy()
         gauge_kpa[:, columns] = bearing_kpa - plan.baseline_kpa
     # The chip's range is judged by what was read, the calibrated one by what the gas settles at.
-    hidden = kpa[:, columns] > plan.chip_end_kpa
+    end_kpa = np.minimum(plan.chip_end_kpa, edge_kpa)
+    hidden = kpa[:, columns] > end_kpa
+    status[(kpa[:, columns] > edge_kpa).any(axis=1)] |= np.uint16(EstimateStatus.CLIPPED)
     settled_kpa, gas_kpa = bearing_kpa, np.zeros(bearing_kpa.shape)
     uncertain = np.zeros(bearing_kpa.shape, dtype=bool)
     if ladder.gas is not None:
@@ -211,11 +221,18 @@ def apparent_forces(
         settled_kpa = np.where(ladder.gas_known, settled_kpa, bearing_kpa)
     if hidden.any():
         # As if the chip's end had been read, with what warmth and surroundings have put into it.
-        least_kpa = bearing_kpa - (kpa[:, columns] - plan.chip_end_kpa)
+        least_kpa = bearing_kpa - (kpa[:, columns] - end_kpa)
         if ladder.gas is not None:
             least_kpa = ladder.gas.settled_at_least(least_kpa)
         settled_kpa = np.where(hidden, least_kpa, settled_kpa)
     static_kpa = settled_kpa - plan.baseline_kpa
+    warmed_kpa, watched = plan.watch.warmed_kpa(frames, sampled_ns, watched)
+    lost_kpa, watched = plan.watch.lost_kpa(
+        np.where(hidden, np.nan, static_kpa), baseline_variance, warmed_kpa, sampled_ns, watched
+    )
+    baseline_variance = baseline_variance + lost_kpa**2
+    astray = (lost_kpa > 0.0) | (np.abs(warmed_kpa) > LOST_KPA)
+    status[astray.any(axis=1)] |= np.uint16(EstimateStatus.BASELINE_LOST)
     static = ladder.curves.force(static_kpa)
     unknown = np.isnan(kpa[:, columns] if plan.tare.is_lost else static.force_n)
     status[unknown.any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
@@ -242,13 +259,14 @@ def apparent_forces(
         noise_n=np.abs(static.slope_n_per_kpa) * plan.noise_kpa,
         sigma_n=np.sqrt(static.slope_n_per_kpa**2 * baseline_variance + static.fit_sigma_n**2),
         gas_n=static.slope_n_per_kpa * ladder.gas_misfit * gas_kpa,
+        warm_n=static.slope_n_per_kpa * warmed_kpa,
         sampled_ns=sampled_ns,
         beyond=beyond,
         t_mono_ns=t_mono_ns,
         run=run,
         status=status,
     )
-    return forces, state
+    return forces, replace(state, watch=watched)
 
 
 def _since(

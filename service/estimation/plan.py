@@ -21,6 +21,7 @@ from service.estimation.foot.contact import ContactRule
 from service.estimation.foot.geometry import grid_indices, hull
 from service.estimation.ladder import MODELS, Ladder, make_ladder
 from service.estimation.tare.tare import Tare
+from service.estimation.watch.watch import Watch, make_watch
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
 CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter
@@ -59,6 +60,7 @@ class EstimationPlan:
     chip_end_kpa: Floats
     """Absolute pressure above which a chip is not known to tell the pressure: the end of its rated
     range, or of what it told on the bench if that is more, or less because it told no more."""
+    watch: Watch
     still_kpa: Floats
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
@@ -150,6 +152,14 @@ def make_plan(
             dtype=np.int64,
         ),
         chip_end_kpa=chip_end_kpa,
+        watch=make_watch(
+            info,
+            calibration,
+            tare,
+            chip_end_kpa,
+            gas_known=ladder.gas_known & (ladder.gas is not None),
+            warms=ladder.temperature is None,
+        ),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
         hull=hull(positions_m[bearing, :2]),

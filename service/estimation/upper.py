@@ -35,13 +35,14 @@ class TileForces:
         force_n: forces.
         sigma_n: standard uncertainties.
         own_n: their part that is every tile's own.
-        common_n: the rest, of gas and of rubber: all tiles share the error, so these are signed.
+        common_n: the rest, of gas, of rubber and of warmth: all tiles share the error, so these are
+            signed.
     """
 
     force_n: Floats
     sigma_n: Floats
     own_n: Floats
-    common_n: tuple[Floats, Floats]
+    common_n: tuple[Floats, Floats, Floats]
 
 
 def tile_forces(
@@ -94,8 +95,8 @@ def tile_forces(
     rubber_n = ladder.rubber_misfit * (force_n - averaged_n)
     # A lower bound has no standard uncertainty.
     own_n = np.where(now.beyond, np.nan, own_n)
-    sigma_n = np.sqrt(own_n**2 + now.gas_n**2 + rubber_n**2)
-    return TileForces(force_n, sigma_n, own_n, (now.gas_n, rubber_n)), state
+    sigma_n = np.sqrt(own_n**2 + now.gas_n**2 + rubber_n**2 + now.warm_n**2)
+    return TileForces(force_n, sigma_n, own_n, (now.gas_n, rubber_n, now.warm_n)), state
 
 
 @dataclass(frozen=True)
@@ -117,19 +118,26 @@ def foot_of(plan: EstimationPlan, tiles: TileForces) -> Foot:
 
 @compiled
 def _foot(
-    force_n: Floats, own_n: Floats, gas_n: Floats, rubber_n: Floats, places_m: Floats
+    force_n: Floats,
+    own_n: Floats,
+    gas_n: Floats,
+    rubber_n: Floats,
+    warm_n: Floats,
+    places_m: Floats,
 ) -> Floats:
     """GRF and its sigma, centre x, y, z, and the sigmas of x and y, to first order: (n, 7)."""
     n, tiles = force_n.shape
     out = np.full((n, 7), math.nan)
     for i in range(n):
-        total = own = gas = rubber = 0.0
+        total = own = gas = rubber = warm = 0.0
         for j in range(tiles):
             total += force_n[i, j]
             own += own_n[i, j] * own_n[i, j]
             gas += gas_n[i, j]
             rubber += rubber_n[i, j]
-        out[i, 0], out[i, 1] = total, math.sqrt(own + gas * gas + rubber * rubber)
+            warm += warm_n[i, j]
+        common = gas * gas + rubber * rubber + warm * warm
+        out[i, 0], out[i, 1] = total, math.sqrt(own + common)
         if total == 0.0:
             continue
         for axis in range(3):
@@ -138,13 +146,15 @@ def _foot(
                 moment += force_n[i, j] * places_m[j, axis]
             out[i, 2 + axis] = moment / total
         for axis in range(2):
-            own = gas = rubber = 0.0
+            own = gas = rubber = warm = 0.0
             for j in range(tiles):
                 arm_m = places_m[j, axis] - out[i, 2 + axis]
                 own += (arm_m * own_n[i, j]) ** 2
                 gas += arm_m * gas_n[i, j]
                 rubber += arm_m * rubber_n[i, j]
-            out[i, 5 + axis] = math.sqrt(own + gas * gas + rubber * rubber) / abs(total)
+                warm += arm_m * warm_n[i, j]
+            common = gas * gas + rubber * rubber + warm * warm
+            out[i, 5 + axis] = math.sqrt(own + common) / abs(total)
     return out
 
 

@@ -189,6 +189,9 @@ def test_every_flag_has_a_bit_of_its_own(status: EstimateStatus) -> None:
         "tare_old": 128,
         "over_rated": 256,
         "tare_lost": 512,
+        "stuck": 2048,
+        "clipped": 4096,
+        "baseline_lost": 8192,
     }
     assert bits[str(status.name).lower()] == status
 
