@@ -12,6 +12,7 @@ import numpy as np
 from mpmath import mp, mpf
 
 from service.estimation.models import ambient, denoise
+from service.estimation.models import temperature as temperature_model
 from service.estimation.models.hysteresis import OPENS, WIDTHS_N
 
 Exact = Any
@@ -136,26 +137,46 @@ def hysteresis(apparent: list[Exact], parts: list[Exact]) -> list[Exact]:
     return out
 
 
-def temperature(counts: list[Exact], t_ns: list[int], lag_s: Exact) -> list[Exact]:
-    """`lag x' = chip - x`, chip linear between readings; for half a second a plain mean."""
+def temperature(
+    counts: list[Exact], t_ns: list[int], lag_s: Exact
+) -> tuple[list[Exact], list[Exact]]:
+    """Counts of the gas, and their rise in counts a second.
+
+    `S x' = chip - x` with the chip linear between readings, and `S y' = x - y` with x as linear;
+    for half a second plain means. The gas is x of the time S = lag, where that is 0.1 s or more;
+    below, and ahead of the chip, it goes on by the rise.
+    """
     out: list[Exact] = []
-    now = before = None
+    rises: list[Exact] = []
+    least = mpf(temperature_model.SMOOTH_LEAST_S)
+    behind = lag_s if lag_s >= 0 else -lag_s * mpf(temperature_model.SMOOTH_PART)
+    smooth = max(behind, least)
+    x = y = before = None
     first_ns = last_ns = 0
     for value, at_ns in zip(counts, t_ns, strict=True):
         if value is not None:
-            if now is None:
-                now, first_ns = value, at_ns
+            if x is None:
+                x = y = value
+                first_ns = at_ns
             else:
                 passed = max(mpf(0), mpf(at_ns - last_ns) / 10**9)
                 known = mpf(at_ns - first_ns) / 10**9
-                lag = lag_s if known > mpf("0.5") else min(lag_s, max(passed, known))
+                time = smooth if known > mpf("0.5") else min(smooth, max(passed, known))
                 if passed > 0:
-                    h = passed / lag
+                    h = passed / time
                     decay, mean = mp.exp(-h), (1 - mp.exp(-h)) / h
-                    now = decay * now + (mean - decay) * before + (1 - mean) * value
+                    old = x
+                    x = decay * x + (mean - decay) * before + (1 - mean) * value
+                    y = decay * y + (mean - decay) * old + (1 - mean) * x
             before, last_ns = value, at_ns
-        out.append(now)
-    return out
+        if x is None:
+            out.append(None)
+            rises.append(None)
+            continue
+        rise = ((before - x) if lag_s >= 0 else (x - y)) / smooth
+        out.append(x + (smooth - lag_s) * rise)
+        rises.append(rise)
+    return out, rises
 
 
 def smoothed(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:

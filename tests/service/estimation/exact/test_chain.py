@@ -73,7 +73,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
     for i in domes:
         warm, curve = effects[i].temperature, effects[i].rubber
         counts = [mpf(c) for c in tadc[i]]
-        of_gas = equations.temperature(counts, t_ns[i], mpf(warm.lag_s.value))
+        of_gas, rise = equations.temperature(counts, t_ns[i], mpf(warm.lag_s.value))
         kpa_per_count = mpf(warm.kpa_per_k.value) / mpf(-5.35)
         lag_ns = mpf(warm.lag_s.value) * 10**9
         away = counts[0] - mpf(float(tare.tadc_counts[i]))
@@ -86,11 +86,10 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             warmed = kpa_per_count * (of_gas[k] - mpf(float(tare.tadc_counts[i])))
             p, head = kpa[i][k], passed * around[k]
             dry.append(None if p is None else p / (1 + warmed / base[i]) - head)
-            late = kpa_per_count * (counts[k] - of_gas[k])
             variance.append(
                 mpf(float(tare.baseline_sigma_kpa[i])) ** 2
                 + (mpf(warm.kpa_per_k.sigma) / mpf(warm.kpa_per_k.value) * warmed) ** 2
-                + (mpf(warm.lag_s.sigma) / mpf(warm.lag_s.value) * late) ** 2
+                + (mpf(warm.lag_s.sigma) * kpa_per_count * rise[k]) ** 2
                 + (doubt * head) ** 2
                 + (kpa_per_count * away * mp.exp(-mpf(t_ns[i][k] - t_ns[i][0]) / lag_ns)) ** 2
             )
