@@ -21,6 +21,7 @@ from service.estimation.foot.contact import ContactRule
 from service.estimation.foot.geometry import grid_indices, hull
 from service.estimation.ladder import MODELS, Ladder, make_ladder
 from service.estimation.tare.tare import Tare
+from service.estimation.unseen import Unseen, make_unseen
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
 CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter
@@ -59,6 +60,7 @@ class EstimationPlan:
     chip_end_kpa: Floats
     """Absolute pressure above which a chip is not known to tell the pressure: the end of its rated
     range, or of what it told on the bench if that is more, or less because it told no more."""
+    unseen: Unseen
     still_kpa: Floats
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
@@ -150,6 +152,7 @@ def make_plan(
             dtype=np.int64,
         ),
         chip_end_kpa=chip_end_kpa,
+        unseen=make_unseen(ladder.curves, ladder.gas, baseline_kpa, chip_end_kpa),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
         hull=hull(positions_m[bearing, :2]),
