@@ -2,8 +2,8 @@
 
 Order of the chain (hardware.md 9): contact force -> creep of the rubber -> hysteresis -> volume of
 the bubble -> gas temperature -> absolute pressure. The gas is heat conduction in a sphere with an
-isothermal wall, eight modes; the rubber three Prony terms and four play operators. None of these
-equations or numbers is the estimator's.
+isothermal wall, eight modes; the rubber Prony terms, as many as the part has, and four play
+operators. None of these equations or numbers is the estimator's.
 
 Everything is computed ahead of the bus in blocks of time on a fine grid, for all domes at once, and
 interpolated where a chip samples: the physics does not know who asks, or when.
@@ -32,13 +32,12 @@ _COARSE = 40  # grid points, 20 ms
 _AHEAD_BLOCKS = 30  # for a driver that asks nothing for so long; bounds memory, 30 MB for 64 domes
 
 _KELVIN = 273.15
-_KAPPA = 0.4 / 1.4  # (gamma - 1) / gamma of air
 _MODES = np.arange(1, 9)
 _MODE_WEIGHTS = 6.0 / (np.pi * _MODES) ** 2  # of the mean temperature of a heated sphere
 _PLAY_WIDTHS_N = np.array([0.5, 1.0, 2.0, 4.0])
 _UNLOADED_N = 0.05  # a dome that bears less is not touched: the next touch is a new loading
 _MANY_LAGS = 128
-_PICARD_LIMIT = 40  # a bound; the iteration contracts by `_KAPPA`
+_PICARD_LIMIT = 40  # a bound; the iteration contracts by kappa
 _PICARD_TOLERANCE_K = 1e-6  # 3e-7 kPa
 
 
@@ -78,7 +77,8 @@ class Domes:
         self._seal_k = scene.ambient_degc + _KELVIN
         self._loading_rngs = [random_of(f"loading/{label}/{serial}") for serial in serials]
 
-        self._creep = np.zeros((n, 3))
+        self._kappa = np.array([part.kappa for part in parts])
+        self._creep = [np.zeros(len(part.creep_s)) for part in parts]
         self._play_n = np.zeros((n, len(_PLAY_WIDTHS_N)))
         self._loading_gain = np.ones(n)
         self._last_force_n = np.zeros(n)
@@ -194,8 +194,8 @@ class Domes:
                 mean = (1 - decay) * tau_s / self._step_s
                 # Exact for a force that is linear between grid points.
                 drive = (mean - decay) * f[:-1] + (1 - mean) * f[1:]
-                slow, _ = lfilter([1], [1, -decay], drive, zi=[decay * self._creep[dome, term]])
-                self._creep[dome, term] = slow[-1]
+                slow, _ = lfilter([1], [1, -decay], drive, zi=[decay * self._creep[dome][term]])
+                self._creep[dome][term] = slow[-1]
                 apparent[:, dome] += share * (slow - f[1:])
         return np.maximum(apparent, 0.0)
 
@@ -261,7 +261,7 @@ class Domes:
         gain = _MODE_WEIGHTS * (1 - decay) / -np.log(decay)
         for _ in range(_PICARD_LIMIT):
             ln_p = np.concatenate([self._last_ln_p[None], np.log(kpa)])
-            drive = _KAPPA * (wall_k + excess_k) * np.diff(ln_p, axis=0)
+            drive = self._kappa * (wall_k + excess_k) * np.diff(ln_p, axis=0)
             modes_k = decaying(drive, gain, decay, self._mode_k)
             new_k = modes_k.sum(axis=2)
             change_k = np.abs(new_k - excess_k).max()

@@ -44,10 +44,14 @@ class DomePart:
     """How long the gas follows its chip's temperature."""
     chip_lag_s: float
     """How long the chip follows the surroundings."""
-    creep_parts: tuple[float, float, float]
-    creep_s: tuple[float, float, float]
+    creep_parts: tuple[float, ...]
+    """Parts of a force that appear late, ..."""
+    creep_s: tuple[float, ...]
+    """... and how late each of them."""
     loop_n: float
     """Half width of the hysteresis loop at full load, in newtons."""
+    kappa: float = 0.4 / 1.4
+    """(gamma - 1) / gamma of the gas: air's, unless vapours of the casting are in it."""
 
 
 def draw_chip(serial: str, parts_seed: int) -> ChipPart:
