@@ -49,7 +49,10 @@ class DomePart:
     creep_s: tuple[float, ...]
     """... and how late each of them."""
     loop_n: float
-    """Half width of the hysteresis loop at full load, in newtons."""
+    """Half width of the hysteresis loop at full load that does not depend on speed, in newtons."""
+    viscous_n: float = 0.0
+    """Half width of the loop that the rubber's viscosity makes beside it, in newtons, where a force
+    changes by 7.5 N/s; faster loads make it wider."""
     kappa: float = 0.4 / 1.4
     """(gamma - 1) / gamma of the gas: air's, unless vapours of the casting are in it."""
 
