@@ -41,9 +41,9 @@ class DomePart:
     conduction_s: float
     """r^2 / (pi^2 a): slowest mode of heat conduction in the bubble at constant pressure."""
     gas_lag_s: float
-    """How long the gas follows its chip's temperature."""
+    """How long the gas follows its chip's temperature; below zero: the chip follows its gas'."""
     chip_lag_s: float
-    """How long the chip follows the surroundings."""
+    """How long the first of the two follows the surroundings."""
     creep_parts: tuple[float, ...]
     """Parts of a force that appear late, ..."""
     creep_s: tuple[float, ...]
