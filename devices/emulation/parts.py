@@ -22,6 +22,9 @@ class ChipPart:
     coefficients: Coefficients
     conversion_ns: int
     tadc_at_25_degc: float
+    late_ns: int = 0
+    """How much later than after a quarter of a conversion it samples: not documented (hardware.md
+    1.4)."""
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ class World:
                 sense.begin(self.epoch_ns)
             self._front_ends.append(sense)
             conversion_ns = chip.conversion_ns if fixed_ms is None else round(fixed_ms * 1e6)
-            return Silicon(chip.coefficients.to_words(), conversion_ns, sense)
+            return Silicon(chip.coefficients.to_words(), conversion_ns, sense, chip.late_ns)
 
         self.parts = [
             EmulatedMpl115a2(
