@@ -80,6 +80,10 @@ class Domes:
         self._knee_n = np.array([part.knee_n for part in parts])
         self._stiffening = np.array([part.stiffening for part in parts])
         self._seal_k = scene.ambient_degc + _KELVIN
+        drifted = [
+            random_of(f"gain drift/{label}/{serial}").uniform(-1.0, 1.0) for serial in serials
+        ]
+        self._stiffening *= 1.0 + scene.gain_drift * np.array(drifted)
         self._loading_rngs = [random_of(f"loading/{label}/{serial}") for serial in serials]
 
         self._kappa = np.array([part.kappa for part in parts])

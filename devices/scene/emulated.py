@@ -122,6 +122,9 @@ class EmulationScene(Section):
     """Correlation time of the noise's core; 0: white."""
     repeatability: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Standard deviation of the normalised output between loadings (paper III-A: 0.03)."""
+    gain_drift: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+    """How much each dome's gain has changed since its bench, up or down, at the most: rubber ages,
+    and stiffens in the cold. Within a session it is constant."""
     gas: bool = True
     """Adiabatic overshoot of fast loads."""
     rubber: bool = True

@@ -21,6 +21,27 @@ from tests.devices.emulation.domes import (
     static_kpa,
 )
 
+# Gain
+
+
+def test_a_gain_that_drifted_since_the_bench_is_another_one_for_each_dome() -> None:
+    def gains(label: str, gain_drift: float) -> Floats:
+        domes = domes_of(
+            np.ones_like, *[PART] * 40, label=label, gain_drift=gain_drift, hysteresis=False
+        )
+        kpa = [domes.pressure_kpa(dome, 0.1) for dome in range(40)]
+        volume = 100.0 / (np.array(kpa) * (1 + PART.wall_per_kpa * (np.array(kpa) - 100.0)))
+        return np.asarray((1 - volume) / lost(1.0))
+
+    drifted = gains("Tuesday", 0.01)
+    assert 0.99 <= drifted.min() < 0.993
+    assert 1.007 < drifted.max() <= 1.01
+    assert len(set(drifted.tolist())) == 40
+    assert gains("Tuesday", 0.01).tolist() == drifted.tolist()
+    assert gains("Wednesday", 0.01).tolist() != drifted.tolist()
+    np.testing.assert_allclose(gains("Tuesday", 0.0), 1.0, atol=1e-9)
+
+
 # Hysteresis
 
 VISCOUS = replace(PART, loop_n=0.0, viscous_n=0.4)
