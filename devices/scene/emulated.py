@@ -111,11 +111,15 @@ GroundScene = Annotated[
 
 
 ReadDuringConversion = Literal["stale", "abort", "torn"]
+Family = Literal["default", "broad"]
+"""Of emulated parts; drawn in `devices.emulation.families`."""
 
 
 class EmulationScene(Section):
     """`[emulation]`: which effects the emulated domes and chips show. A real node ignores it."""
 
+    family: Family = "default"
+    """Which domes and chips are drawn: the usual ones, or whatever a real batch may be."""
     noise_kpa: Annotated[float, Field(ge=0, le=100)] = 0.165
     """Standard deviation of a single reading in all: core, outliers and rounding."""
     correlated_ms: NotNegative = 0.0
