@@ -32,8 +32,9 @@ from devices.emulation.ground.hopping import Hopping
 from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation, Mill
 from devices.emulation.parts import random_of
+from devices.emulation.puncture import Puncture
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulated import BUS, FaultKind, MudGround, TileFault
+from devices.scene.emulated import BUS, LEAK_S, FaultKind, MudGround, PartFault
 from devices.scene.file import Scene
 from devices.scene.hardware import ServoScene
 
@@ -122,6 +123,8 @@ class World:
                 scene.emulation,
                 f"noise/{draw}/{serial}",
                 self._faults.of("over_range", serials[index]),
+                self._faults.of("frozen", serials[index]),
+                self._puncture(serials[index], surroundings),
             )
             if self._begun:
                 sense.begin(self.epoch_ns)
@@ -253,9 +256,13 @@ class World:
             return Mill(self.ground, self._seconds, self._mill_rng)
         return None
 
+    def _puncture(self, serial: str, surroundings: Surroundings) -> Puncture:
+        leaks_s = (f.leak_s for f in self.scene.fault if (f.kind, f.tile) == ("puncture", serial))
+        fault = self._faults.of("puncture", serial)
+        return Puncture(fault, next(leaks_s, LEAK_S), surroundings.ambient_kpa)
+
     def _part_faults(self, serial: str) -> PartFaults:
-        kinds = get_args(TileFault)
-        own = {kind: self._faults.of(kind, serial) for kind in kinds if kind != "over_range"}
+        own = {kind: self._faults.of(kind, serial) for kind in get_args(PartFault)}
         return PartFaults(**own, scene=self._faults)
 
     def _surroundings(self, draw: str) -> Surroundings:

@@ -6,6 +6,7 @@ The digests were taken from the emulator as it was before there was another fami
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from tests.devices.feet import foot
 SHELVES = [(serial, seed) for seed in range(5) for serial in ("T01", "T02", "T07", "S-3")]
 
 
-def digest(rows: list[tuple[float, ...]]) -> str:
+def digest(rows: Sequence[tuple[float, ...]]) -> str:
     """Of numbers to twelve digits: the last one of an exponential may differ between machines."""
     text = "\n".join(" ".join(f"{number:.12g}" for number in row) for row in rows)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
