@@ -19,10 +19,13 @@ from typing import Any
 
 import uvicorn
 from starlette.types import Receive, Scope, Send
+from starlette.websockets import WebSocket as StarletteWebSocket
+from starlette.websockets import WebSocketDisconnect
 from uvicorn._types import ASGIReceiveEvent
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import CloseCode
 from websockets.http11 import Request
 
 from service.api.doors import Doors
@@ -259,6 +262,19 @@ class WebSocket(WebSocketsSansIOProtocol):
         """Serve it; then it only has to go, which one that does not read does not do by itself."""
         await super().run_asgi()
         self.config.doors.rest(self.transport)
+
+
+async def send_text(socket: StarletteWebSocket, text: str) -> None:
+    """Send a text on an open websocket.
+
+    Raises:
+        WebSocketDisconnect: it has gone; where this end has closed it meanwhile, starlette and
+            uvicorn say so with a RuntimeError, which must not be taken for another's.
+    """
+    try:
+        await socket.send_text(text)
+    except RuntimeError as error:
+        raise WebSocketDisconnect(CloseCode.ABNORMAL_CLOSURE) from error
 
 
 async def refuse(scope: Scope, receive: Receive, send: Send) -> None:

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from devices.errors import FileFormatError, LinkError, StorageError
+from service.api.protocols import send_text
 from service.link import (
     MESSAGE_BYTES_MAX,
     PROTOCOL,
@@ -53,7 +54,7 @@ async def ingest(socket: WebSocket, server: Server) -> None:
             await _serve(socket, server, link)
     except HangUp as end:
         await _close(socket, end)
-    except (WebSocketDisconnect, RuntimeError):  # it went away, perhaps while we were sending
+    except WebSocketDisconnect:  # it went away, perhaps while we were sending
         pass
     except Exception:
         log.exception("this is a bug; a node's connection ends, the server goes on")
@@ -126,7 +127,7 @@ async def _welcome(socket: WebSocket, server: Server, link: Link) -> None:
     link.wanted = server.recorder.wanted(node.name)
     lacks = node.lacks(server.recorder.needed(node.name))
     welcome = Welcome(protocol=PROTOCOL, server_id=server.id, lacks=lacks, wanted=link.wanted)
-    await socket.send_text(say(welcome))
+    await send_text(socket, say(welcome))
     log.info("node %s connected, stream %s", node.name, node.boot_id)
     server.tell_node(node)
 
@@ -190,7 +191,7 @@ def _announced(node: ServerNode, boot_id: str) -> ServerStream:
 async def _answer(socket: WebSocket, probe: Probe) -> None:
     try:
         async with asyncio.timeout(SILENCE_S):
-            await socket.send_text(say(probe))
+            await send_text(socket, say(probe))
     except TimeoutError as error:  # else nobody would notice that nothing is heard either
         raise HangUp(Close.SILENT, f"nothing was read for {SILENCE_S:g} s") from error
 
@@ -204,11 +205,11 @@ async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
         wanted = server.recorder.wanted(link.node.name)
         if wanted != link.wanted:
             link.wanted = wanted
-            await socket.send_text(say(wanted))
+            await send_text(socket, say(wanted))
         for boot_id, numbers in link.acks().items():
             for first, last in numbers:
                 ack = Ack(boot_id=boot_id, seq_first=first, seq_last=last)
-                await socket.send_text(say(ack))
+                await send_text(socket, say(ack))
 
 
 async def _receive(socket: WebSocket) -> str | bytes:

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from service.api.protocols import OUTLET
+from service.api.protocols import OUTLET, send_text
 from service.link import SUBPROTOCOL, Close, HangUp, close_reason
 from service.server.screens.fan_out import RATES_HZ, Outlet, framed
 from service.server.screens.picture import dumps
@@ -52,7 +52,7 @@ async def live(socket: WebSocket, server: Server) -> None:
             with suppress(RuntimeError, WebSocketDisconnect, TimeoutError):
                 async with asyncio.timeout(1.0):
                     await socket.close(end.code, close_reason(end.reason))
-    except (WebSocketDisconnect, RuntimeError):  # it went away, perhaps while we were sending
+    except WebSocketDisconnect:  # it went away, perhaps while we were sending
         pass
     except Exception:
         log.exception("this is a bug; one screen's connection ends, the server goes on")
@@ -113,4 +113,4 @@ async def _read(socket: WebSocket) -> None:
         t_ms = said.get("t_ms")
         if isinstance(t_ms, bool) or not isinstance(t_ms, int | float) or not abs(t_ms) < 1e18:
             raise HangUp(Close.POLICY, "ping needs t_ms, a number")
-        await socket.send_text(dumps({"type": "pong", "t_ms": t_ms, "t_ns": utc_ns()}))
+        await send_text(socket, dumps({"type": "pong", "t_ms": t_ms, "t_ns": utc_ns()}))

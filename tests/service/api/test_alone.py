@@ -77,15 +77,19 @@ def test_a_hello_that_cannot_be_leaves_no_trace(
     assert node.connect() == [(0, None)]
 
 
+@pytest.mark.parametrize("kind", [ArithmeticError, RuntimeError])
 def test_a_node_that_could_not_be_taken_in_is_not_known_and_its_name_is_free(
     running: Running,
     screen: Any,
     other: FakeNode,
     node: FakeNode,
     monkeypatch: pytest.MonkeyPatch,
+    kind: type[Exception],
 ) -> None:
+    """A RuntimeError is also what a socket says that has gone: it is told apart."""
+
     def failing(*_: Any) -> None:
-        raise ArithmeticError("as a bug would")
+        raise kind("as a bug would")
 
     with monkeypatch.context() as patch:
         patch.setattr(ServerNode, "attach", failing)
