@@ -25,14 +25,16 @@ from devices.emulation.chips.front_end import FrontEnd
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.dome import Domes
+from devices.emulation.families import chip_of, dome_of
 from devices.emulation.faults import Faults
 from devices.emulation.ground.grounds import make_ground, tile_positions_m
 from devices.emulation.ground.hopping import Hopping
 from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation, Mill
-from devices.emulation.parts import draw_chip, draw_dome, random_of
+from devices.emulation.parts import random_of
+from devices.emulation.puncture import Puncture
 from devices.emulation.surroundings import Surroundings
-from devices.scene.emulated import BUS, FaultKind, MudGround, TileFault
+from devices.scene.emulated import BUS, LEAK_S, FaultKind, MudGround, PartFault
 from devices.scene.file import Scene
 from devices.scene.hardware import ServoScene
 
@@ -97,7 +99,8 @@ class World:
         self.ground = make_ground(scene, seed=seed, lead_s=lead_s, pressed=pressed, looped=looped)
         self._positions_m = tile_positions_m(scene.tile)
         serials = [tile.serial for tile in scene.tile]
-        domes = [draw_dome(serial, parts_seed) for serial in serials]
+        family = scene.emulation.family
+        domes = [dome_of(family, serial, parts_seed) for serial in serials]
         # By scene too: a tile on the bench and in the field must not see the same noise again.
         draw = f"{scene.name}/{seed}"
         surroundings = self._surroundings(draw)
@@ -110,7 +113,7 @@ class World:
 
         def silicon(index: int, serial: str) -> Silicon:
             """The chip of a serial under a dome of this foot, or bare if it is for reference."""
-            chip = draw_chip(serial, parts_seed)
+            chip = chip_of(family, serial, parts_seed)
             fixed_ms = scene.array.conversion_ms
             sense = FrontEnd(
                 chip,
@@ -120,12 +123,14 @@ class World:
                 scene.emulation,
                 f"noise/{draw}/{serial}",
                 self._faults.of("over_range", serials[index]),
+                self._faults.of("frozen", serials[index]),
+                self._puncture(serials[index], surroundings),
             )
             if self._begun:
                 sense.begin(self.epoch_ns)
             self._front_ends.append(sense)
             conversion_ns = chip.conversion_ns if fixed_ms is None else round(fixed_ms * 1e6)
-            return Silicon(chip.coefficients.to_words(), conversion_ns, sense)
+            return Silicon(chip.coefficients.to_words(), conversion_ns, sense, chip.late_ns)
 
         self.parts = [
             EmulatedMpl115a2(
@@ -251,9 +256,13 @@ class World:
             return Mill(self.ground, self._seconds, self._mill_rng)
         return None
 
+    def _puncture(self, serial: str, surroundings: Surroundings) -> Puncture:
+        leaks_s = (f.leak_s for f in self.scene.fault if (f.kind, f.tile) == ("puncture", serial))
+        fault = self._faults.of("puncture", serial)
+        return Puncture(fault, next(leaks_s, LEAK_S), surroundings.ambient_kpa)
+
     def _part_faults(self, serial: str) -> PartFaults:
-        kinds = get_args(TileFault)
-        own = {kind: self._faults.of(kind, serial) for kind in kinds if kind != "over_range"}
+        own = {kind: self._faults.of(kind, serial) for kind in get_args(PartFault)}
         return PartFaults(**own, scene=self._faults)
 
     def _surroundings(self, draw: str) -> Surroundings:

@@ -111,17 +111,24 @@ GroundScene = Annotated[
 
 
 ReadDuringConversion = Literal["stale", "abort", "torn"]
+Family = Literal["default", "broad"]
+"""Of emulated parts; drawn in `devices.emulation.families`."""
 
 
 class EmulationScene(Section):
     """`[emulation]`: which effects the emulated domes and chips show. A real node ignores it."""
 
+    family: Family = "default"
+    """Which domes and chips are drawn: the usual ones, or whatever a real batch may be."""
     noise_kpa: Annotated[float, Field(ge=0, le=100)] = 0.165
     """Standard deviation of a single reading in all: core, outliers and rounding."""
     correlated_ms: NotNegative = 0.0
     """Correlation time of the noise's core; 0: white."""
     repeatability: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Standard deviation of the normalised output between loadings (paper III-A: 0.03)."""
+    gain_drift: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+    """How much each dome's gain has changed since its bench, up or down, at the most: rubber ages,
+    and stiffens in the cold. Within a session it is constant."""
     gas: bool = True
     """Adiabatic overshoot of fast loads."""
     rubber: bool = True
@@ -148,10 +155,17 @@ class EmulationScene(Section):
     core idles at 250 MHz (hardware.md 3.2)."""
 
 
-TileFault = Literal["no_answer", "unplugged", "replaced", "stale", "slow", "all_ones", "over_range"]
+PartFault = Literal["no_answer", "unplugged", "replaced", "stale", "slow", "all_ones"]
+"""Of a tile, at its registers."""
+SenseFault = Literal["over_range", "frozen", "puncture"]
+"""Of a tile, before its registers: what is converted is wrong already."""
+TileFault = Literal[PartFault, SenseFault]
 MuxFault = Literal["brown_out", "mux_reset"]
 BusFault = Literal["sda_low", "sda_high", "scl_low", "adapter_timeout", "nack_storm", "bit_errors"]
 FaultKind = Literal[TileFault, MuxFault, BusFault]
+
+LEAK_S = 2.0
+"""How long a punctured dome takes to even out, unless a scene says otherwise."""
 
 RATE = 0.01
 """How often a fault strikes that comes by chance, unless a scene says otherwise."""
@@ -176,6 +190,8 @@ class FaultScene(Section):
     rate: Annotated[float, Field(gt=0, le=1)] = RATE
     """How often, for what comes by chance: of the bytes for `nack_storm` and `bit_errors`, of the
     transfers for `adapter_timeout`."""
+    leak_s: Positive = LEAK_S
+    """Of a `puncture`: in this time its pressure difference falls to 1/e."""
 
     @property
     def target(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -33,7 +33,11 @@ class Pressed:
 
 
 def calibrate_recordings(
-    recordings: Mapping[str, Sequence[Pressed]], *, name: str, reference: str
+    recordings: Mapping[str, Sequence[Pressed]],
+    *,
+    name: str,
+    reference: str,
+    progress: Callable[[str], None] = lambda message: None,
 ) -> Calibration:
     """Fit every tile that was pressed.
 
@@ -45,19 +49,23 @@ def calibrate_recordings(
         recordings: of each serial.
         name: for people.
         reference: the force sensor.
+        progress: told of every tile what was found.
 
     Raises:
         CalibrationError: no tile has a curve.
     """
     tiles: list[TileCalibration] = []
     refused: dict[str, str] = {}
-    for serial, pressed in recordings.items():
+    for number, (serial, pressed) in enumerate(recordings.items(), start=1):
         try:
             tiles.append(_fitted(pressed))
+            found = _in_words(tiles[-1])
         except CalibrationError as error:
             if len(recordings) == 1:
                 raise
             refused[serial] = str(error)
+            found = "refused"
+        progress(f"tile {serial}, {number} of {len(recordings)}: {found}")
     if not tiles:
         raise CalibrationError(
             "no tile has a curve: "
@@ -143,6 +151,23 @@ def _fitted(pressed: Sequence[Pressed]) -> TileCalibration:
             "effects": fit_effects(recordings, tile),
         }
     )
+
+
+def _in_words(tile: TileCalibration) -> str:
+    """What was found, in a line."""
+    effects = tile.effects
+    found = [f"curve to {tile.range_kpa[1]:.1f} kPa"]
+    if (gas := effects.gas) is not None:
+        found.append(f"gas {gas.gamma.value:.2f} in {1e3 * gas.tau_s.value:.0f} ms")
+    if (rubber := effects.rubber) is not None:
+        terms = zip(rubber.part, rubber.tau_s, strict=True)
+        each = (f"{100 * part.value:.1f} % in {tau.value:.2g} s" for part, tau in terms)
+        found.append("creep " + " and ".join(each))
+    if effects.hysteresis is not None:
+        found.append("loop")
+    if (warm := effects.temperature) is not None:
+        found.append(f"{warm.kpa_per_k.value:.3f} kPa/K")
+    return ", ".join([*found, *(f"no {name}" for name in effects.refused)])
 
 
 def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:

@@ -20,7 +20,7 @@ from devices.emulation.faults import Faults
 from devices.emulation.parts import random_of
 from devices.frames import TileInfo
 from devices.recovery.recovery import BusRecovery
-from devices.scene.emulated import BUS, FaultKind, ReadDuringConversion, TileFault
+from devices.scene.emulated import BUS, FaultKind, PartFault, ReadDuringConversion
 from devices.scene.hardware import ScheduleName
 from tests.builders.arrays import DATA_SHEET_CHIP, make_tile
 
@@ -102,8 +102,7 @@ class Wires:
         self.after_transaction: Callable[[], None] = lambda: None
 
     def _part_faults(self, serial: str) -> PartFaults:
-        kinds = set(get_args(TileFault)) - {"over_range"}
-        own = {kind: self._faults.of(kind, serial) for kind in kinds}
+        own = {kind: self._faults.of(kind, serial) for kind in get_args(PartFault)}
         return PartFaults(**own, scene=self._faults)
 
     def fault(self, kind: FaultKind, target: str = BUS) -> AbstractContextManager[None]:

@@ -14,6 +14,7 @@ import numpy as np
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.emulation.faults import Fault
 from devices.emulation.parts import ChipPart, DomePart, random_of
+from devices.emulation.puncture import Puncture
 from devices.emulation.surroundings import Surroundings
 from devices.scene.emulated import EmulationScene
 
@@ -33,7 +34,8 @@ class FrontEnd:
     """Samples one dome, or what is around a bare chip: a `Sense` for the emulated chip.
 
     Before `begin` its dome is at rest at the scene's first instant. Fault `over_range`: it is
-    pressed 45 kPa harder, past its range; most wrap.
+    pressed 45 kPa harder, past its range; most wrap. `frozen`: the word of its pressure stands
+    still, that of its temperature does not.
     """
 
     def __init__(
@@ -45,15 +47,20 @@ class FrontEnd:
         scene: EmulationScene,
         label: str,
         over_range: Fault | None = None,
+        frozen: Fault | None = None,
+        puncture: Puncture | None = None,
     ) -> None:
         self._c = chip.coefficients
         self._tadc_at_25 = chip.tadc_at_25_degc
-        self._chip_lag_s = dome.chip_lag_s
+        self._lags_s = dome.chip_lag_s, dome.gas_lag_s
         self._pressure_kpa = pressure_kpa
         self._surroundings = surroundings
         self._clip_kpa = scene.clip_kpa or math.inf
         self._epoch_ns: int | None = None
         self._over_range = over_range if over_range is not None else Fault()
+        self._frozen = frozen if frozen is not None else Fault()
+        self._puncture = puncture
+        self._padc = -1  # none so far
         self._noise = _noise(scene, self._lsb_kpa(), random_of(label))
         self._correlated_s = scene.correlated_ms * 1e-3
         self._core_kpa = 0.0
@@ -70,7 +77,10 @@ class FrontEnd:
         # A conversion that was under way when the scene began saw its first instant.
         t_s = 0.0 if self._epoch_ns is None else max(0.0, (t_ns - self._epoch_ns) * 1e-9)
         core_kpa, outlier_kpa, tadc_noise = next(self._noise)
-        kpa = min(self._pressure_kpa(t_s), self._clip_kpa)
+        kpa = self._pressure_kpa(t_s)
+        if self._puncture is not None:
+            kpa = self._puncture.leaked_kpa(kpa, t_s, t_ns)
+        kpa = min(kpa, self._clip_kpa)
         if self._over_range(t_ns):
             kpa += _FAR_OVER_RANGE_KPA
         kpa += self._correlate(core_kpa, t_ns * 1e-9) + outlier_kpa
@@ -79,10 +89,12 @@ class FrontEnd:
         c = self._c
         pcomp = (kpa - PRESSURE_MIN_KPA) / _KPA_PER_PCOMP
         padc = (pcomp - c.a0 - c.b2 * tadc) / (c.b1 + c.c12 * tadc)
-        return round(padc) % 1024, min(max(round(tadc + tadc_noise), 0), 1023)
+        if self._padc < 0 or not self._frozen(t_ns):
+            self._padc = round(padc) % 1024
+        return self._padc, min(max(round(tadc + tadc_noise), 0), 1023)
 
     def _true_tadc(self, t_s: float) -> float:
-        degc = self._surroundings.chip_degc(t_s, self._chip_lag_s)
+        degc = self._surroundings.chip_degc(t_s, *self._lags_s)
         return self._tadc_at_25 + (degc - 25.0) * _TADC_PER_KELVIN
 
     def _lsb_kpa(self) -> float:

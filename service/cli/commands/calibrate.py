@@ -46,7 +46,9 @@ def calibrate_command(
     plot_path = output_path(plot, out, *recordings) if plot is not None else None
     with progress("fitting"):
         pressed = read_recordings(recordings)
-        calibration = calibrate_recordings(pressed, name=path.stem, reference=reference)
+        calibration = calibrate_recordings(
+            pressed, name=path.stem, reference=reference, progress=remark
+        )
         png = None
         if plot_path is not None:
             from service.offline.calibration_plot import plot_calibration

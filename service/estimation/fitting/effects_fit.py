@@ -12,7 +12,7 @@ from service.estimation.calibration import TileCalibration, is_monotonic
 from service.estimation.effects import Effects, TemperatureEffect, values
 from service.estimation.fitting.identify import identify
 from service.estimation.fitting.indentation import Indentation, pressed_in, soak, unloaded
-from service.estimation.fitting.model import DomeModel
+from service.estimation.fitting.model import DomeModel, load
 from service.estimation.fitting.press import Presses, joined, presses
 from service.estimation.fitting.soak import fit_soak
 
@@ -116,9 +116,7 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
     static_curve = curve_over_range(tile.coefficients)
 
     late_s = 0.0 if effects.late_s is None else effects.late_s.value
-    static = DomeModel(
-        static_curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa, late_s=late_s
-    )
+    static = DomeModel(static_curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa)
     model = replace(static, curve=curve)
     if gas is not None:
         model = replace(model, gamma=gas.gamma.value, tau_s=gas.tau_s.value)
@@ -126,8 +124,9 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
         model = replace(model, part=values(rubber.part), creep_s=values(rubber.tau_s))
     if loop is not None:
         model = replace(model, loop=values(loop.part))
+    force_n = load(points.t_s, points.force_n)(points.t_s + late_s)
     static_kpa, modelled_kpa = (
-        each.pressed(points.t_s, points.force_n)[:, 0] - baseline_kpa for each in (static, model)
+        each.pressed(points.t_s, force_n)[:, 0] - baseline_kpa for each in (static, model)
     )
     measured_kpa = points.kpa - baseline_kpa
     found: dict[str, Replay] = {}

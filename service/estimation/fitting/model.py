@@ -8,18 +8,23 @@ away (gamma = 46).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from devices.arrays import Floats
 from service.estimation.compiled import compiled
-from service.estimation.models.gas import warmed
 from service.estimation.models.hysteresis import WIDTHS_N, played
 from service.estimation.models.rubber import crept_parts
 
-_NEWTON_STEPS = 30  # a bound; it ends when a step is below 1e-10
-_GAS_STEPS = 6  # of a fixed point that contracts by (gamma - 1) / gamma
+_NEWTON_STEPS = 30  # a bound; it ends when a step is below `_CLOSE`
+_GAS_STEPS = 30  # likewise; two are the rule
+_CLOSE = 1e-10
+"""A smaller step changes nothing: behind it, the next would be as its square."""
+_FLAT = 1e-5
+"""Below it a difference of exponentials is its series: the next term is lost in rounding."""
 _FLATTEST = 0.05
 """Part of the slope at zero with which a trial cubic goes on where it turns over."""
 
@@ -38,7 +43,8 @@ class DomeModel:
         part: (terms,) of the creep.
         creep_s: (terms,) its times.
         loop: (plays,) parts of the plays of half widths `WIDTHS_N`.
-        late_s: how much later than its instant says the tile is sampled.
+        late_s: how much later than its instant says the tile is sampled; the forces given to
+            `pressed` are those of that time, from `load`.
     """
 
     curve: Floats
@@ -53,10 +59,10 @@ class DomeModel:
     late_s: float = 0.0
 
     def pressed(self, t_s: Floats, force_n: Floats) -> Floats:
-        """What `pressed` gives for these parameters, under forces that are of the instants."""
+        """What `pressed` gives for these parameters."""
         return pressed(
             t_s,
-            np.interp(t_s + self.late_s, t_s, force_n),
+            force_n,
             self.curve,
             self.scale_kpa,
             self.baseline_kpa,
@@ -68,6 +74,53 @@ class DomeModel:
             self.loop,
             WIDTHS_N[: len(self.loop)],
         )
+
+
+def load(t_s: Floats, force_n: Floats) -> Callable[[Floats], Floats]:
+    """Force at any instant, from a reference's readings.
+
+    Smooth, and nowhere beyond the readings: along straight lines a fit of the instant would stop at
+    every reading, where they have a corner.
+    """
+    between = PchipInterpolator(t_s, force_n)
+    first_s, last_s = t_s[0], t_s[-1]
+    return lambda at_s: np.asarray(between(np.clip(at_s, first_s, last_s)))
+
+
+@compiled
+def _heated(
+    static: float,
+    baseline_kpa: float,
+    ln_before: float,
+    warm: float,
+    h: float,
+    k: float,
+    wall: float,
+) -> tuple[float, float]:
+    """Pressure of a gas that would settle at `static`, and its temperature over the wall's.
+
+    Both follow from one another (model `gas`): Newton's steps in the logarithm of the pressure.
+    """
+    ln_static = math.log(static)
+    ln_p = ln_before
+    p = math.exp(ln_p)
+    now = warm
+    for _ in range(_GAS_STEPS):
+        x = h - k * (ln_p - ln_before)
+        decay = math.exp(-x)
+        mean = (1.0 - decay) / x if abs(x) > _FLAT else 1.0 - 0.5 * x
+        slope = (mean - decay) / x if abs(x) > _FLAT else 0.5 - x / 3.0
+        now = warm * decay + h * mean
+        rise = k * (warm * decay + h * slope) / now  # of ln T with ln p
+        iso = p / now
+        inner, outer = 1.0 + wall * (iso - baseline_kpa), 1.0 + wall * (p - baseline_kpa)
+        give = wall * (iso * (1.0 - rise) / inner - p / outer)  # how the wall's share rises
+        step = (ln_static + math.log(now * inner / outer) - ln_p) / (1.0 - rise - give)
+        ln_p += step
+        p = math.exp(ln_p)
+        if abs(step) < _CLOSE:
+            break
+    return p, now
 
 
 @compiled
@@ -132,17 +185,12 @@ def pressed(
             value = inside * (c1 + inside * (c2 + inside * c3)) + (x - inside) * slope
             step = (apparent - value) / slope
             x += step
-            if abs(step) < 1e-10:
+            if abs(step) < _CLOSE:
                 break
         static = baseline_kpa + x * scale_kpa
         p = static * warm
-        before = warm
         if gamma > 1.0:
-            for _ in range(_GAS_STEPS):
-                warm = warmed(before, math.log(p) - ln_p, dt / (gamma * tau_s), k)
-                iso = p / warm
-                give = (1.0 + wall * (iso - baseline_kpa)) / (1.0 + wall * (p - baseline_kpa))
-                p = static * give * warm
+            p, warm = _heated(static, baseline_kpa, ln_p, warm, dt / (gamma * tau_s), k, wall)
         out[i, 0], out[i, 1], out[i, 2] = p, static, force_n[i] - apparent
         ln_p, force, time = math.log(p), force_n[i], t_s[i]
     return out

@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares, nnls
+from scipy.optimize import nnls
 
 from devices.arrays import Bools, Floats
 from service.estimation.effects import EffectName
 from service.estimation.fitting.confidence import fit_covariance
-from service.estimation.fitting.model import DomeModel
+from service.estimation.fitting.least_squares import least_squares
+from service.estimation.fitting.model import DomeModel, load
 from service.estimation.fitting.press import Presses
 from service.estimation.models.hysteresis import WIDTHS_N
 
@@ -24,7 +25,6 @@ TERMS = 2  # of the creep: one fast, one slow
 _SCATTER = (0.003, 0.03)
 """Least scatter of loadings that is believed; and the paper's scatter, to begin with."""
 _ROUNDS = 2  # the second one knows how much loadings scatter
-_EVALUATIONS = 60  # of the residuals in a round, at most
 _NO_LIMIT = 1e3  # newtons: no coefficient of a curve of 30 N comes near
 _BINS = 15  # parts of the range that systematic errors are averaged over
 _OPENS_N = 0.1
@@ -118,6 +118,7 @@ class OutputErrorProblem:
         self._usable &= gauge_kpa <= static.scale_kpa
         self._weight = np.where(self._usable, points.weight, 0.0)
         self._gauge_kpa = np.where(self._usable, gauge_kpa, 0.0)
+        self._load = load(points.t_s, points.force_n)
 
     def fit(self, free: frozenset[Fitted]) -> Fit:
         """Fit the curve and the effects that are `free`."""
@@ -131,23 +132,22 @@ class OutputErrorProblem:
                 at[unknowns.name] = slice(len(x), len(x) + len(unknowns.start))
                 x = np.append(x, unknowns.start)
                 low, high = np.append(low, unknowns.least), np.append(high, unknowns.most)
+        # What readings hardly tell is known as well as its bounds say.
+        known = (high - low) / np.sqrt(12.0)
         scatter = _SCATTER[1]
         for _ in range(_ROUNDS):
 
             def residual(x: Floats, scatter: float = scatter) -> Floats:
-                return self._residual(self._model(x, at), scatter)
+                return self.residual(self._model(x, at), scatter)
 
-            found = least_squares(
-                residual, x, bounds=(low, high), x_scale="jac", max_nfev=_EVALUATIONS
-            )
+            found = least_squares(residual, x, low, high, known)
             x = found.x
             model = self._model(x, at)
             gains, modelled = self._gains(model, scatter)
             # Gains scatter about their mean, which the curve should have taken: not quite, and
             # there are few of them.
             scatter = max(_SCATTER[0], float(np.sqrt(np.mean((gains - 1.0) ** 2))))
-        # What readings hardly tell is known as well as its bounds say.
-        covariance = fit_covariance(found.jac, (high - low) / np.sqrt(12.0))
+        covariance = fit_covariance(found.jacobian, known)
         every = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         sigma = {name: every[where] for name, where in at.items()}
         for name, total, weights in (
@@ -157,7 +157,7 @@ class OutputErrorProblem:
             if name in at:
                 variance = float(weights @ covariance[at[name], at[name]] @ weights)
                 sigma[total] = np.array([np.sqrt(max(0.0, variance))])
-        at_bound = tuple(name for name, where in at.items() if found.active_mask[where].any())
+        at_bound = tuple(name for name, where in at.items() if found.at_bound[where].any())
         curve_covariance = covariance[at["curve"], at["curve"]]
         return Fit(model, gains, scatter, modelled, sigma, curve_covariance, at_bound)
 
@@ -197,7 +197,7 @@ class OutputErrorProblem:
     def _gains(self, model: DomeModel, scatter: float) -> tuple[Floats, Floats]:
         """Gain of each loading, by least squares with a prior of one, and modelled pressures."""
         points = self._points
-        modelled = model.pressed(points.t_s, points.force_n)
+        modelled = model.pressed(points.t_s, self._load(points.t_s + model.late_s))
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
         n = points.loadings
         prior = 1.0 / scatter**2
@@ -205,7 +205,8 @@ class OutputErrorProblem:
         product = np.bincount(points.loading, self._weight**2 * gauge_kpa * self._gauge_kpa, n)
         return (product + prior) / (square + prior), modelled
 
-    def _residual(self, model: DomeModel, scatter: float) -> Floats:
+    def residual(self, model: DomeModel, scatter: float) -> Floats:
+        """What is fitted: pressures, gains and priors off, in their standard uncertainties."""
         gains, modelled = self._gains(model, scatter)
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
         off = (gains[self._points.loading] * gauge_kpa - self._gauge_kpa) * self._weight

@@ -449,6 +449,30 @@ def test_a_tile_pressed_over_its_range_shows_no_pressure_of_its_range() -> None:
     assert 95 < kpa() < 105
 
 
+def test_a_punctured_dome_loses_its_gas_and_its_neighbour_does_not() -> None:
+    fault = {"kind": "puncture", "tile": "T01", "t_s": 1.0, "duration_s": 60.0, "leak_s": 0.2}
+    loads = {"ground": {"kind": "plate", "load_n": 20.0, "sway_m": 0.0}, "fault": [fault]}
+    scene = make_scene(TWO, **loads)
+    world, array, clock = switched_on(scene, lead_s=0.2)
+
+    def kpa() -> list[float]:
+        scan = array.scan()
+        return [
+            float(compensate_kpa(padc, tadc, c.a0, c.b1, c.b2, c.c12))
+            for padc, tadc, tile in zip(scan.padc, scan.tadc, array.tiles, strict=True)
+            for c in [Coefficients.from_words(tile.coefficient_words)]
+        ]
+
+    clock.sleep_until_ns(EPOCH_NS + 900_000_000)
+    before = kpa()
+    while clock.now_ns() < EPOCH_NS + 3_000_000_000:
+        array.scan()
+    after = kpa()
+    assert before[0] > after[0] + 1.0
+    assert after[1] == pytest.approx(before[1], abs=0.5)
+    assert after[0] == pytest.approx(world._surroundings(f"{scene.name}/0").ambient_kpa, abs=0.3)
+
+
 def test_physics_that_takes_long_is_waited_for_before_a_transfer_and_not_within(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -244,6 +244,20 @@ def test_a_tile_pressed_over_its_range_reads_45_kpa_more() -> None:
     assert kpa(*words_at(sense, 0))[0] == pytest.approx(100.0, abs=0.15)
 
 
+def test_a_frozen_pressure_stands_still_while_the_temperature_does_not() -> None:
+    frozen, scene = Fault(), EmulationScene()
+    sense = FrontEnd(
+        CHIP, DOME, lambda t_s: 100.0 + t_s, Surroundings(scene), scene, "x", None, frozen
+    )
+    sense.begin(0)
+    before = sense(0)[0]
+    with frozen.injected():
+        words = np.array([sense(i * 2_000_000) for i in range(1, 500)])
+    assert (words[:, 0] == before).all()
+    assert len(np.unique(words[:, 1])) > 1
+    assert sense(10_000_000_000)[0] < before - 40  # 10 kPa
+
+
 def words_at(sense: FrontEnd, t_ns: int) -> tuple[Floats, Floats]:
     padc, tadc = sense(t_ns)
     return np.array([float(padc)]), np.array([float(tadc)])

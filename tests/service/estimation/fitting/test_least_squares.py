@@ -1,0 +1,99 @@
+"""`least_squares`: against closed forms, against scipy's trust region, and between bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.estimation.effects import WALL_PER_KPA
+from service.estimation.fitting.effects_fit import curve_over_range, loadings
+from service.estimation.fitting.fit import fit_tile
+from service.estimation.fitting.least_squares import least_squares
+from service.estimation.fitting.model import DomeModel
+from service.estimation.fitting.output_error import OutputErrorProblem
+from tests.service.estimation.fitting.test_identify import recorded
+
+_WIDE = np.full(3, 100.0)
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 1000))
+def test_a_linear_problem_is_solved_as_by_its_normal_equations(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    design, y = rng.normal(size=(40, 3)), rng.normal(size=40)
+    found = least_squares(lambda x: design @ x - y, np.zeros(3), -_WIDE, _WIDE, np.ones(3))
+    exact, *_ = np.linalg.lstsq(design, y, rcond=None)
+    sigma = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
+    assert (np.abs(found.x - exact) < 0.02 * sigma).all()
+    assert not found.at_bound.any()
+    np.testing.assert_allclose(found.jacobian, design, atol=1e-6)
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 1000))
+def test_between_bounds_it_finds_what_scipy_finds_and_says_which_hold(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t, truth = np.linspace(0.0, 5.0, 80), rng.uniform(0.2, 3.0, 3)
+    low, high = np.full(3, 0.5), np.full(3, 2.0)
+
+    def curve(x: np.ndarray) -> np.ndarray:
+        return np.asarray(x[0] * np.exp(-x[1] * t) + x[2])
+
+    y = curve(truth) + rng.normal(0, 0.05, len(t))
+
+    def off(x: np.ndarray) -> np.ndarray:
+        return (curve(x) - y) / 0.05
+
+    found = least_squares(off, np.ones(3), low, high, np.ones(3))
+    inside = found.x.clip(low + 1e-9, high - 1e-9)
+    other = scipy.optimize.least_squares(off, inside, bounds=(low, high))
+    assert found.residual @ found.residual <= 2.0 * other.cost + 2e-3
+    assert ((found.x == low) | (found.x == high))[found.at_bound].all()
+    assert (found.x >= low).all()
+    assert (found.x <= high).all()
+
+
+def test_it_gets_out_of_a_bent_valley() -> None:
+    found = least_squares(
+        lambda x: np.array([100.0 * (x[1] - x[0] ** 2), 10.0 * (1.0 - x[0])]),
+        np.array([-1.2, 1.0]), -_WIDE[:2], _WIDE[:2], np.ones(2),
+    )  # fmt: skip
+    assert found.x == pytest.approx([1.0, 1.0], abs=1e-3)
+
+
+@pytest.mark.slow
+def test_a_tiles_fit_is_that_of_a_long_search_within_a_small_part_of_its_sigma() -> None:
+    recording = recorded(seed=0)
+    tile = fit_tile(recording)
+    points, baseline_kpa = loadings([recording])
+    static = DomeModel(
+        curve_over_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, WALL_PER_KPA
+    )
+    problem = OutputErrorProblem(points, static)
+    fit = problem.fit(frozenset({"late", "gas", "rubber", "hysteresis"}))
+    rows = ("late_s", "gamma", "tau_s", "part", "creep_s", "loop")
+    stated = [getattr(fit.model, name) for name in rows]
+    sigma = [
+        *fit.sigma["late_s"], *fit.sigma["gamma"], *fit.sigma["ln_tau"] * fit.model.tau_s,
+        *fit.sigma["part"], *fit.sigma["ln_creep"] * fit.model.creep_s, *fit.sigma["loop"],
+    ]  # fmt: skip
+    curve_sigma = np.sqrt(np.diag(fit.curve_covariance))
+    unit = np.concatenate([curve_sigma, sigma])
+    x = np.concatenate([fit.model.curve, *(np.atleast_1d(part) for part in stated)])
+
+    def residual(steps: np.ndarray) -> np.ndarray:
+        at = x + steps * unit
+        model = DomeModel(
+            at[:3], static.scale_kpa, baseline_kpa, WALL_PER_KPA, late_s=at[3], gamma=at[4],
+            tau_s=at[5], part=at[6:8], creep_s=at[8:10], loop=at[10:],
+        )  # fmt: skip
+        return problem.residual(model, fit.scatter)
+
+    other = scipy.optimize.least_squares(
+        residual, np.zeros(len(x)), ftol=1e-12, xtol=1e-12, gtol=1e-12,
+        diff_step=np.full(len(x), 1e-4), max_nfev=40,
+    )  # fmt: skip
+    assert np.abs(other.x).max() < 0.1
