@@ -105,6 +105,7 @@ def tile_forces(
             denoise.PAST_NS,
             denoise.REACHES,
             denoise.AGREE,
+            plan.noise_left,
         )
         force_n = np.where(np.isnan(averaged_n), force_n, averaged_n)
         noise_n = noise_n * np.sqrt(np.where(np.isnan(left), 1.0, left))

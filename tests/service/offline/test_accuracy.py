@@ -216,6 +216,7 @@ def test_where_there_is_nothing_to_judge_figures_are_nan_and_null_in_json() -> N
         "cop_p95_m",
         "cop_coverage_95",
         "cop_masked_share",
+        "after_saturation_mae_n",
     }
     assert figures["grf_phases"]["loading"] == {"frames": 0, "within": 0, "coverage_95": None}
     assert json.loads(json.dumps(figures, allow_nan=False))["frames"] == 2

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from mpmath import mp, mpf
 
+from devices.arrays import Floats
 from service.estimation.models import ambient, denoise
 from service.estimation.models.hysteresis import OPENS, WIDTHS_N
 
@@ -242,6 +243,13 @@ def curve_at_zero(x: list[Exact], y: list[Exact], degree: int) -> tuple[Exact, E
     return value, sum(q0**2 / mp.fdot(q, q) for q, q0 in pairs)
 
 
+def _between(table: Floats, at: Any) -> Any:
+    """Linearly interpolated."""
+    below = min(int(mp.floor(at)), len(table) - 2)
+    first, second = mpf(table[below]), mpf(table[below + 1])
+    return first + (at - below) * (second - first)
+
+
 def denoised(
     values: list[Exact],
     sigmas: list[Exact],
@@ -250,6 +258,7 @@ def denoised(
     at_ns: list[int],
     run: list[int],
     look_ns: int,
+    noise_left: Floats,
 ) -> list[tuple[Exact, Exact] | None]:
     """Growing windows, a parabola and a line in each; the longest that agrees with all shorter."""
     out: list[tuple[Exact, Exact] | None] = []
@@ -283,6 +292,8 @@ def denoised(
                 if found is None:
                     continue
                 value, variance = found
+                variance *= _between(noise_left, 1 / variance)
+                found = value, variance
                 spread = sigma * mp.sqrt(variance)
                 if value - spread > most or value + spread < least:
                     straight, refused = False, degree == 2

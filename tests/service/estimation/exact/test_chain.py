@@ -155,6 +155,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             frame_ns,
             run,
             plan.lag_ns - 1,
+            plan.noise_left[domes.index(i)],
         )
         smooth = [f if a is None else a[0] for f, a in zip(apparent, averaged, strict=True)]
         loop = [mpf(w.value) for w in effects[i].hysteresis.part]
