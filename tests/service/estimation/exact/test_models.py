@@ -13,6 +13,7 @@ from mpmath import mpf
 
 from service.estimation.models import ambient, denoise, gas, rubber, temperature
 from service.estimation.models.hysteresis import Hysteresis
+from service.estimation.tare.noise import left_by_mean
 from tests.service.estimation.exact import equations
 
 GOAL = 1e-9
@@ -142,9 +143,12 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
 
 @pytest.mark.parametrize("look_ms", [0, 3, 10, 100])
 @pytest.mark.parametrize("kind", ["still", "moving", "uneven", "few", "crowded"])
-def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str) -> None:
+@pytest.mark.parametrize("lasts", [0.0, 0.6])
+def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -> None:
     rng = np.random.default_rng([look_ms, len(kind)])
     n = 90
+    readings = np.maximum(np.arange(denoise.AVERAGED_MAX + 1), 1)
+    noise_left = left_by_mean(np.array([lasts]), np.array([6.0]), readings)
     swing_n = {"still": 0.0, "moving": 25.0, "uneven": 5.0, "few": 1.0, "crowded": 0.0}[kind]
     values = 30.0 + swing_n * np.sin(np.arange(n) / 9.0) + rng.normal(0, 0.3, n)
     steps_ns = np.full(n, 2_000_000)
@@ -170,6 +174,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str) -> None:
         denoise.PAST_NS,
         denoise.REACHES,
         denoise.AGREE,
+        noise_left[None, :],
     )
     found = equations.denoised(
         equations.exact(column),
@@ -179,6 +184,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str) -> None:
         frame_ns.tolist(),
         run.tolist(),
         look_ms * 1_000_000,
+        noise_left,
     )
     assert equations.apart(averaged, [None if x is None else x[0] for x in found]) < GOAL
     assert equations.apart(left, [None if x is None else x[1] for x in found]) < GOAL
