@@ -73,8 +73,10 @@ def make_unseen(
     most_n = MOST * (end_n + slope * (tells_kpa - curves.high_kpa))
     most_kpa = curves.high_kpa + (most_n - end_n) / slope
     gamma = np.ones(len(end_n)) if gas is None else gas.gamma
+    # Of a plan that waits for its tare the baseline is nothing.
+    base_kpa = np.maximum(baseline_kpa, 1.0)
     end_hot_kpa, most_hot_kpa = (
-        baseline_kpa * (1.0 + gauge_kpa / baseline_kpa) ** gamma
+        base_kpa * (1.0 + gauge_kpa / base_kpa) ** gamma
         for gauge_kpa in (curves.high_kpa, most_kpa)
     )
     return Unseen(curves.high_kpa, end_n, slope, most_n, end_hot_kpa, most_hot_kpa)
