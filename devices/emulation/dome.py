@@ -2,8 +2,10 @@
 
 Order of the chain (hardware.md 9): contact force -> creep of the rubber -> hysteresis -> volume of
 the bubble -> gas temperature -> absolute pressure. The gas is heat conduction in a sphere with an
-isothermal wall, eight modes; the rubber three Prony terms and four play operators. None of these
-equations or numbers is the estimator's.
+isothermal wall, eight modes; the rubber Prony terms, as many as the part has, and four play
+operators, and where the part has it a branch that flows (Bergstrom and Boyce 1998: filled rubbers
+lose energy in chains that creep past one another, at a rate that is a high power of their stress,
+so that the loop grows slowly with speed). None of these equations or numbers is the estimator's.
 
 Everything is computed ahead of the bus in blocks of time on a fine grid, for all domes at once, and
 interpolated where a chip samples: the physics does not know who asks, or when.
@@ -32,13 +34,15 @@ _COARSE = 40  # grid points, 20 ms
 _AHEAD_BLOCKS = 30  # for a driver that asks nothing for so long; bounds memory, 30 MB for 64 domes
 
 _KELVIN = 273.15
-_KAPPA = 0.4 / 1.4  # (gamma - 1) / gamma of air
 _MODES = np.arange(1, 9)
 _MODE_WEIGHTS = 6.0 / (np.pi * _MODES) ** 2  # of the mean temperature of a heated sphere
 _PLAY_WIDTHS_N = np.array([0.5, 1.0, 2.0, 4.0])
+_FLOW_POWER = 4.0  # of the rate of flow over stress (Bergstrom and Boyce 1998: about 4)
+_FLOW_PART = 0.08  # of a change of force that the flowing branch bears at first
+_FLOW_N_PER_S = 7.5  # where the loop is as wide as the part says: 30 N within 4 s
 _UNLOADED_N = 0.05  # a dome that bears less is not touched: the next touch is a new loading
 _MANY_LAGS = 128
-_PICARD_LIMIT = 40  # a bound; the iteration contracts by `_KAPPA`
+_PICARD_LIMIT = 40  # a bound; the iteration contracts by kappa
 _PICARD_TOLERANCE_K = 1e-6  # 3e-7 kPa
 
 
@@ -76,10 +80,20 @@ class Domes:
         self._knee_n = np.array([part.knee_n for part in parts])
         self._stiffening = np.array([part.stiffening for part in parts])
         self._seal_k = scene.ambient_degc + _KELVIN
+        drifted = [
+            random_of(f"gain drift/{label}/{serial}").uniform(-1.0, 1.0) for serial in serials
+        ]
+        self._stiffening *= 1.0 + scene.gain_drift * np.array(drifted)
         self._loading_rngs = [random_of(f"loading/{label}/{serial}") for serial in serials]
 
-        self._creep = np.zeros((n, 3))
+        self._kappa = np.array([part.kappa for part in parts])
+        self._creep = [np.zeros(len(part.creep_s)) for part in parts]
         self._play_n = np.zeros((n, len(_PLAY_WIDTHS_N)))
+        viscous_n = np.array([part.viscous_n for part in parts])
+        self._flowing = np.flatnonzero(viscous_n > 0.0)
+        self._viscous_n = viscous_n[self._flowing]
+        self._branch_n = np.zeros(len(self._flowing))
+        self._last_flow_n = np.zeros(len(self._flowing))
         self._loading_gain = np.ones(n)
         self._last_force_n = np.zeros(n)
         self._mode_k = np.zeros((n, len(_MODES)))
@@ -174,7 +188,7 @@ class Domes:
         self._step_s = stride * GRID_S
         t_s: Floats = GRID_S * steps
         force_n = self._load.forces_n(t_s)
-        apparent_n = self._hysteresis(self._creeping(force_n))
+        apparent_n = self._viscous(self._hysteresis(self._creeping(force_n)))
         lost = self._stiffening * np.log1p(apparent_n / self._knee_n) * self._loading_gains(force_n)
         kpa = self._gas(t_s, 1.0 - lost)
         around_kpa = self._surroundings.bare_kpa(t_s)
@@ -194,8 +208,8 @@ class Domes:
                 mean = (1 - decay) * tau_s / self._step_s
                 # Exact for a force that is linear between grid points.
                 drive = (mean - decay) * f[:-1] + (1 - mean) * f[1:]
-                slow, _ = lfilter([1], [1, -decay], drive, zi=[decay * self._creep[dome, term]])
-                self._creep[dome, term] = slow[-1]
+                slow, _ = lfilter([1], [1, -decay], drive, zi=[decay * self._creep[dome][term]])
+                self._creep[dome][term] = slow[-1]
                 apparent[:, dome] += share * (slow - f[1:])
         return np.maximum(apparent, 0.0)
 
@@ -215,6 +229,30 @@ class Domes:
         loop_n = np.array([part.loop_n for part in self._parts])
         weight = loop_n / _PLAY_WIDTHS_N.sum()
         return np.asarray(force_n + weight * (played - f).sum(axis=2))
+
+    def _viscous(self, force_n: Floats) -> Floats:
+        """A branch beside the spring bears part of a change, and flows: the bubble gets the rest.
+
+        Branch stress s: ds/dt = part dF/dt - rate |s|^power sign(s). The flow by itself has a
+        closed form, which stands between two halves of the step in force; where F changes at
+        `_FLOW_N_PER_S` it ends at s = `viscous_n`.
+        """
+        if not self._scene.hysteresis or not len(self._flowing):
+            return force_n
+        f = force_n[:, self._flowing]
+        half_n = 0.5 * _FLOW_PART * np.diff(f, axis=0, prepend=self._last_flow_n[None])
+        more = _FLOW_POWER - 1.0
+        flow = more * self._step_s * _FLOW_PART * _FLOW_N_PER_S / self._viscous_n**_FLOW_POWER
+        borne_n = np.empty_like(f)
+        s = self._branch_n
+        for k in range(len(f)):
+            s = s + half_n[k]
+            s = s / (1.0 + flow * np.abs(s) ** more) ** (1.0 / more) + half_n[k]
+            borne_n[k] = s
+        self._branch_n, self._last_flow_n = s, f[-1]
+        apparent_n = force_n.copy()
+        apparent_n[:, self._flowing] = np.maximum(f - borne_n, 0.0)
+        return apparent_n
 
     def _loading_gains(self, force_n: Floats) -> Floats:
         """A separate gain for every loading, drawn when the dome is touched."""
@@ -261,7 +299,7 @@ class Domes:
         gain = _MODE_WEIGHTS * (1 - decay) / -np.log(decay)
         for _ in range(_PICARD_LIMIT):
             ln_p = np.concatenate([self._last_ln_p[None], np.log(kpa)])
-            drive = _KAPPA * (wall_k + excess_k) * np.diff(ln_p, axis=0)
+            drive = self._kappa * (wall_k + excess_k) * np.diff(ln_p, axis=0)
             modes_k = decaying(drive, gain, decay, self._mode_k)
             new_k = modes_k.sum(axis=2)
             change_k = np.abs(new_k - excess_k).max()

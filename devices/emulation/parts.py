@@ -22,6 +22,9 @@ class ChipPart:
     coefficients: Coefficients
     conversion_ns: int
     tadc_at_25_degc: float
+    late_ns: int = 0
+    """How much later than after a quarter of a conversion it samples: not documented (hardware.md
+    1.4)."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +44,20 @@ class DomePart:
     conduction_s: float
     """r^2 / (pi^2 a): slowest mode of heat conduction in the bubble at constant pressure."""
     gas_lag_s: float
-    """How long the gas follows its chip's temperature."""
+    """How long the gas follows its chip's temperature; below zero: the chip follows its gas'."""
     chip_lag_s: float
-    """How long the chip follows the surroundings."""
-    creep_parts: tuple[float, float, float]
-    creep_s: tuple[float, float, float]
+    """How long the first of the two follows the surroundings."""
+    creep_parts: tuple[float, ...]
+    """Parts of a force that appear late, ..."""
+    creep_s: tuple[float, ...]
+    """... and how late each of them."""
     loop_n: float
-    """Half width of the hysteresis loop at full load, in newtons."""
+    """Half width of the hysteresis loop at full load that does not depend on speed, in newtons."""
+    viscous_n: float = 0.0
+    """Half width of the loop that the rubber's viscosity makes beside it, in newtons, where a force
+    changes by 7.5 N/s; faster loads make it wider."""
+    kappa: float = 0.4 / 1.4
+    """(gamma - 1) / gamma of the gas: air's, unless vapours of the casting are in it."""
 
 
 def draw_chip(serial: str, parts_seed: int) -> ChipPart:

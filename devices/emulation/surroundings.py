@@ -51,18 +51,27 @@ class Surroundings:
         """Does the temperature never change?"""
         return self._scene.temperature_step_k == 0.0
 
-    def chip_degc(self, t_s: float, lag_s: float) -> float:
-        """Temperature of a chip that follows the surroundings with one lag."""
+    def chip_degc(self, t_s: float, chip_lag_s: float, gas_lag_s: float) -> float:
+        """Temperature of a chip: with one lag, or behind its gas with a second (`DomePart`)."""
         scene = self._scene
         since = max(t_s - scene.temperature_step_s, 0.0)
-        return scene.ambient_degc - scene.temperature_step_k * math.expm1(-since / lag_s)
+        if gas_lag_s < 0.0:
+            return float(self._second_degc(np.array(since), chip_lag_s, -gas_lag_s))
+        return scene.ambient_degc - scene.temperature_step_k * math.expm1(-since / chip_lag_s)
 
     def gas_wall_degc(self, t_s: Floats, chip_lag_s: float, gas_lag_s: float) -> Floats:
-        """Temperature of the bubble's wall, which follows the chip with a second lag."""
-        scene, a, b = self._scene, chip_lag_s, gas_lag_s
+        """Temperature of the bubble's wall: behind its chip with a second lag, or before it."""
+        scene = self._scene
         since = np.maximum(t_s - scene.temperature_step_s, 0.0)
+        if gas_lag_s < 0.0:
+            warmed_k = scene.temperature_step_k * np.expm1(-since / chip_lag_s)
+            return np.asarray(scene.ambient_degc - warmed_k)
+        return self._second_degc(since, chip_lag_s, gas_lag_s)
+
+    def _second_degc(self, since: Floats, a: float, b: float) -> Floats:
+        """Of what follows with lag `b` what follows the surroundings with lag `a`."""
         arrived = 1 - (a * np.exp(-since / a) - b * np.exp(-since / b)) / (a - b)
-        return np.asarray(scene.ambient_degc + scene.temperature_step_k * arrived)
+        return np.asarray(self._scene.ambient_degc + self._scene.temperature_step_k * arrived)
 
     def head_kpa(self, t_s: Floats) -> Floats:
         """Pressure around each tile above the atmosphere's.

@@ -25,12 +25,13 @@ from devices.emulation.chips.front_end import FrontEnd
 from devices.emulation.chips.mpl115a2 import EmulatedMpl115a2, PartFaults, Silicon
 from devices.emulation.chips.tca9548a import EmulatedTca9548a
 from devices.emulation.dome import Domes
+from devices.emulation.families import chip_of, dome_of
 from devices.emulation.faults import Faults
 from devices.emulation.ground.grounds import make_ground, tile_positions_m
 from devices.emulation.ground.hopping import Hopping
 from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation, Mill
-from devices.emulation.parts import draw_chip, draw_dome, random_of
+from devices.emulation.parts import random_of
 from devices.emulation.puncture import Puncture
 from devices.emulation.surroundings import Surroundings
 from devices.scene.emulated import BUS, LEAK_S, FaultKind, MudGround, PartFault
@@ -98,7 +99,8 @@ class World:
         self.ground = make_ground(scene, seed=seed, lead_s=lead_s, pressed=pressed, looped=looped)
         self._positions_m = tile_positions_m(scene.tile)
         serials = [tile.serial for tile in scene.tile]
-        domes = [draw_dome(serial, parts_seed) for serial in serials]
+        family = scene.emulation.family
+        domes = [dome_of(family, serial, parts_seed) for serial in serials]
         # By scene too: a tile on the bench and in the field must not see the same noise again.
         draw = f"{scene.name}/{seed}"
         surroundings = self._surroundings(draw)
@@ -111,7 +113,7 @@ class World:
 
         def silicon(index: int, serial: str) -> Silicon:
             """The chip of a serial under a dome of this foot, or bare if it is for reference."""
-            chip = draw_chip(serial, parts_seed)
+            chip = chip_of(family, serial, parts_seed)
             fixed_ms = scene.array.conversion_ms
             sense = FrontEnd(
                 chip,
@@ -128,7 +130,7 @@ class World:
                 sense.begin(self.epoch_ns)
             self._front_ends.append(sense)
             conversion_ns = chip.conversion_ns if fixed_ms is None else round(fixed_ms * 1e6)
-            return Silicon(chip.coefficients.to_words(), conversion_ns, sense)
+            return Silicon(chip.coefficients.to_words(), conversion_ns, sense, chip.late_ns)
 
         self.parts = [
             EmulatedMpl115a2(

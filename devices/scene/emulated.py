@@ -111,17 +111,24 @@ GroundScene = Annotated[
 
 
 ReadDuringConversion = Literal["stale", "abort", "torn"]
+Family = Literal["default", "broad"]
+"""Of emulated parts; drawn in `devices.emulation.families`."""
 
 
 class EmulationScene(Section):
     """`[emulation]`: which effects the emulated domes and chips show. A real node ignores it."""
 
+    family: Family = "default"
+    """Which domes and chips are drawn: the usual ones, or whatever a real batch may be."""
     noise_kpa: Annotated[float, Field(ge=0, le=100)] = 0.165
     """Standard deviation of a single reading in all: core, outliers and rounding."""
     correlated_ms: NotNegative = 0.0
     """Correlation time of the noise's core; 0: white."""
     repeatability: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Standard deviation of the normalised output between loadings (paper III-A: 0.03)."""
+    gain_drift: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+    """How much each dome's gain has changed since its bench, up or down, at the most: rubber ages,
+    and stiffens in the cold. Within a session it is constant."""
     gas: bool = True
     """Adiabatic overshoot of fast loads."""
     rubber: bool = True

@@ -16,6 +16,7 @@ from pathlib import Path
 from platformdirs import user_cache_path
 
 from devices.errors import CalibrationError, DamagedFileError, StorageError, needs_extra
+from devices.scene.emulated import Family
 from devices.scene.file import Scene, build_scene, load_scene
 from service.estimation.calibration import EDITED, PRESETS, UNPROVEN, Calibration
 from service.rig.emulated import EmulatedFoot
@@ -34,6 +35,8 @@ def find_calibration(
     serials: Sequence[str],
     *,
     parts_seed: int = 0,
+    family: Family = "default",
+    repeatability: float | None = None,
     cache: Path | None = None,
     progress: Progress = lambda message: None,
 ) -> Calibration:
@@ -43,6 +46,8 @@ def find_calibration(
         name: "bench", a preset's name, or the path of a file.
         serials: tiles that it must cover.
         parts_seed: which parts the emulated bench presses.
+        family: of which family of parts.
+        repeatability: how much their loadings differ on it, instead of what the bench's scene says.
         cache: where the bench's results are kept; default: the user's cache.
         progress: told what takes time.
 
@@ -51,7 +56,8 @@ def find_calibration(
     """
     if name == BENCH:
         folder = cache if cache is not None else user_cache_path("foottile") / "bench"
-        entries = [_bench_tile(serial, parts_seed, folder, progress) for serial in serials]
+        scenes = [bench_scene(serial, family, repeatability) for serial in serials]
+        entries = [_bench_tile(scene, parts_seed, folder, progress) for scene in scenes]
         return Calibration(
             name=BENCH,
             reference=BENCH_REFERENCE,
@@ -95,8 +101,8 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     write_checked(path, calibration.to_json().encode())
 
 
-def _bench_tile(serial: str, parts_seed: int, folder: Path, progress: Progress) -> Calibration:
-    scene = bench_scene(serial)
+def _bench_tile(scene: Scene, parts_seed: int, folder: Path, progress: Progress) -> Calibration:
+    serial = scene.tile[0].serial
     # Another version or another bench is another result.
     made_by = hashlib.sha256(f"{SOFTWARE}/{parts_seed}/{scene.model_dump_json()}".encode())
     kept = folder / f"{serial}-{made_by.hexdigest()[:16]}.json"
@@ -145,9 +151,15 @@ def _kept_in(kept: Path, serial: str, progress: Progress) -> Calibration | None:
     return None
 
 
-def bench_scene(serial: str) -> Scene:
+def bench_scene(
+    serial: str, family: Family = "default", repeatability: float | None = None
+) -> Scene:
     """The mill with one tile under it."""
-    return with_tiles(load_scene("indentation"), [serial])
+    scene = with_tiles(load_scene("indentation"), [serial])
+    asked: dict[str, object] = {"family": family}
+    if repeatability is not None:
+        asked["repeatability"] = repeatability
+    return scene.model_copy(update={"emulation": scene.emulation.model_copy(update=asked)})
 
 
 def with_tiles(scene: Scene, serials: Sequence[str]) -> Scene:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from devices.errors import CalibrationError, FileFormatError, TareError, UsageError
 from devices.frames import ArrayInfo
+from devices.scene.emulated import Family
 from devices.scene.file import Scene, load_scene
 from service.estimation.calibration import Calibration
 from service.estimation.plan import EstimationPlan
@@ -146,5 +148,14 @@ def _calibration(
         name,
         [tile.serial for tile in session.info.tiles if not tile.reference],
         parts_seed=int(notes.get("parts_seed", 0)),
+        family=_family(notes),
         progress=remark,
     )
+
+
+def _family(notes: Mapping[str, Any]) -> Family:
+    """Of the emulated parts of a session; those of before there was another are the usual ones."""
+    scene = notes.get("scene")
+    emulation = scene.get("emulation") if isinstance(scene, dict) else None
+    is_broad = isinstance(emulation, dict) and emulation.get("family") == "broad"
+    return "broad" if is_broad else "default"

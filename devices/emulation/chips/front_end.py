@@ -52,7 +52,7 @@ class FrontEnd:
     ) -> None:
         self._c = chip.coefficients
         self._tadc_at_25 = chip.tadc_at_25_degc
-        self._chip_lag_s = dome.chip_lag_s
+        self._lags_s = dome.chip_lag_s, dome.gas_lag_s
         self._pressure_kpa = pressure_kpa
         self._surroundings = surroundings
         self._clip_kpa = scene.clip_kpa or math.inf
@@ -94,7 +94,7 @@ class FrontEnd:
         return self._padc, min(max(round(tadc + tadc_noise), 0), 1023)
 
     def _true_tadc(self, t_s: float) -> float:
-        degc = self._surroundings.chip_degc(t_s, self._chip_lag_s)
+        degc = self._surroundings.chip_degc(t_s, *self._lags_s)
         return self._tadc_at_25 + (degc - 25.0) * _TADC_PER_KELVIN
 
     def _lsb_kpa(self) -> float:

@@ -54,6 +54,8 @@ class Silicon:
     coefficient_words: tuple[int, int, int, int]
     conversion_ns: int
     sense: Sense
+    late_ns: int = 0
+    """How much later than after a quarter of a conversion it samples, below zero earlier."""
 
 
 @dataclass
@@ -148,7 +150,9 @@ class EmulatedMpl115a2:
             self._convert_at_stop = False
             self._settle(t_ns)
             self._conversion = None
-            words = self._silicon.sense(t_ns + self._silicon.conversion_ns // _SAMPLE_QUARTER)
+            silicon = self._silicon
+            after_ns = silicon.conversion_ns // _SAMPLE_QUARTER + silicon.late_ns
+            words = silicon.sense(t_ns + after_ns)
             if self.on_conversion is not None:
                 self.on_conversion(t_ns, words, self._silicon.coefficient_words)
             if not self._faults.stale(t_ns):

@@ -148,6 +148,7 @@ def calibration_of(options: RigOptions) -> tuple[Calibration | None, str | None]
             scene.calibration,
             [tile.serial for tile in scene.tile if not tile.reference],
             parts_seed=options.foot.parts_seed,
+            family=scene.emulation.family,
             progress=remark,
         )
     except (CalibrationError, MissingExtraError) as error:

@@ -87,6 +87,7 @@ def simulate_command(
             the_scene.calibration,
             [tile.serial for tile in the_scene.tile if not tile.reference],
             parts_seed=foot.parts_seed,
+            family=the_scene.emulation.family,
             progress=remark,
         )
         return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS)

@@ -171,7 +171,7 @@ def repeating(
     after = state.copy()
     found = np.zeros(padc.shape, dtype=np.bool_)
     _follow(
-        np.ascontiguousarray(padc),
+        padc.astype(np.int64, order="C"),  # owned: what is compiled is compiled for that
         np.ascontiguousarray(above_kpa),
         unloaded_kpa,
         most.repeats,
@@ -187,7 +187,7 @@ def repeating(
 
 @compiled
 def _follow(
-    padc: npt.NDArray[np.uint16],
+    padc: Ints,
     above_kpa: Floats,
     unloaded_kpa: Floats,
     supposed_repeats: Floats,
@@ -207,7 +207,7 @@ def _follow(
             if math.isnan(above):
                 tile.quiet = 0
                 continue
-            word = np.int64(padc[i, j])
+            word = padc[i, j]
             step = abs(word - tile.padc)
             quiet = abs(above) < unloaded_kpa[j]
             loaded = 1 if above > 2.0 * unloaded_kpa[j] else (0 if quiet else tile.loaded)

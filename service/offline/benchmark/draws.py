@@ -192,8 +192,14 @@ def record(
     Raises:
         FootTileError: scene or calibration is not usable.
     """
-    serials = [tile.serial for tile in scene.tile]
-    calibration = find_calibration(scene.calibration, serials, parts_seed=draw, progress=progress)
+    serials = [tile.serial for tile in scene.tile if not tile.reference]
+    calibration = find_calibration(
+        scene.calibration,
+        serials,
+        parts_seed=draw,
+        family=scene.emulation.family,
+        progress=progress,
+    )
     with ExitStack() as stack:
         foot = EmulatedFoot(seed=draw, parts_seed=draw)
         options = SimulateOptions(scene, seconds, otherwise_s=SECONDS, truth=True, foot=foot)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from tests.devices.emulation.domes import (
     PART,
@@ -19,7 +21,30 @@ from tests.devices.emulation.domes import (
     static_kpa,
 )
 
+# Gain
+
+
+def test_a_gain_that_drifted_since_the_bench_is_another_one_for_each_dome() -> None:
+    def gains(label: str, gain_drift: float) -> Floats:
+        domes = domes_of(
+            np.ones_like, *[PART] * 40, label=label, gain_drift=gain_drift, hysteresis=False
+        )
+        kpa = [domes.pressure_kpa(dome, 0.1) for dome in range(40)]
+        volume = 100.0 / (np.array(kpa) * (1 + PART.wall_per_kpa * (np.array(kpa) - 100.0)))
+        return np.asarray((1 - volume) / lost(1.0))
+
+    drifted = gains("Tuesday", 0.01)
+    assert 0.99 <= drifted.min() < 0.993
+    assert 1.007 < drifted.max() <= 1.01
+    assert len(set(drifted.tolist())) == 40
+    assert gains("Tuesday", 0.01).tolist() == drifted.tolist()
+    assert gains("Wednesday", 0.01).tolist() != drifted.tolist()
+    np.testing.assert_allclose(gains("Tuesday", 0.0), 1.0, atol=1e-9)
+
+
 # Hysteresis
+
+VISCOUS = replace(PART, loop_n=0.0, viscous_n=0.4)
 
 
 def triangle(t_s: Floats, peak_n: float = 30.0, half_s: float = 2.0) -> Floats:
@@ -62,6 +87,57 @@ def test_the_loop_does_not_depend_on_the_speed() -> None:
     loads_n = np.array([2.0, 8.0, 15.0, 22.0])
     for slow, fast in zip(loop(4.0, loads_n), loop(0.5, loads_n), strict=True):
         np.testing.assert_allclose(slow, fast, atol=2e-5)
+
+
+def viscous_width_n(half_s: float, at_n: float) -> float:
+    """Width of the loop of viscosity alone, of a triangle of 30 N."""
+    domes = domes_of(lambda t_s: triangle(t_s, 30.0, half_s), VISCOUS, hysteresis=True)
+    up_s = at_n / 30.0 * half_s
+    up, down = felt_n(kpa_at(domes, [up_s, 2 * half_s - up_s]))
+    return float(down - up)
+
+
+def test_the_viscous_loop_is_as_wide_as_the_part_says_at_a_slow_stroke() -> None:
+    assert viscous_width_n(4.0, 20.0) == pytest.approx(2 * 0.4, rel=0.05)
+
+
+def test_the_viscous_loop_grows_with_a_low_power_of_the_speed() -> None:
+    # Where flow has become steady, rate is stress to the fourth.
+    slow, fast = viscous_width_n(8.0, 15.0), viscous_width_n(0.5, 15.0)
+    assert fast / slow == pytest.approx(16 ** (1 / 4), rel=0.1)
+
+
+def test_viscous_flow_obeys_its_equation_under_any_load() -> None:
+    def force(t: float) -> float:
+        return 8.0 * math.sin(3.0 * t) ** 2 + 6.0 * math.sin(11.0 * t) ** 2
+
+    def rate(t: float, s: Floats) -> Floats:
+        force_n_s = 24.0 * math.sin(6.0 * t) + 66.0 * math.sin(22.0 * t)
+        return np.asarray(0.08 * (force_n_s - 7.5 * np.sign(s) * np.abs(s / 0.4) ** 4))
+
+    t_s = grid(0.0, 2.0, every=20)
+    solved = solve_ivp(rate, (0.0, 2.0), [0.0], "LSODA", t_s, rtol=1e-9, atol=1e-10, max_step=1e-3)
+    load = np.array([force(t) for t in t_s])
+    domes = domes_of(lambda t_s: np.array([force(t) for t in t_s]), VISCOUS, hysteresis=True)
+    np.testing.assert_allclose(
+        felt_n(kpa_at(domes, t_s), VISCOUS), np.maximum(load - solved.y[0], 0.0), atol=2e-3
+    )
+
+
+def test_what_viscosity_has_left_behind_fades_and_the_dome_never_pulls() -> None:
+    domes = domes_of(lambda t_s: np.interp(t_s, [1, 1.005], [20.0, 0.0]), VISCOUS, hysteresis=True)
+    felt = felt_n(kpa_at(domes, grid(1.005, 9.0, every=20)), VISCOUS)
+    assert 0.5 < felt[0] <= 0.08 * 20.0
+    assert (np.diff(felt) < 1e-9).all()
+    assert 0.0 < felt[-1] < 0.25
+
+
+def test_domes_with_and_without_viscosity_stand_beside_one_another() -> None:
+    t_s = grid(0.0, 4.0, every=40)
+    for dome, part in enumerate((PART, VISCOUS)):
+        both = domes_of(triangle, PART, VISCOUS, hysteresis=True)
+        alone = domes_of(triangle, part, hysteresis=True)
+        np.testing.assert_allclose(kpa_at(both, t_s, dome), kpa_at(alone, t_s), atol=1e-9)
 
 
 def test_a_held_load_stays_where_it_is_on_the_loop() -> None:

@@ -29,10 +29,15 @@ def test_chip_and_gas_follow_the_surroundings_with_one_and_two_lags() -> None:
         return [(outside - state[0]) / 1.0, (state[0] - state[1]) / 4.0]
 
     solved = solve_ivp(lags, (0, 20), [20.0, 20.0], t_eval=t_s, rtol=1e-8, max_step=0.02)
-    chip = [surroundings.chip_degc(float(t), 1.0) for t in t_s]
+    chip = [surroundings.chip_degc(float(t), 1.0, 4.0) for t in t_s]
     np.testing.assert_allclose(chip, solved.y[0], atol=0.05)
     gas = surroundings.gas_wall_degc(t_s, 1.0, 4.0)
     np.testing.assert_allclose(gas, solved.y[1], atol=0.05)
+    # The other way round: the chip is further from the surroundings than its gas.
+    gas = surroundings.gas_wall_degc(t_s, 1.0, -4.0)
+    np.testing.assert_allclose(gas, solved.y[0], atol=0.05)
+    chip = [surroundings.chip_degc(float(t), 1.0, -4.0) for t in t_s]
+    np.testing.assert_allclose(chip, solved.y[1], atol=0.05)
     assert not surroundings.steady
     assert Surroundings(EmulationScene()).steady
 

@@ -77,6 +77,16 @@ def test_the_pressure_is_sampled_a_quarter_into_the_conversion() -> None:
     assert samples.asked_ns == [1_000 + TC_NS // 4]
 
 
+@pytest.mark.parametrize("late_ns", [-300_000, 300_000])
+def test_a_part_may_sample_earlier_or_later_and_is_ready_when_it_would_be(late_ns: int) -> None:
+    samples = Samples()
+    chip = EmulatedMpl115a2(Silicon(DATA_SHEET_CHIP, TC_NS, samples, late_ns))
+    convert(chip, 1_000)
+    assert samples.asked_ns == [1_000 + TC_NS // 4 + late_ns]
+    assert counts(chip, 1_000 + TC_NS - 1) == (0, 0)
+    assert counts(chip, 1_000 + TC_NS) == (1, 101)
+
+
 def test_a_convert_during_a_conversion_starts_it_anew() -> None:
     chip = part()
     convert(chip, 0)

@@ -186,8 +186,8 @@ def test_the_reference_tile_bears_nothing_and_reads_the_atmosphere_plus_the_head
 def test_mud_is_cold_from_the_first_touch_on() -> None:
     world, ground = hopping("mud")
     surroundings = world._surroundings("any")
-    assert surroundings.chip_degc(ground.touch_s[0], 1.0) == pytest.approx(21.0)
-    assert surroundings.chip_degc(ground.touch_s[0] + 1.0, 1.0) == pytest.approx(
+    assert surroundings.chip_degc(ground.touch_s[0], 1.0, 4.0) == pytest.approx(21.0)
+    assert surroundings.chip_degc(ground.touch_s[0] + 1.0, 1.0, 4.0) == pytest.approx(
         21.0 - 4.0 * (1 - np.exp(-1.0)), abs=1e-6
     )
     assert hopping("poppy")[0]._surroundings("any").steady

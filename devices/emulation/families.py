@@ -1,0 +1,76 @@
+"""Families of parts: the usual one, and a broad one that contains what a real batch may be.
+
+The usual family (`devices.emulation.parts`) is what calibrations and results are kept for, and
+never changes. The broad one is there to try an estimator on domes that nobody has seen: its ranges
+are wider wherever hardware.md says "not known", or gives a number of one part only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
+from devices.emulation.parts import ChipPart, DomePart, draw_chip, draw_dome, random_of
+from devices.scene.emulated import Family
+
+_LATE_NS = 300_000
+"""A sample is that much earlier or later than a quarter into the conversion, at the most."""
+_LACKING = 0.05
+"""So many domes show no gas effect, or no creep, or no loop: an estimator must not invent one."""
+
+
+def chip_of(family: Family, serial: str, parts_seed: int) -> ChipPart:
+    """The chip of a serial in a family."""
+    chip = draw_chip(serial, parts_seed)
+    if family == "default":
+        return chip
+    rng = random_of(f"broad chip/{parts_seed}/{serial}")
+    return replace(chip, late_ns=round(rng.uniform(-_LATE_NS, _LATE_NS)))
+
+
+def dome_of(family: Family, serial: str, parts_seed: int) -> DomePart:
+    """The dome of a serial in a family."""
+    if family == "default":
+        return draw_dome(serial, parts_seed)
+    return _broad_dome(random_of(f"broad dome/{parts_seed}/{serial}"))
+
+
+def _broad_dome(rng: np.random.Generator) -> DomePart:
+    """A dome that reads the chip's full scale at 20 to 40 N, of whatever rubber and gas.
+
+    Creep is of one to four terms from 10 ms to 10 s, 2 to 15 % in sum. The loop of a slow stroke is
+    1 to 5 % of full scale from branch to branch, any part of it viscous.
+    """
+    seal_kpa = rng.uniform(98.0, 102.5)
+    full_scale_n = 20.0 * 2.0 ** rng.uniform(0.0, 1.0)
+    knee_n = full_scale_n * rng.uniform(0.25, 0.5)
+    wall_per_kpa = rng.uniform(0.0010, 0.0015) * 30.0 / full_scale_n  # a softer wall gives way more
+    lost = 1.0 - seal_kpa / (
+        PRESSURE_MAX_KPA * (1.0 + wall_per_kpa * (PRESSURE_MAX_KPA - seal_kpa))
+    )
+    gamma = rng.uniform(1.1, 1.4)
+    conduction_s = float(np.exp(rng.uniform(np.log(0.005), np.log(0.060))))
+    chip_lag_s = rng.uniform(0.8, 2.0)
+    gas_lag_s = rng.uniform(-3.0, 3.0)
+    terms = int(rng.integers(1, 5))
+    creep_s = np.sort(np.exp(rng.uniform(np.log(0.010), np.log(10.0), terms)))
+    creep_parts = rng.uniform(0.02, 0.15) * rng.dirichlet(np.ones(terms))
+    loop_n = full_scale_n * rng.uniform(0.01, 0.05) / 2.0
+    viscous_part = rng.uniform(0.0, 1.0)
+    has_gas, has_creep, has_loop = (rng.random(3) >= _LACKING).tolist()
+    return DomePart(
+        seal_kpa=seal_kpa,
+        knee_n=knee_n,
+        stiffening=float(lost / np.log1p(full_scale_n / knee_n)),
+        wall_per_kpa=wall_per_kpa,
+        conduction_s=conduction_s,
+        gas_lag_s=gas_lag_s,
+        chip_lag_s=chip_lag_s,
+        creep_parts=tuple(creep_parts.tolist()) if has_creep else (),
+        creep_s=tuple(creep_s.tolist()) if has_creep else (),
+        loop_n=(1.0 - viscous_part) * loop_n if has_loop else 0.0,
+        viscous_n=viscous_part * loop_n if has_loop else 0.0,
+        kappa=(gamma - 1.0) / gamma if has_gas else 0.0,
+    )

@@ -1,0 +1,133 @@
+"""The broad family holds what a real batch of tiles may be, and draws from all of it.
+
+The ranges are those that were asked for (issue 14); the default family's are in hardware.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from devices.clock import VirtualClock
+from devices.emulation.families import chip_of, dome_of
+from devices.emulation.parts import DomePart, draw_chip, draw_dome
+from devices.emulation.world import World
+from devices.scene.file import Scene, load_scene
+from tests.devices.emulation.domes import static_kpa
+from tests.devices.feet import foot
+
+DOMES = [dome_of("broad", f"T{i:02d}", seed) for i in range(20) for seed in range(100)]
+
+
+def fills(values: list[float], low: float, high: float) -> None:
+    """All of them lie between, and some near either end."""
+    near = 0.02 * (high - low)
+    assert low <= min(values) < low + near
+    assert high - near < max(values) <= high
+
+
+def full_scale_n(part: DomePart) -> float:
+    """The slow force at 115 kPa."""
+    force_n = np.linspace(10.0, 50.0, 4001)
+    return float(np.interp(115.0, static_kpa(force_n, part), force_n))
+
+
+def test_the_default_family_is_the_usual_draw() -> None:
+    assert chip_of("default", "T01", 3) == draw_chip("T01", 3)
+    assert dome_of("default", "T01", 3) == draw_dome("T01", 3)
+
+
+def test_a_broad_serial_is_the_same_part_for_ever() -> None:
+    # As of the default family: what was measured with it can be measured again.
+    assert dome_of("broad", "T01", 0).seal_kpa == pytest.approx(100.011395, abs=1e-6)
+    assert chip_of("broad", "T01", 0).late_ns == 211931
+
+
+def test_stiffness_differs_by_a_factor_of_two() -> None:
+    fills([full_scale_n(part) for part in DOMES[:400]], 20.0, 40.0)
+
+
+def test_gas_is_of_any_gamma_and_time() -> None:
+    gassy = [part for part in DOMES if part.kappa]
+    fills([1.0 / (1.0 - part.kappa) for part in gassy], 1.1, 1.4)
+    fills([float(np.log(part.conduction_s)) for part in gassy], np.log(0.005), np.log(0.060))
+
+
+def test_creep_is_of_one_to_four_terms_from_10_ms_to_10_s() -> None:
+    creeping = [part for part in DOMES if part.creep_s]
+    assert {len(part.creep_s) for part in creeping} == {1, 2, 3, 4}
+    fills([float(np.log(t)) for part in creeping for t in part.creep_s], np.log(0.01), np.log(10))
+    fills([sum(part.creep_parts) for part in creeping], 0.02, 0.15)
+    assert all(len(part.creep_parts) == len(part.creep_s) for part in creeping)
+
+
+def test_the_loop_is_1_to_5_percent_and_any_part_of_it_viscous() -> None:
+    looped = [part for part in DOMES if part.loop_n]
+    half_n = [part.loop_n + part.viscous_n for part in looped]
+    full_n = [full_scale_n(part) for part in looped]
+    fills([2 * n / full for n, full in zip(half_n, full_n, strict=True)], 0.01, 0.05)
+    fills([part.viscous_n / n for part, n in zip(looped, half_n, strict=True)], 0.0, 1.0)
+
+
+def test_the_chip_is_before_or_behind_its_gas_by_up_to_3_s() -> None:
+    fills([part.gas_lag_s for part in DOMES], -3.0, 3.0)
+
+
+def test_a_chip_samples_up_to_300_us_off_and_never_before_it_was_asked() -> None:
+    chips = [chip_of("broad", f"T{i:02d}", seed) for i in range(20) for seed in range(100)]
+    fills([chip.late_ns / 1000.0 for chip in chips], -300.0, 300.0)
+    assert all(0 < chip.conversion_ns // 4 + chip.late_ns < chip.conversion_ns for chip in chips)
+
+
+def test_one_dome_in_twenty_lacks_an_effect_each() -> None:
+    for lacks in (
+        [part.kappa == 0.0 for part in DOMES],
+        [part.creep_s == () for part in DOMES],
+        [part.loop_n == part.viscous_n == 0.0 for part in DOMES],
+    ):
+        assert np.mean(lacks) == pytest.approx(0.05, abs=0.02)
+
+
+def of_family(scene: Scene, family: str) -> Scene:
+    emulation = scene.emulation.model_copy(update={"family": family})
+    return scene.model_copy(update={"emulation": emulation})
+
+
+def test_a_scene_says_of_which_family_its_parts_are() -> None:
+    rolling = load_scene("rolling")
+    assert rolling.emulation.family == "default"
+    counts = {
+        family: foot(of_family(rolling, family)).run_for(0.2).padc
+        for family in ("default", "broad")
+    }
+    assert (counts["default"] != counts["broad"]).any()
+
+
+def test_the_driver_does_not_know_when_a_broad_chip_samples() -> None:
+    rolling = load_scene("rolling")
+    frames = {
+        family: foot(of_family(rolling, family)).run_for(0.02) for family in ("default", "broad")
+    }
+    for column in ("t_mono_ns", "sample_offset_us"):
+        np.testing.assert_array_equal(
+            getattr(frames["default"], column), getattr(frames["broad"], column)
+        )
+
+
+@pytest.mark.parametrize("name", ["rolling", "poppy", "mud"])
+def test_every_scene_runs_with_broad_parts_and_reads_plausible_pressures(name: str) -> None:
+    frames = foot(of_family(load_scene(name), "broad")).run_for(1.0)
+    assert not frames.status.any()
+    assert ((frames.padc > 100) & (frames.padc < 600)).all()
+
+
+def test_the_truth_of_a_scene_does_not_depend_on_the_family() -> None:
+    t_ns = np.arange(0, 3_000_000_000, 10_000_000)
+    truths = [
+        asdict(World(of_family(load_scene("poppy"), family), VirtualClock()).truth(t_ns))
+        for family in ("default", "broad")
+    ]
+    for name, values in truths[0].items():
+        np.testing.assert_array_equal(values, truths[1][name])
