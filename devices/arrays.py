@@ -32,6 +32,13 @@ class Arrays:
         """The same, in arrays of its own that may be written to."""
         return type(self)(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
+    def is_same(self, other: Self) -> bool:
+        """Are all values of the other the same? NaN is the same as NaN."""
+        return all(
+            np.array_equal(getattr(self, f.name), getattr(other, f.name), equal_nan=True)
+            for f in fields(self)
+        )
+
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """One record of all `parts`, in their order.

@@ -103,7 +103,8 @@ def _effects(calibration: Calibration) -> Table:
     table = _table(
         "Beside the curve",
         [
-            "each with half its 95 % interval; creep: parts of the force, and their times",
+            "each with half its 95 % interval; creep: parts of the force, and their times;",
+            "gas lag: behind its chip, negative where the chip is behind",
             *(
                 f"{tile.serial}: sampled {_interval(late_s, 0, 1e6)} us later than assumed"
                 for tile in calibration.tiles

@@ -59,6 +59,13 @@ def accuracy_table(a: Accuracy) -> Table:
         "COP not stated", f"{a.cop_masked_frames}{share}", f"{heavy} frames above {COP_FROM_N} N"
     )
     table.add_row("saturated", str(a.saturated_frames), f"{a.frames} frames")
+    after = a.after_saturation
+    if after.frames:
+        table.add_row(
+            "after saturation",
+            f"{a.after_saturation_mae_n:.3f} N",
+            f"{after.frames} frames, {100 * after.share:.1f} % within 1.96 sigma",
+        )
     return table
 
 

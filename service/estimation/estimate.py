@@ -199,7 +199,8 @@ def _release(
         angle_rad=angle,
         contact=np.where(np.isnan(foot.grf_n), UNKNOWN, contact).astype(np.uint8),
         estimate_status=forces.status[first:stop]
-        | np.where(masked, EstimateStatus.COP_MASKED, 0).astype(np.uint16),
+        | np.where(masked, EstimateStatus.COP_MASKED, 0).astype(np.uint16)
+        | np.where(tiles.unsettled, EstimateStatus.AFTER_SATURATION, 0).astype(np.uint16),
     )
     return out, replace(
         state,

@@ -45,6 +45,9 @@ class EstimateStatus(IntFlag):
     """A tile is above the chip's 115 kPa, but within its calibration."""
     TARE_LOST = 512
     """The tare that was in force is damaged on disk: no pressure and no force is known."""
+    AFTER_SATURATION = 1024
+    """What a tile bore unseen, saturated or away, has left more in its sigma than a reading's
+    noise."""
 
 
 @dataclass(frozen=True)

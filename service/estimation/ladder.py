@@ -105,7 +105,7 @@ def make_ladder(
     baseline_kpa = tare.baseline_kpa[columns]
     return Ladder(
         unwrap="unwrap" in models,
-        temperature=_temperature(tiles, tare, columns) if "temperature" in models else None,
+        temperature=(_temperature(tiles, tare, columns, info) if "temperature" in models else None),
         ambient=_ambient(tiles, baseline_kpa) if "ambient" in models else None,
         gas=_gas(tiles, baseline_kpa) if "gas" in models else None,
         gas_known=np.array([tile.effects.gas is not None for tile in tiles]),
@@ -168,16 +168,17 @@ def _refuse_mixed(
 
 
 def _temperature(
-    tiles: Sequence[TileCalibration], tare: Tare, columns: npt.NDArray[np.intp]
+    tiles: Sequence[TileCalibration], tare: Tare, columns: npt.NDArray[np.intp], info: ArrayInfo
 ) -> Temperature:
     found = [effect for tile in tiles if (effect := tile.effects.temperature) is not None]
     return Temperature(
         kpa_per_count=values(e.kpa_per_k for e in found) / TADC_PER_KELVIN,
         relative_sigma=np.array([e.kpa_per_k.sigma / e.kpa_per_k.value for e in found]),
         lag_s=values(e.lag_s for e in found),
-        relative_lag_sigma=np.array([e.lag_s.sigma / e.lag_s.value for e in found]),
+        lag_sigma_s=np.array([e.lag_s.sigma for e in found]),
         tare_counts=tare.tadc_counts[columns],
         baseline_kpa=tare.baseline_kpa[columns],
+        step_s=1.0 / info.nominal_rate_hz,
     )
 
 

@@ -18,10 +18,12 @@ from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.estimates import EstimateStatus
 from service.estimation.foot.kinematics import Readings
 from service.estimation.models import ambient, denoise, gas, skew, temperature
+from service.estimation.models.gas import Gas, GasState
 from service.estimation.models.outliers import despiked
 from service.estimation.models.unwrap import unwrap
 from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
 from service.estimation.tare.tare import has_warmed
+from service.estimation.unseen import EVENLY, Unseen, farthest, was_away
 
 
 @dataclass(frozen=True)
@@ -87,9 +89,6 @@ class Pending:
         )
 
 
-NEVER_NS = -(1 << 62)
-
-
 @dataclass(frozen=True)
 class ApparentForces(Arrays):
     """Forces as they appear in n frames; arrays (n, bearing tiles) unless said otherwise.
@@ -101,8 +100,10 @@ class ApparentForces(Arrays):
         sigma_n: standard uncertainty from all else but the gas; does not.
         gas_n: standard uncertainty that the gas' correction leaves, with the correction's sign: all
             tiles err to the same side.
+        unseen_gas_n: standard uncertainty from what the gas did unseen, with a sign likewise.
         sampled_ns: when each tile was sampled, on the monotonic clock.
         beyond: beyond the calibrated range, or the chip's: a lower bound.
+        guess_n: what the force may be where there is only that bound; NaN elsewhere.
         t_mono_ns: (n,), instants of the frames.
         run: (n,), number of the unbroken run that each frame belongs to.
         status: (n,), bits of `EstimateStatus` that these frames have by themselves.
@@ -113,8 +114,10 @@ class ApparentForces(Arrays):
     noise_n: Floats
     sigma_n: Floats
     gas_n: Floats
+    unseen_gas_n: Floats
     sampled_ns: Times
     beyond: Bools
+    guess_n: Floats
     t_mono_ns: Times
     run: Ints
     status: npt.NDArray[np.uint16]
@@ -126,10 +129,10 @@ class LowerState:
 
     temperature: temperature.TemperatureState | None = None
     ambient: ambient.AmbientState = ambient.AT_REST
-    gas: gas.GasState | None = None
+    gas: GasState | None = None
+    gas_else: GasState | None = None
+    """After the pressures farthest from those that were taken; None: nothing was unseen."""
     skew: skew.SkewState | None = None
-    hidden_ns: Times | None = None
-    """When each tile's pressure was last beyond its chip's range."""
 
 
 def tile_kpa(plan: EstimationPlan, frames: FrameBatch) -> Floats:
@@ -195,32 +198,28 @@ def apparent_forces(
         gauge_kpa[:, columns] = bearing_kpa - plan.baseline_kpa
     # The chip's range is judged by what was read, the calibrated one by what the gas settles at.
     hidden = kpa[:, columns] > plan.chip_end_kpa
-    settled_kpa, gas_kpa = bearing_kpa, np.zeros(bearing_kpa.shape)
-    uncertain = np.zeros(bearing_kpa.shape, dtype=bool)
+    # As if the chip's end had been read, with what warmth and surroundings have put into it.
+    least_kpa = bearing_kpa - np.where(hidden, kpa[:, columns] - plan.chip_end_kpa, 0.0)
+    settled_kpa = bearing_kpa
+    gas_kpa = unseen_kpa = np.zeros(bearing_kpa.shape)
     if ladder.gas is not None:
-        # What the chip cannot tell is only a bound: the gas model must not take it as a value.
-        settled_kpa, warm = ladder.gas.settled(
-            np.where(hidden, np.nan, bearing_kpa),
-            sampled_ns,
-            state.gas or gas.at_rest(len(columns)),
+        settled_kpa, unseen_kpa, state = _settled(
+            ladder.gas, plan.unseen, bearing_kpa, least_kpa, hidden, sampled_ns, state
         )
-        uncertain, last_ns = _since(hidden, sampled_ns, state.hidden_ns, ladder.gas.memory_ns)
-        state = replace(state, gas=warm, hidden_ns=last_ns)
         gas_kpa = settled_kpa - bearing_kpa
         # A tile whose bench does not tell of its gas goes without, and is that uncertain.
         settled_kpa = np.where(ladder.gas_known, settled_kpa, bearing_kpa)
-    if hidden.any():
-        # As if the chip's end had been read, with what warmth and surroundings have put into it.
-        least_kpa = bearing_kpa - (kpa[:, columns] - plan.chip_end_kpa)
-        if ladder.gas is not None:
-            least_kpa = ladder.gas.settled_at_least(least_kpa)
-        settled_kpa = np.where(hidden, least_kpa, settled_kpa)
+        least_kpa = ladder.gas.settled_at_least(least_kpa)
+    guess_kpa = settled_kpa - plan.baseline_kpa
+    settled_kpa = np.where(hidden, least_kpa, settled_kpa)
     static_kpa = settled_kpa - plan.baseline_kpa
     static = ladder.curves.force(static_kpa)
     unknown = np.isnan(kpa[:, columns] if plan.tare.is_lost else static.force_n)
     status[unknown.any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
-    # After what was hidden the gas' temperature is unknown until it has cooled.
-    beyond = (static_kpa > ladder.curves.high_kpa) | hidden | uncertain
+    beyond = (static_kpa > ladder.curves.high_kpa) | hidden
+    guess_n = np.full(beyond.shape, np.nan)
+    if beyond.any():
+        guess_n = np.where(beyond, plan.unseen.guess_n(ladder.curves, guess_kpa), guess_n)
     status[beyond.any(axis=1)] |= np.uint16(EstimateStatus.SATURATED)
     low_kpa = ladder.curves.low_kpa - SIGMAS * plan.still_kpa
     status[(static_kpa < low_kpa).any(axis=1)] |= np.uint16(EstimateStatus.EXTRAPOLATED)
@@ -242,8 +241,10 @@ def apparent_forces(
         noise_n=np.abs(static.slope_n_per_kpa) * plan.noise_kpa,
         sigma_n=np.sqrt(static.slope_n_per_kpa**2 * baseline_variance + static.fit_sigma_n**2),
         gas_n=static.slope_n_per_kpa * ladder.gas_misfit * gas_kpa,
+        unseen_gas_n=static.slope_n_per_kpa * unseen_kpa,
         sampled_ns=sampled_ns,
         beyond=beyond,
+        guess_n=guess_n,
         t_mono_ns=t_mono_ns,
         run=run,
         status=status,
@@ -251,17 +252,34 @@ def apparent_forces(
     return forces, state
 
 
-def _since(
-    happened: Bools,
+def _settled(
+    model: Gas,
+    unseen: Unseen,
+    kpa: Floats,
+    least_kpa: Floats,
+    hidden: Bools,
     t_ns: Times,
-    before_ns: Times | None,
-    memory_ns: Floats,
-) -> tuple[Bools, Ints]:
-    """Where something happened in the last `memory_ns`, and when it last did; arrays over tiles."""
-    first = np.full(happened.shape[1], NEVER_NS) if before_ns is None else before_ns
-    last_ns = np.maximum.accumulate(np.where(happened, t_ns, NEVER_NS), axis=0)
-    last_ns = np.maximum(last_ns, first)
-    return ~happened & (t_ns - last_ns < memory_ns), last_ns[-1]
+    state: LowerState,
+) -> tuple[Floats, Floats, LowerState]:
+    """Pressures that the gas settles at, and their uncertainty from what it did unseen.
+
+    What is hidden behind the chip's end is taken as it reads: the best guess, which is no more than
+    a guess.
+    """
+    before = state.gas or gas.at_rest(kpa.shape[1])
+    taken_kpa = np.where(hidden, np.minimum(kpa, unseen.most_hot_kpa), kpa)
+    settled_kpa, after = model.settled(taken_kpa, t_ns, before)
+    unseen_kpa, after_else = np.zeros(kpa.shape), state.gas_else
+    last_ns = np.where(np.isnan(before.ln_kpa), t_ns[0], before.t_ns)
+    if after_else is not None or hidden.any() or was_away(~np.isnan(kpa), t_ns, last_ns):
+        else_kpa = np.where(hidden, farthest(taken_kpa, least_kpa, unseen.most_hot_kpa), kpa)
+        at_else_kpa, after_else = model.settled(
+            else_kpa, t_ns, after_else or before, away_kpa=unseen.end_hot_kpa
+        )
+        unseen_kpa = np.where(hidden, 0.0, EVENLY * (at_else_kpa - settled_kpa))
+        if after_else.is_same(after):
+            after_else = None
+    return settled_kpa, unseen_kpa, replace(state, gas=after, gas_else=after_else)
 
 
 def _frame_status(

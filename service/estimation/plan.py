@@ -20,7 +20,10 @@ from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.foot.contact import ContactRule
 from service.estimation.foot.geometry import grid_indices, hull
 from service.estimation.ladder import MODELS, Ladder, make_ladder
+from service.estimation.models import denoise
+from service.estimation.tare.noise import left_by_mean
 from service.estimation.tare.tare import Tare
+from service.estimation.unseen import Unseen, make_unseen
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
 CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter
@@ -54,11 +57,14 @@ class EstimationPlan:
     baseline_kpa: Floats
     baseline_sigma_kpa: Floats
     noise_kpa: Floats
+    noise_left: Floats
+    """(bearing tiles, n), how much more of it an average of n readings leaves than of white."""
     late_ns: Ints
     """How much later a tile is sampled than its frames say."""
     chip_end_kpa: Floats
     """Absolute pressure above which a chip is not known to tell the pressure: the end of its rated
     range, or of what it told on the bench if that is more, or less because it told no more."""
+    unseen: Unseen
     still_kpa: Floats
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
@@ -142,6 +148,7 @@ def make_plan(
         baseline_kpa=baseline_kpa,
         baseline_sigma_kpa=tare.baseline_sigma_kpa[bearing],
         noise_kpa=tare.noise_kpa[bearing],
+        noise_left=_noise_left(tare, bearing, info.nominal_rate_hz),
         late_ns=np.array(
             [
                 round(1e9 * late.value) if (late := e.effects.late_s) is not None else 0
@@ -150,6 +157,7 @@ def make_plan(
             dtype=np.int64,
         ),
         chip_end_kpa=chip_end_kpa,
+        unseen=make_unseen(ladder.curves, ladder.gas, baseline_kpa, chip_end_kpa),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
         hull=hull(positions_m[bearing, :2]),
@@ -162,6 +170,14 @@ def make_plan(
         assumed_scale=any(entry.absolute_scale == "assumed" for entry in entries),
         gap_ns=round(GAP * 1e9 / info.nominal_rate_hz),
     )
+
+
+def _noise_left(tare: Tare, bearing: npt.NDArray[np.intp], rate_hz: float) -> Floats:
+    readings = np.arange(denoise.AVERAGED_MAX + 1)
+    if tare.noise_lasting is None or tare.noise_lasting_s is None:
+        return np.ones((len(bearing), len(readings)))
+    part, lasts_s = tare.noise_lasting[bearing, None], tare.noise_lasting_s[bearing, None]
+    return left_by_mean(part, lasts_s * rate_hz, np.maximum(readings, 1))
 
 
 def _chip_end_kpa(entry: TileCalibration, baseline_kpa: float) -> float:

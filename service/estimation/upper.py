@@ -7,24 +7,48 @@ round in another order, and a matrix product does for one row and for many.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Floats
+from devices.arrays import Bools, Floats, Times
 from service.estimation.compiled import compiled
+from service.estimation.ladder import Ladder
 from service.estimation.lower import ApparentForces
 from service.estimation.models import denoise
 from service.estimation.models.rubber import RubberState
 from service.estimation.plan import EstimationPlan
+from service.estimation.unseen import EVENLY, farthest, was_away
+
+BOUND_SIGMAS = 2.33
+"""A stated bound lies so many standard uncertainties below: one in a hundred is above the truth."""
+
+
+@dataclass(frozen=True)
+class DomeState:
+    """What a dome remembers; None for models that are not named, or have not begun."""
+
+    plays_n: Floats | None = None
+    rubber: RubberState | None = None
+
+    def is_same(self, other: DomeState) -> bool:
+        """Does the other remember the same?"""
+        if self.plays_n is not None and other.plays_n is not None:
+            plays = np.array_equal(self.plays_n, other.plays_n)
+        else:
+            plays = self.plays_n is other.plays_n
+        if self.rubber is not None and other.rubber is not None:
+            return plays and self.rubber.is_same(other.rubber)
+        return plays and self.rubber is other.rubber
 
 
 @dataclass(frozen=True)
 class UpperState:
-    """What the upper models remember; None for those that are not named, or have not begun."""
+    """What the upper models remember."""
 
-    plays_n: Floats | None = None
-    rubber: RubberState | None = None
+    dome: DomeState = DomeState()  # frozen, so one for all is safe
+    dome_else: DomeState | None = None
+    """After the forces farthest from those that were taken; None: nothing was unseen."""
 
 
 @dataclass(frozen=True)
@@ -32,16 +56,19 @@ class TileForces:
     """Force on the bearing tiles and its standard uncertainty, (n, bearing tiles).
 
     Attributes:
-        force_n: forces.
-        sigma_n: standard uncertainties.
+        force_n: forces; where `beyond`, lower bounds.
+        sigma_n: standard uncertainties; NaN for a bound.
         own_n: their part that is every tile's own.
-        common_n: the rest, of gas and of rubber: all tiles share the error, so these are signed.
+        common_n: (parts, n, bearing tiles), the rest, of corrections of gas and rubber, and of what
+            either did unseen: all tiles share the error, so these are signed.
+        unsettled: (n,), has what was unseen left more than the noise of a reading in any tile?
     """
 
     force_n: Floats
     sigma_n: Floats
     own_n: Floats
-    common_n: tuple[Floats, Floats]
+    common_n: Floats
+    unsettled: Bools
 
 
 def tile_forces(
@@ -78,24 +105,72 @@ def tile_forces(
             denoise.PAST_NS,
             denoise.REACHES,
             denoise.AGREE,
+            plan.noise_left,
         )
         force_n = np.where(np.isnan(averaged_n), force_n, averaged_n)
         noise_n = noise_n * np.sqrt(np.where(np.isnan(left), 1.0, left))
     own_n = np.sqrt(noise_n**2 + now.sigma_n**2)
     averaged_n = force_n
-    if ladder.hysteresis is not None:
-        plays_n = ladder.hysteresis.at_rest() if state.plays_n is None else state.plays_n
-        force_n, plays_n = ladder.hysteresis.compensated(force_n, plays_n)
-        state = replace(state, plays_n=plays_n)
-    if ladder.rubber is not None:
-        before = ladder.rubber.at_rest() if state.rubber is None else state.rubber
-        force_n, crept = ladder.rubber.compensated(force_n, at_ns, before)
-        state = replace(state, rubber=crept)
+    force_n, unseen_n, state = _undone(plan, now, averaged_n, at_ns, state)
     rubber_n = ladder.rubber_misfit * (force_n - averaged_n)
+    common_n = np.stack([now.gas_n, rubber_n, now.unseen_gas_n, unseen_n])
+    sigma_n = np.sqrt(own_n**2 + (common_n**2).sum(axis=0))
+    force_n = np.where(now.beyond, force_n - BOUND_SIGMAS * sigma_n, force_n)
+    unsettled = (~now.beyond & (np.hypot(now.unseen_gas_n, unseen_n) > now.noise_n)).any(axis=1)
     # A lower bound has no standard uncertainty.
-    own_n = np.where(now.beyond, np.nan, own_n)
-    sigma_n = np.sqrt(own_n**2 + now.gas_n**2 + rubber_n**2)
-    return TileForces(force_n, sigma_n, own_n, (now.gas_n, rubber_n)), state
+    own_n, sigma_n = (np.where(now.beyond, np.nan, each) for each in (own_n, sigma_n))
+    return TileForces(force_n, sigma_n, own_n, common_n, np.asarray(unsettled)), state
+
+
+def _undone(
+    plan: EstimationPlan, now: ApparentForces, force_n: Floats, at_ns: Times, state: UpperState
+) -> tuple[Floats, Floats, UpperState]:
+    """Forces without loop and creep, and their uncertainty from what the domes did unseen."""
+    ladder, unseen = plan.ladder, plan.unseen
+    if ladder.hysteresis is None and ladder.rubber is None:
+        return force_n, np.zeros(force_n.shape), state
+    before, borne_n = state.dome, None
+    beyond, other, after_else = now.beyond.any(), state.dome_else, None
+    if beyond:
+        borne_n = now.guess_n
+    out_n, after = _without_loop_and_creep(ladder, force_n, at_ns, before, borne_n, None)
+    last_ns = at_ns[0]
+    if before.rubber is not None:
+        last_ns = np.where(np.isnan(before.rubber.force_n), last_ns, before.rubber.t_ns)
+    unseen_n = np.zeros(out_n.shape)
+    if other is not None or beyond or was_away(~np.isnan(force_n), at_ns, last_ns):
+        if beyond:
+            borne_n = np.where(
+                now.beyond, farthest(now.guess_n, now.apparent_n, unseen.most_n), np.nan
+            )
+        else_n, after_else = _without_loop_and_creep(
+            ladder, force_n, at_ns, other or before, borne_n, unseen.end_n
+        )
+        unseen_n = np.where(now.beyond, 0.0, EVENLY * (else_n - out_n))
+        out_n = np.where(now.beyond, np.minimum(out_n, else_n), out_n)
+        if after_else.is_same(after):
+            after_else = None
+    return out_n, unseen_n, UpperState(after, after_else)
+
+
+def _without_loop_and_creep(
+    ladder: Ladder,
+    force_n: Floats,
+    at_ns: Times,
+    state: DomeState,
+    borne_n: Floats | None,
+    away_n: Floats | None,
+) -> tuple[Floats, DomeState]:
+    plays_n, crept = state.plays_n, state.rubber
+    if ladder.hysteresis is not None:
+        plays_n = ladder.hysteresis.at_rest() if plays_n is None else plays_n
+        force_n, plays_n = ladder.hysteresis.compensated(force_n, plays_n, borne_n=borne_n)
+    if ladder.rubber is not None:
+        crept = ladder.rubber.at_rest() if crept is None else crept
+        force_n, crept = ladder.rubber.compensated(
+            force_n, at_ns, crept, borne_n=borne_n, away_n=away_n
+        )
+    return force_n, DomeState(plays_n, crept)
 
 
 @dataclass(frozen=True)
@@ -110,26 +185,23 @@ class Foot:
 
 def foot_of(plan: EstimationPlan, tiles: TileForces) -> Foot:
     """Sum of the tile forces, and the force-weighted mean of the tiles' places."""
-    columns = _foot(tiles.force_n, tiles.own_n, *tiles.common_n, plan.bearing_m)
+    columns = _foot(tiles.force_n, tiles.own_n, tiles.common_n, plan.bearing_m)
     grf_n, sigma_n, x_m, y_m, z_m, sigma_x_m, sigma_y_m = columns.T
     return Foot(grf_n, sigma_n, (x_m, y_m, z_m), (sigma_x_m, sigma_y_m))
 
 
 @compiled
-def _foot(
-    force_n: Floats, own_n: Floats, gas_n: Floats, rubber_n: Floats, places_m: Floats
-) -> Floats:
+def _foot(force_n: Floats, own_n: Floats, common_n: Floats, places_m: Floats) -> Floats:
     """GRF and its sigma, centre x, y, z, and the sigmas of x and y, to first order: (n, 7)."""
     n, tiles = force_n.shape
     out = np.full((n, 7), math.nan)
+    weights = np.empty(tiles)
     for i in range(n):
-        total = own = gas = rubber = 0.0
+        total = 0.0
         for j in range(tiles):
             total += force_n[i, j]
-            own += own_n[i, j] * own_n[i, j]
-            gas += gas_n[i, j]
-            rubber += rubber_n[i, j]
-        out[i, 0], out[i, 1] = total, math.sqrt(own + gas * gas + rubber * rubber)
+            weights[j] = 1.0
+        out[i, 0], out[i, 1] = total, _sigma(own_n, common_n, i, weights)
         if total == 0.0:
             continue
         for axis in range(3):
@@ -138,14 +210,24 @@ def _foot(
                 moment += force_n[i, j] * places_m[j, axis]
             out[i, 2 + axis] = moment / total
         for axis in range(2):
-            own = gas = rubber = 0.0
             for j in range(tiles):
-                arm_m = places_m[j, axis] - out[i, 2 + axis]
-                own += (arm_m * own_n[i, j]) ** 2
-                gas += arm_m * gas_n[i, j]
-                rubber += arm_m * rubber_n[i, j]
-            out[i, 5 + axis] = math.sqrt(own + gas * gas + rubber * rubber) / abs(total)
+                weights[j] = places_m[j, axis] - out[i, 2 + axis]
+            out[i, 5 + axis] = _sigma(own_n, common_n, i, weights) / abs(total)
     return out
+
+
+@compiled
+def _sigma(own_n: Floats, common_n: Floats, i: int, weights: Floats) -> float:
+    """Of a weighted sum over the tiles of frame `i`: own parts add as squares, others as is."""
+    variance = 0.0
+    for j in range(len(weights)):
+        variance += (weights[j] * own_n[i, j]) ** 2
+    for part in range(len(common_n)):
+        shared = 0.0
+        for j in range(len(weights)):
+            shared += weights[j] * common_n[part, i, j]
+        variance += shared * shared
+    return math.sqrt(variance)
 
 
 def grid_index(plan: EstimationPlan, gauge_kpa: Floats) -> tuple[Floats, Floats]:

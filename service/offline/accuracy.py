@@ -107,6 +107,11 @@ class Accuracy:
     cop_masked_share: float
     """The same as a part of all frames with more than 3 N of truth."""
     saturated_frames: int
+    after_saturation_mae_n: float
+    """Mean absolute error of the GRF in usable frames that carry what was unseen, which are also
+    among the others."""
+    after_saturation: Covered
+    """Those frames, and in how many the truth lies within 1.96 sigma."""
 
 
 def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0) -> Accuracy:
@@ -119,6 +124,7 @@ def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0)
     true_n, error_n = columns["true_grf_n"], columns["grf_n"] - columns["true_grf_n"]
     saturated = (columns["estimate_status"] & EstimateStatus.SATURATED) != 0
     usable = ~saturated & np.isfinite(error_n)
+    after = usable & ((columns["estimate_status"] & EstimateStatus.AFTER_SATURATION) != 0)
     judged = (true_n > GRF_FROM_N) & usable
     heavy = true_n > COP_FROM_N
     stated = heavy & np.isfinite(columns["cop_x_m"])
@@ -165,6 +171,8 @@ def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0)
         cop_masked_frames=cop_masked,
         cop_masked_share=cop_masked / int(heavy.sum()) if heavy.any() else math.nan,
         saturated_frames=int(saturated.sum()),
+        after_saturation_mae_n=_mean(np.abs(error_n[after])),
+        after_saturation=Covered(int(after.sum()), int((after & covered).sum())),
     )
 
 

@@ -207,9 +207,12 @@ def folder_of_a_server(play: Play) -> Outcome:
 def _says_the_same(now: Path, before: Path) -> bool:
     if now.is_symlink() or not now.is_file():
         return False
-    # Cut behind its 32 digits it is the same id, as a version without a CRC-32 wrote it.
-    is_same_id = now.name == SERVER_ID_NAME and now.read_bytes().strip() == before.read_bytes()[:32]
-    return is_same_id or _sha(now) == _sha(before)
+    if now.name == SERVER_ID_NAME:
+        # With another space at its end it is the same; cut behind its 32 digits it is the same id,
+        # as a version without a CRC-32 wrote it.
+        whole = before.read_bytes().strip()
+        return now.read_bytes().strip() in (whole, whole[:32])
+    return _sha(now) == _sha(before)
 
 
 def _in_time(copy: Path) -> tuple[Served, list[str], float] | str:

@@ -11,6 +11,7 @@ const BELOW_RANGE = "Below the calibrated range: suction, or an old tare.";
 const SETTLE_MESSAGES = 15;
 const FROM_ESTIMATE = [
   [ESTIMATE.TILE_MISSING, "Tile missing: force and COP incomplete."],
+  [ESTIMATE.AFTER_SATURATION, "After a load that was not seen, force is less certain for a while."],
   [ESTIMATE.OVER_RATED, "Above the 115 kPa the chip is rated for, yet calibrated."],
 ];
 const FROM_FRAME = [

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
-from devices.arrays import Floats
+from devices.arrays import Bools, Floats
 from service.estimation.calibration import BASIS, TileCalibration, loop_share
 
 _UPPER_95 = 0.975
@@ -29,6 +29,19 @@ def fit_covariance(jacobian: Any, known: Floats) -> Floats:
     """
     j = np.asarray(jacobian) * known
     return np.asarray(np.linalg.inv(j.T @ j + np.eye(len(known))) * np.outer(known, known))
+
+
+def beyond_bounds(jacobian: Any, residual: Floats, known: Floats, held: Bools) -> Floats:
+    """How far beyond their bounds the parameters that are held back would go, to first order.
+
+    What is not possible but fits better says that something else is wrong: the parameter is as
+    uncertain as that. No more than `known`; zero for parameters that are free.
+    """
+    if not held.any():
+        return np.zeros(len(known))
+    j = np.asarray(jacobian) * known
+    step = np.linalg.solve(j.T @ j + np.eye(len(known)), -j.T @ residual)
+    return np.asarray(np.where(held, np.minimum(np.abs(step), 1.0) * known, 0.0))
 
 
 def student_t_95(repeats: int) -> float:

@@ -19,6 +19,7 @@ from service.estimation.effects import (
 from service.estimation.fitting.model import DomeModel
 from service.estimation.fitting.output_error import Fit, Fitted, OutputErrorProblem
 from service.estimation.fitting.press import Presses
+from service.estimation.fitting.soak import bounds_of
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _CLEAR = 3.0
@@ -96,7 +97,7 @@ def identify(
         hysteresis=hysteresis,
         temperature=temperature,
         late_s=late_s,
-        at_bound=fit.at_bound,
+        at_bound=(*fit.at_bound, *bounds_of(temperature)),
         refused=refused,
     )
 

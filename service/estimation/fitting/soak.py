@@ -1,7 +1,9 @@
 """What warmth does to an unloaded tile, from the end of a bench recording: a soak at two warmths.
 
-A sealed bubble at rest follows p/T of its gas, less what its wall gives way. The gas follows its
-chip with one lag, and `tadc` tells the chip's temperature (hardware.md 1.3, 9).
+A sealed bubble at rest follows p/T of its gas, less what its wall gives way. The gas is some
+seconds behind its chip or ahead of it, and `tadc` tells the chip's temperature (hardware.md 1.3,
+9). The gas is followed as the estimator will (model `temperature`), so what that does not describe
+is seen here, and goes into the uncertainty of the lag.
 """
 
 from __future__ import annotations
@@ -9,17 +11,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.signal import lfilter
 
-from devices.arrays import Floats
+from devices.arrays import Bools, Floats, Ints
 from devices.chips.mpl115a2 import TADC_PER_KELVIN, indicative_degc
 from service.estimation.effects import Parameter, TemperatureEffect
-from service.estimation.fitting.confidence import fit_covariance
+from service.estimation.fitting.confidence import beyond_bounds, fit_covariance
+from service.estimation.fitting.least_squares import least_squares
+from service.estimation.models.temperature import at_rest, followed
 
 STEP_MIN_K = 1.0
-_LAG_S = (0.3, 30.0)  # shortest and longest lag that is looked for
-_BIN_S = 0.1  # shorter than the shortest lag, and long enough to average noise
+LAG_S = (-10.0, 30.0)
+"""Lags that are looked for: from a chip that is that late to a gas that is."""
+_LAGS_S = np.concatenate([-np.geomspace(10.0, 0.3, 8), [0.0], np.geomspace(0.3, 30.0, 10)])
+"""Where the search may begin: misfits have valleys."""
+_BIN_S = 0.1  # shorter than lags that matter, and long enough to average noise
 _SIGMA_MAX = 0.1  # relative: a baseline per kelvin that is known worse is not used
 _KELVIN = 273.15
 _T_SIGMA = 5.0 / 298.0
@@ -47,63 +52,94 @@ class Soak:
 
 def fit_soak(soak: Soak) -> TemperatureEffect | str:
     """How a tile's baseline follows temperature, or why the recording does not show it."""
-    binned = _binned(soak)
-    if binned is None:
+    bins = _bins(soak)
+    if bins is None:
         return "the recording has no soak at two temperatures"
-    t_s, kpa, tadc, sigma_kpa = binned
-    # From the mean of the first second on: a single count of noise would stay for a lag.
-    chip_k = (tadc - tadc[t_s < t_s[0] + 1.0].mean()) / TADC_PER_KELVIN
-    if np.ptp(chip_k) < STEP_MIN_K:
-        return f"temperature changes by {np.ptp(chip_k):.1f} K only, {STEP_MIN_K} K are needed"
-    step_s = float(np.median(np.diff(t_s)))
+    chip_counts, kpa, sigma_kpa = bins.mean(soak.tadc), bins.mean(soak.kpa), bins.sigma(soak)
+    still_counts = chip_counts[: round(1.0 / _BIN_S)].mean()
+    if (change_k := float(np.ptp(chip_counts)) / -TADC_PER_KELVIN) < STEP_MIN_K:
+        return f"temperature changes by {change_k:.1f} K only, {STEP_MIN_K} K are needed"
+    t_ns = np.rint(1e9 * soak.t_s).astype(np.int64)[:, None]
+
+    def gas_k(lag_s: float) -> tuple[Floats, Floats]:
+        """Of the gas above the chip's at first, and its rise in kelvins a second."""
+        counts, rise, _ = followed(soak.tadc[:, None], t_ns, np.array([lag_s]), at_rest(1))
+        return (
+            (bins.mean(counts[:, 0]) - still_counts) / TADC_PER_KELVIN,
+            bins.mean(rise[:, 0]) / TADC_PER_KELVIN,
+        )
 
     def residual(x: Floats) -> Floats:
-        base_kpa, kpa_per_k, ln_lag = x
-        # Exact for a chip whose temperature is linear between the means.
-        h = step_s / np.exp(ln_lag)
-        decay, mean = np.exp(-h), -np.expm1(-h) / h
-        gas_k, _ = lfilter([1.0 - mean, mean - decay], [1.0, -decay], chip_k, zi=[0.0])
-        return np.asarray((base_kpa + kpa_per_k * gas_k - kpa) / sigma_kpa)
+        off = (x[0] + x[1] * gas_k(float(x[2]))[0] - kpa) / sigma_kpa
+        # Spikes count less: as for a loss that grows with their size, not with its square.
+        return np.asarray(off * np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + off**2))))
 
-    low, high = np.log(_LAG_S)
-    least, most = np.array([0.0, -2.0, low]), np.array([200.0, 2.0, high])
-    found = least_squares(
-        residual,
-        [float(kpa[0]), 0.3, np.log(3.0)],
-        bounds=(least, most),
-        x_scale=[1.0, 0.1, 1.0],
-        loss="soft_l1",
-    )
+    def straight(lag_s: float) -> Floats:
+        """The best base and rise for a lag."""
+        design = np.stack([np.ones(len(kpa)), gas_k(lag_s)[0]], axis=1) / sigma_kpa[:, None]
+        base, *_ = np.linalg.lstsq(design, kpa / sigma_kpa, rcond=None)
+        return np.array([*base, lag_s])
+
+    low, high = np.array([0.0, -2.0, LAG_S[0]]), np.array([200.0, 2.0, LAG_S[1]])
+    starts = [np.clip(straight(float(lag_s)), low, high) for lag_s in _LAGS_S]
+    start = min(starts, key=lambda x: float((residual(x) ** 2).sum()))
+    known = (high - low) / np.sqrt(12.0)
+    found = least_squares(residual, start, low, high, known)
     # Where readings scatter more than their noise says, so do the parameters.
-    covariance = fit_covariance(found.jac, (most - least) / np.sqrt(12.0))
-    sigma = np.sqrt(np.diag(covariance)) * max(1.0, np.sqrt(np.mean(found.fun**2)))
-    base_kpa, kpa_per_k, ln_lag = (float(x) for x in found.x)
+    covariance = fit_covariance(found.jacobian, known)
+    wide = max(1.0, float(np.sqrt(np.mean(found.residual**2))))
+    beyond = beyond_bounds(found.jacobian, found.residual, known, found.at_bound)
+    sigma = np.hypot(np.sqrt(np.diag(covariance)) * wide, beyond)
+    base_kpa, kpa_per_k, lag_s = (float(x) for x in found.x)
     if not kpa_per_k > 0.0 or sigma[1] > _SIGMA_MAX * kpa_per_k:
         return f"baseline per kelvin is {kpa_per_k:.3f} +- {sigma[1]:.3f} kPa: not determined"
-    lag_s = float(np.exp(ln_lag))
+    # What is left beyond noise while the temperature changes, as seconds of a lag.
+    expected_k, rise_k = gas_k(lag_s)
+    left = (base_kpa + kpa_per_k * expected_k - kpa) ** 2 - sigma_kpa**2
+    wrong_s = np.sqrt(max(0.0, float(left.sum())) / float(((kpa_per_k * rise_k) ** 2).sum()))
     # A rigid bubble would follow p/T; what is missing is the wall's give, dp/dT = p/T/(1 + c p).
-    rigid = base_kpa / (indicative_degc(float(tadc[0])) + _KELVIN)
-    wall = max(0.0, (rigid / kpa_per_k - 1.0) / base_kpa)
+    rigid = base_kpa / (indicative_degc(float(chip_counts[0])) + _KELVIN)
+    wall = (rigid / kpa_per_k - 1.0) / base_kpa
+    wall_sigma = rigid / kpa_per_k / base_kpa * float(np.hypot(sigma[1] / kpa_per_k, _T_SIGMA))
     return TemperatureEffect(
         kpa_per_k=Parameter(value=kpa_per_k, sigma=float(sigma[1])),
-        lag_s=Parameter(value=lag_s, sigma=lag_s * float(sigma[2])),
+        lag_s=Parameter(value=lag_s, sigma=float(np.hypot(sigma[2], wrong_s))),
         wall_per_kpa=Parameter(
-            value=wall,
-            sigma=rigid / kpa_per_k / base_kpa * float(np.hypot(sigma[1] / kpa_per_k, _T_SIGMA)),
+            value=max(0.0, wall), sigma=float(np.hypot(wall_sigma, min(0.0, wall)))
         ),
     )
 
 
-def _binned(soak: Soak) -> tuple[Floats, Floats, Floats, Floats] | None:
-    """Means over tenths of a second: instants, kPa, counts, and standard uncertainty."""
+def bounds_of(effect: TemperatureEffect | None) -> tuple[str, ...]:
+    """Which parameters were found at the end of what is possible."""
+    if effect is None:
+        return ()
+    found = (("lag_s", effect.lag_s, LAG_S), ("wall_per_kpa", effect.wall_per_kpa, (0.0,)))
+    return tuple(name for name, parameter, ends in found if parameter.value in ends)
+
+
+@dataclass(frozen=True)
+class _Bins:
+    """Means over tenths of a second of readings that are there, in which none is empty."""
+
+    good: Bools
+    index: Ints
+    count: Ints
+
+    def mean(self, values: Floats) -> Floats:
+        return np.asarray(np.bincount(self.index, values[self.good]) / self.count)
+
+    def sigma(self, soak: Soak) -> Floats:
+        return np.asarray(soak.noise_kpa / np.sqrt(self.count))
+
+
+def _bins(soak: Soak) -> _Bins | None:
     good = np.isfinite(soak.kpa) & np.isfinite(soak.tadc)
     good &= soak.t_s >= soak.t_s[:1] + _RECOVERS_S
     if good.sum() < 100:
         return None
-    t_s, kpa, tadc = soak.t_s[good], soak.kpa[good], soak.tadc[good]
+    t_s = soak.t_s[good]
     index = ((t_s - t_s[0]) / _BIN_S).astype(np.int64)
-    n = np.bincount(index)
-    if (n == 0).any():  # a hole: the lag's filter wants equal steps
-        return None
-    sums = [np.bincount(index, values) / n for values in (t_s, kpa, tadc)]
-    return sums[0], sums[1], sums[2], np.asarray(soak.noise_kpa / np.sqrt(n))
+    count = np.bincount(index)
+    # A hole: what the temperature did in it is not known.
+    return None if (count == 0).any() else _Bins(good, index, count)

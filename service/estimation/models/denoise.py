@@ -1,4 +1,4 @@
-"""`denoise`: white noise averaged away over as long as nothing happens.
+"""`denoise`: noise averaged away over as long as nothing happens.
 
 Around every sample a line and a parabola are fitted to windows that grow, up to the look-ahead on
 one side and `PAST_NS` on the other. The longest one is taken whose value still agrees with those of
@@ -18,6 +18,8 @@ from service.estimation.compiled import compiled
 PAST_NS = 250_000_000  # how far the longest window reaches back
 REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
 """How far the windows reach to either side, in samples."""
+AVERAGED_MAX = 2 * int(REACHES[-1]) + 2
+"""Readings in the longest window, and one."""
 AGREE = 1.0
 """In standard uncertainties: how far the value of a longer window may be from that of any shorter
 one. A compromise between noise in quiet stance and lag at an impact."""
@@ -41,6 +43,7 @@ def denoised(
     past_ns: int,
     reaches: Times,
     agree: float,
+    noise_left: Floats,
 ) -> tuple[Floats, Floats]:
     """Averaged values of rows `first` to `stop`.
 
@@ -57,6 +60,8 @@ def denoised(
         past_ns: how far a window may reach back.
         reaches: as `REACHES`.
         agree: as `AGREE`.
+        noise_left: (tiles, `AVERAGED_MAX` + 1), how much more of the noise's variance is left of an
+            average of so many readings than of white noise.
 
     Returns:
         Values (stop - first, tiles), and their squared standard uncertainty in units of that of a
@@ -106,6 +111,7 @@ def denoised(
                     value, of_noise = _parabola(moments) if bent else _line(moments)
                     if math.isnan(value):
                         continue
+                    of_noise *= _left(noise_left[j], of_noise)
                     spread = agree * sigma * math.sqrt(of_noise)
                     if value - spread > most or value + spread < least:
                         straight = False
@@ -126,6 +132,16 @@ def denoised(
                 variance += max(0.0, off - (shortest_variance - variance))
             out[i - first, j], left[i - first, j] = best, variance
     return out, left
+
+
+@compiled
+def _left(by_readings: Floats, of_noise: float) -> float:
+    """Of a curve's value, which is as uncertain as a mean of so many readings."""
+    readings = min(1.0 / of_noise, len(by_readings) - 1.5)
+    whole = int(readings)
+    below: float = by_readings[whole]
+    above: float = by_readings[whole + 1]
+    return below + (readings - whole) * (above - below)
 
 
 @compiled

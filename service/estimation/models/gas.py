@@ -22,6 +22,7 @@ import numpy as np
 
 from devices.arrays import Arrays, Floats, Times
 from service.estimation.compiled import compiled
+from service.estimation.foot.contact import UNSEEN_NS
 
 RESTART = 5.0
 """After this many gamma tau without a reading the gas is as warm as its wall."""
@@ -57,11 +58,6 @@ class Gas:
     wall_per_kpa: Floats
     baseline_kpa: Floats
 
-    @property
-    def memory_ns(self) -> Floats:
-        """How long each tile's gas remembers what was before."""
-        return np.asarray(RESTART * self.gamma * self.tau_s * 1e9)
-
     def settled_at_least(self, kpa: Floats) -> Floats:
         """Least pressure that the gas can settle at from one that it has now, or had more of.
 
@@ -73,13 +69,18 @@ class Gas:
         k = (self.gamma - 1.0) / self.gamma
         return np.asarray(kpa * (self.baseline_kpa / np.maximum(kpa, self.baseline_kpa)) ** k)
 
-    def settled(self, kpa: Floats, t_ns: Times, state: GasState) -> tuple[Floats, GasState]:
+    def settled(
+        self, kpa: Floats, t_ns: Times, state: GasState, *, away_kpa: Floats | None = None
+    ) -> tuple[Floats, GasState]:
         """Pressures that measured ones would settle at.
 
         Args:
             kpa: absolute pressures (n, tiles); NaN stays NaN and changes nothing after it.
             t_ns: instants of the readings (n, tiles).
             state: from the readings before.
+            away_kpa: (tiles,), pressure that the gas may have had until just now, if there was no
+                reading for more than `UNSEEN_NS`: it had this one or its baseline, whichever is
+                farther from the present; None: a straight line was between, or it has cooled.
         """
         out = np.empty_like(kpa)
         after = state.copy()
@@ -90,6 +91,7 @@ class Gas:
             self.tau_s,
             self.wall_per_kpa,
             self.baseline_kpa,
+            np.full(len(self.gamma), math.nan) if away_kpa is None else away_kpa,
             after.temperature,
             after.ln_kpa,
             after.t_ns,
@@ -115,6 +117,7 @@ def _settle(
     tau_s: Floats,
     wall_per_kpa: Floats,
     baseline_kpa: Floats,
+    away_kpa: Floats,
     temperature: Floats,
     ln_kpa: Floats,
     last_ns: Times,
@@ -137,6 +140,9 @@ def _settle(
                 now = 1.0
             else:
                 now = warmed(now, ln_p - before, h, k)
+            if away_kpa[j] > p0 and t_ns[i, j] - before_ns > UNSEEN_NS and not math.isnan(before):
+                farther = away_kpa[j] if away_kpa[j] * p0 > p * p else p0
+                now = (p / farther) ** k
             before, before_ns = ln_p, t_ns[i, j]
             iso = p / now
             out[i, j] = iso * (1.0 + c * (p - p0)) / (1.0 + c * (iso - p0))

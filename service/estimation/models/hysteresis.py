@@ -25,6 +25,7 @@ OPENS = 0.4
 _ITERATIONS = 100  # a bound; see `_inverted`
 _CLOSE = 1e-14
 """Relative; a smaller step changes nothing any more."""
+_NONE = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -37,16 +38,21 @@ class Hysteresis:
         """State before the first reading: plays (tiles, plays) at zero load."""
         return np.zeros(self.part.shape)
 
-    def compensated(self, apparent_n: Floats, plays_n: Floats) -> tuple[Floats, Floats]:
+    def compensated(
+        self, apparent_n: Floats, plays_n: Floats, *, borne_n: Floats | None = None
+    ) -> tuple[Floats, Floats]:
         """Forces that appear as these, and the plays after them.
 
         Args:
             apparent_n: (n, tiles); NaN stays NaN and changes nothing after it.
             plays_n: state from the readings before.
+            borne_n: (n, tiles), forces that move the plays, whatever the apparent ones say; NaN:
+                what they say.
         """
+        borne_n = _NONE if borne_n is None else np.ascontiguousarray(borne_n)
         out = np.empty_like(apparent_n)
         plays_n = plays_n.copy()
-        _compensate(np.ascontiguousarray(apparent_n), self.part, WIDTHS_N, plays_n, out)
+        _compensate(np.ascontiguousarray(apparent_n), self.part, WIDTHS_N, borne_n, plays_n, out)
         return out, plays_n
 
 
@@ -98,6 +104,7 @@ def _compensate(
     apparent_n: Floats,
     part: Floats,
     widths: Floats,
+    borne: Floats,
     plays: Floats,
     out: Floats,
 ) -> None:
@@ -107,7 +114,8 @@ def _compensate(
             if not math.isfinite(apparent_n[i, j]):
                 out[i, j] = math.nan
                 continue
-            force = _inverted(apparent_n[i, j], part[j], widths, plays[j])
+            out[i, j] = force = _inverted(apparent_n[i, j], part[j], widths, plays[j])
+            if len(borne) > 0 and not math.isnan(borne[i, j]):
+                force = borne[i, j]
             for m in range(len(widths)):
                 plays[j, m] = played(force, widths[m], plays[j, m])
-            out[i, j] = force

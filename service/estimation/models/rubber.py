@@ -18,6 +18,9 @@ import numpy as np
 
 from devices.arrays import Arrays, Floats, Times
 from service.estimation.compiled import compiled
+from service.estimation.foot.contact import UNSEEN_NS
+
+_NONE = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,13 @@ class Rubber:
         )
 
     def compensated(
-        self, apparent_n: Floats, t_ns: Times, state: RubberState
+        self,
+        apparent_n: Floats,
+        t_ns: Times,
+        state: RubberState,
+        *,
+        borne_n: Floats | None = None,
+        away_n: Floats | None = None,
     ) -> tuple[Floats, RubberState]:
         """Forces that appear as these.
 
@@ -52,6 +61,11 @@ class Rubber:
             apparent_n: (n, tiles); NaN stays NaN and changes nothing after it.
             t_ns: instants (n, tiles).
             state: from the readings before.
+            borne_n: (n, tiles), forces under which the dome creeps, whatever the apparent ones
+                say; NaN: what they say.
+            away_n: (tiles,), force that may have been borne while there was no reading for more
+                than `UNSEEN_NS`: it or nothing was, whichever is farther from the straight line;
+                None: the straight line.
         """
         out = np.empty_like(apparent_n)
         after = state.copy()
@@ -60,6 +74,8 @@ class Rubber:
             np.ascontiguousarray(t_ns),
             self.part,
             self.tau_s,
+            _NONE if borne_n is None else np.ascontiguousarray(borne_n),
+            np.full(len(self.part), math.nan) if away_n is None else away_n,
             after.crept_n,
             after.force_n,
             after.t_ns,
@@ -82,6 +98,8 @@ def _compensate(
     t_ns: Times,
     part: Floats,
     tau_s: Floats,
+    borne: Floats,
+    away: Floats,
     crept: Floats,
     force: Floats,
     last_ns: Times,
@@ -100,17 +118,22 @@ def _compensate(
                 continue
             if math.isnan(before):  # the first reading: at rest without a force
                 before, before_ns = 0.0, t_ns[i, j]
+            was_away = away[j] > 0.0 and t_ns[i, j] - before_ns > UNSEEN_NS
+            meanwhile = away[j] if before + apparent < away[j] else 0.0
             left, known = 1.0, apparent
             for m in range(terms):
                 h = max(0.0, (t_ns[i, j] - before_ns) * 1e-9 / tau_s[j, m])
                 decay, of_before, of_now = crept_parts(h)
-                carried[m] = decay * crept[j, m] + of_before * before
-                share[m] = of_now
-                left -= part[j, m] * (1.0 - of_now)
+                if was_away:  # until just now
+                    carried[m], share[m] = decay * crept[j, m] + (1.0 - decay) * meanwhile, 0.0
+                else:
+                    carried[m], share[m] = decay * crept[j, m] + of_before * before, of_now
+                left -= part[j, m] * (1.0 - share[m])
                 known -= part[j, m] * carried[m]
-            now = known / left
+            out[i, j] = now = known / left
+            if len(borne) > 0 and not math.isnan(borne[i, j]):
+                now = borne[i, j]
             for m in range(terms):
                 crept[j, m] = carried[m] + share[m] * now
             before, before_ns = now, t_ns[i, j]
-            out[i, j] = now
         force[j], last_ns[j] = before, before_ns

@@ -18,6 +18,7 @@ from devices.errors import TareError
 
 TakenFrom = Literal["interval", "lead", "recognised", "unloaded", "flight"]
 Source = TakenFrom | Literal["lost"]
+_LASTING_MAX = {"noise_lasting": 1.0, "noise_lasting_s": 3600.0}
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,9 @@ class Tare:
         frames: number of frames it was taken from.
         source: how the interval was found; "lost": there was a tare, and it is not known what it
             said: its arrays are NaN, and so is every force while it is in force.
+        noise_lasting: part of the noise's variance that lasts, 0 for white noise; None in tares of
+            older versions, which took all for white.
+        noise_lasting_s: how long it lasts, a time constant; likewise.
     """
 
     baseline_kpa: Floats
@@ -46,6 +50,8 @@ class Tare:
     end_s: float
     frames: int
     source: Source
+    noise_lasting: Floats | None = None
+    noise_lasting_s: Floats | None = None
 
     @classmethod
     def lost(cls, *, tiles: int, t_ns: int) -> Tare:
@@ -93,6 +99,12 @@ class Tare:
             values["tadc_counts"] = np.array(counts, dtype=np.float64)  # None becomes NaN
             if values["tadc_counts"].shape != (tiles,):
                 raise ValueError(f"tadc_counts are not those of {tiles} tiles")  # noqa: TRY301  # caught with the others
+            for name in ("noise_lasting", "noise_lasting_s"):
+                if content.get(name) is not None:
+                    values[name] = np.array(content[name], dtype=np.float64)
+                    is_possible = (values[name] >= 0.0) & (values[name] <= _LASTING_MAX[name])
+                    if values[name].shape != (tiles,) or not is_possible.all():
+                        raise ValueError(f"{name} is not that of {tiles} tiles")  # noqa: TRY301  # caught with the others
             return cls(**values)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise TareError(f"a recorded tare is not readable: {error}") from error

@@ -21,6 +21,7 @@ from devices.errors import TareError
 from devices.frames import FrameBatch, FrameStatus
 from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration
+from service.estimation.tare.noise import lasting, left_by_mean
 from service.estimation.tare.tare import Source, Tare
 
 FRAMES_MIN = 20  # fewer do not tell noise from drift
@@ -144,9 +145,11 @@ class TareFrames:
         # A perfectly quiet reading is still rounded to a count.
         noise_kpa = np.maximum(np.nanstd(kpa, axis=0, ddof=1), self.rounding_kpa(tadc_counts))
         t_s = self.since_ns[rows] * 1e-9
+        part, readings = lasting(kpa)
         return Tare(
             baseline_kpa=np.nanmean(kpa, axis=0),
-            baseline_sigma_kpa=noise_kpa / np.sqrt(readable),
+            baseline_sigma_kpa=noise_kpa
+            * np.sqrt(left_by_mean(part, readings, readable) / readable),
             noise_kpa=noise_kpa,
             tadc_counts=tadc_counts,
             t_ns=int(self.frames.t_ns[rows][-1]),
@@ -154,6 +157,8 @@ class TareFrames:
             end_s=float(t_s[-1]),
             frames=len(kpa),
             source=source,
+            noise_lasting=part,
+            noise_lasting_s=readings * float(np.median(np.diff(t_s))),
         )
 
     def rounding_kpa(self, tadc_counts: Floats) -> Floats:

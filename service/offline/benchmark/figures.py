@@ -78,6 +78,8 @@ def goals_of(figures: SceneFigures) -> list[Goal]:
             for title, name, scale, most in limits
         ]
         for name, covered in measured.coverage.items():
+            if name == "after_saturation":
+                continue  # stated, without a goal
             low, high = COVERAGE_OF_A_PHASE if name in PHASES else COVERAGE
             title = f"covered by the 95 % interval, {COVERED[name]}, %"
             goals.append(Goal(mode, title, 100 * covered.share, 100 * low, 100 * high))
@@ -88,6 +90,7 @@ COVERED = {
     "all": "GRF, all frames",
     **{phase: f"GRF, {phase.replace('_', '-')}" for phase in PHASES},
     "cop_x": "COP x",
+    "after_saturation": "GRF, after saturation",
 }
 """Names of what coverage is counted of."""
 
@@ -128,7 +131,7 @@ class Measured:
         ns_per_frame: over repetitions.
         figures: over draws, by the names of `Accuracy`; magnitudes of those that have a sign.
         coverage: pooled over all frames of all draws: GRF in all frames and in each of `PHASES`,
-            and "cop_x".
+            "cop_x" and "after_saturation".
         beyond_whole: how much greater `BUDGETED` figures are than those of the whole ladder in the
             same draw, over draws.
     """
@@ -237,6 +240,7 @@ def coverage_of(judged: Sequence[Accuracy]) -> dict[str, Covered]:
         "all": sum(phases.values(), nothing),
         **phases,
         "cop_x": sum((a.cop_covered for a in judged), nothing),
+        "after_saturation": sum((a.after_saturation for a in judged), nothing),
     }
 
 

@@ -42,6 +42,7 @@ BESIDE = (
     ("sigma in mid-stance N", "grf_sigma_mid_stance_n", 1.0, 3),
     ("COP not stated %", "cop_masked_share", 100.0, 1),
     ("saturated frames", "saturated_frames", 1.0, 0),
+    ("after saturation, mean abs N", "after_saturation_mae_n", 1.0, 3),
 )
 
 

@@ -66,7 +66,6 @@ def test_the_walls_give_is_that_of_the_soak_or_of_the_material() -> None:
         lambda: HysteresisEffect(part=(p(0.4), p(0.4), p(0.2))),
         lambda: HysteresisEffect(part=(p(-0.1),)),
         lambda: temperature(kpa_per_k=0.0),
-        lambda: temperature(lag_s=0.0),
         lambda: Parameter(value=float("nan"), sigma=0.0),
         lambda: Parameter(value=1.0, sigma=float("inf")),
         lambda: Parameter(value=1.0, sigma=-1.0),

@@ -69,9 +69,9 @@ def test_saturated_says_that_force_and_sum_are_lower_bounds() -> None:
     # the calibration ends at 150 N
     e = estimate(newton_plan(array_at(SQUARE)), loaded_frames(held([151, 9, 9, 9])))
     assert e.estimate_status[-1] == EstimateStatus.SATURATED | EstimateStatus.COP_MASKED
-    assert e.force_n[-1] == pytest.approx([150, 9, 9, 9])
+    assert e.force_n[-1] == pytest.approx([150 - 2.33 * 0.5, 9, 9, 9])  # of noise: 0.5 N
     assert np.isnan(e.force_sigma_n[-1]).tolist() == [True, False, False, False]
-    assert e.grf_n[-1] == pytest.approx(177)
+    assert e.grf_n[-1] == pytest.approx(177 - 2.33 * 0.5)
     assert np.isnan(e.grf_sigma_n[-1])
     assert e.contact[-1] == 1
     at_the_end = estimate(newton_plan(array_at(SQUARE)), loaded_frames(held([150, 9, 9, 9])))
@@ -80,7 +80,7 @@ def test_saturated_says_that_force_and_sum_are_lower_bounds() -> None:
 
 def test_all_tiles_saturated_are_a_lower_bound_in_contact() -> None:
     e = estimate(newton_plan(array_at(SQUARE)), loaded_frames(held([400] * 4)))
-    assert e.grf_n == pytest.approx([600.0] * 12)
+    assert e.grf_n == pytest.approx([600.0 - 4 * 2.33 * 0.5] * 12)
     assert e.contact[-1] == 1
 
 
@@ -166,9 +166,8 @@ def test_a_tare_at_another_temperature_is_flagged_like_an_old_one() -> None:
     frames = replace(loaded_frames(held([9] * 4)), tadc=tadc.astype(np.uint16))
     status = estimate(plan, frames).estimate_status
     assert np.flatnonzero(status & EstimateStatus.TARE_OLD).tolist() == [4, 6]
-    model = Temperature(
-        *(np.zeros(3), np.zeros(3), np.ones(3), np.zeros(3)), np.full(3, 480.0), np.full(3, 100.0)
-    )
+    none, tare = np.zeros(3), np.full(3, 480.0)
+    model = Temperature(none, none, np.ones(3), none, tare, np.full(3, 100.0), step_s=0.002)
     corrected = replace(plan, ladder=replace(plan.ladder, temperature=model))
     assert not (estimate(corrected, frames).estimate_status & EstimateStatus.TARE_OLD).any()
     unknown = replace(plan, tare=replace(plan.tare, tadc_counts=np.full(4, np.nan)))
@@ -189,6 +188,7 @@ def test_every_flag_has_a_bit_of_its_own(status: EstimateStatus) -> None:
         "tare_old": 128,
         "over_rated": 256,
         "tare_lost": 512,
+        "after_saturation": 1024,
     }
     assert bits[str(status.name).lower()] == status
 

@@ -51,6 +51,16 @@ def test_saturated_and_missing_frames_are_not_judged_and_saturated_ones_are_coun
     assert a.grf_mae_n == pytest.approx(0.5)
 
 
+def test_frames_after_what_was_unseen_are_counted_among_the_others_and_by_themselves() -> None:
+    after = EstimateStatus.AFTER_SATURATION
+    status = [after | EstimateStatus.SATURATED, after, after, after, 0]
+    grf_n = [9.0, 10.1, 10.4, np.nan, 10.0]
+    a = accuracy_of(columns([10.0] * 5, grf_n=grf_n, estimate_status=status))
+    assert a.grf_frames == 3
+    assert a.after_saturation == Covered(2, 1)
+    assert a.after_saturation_mae_n == pytest.approx(0.25)
+
+
 def test_coverage_is_the_part_within_1_96_sigma() -> None:
     grf_n = [10.195, 9.805, 10.197, 10.0]  # 1.96 sigma is 0.196 N
     a = accuracy_of(columns([10.0] * 4, grf_n=grf_n))
@@ -206,6 +216,7 @@ def test_where_there_is_nothing_to_judge_figures_are_nan_and_null_in_json() -> N
         "cop_p95_m",
         "cop_coverage_95",
         "cop_masked_share",
+        "after_saturation_mae_n",
     }
     assert figures["grf_phases"]["loading"] == {"frames": 0, "within": 0, "coverage_95": None}
     assert json.loads(json.dumps(figures, allow_nan=False))["frames"] == 2

@@ -45,7 +45,7 @@ class Row:
         mode: live or offline.
         errors: spreads of `grf_mae_n`, `peak_error_n`, `cop_p95_m` and `flight_mean_n`, of the last
             the magnitude.
-        coverage: pooled over all frames; GRF in all frames, in each phase, and "cop_x".
+        coverage: pooled over all frames, by the names of `COVERED`.
         coverage_of_arrays: the same of each array.
         sigma_over_rms: stated over actual error of each array, in all frames and in each phase.
         sums: of flags, over all arrays.
@@ -70,7 +70,7 @@ SUMS = (
     "saturated_tile_frames",
     "wrongly",
     "held",
-    "after_saturation_frames",
+    "after_frames",
 )
 
 
@@ -91,7 +91,10 @@ def _row(scene: str, condition: str, mode: str, judged: Sequence[Judged]) -> Row
     phases = [{ANY_PHASE: _whole(j.phases.values()), **j.phases} for j in judged]
     covered = [
         {name: phase.covered for name, phase in of_array.items()}
-        | {"cop_x": Covered(j.cop_frames, j.cop_within)}
+        | {
+            "cop_x": Covered(j.cop_frames, j.cop_within),
+            "after_saturation": Covered(j.after_frames, j.after_within),
+        }
         for of_array, j in zip(phases, judged, strict=True)
     ]
     return Row(

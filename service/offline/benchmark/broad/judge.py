@@ -42,7 +42,6 @@ def judged(
     usable = ((status & EstimateStatus.SATURATED) == 0) & np.isfinite(error_n)
     phases = phases_of(columns["t_ns"], columns["true_grf_n"])
     covered = np.abs(error_n) <= INTERVAL_95 * sigma_n
-    after = usable & ((status & AFTER_SATURATION) != 0)
     # A lower bound has no sigma.
     bounds = np.isfinite(columns["force_n"]) & ~np.isfinite(columns["force_sigma_n"])
     held = columns["true_force_n"] >= columns["force_n"]
@@ -68,12 +67,10 @@ def judged(
         saturated_tile_frames=int(bounds.sum()),
         wrongly=int((bounds & below_end).sum()),
         held=int((bounds & held).sum()),
-        after_saturation_frames=int(after.sum()),
-        after_saturation_mae_n=known(float(np.abs(error_n[after]).mean())) if after.any() else None,
+        after_frames=accuracy.after_saturation.frames,
+        after_within=accuracy.after_saturation.within,
+        after_saturation_mae_n=known(accuracy.after_saturation_mae_n),
     )
-
-
-AFTER_SATURATION = int(EstimateStatus.__members__.get("AFTER_SATURATION", 0))
 
 
 def surely_below_end(recording: Recording, world: World) -> npt.NDArray[np.bool_]:

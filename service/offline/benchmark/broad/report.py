@@ -131,8 +131,7 @@ def _coverage(rows: Sequence[Row]) -> list[str]:
         (
             *_place(row),
             *(
-                f"{100 * row.coverage[name].share:.1f} % "
-                f"({100 * row.coverage_of_arrays[name].p5:.0f})"
+                _covered(row.coverage[name].share, row.coverage_of_arrays[name].p5)
                 for name in COVERED
             ),
         )
@@ -155,11 +154,11 @@ def _saturation(rows: Sequence[Row]) -> list[str]:
             *_place(row),
             f"{row.sums['saturated_frames']} of {row.sums['frames']}",
             *(str(row.sums[name]) for name in ("saturated_tile_frames", "wrongly", "held")),
-            str(row.sums["after_saturation_frames"]),
+            str(row.sums["after_frames"]),
             _worst(row.after_saturation_mae_n, 1.0, 2),
         )
         for row in rows
-        if row.sums["saturated_frames"] or row.sums["after_saturation_frames"]
+        if row.sums["saturated_frames"] or row.sums["after_frames"]
     ]
     if not cells:
         return ["No frame was called saturated."]
@@ -205,6 +204,10 @@ def _refusals(bench: BroadBench) -> list[str]:
         found = ", ".join(f"{name} {n}" for name, n in at_bound.most_common())
         said += ["", f"Parameters found at the end of what is possible, in so many tiles: {found}."]
     return said
+
+
+def _covered(share: float, worst: float) -> str:
+    return "-" if math.isnan(share) else f"{100 * share:.1f} % ({100 * worst:.0f})"
 
 
 def _effect(effect_n: float | None) -> str:

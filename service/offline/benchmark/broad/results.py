@@ -61,7 +61,8 @@ class Judged(Facts):
     saturated_tile_frames: int
     wrongly: int
     held: int
-    after_saturation_frames: int
+    after_frames: int
+    after_within: int
     after_saturation_mae_n: float | None
 
 

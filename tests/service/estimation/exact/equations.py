@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from mpmath import mp, mpf
 
+from devices.arrays import Floats
 from service.estimation.models import ambient, denoise
+from service.estimation.models import temperature as temperature_model
 from service.estimation.models.hysteresis import OPENS, WIDTHS_N
 
 Exact = Any
@@ -50,10 +52,24 @@ def pressure_kpa(words: tuple[int, ...], padc: int, tadc: int) -> Exact:
     return pressure if pressure >= 50 else None
 
 
+AWAY_NS = 50_000_000
+"""So long without a reading a tile may have borne anything."""
+
+
 def gas(
-    kpa: list[Exact], t_ns: list[int], gamma: Exact, tau_s: Exact, c: Exact, p0: Exact
+    kpa: list[Exact],
+    t_ns: list[int],
+    gamma: Exact,
+    tau_s: Exact,
+    c: Exact,
+    p0: Exact,
+    away: Exact = None,
 ) -> list[Exact]:
-    """`gamma dT/dt = (gamma - 1) T d(ln p)/dt - (T - 1)/tau`, ln p linear, by its own integral."""
+    """`gamma dT/dt = (gamma - 1) T d(ln p)/dt - (T - 1)/tau`, ln p linear, by its own integral.
+
+    With `away` the gas had cooled at that pressure or at p0, the farther one, while nothing was
+    read, and went to its present one without losing heat.
+    """
     k = (gamma - 1) / gamma
     out: list[Exact] = []
     temperature, before, before_ns = mpf(1), None, 0
@@ -70,6 +86,8 @@ def gas(
             x = h - k * mp.log(p / before)
             warming = h * (1 - mp.exp(-x)) / x if x != 0 else h
             temperature = mp.exp(-x) * temperature + warming
+        if away is not None and before is not None and now_ns - before_ns > AWAY_NS:
+            temperature = (p / max((away, p0), key=lambda q: abs(mp.log(p / q)))) ** k
         before, before_ns = p, now_ns
         iso = p / temperature
         out.append(iso * (1 + c * (p - p0)) / (1 + c * (iso - p0)))
@@ -77,9 +95,18 @@ def gas(
 
 
 def rubber(
-    apparent: list[Exact], t_ns: list[int], parts: list[Exact], taus_s: list[Exact]
+    apparent: list[Exact],
+    t_ns: list[int],
+    parts: list[Exact],
+    taus_s: list[Exact],
+    borne: list[Exact] | None = None,
+    away: Exact = None,
 ) -> list[Exact]:
-    """`apparent = F - sum g (F - z)`, `tau z' = F - z`, F linear between readings, 0 at first."""
+    """`apparent = F - sum g (F - z)`, `tau z' = F - z`, F linear between readings, 0 at first.
+
+    The dome creeps under what it has `borne` where that is not None. While nothing was read it bore
+    `away`, or nothing, the farther one, until just now.
+    """
     z = [mpf(0) for _ in parts]
     before, before_ns = mpf(0), None
     out: list[Exact] = []
@@ -90,22 +117,37 @@ def rubber(
         passed = mpf(max(0, now_ns - before_ns)) / 10**9 if before_ns is not None else mpf(0)
         # z after the step is held + share F, linear in the F that is looked for.
         held, share = [], []
-        for m, tau in enumerate(taus_s):
+        absent = away is not None and passed * 10**9 > AWAY_NS
+        for m, tau in enumerate(taus_s if not absent else ()):
             h = passed / tau
             decay = mp.exp(-h)
             mean = (1 - decay) / h if h != 0 else mpf(1)
             held.append(decay * z[m] + (mean - decay) * before)
             share.append(1 - mean)
+        if absent:
+            load = max((away, mpf(0)), key=lambda f: abs(f - (before + value) / 2))
+            held = [
+                x * mp.exp(-passed / tau) + load * (1 - mp.exp(-passed / tau))
+                for x, tau in zip(z, taus_s, strict=True)
+            ]
+            share = [mpf(0) for _ in taus_s]
         left = 1 - sum(g * (1 - s) for g, s in zip(parts, share, strict=True))
         force = (value - sum(g * x for g, x in zip(parts, held, strict=True))) / left
+        out.append(force)
+        if borne is not None and borne[len(out) - 1] is not None:
+            force = borne[len(out) - 1]
         z = [x + s * force for x, s in zip(held, share, strict=True)]
         before, before_ns = force, now_ns
-        out.append(force)
     return out
 
 
-def hysteresis(apparent: list[Exact], parts: list[Exact]) -> list[Exact]:
-    """`apparent = F + sum w (y - F)` solved on the pieces of the broken line that it is."""
+def hysteresis(
+    apparent: list[Exact], parts: list[Exact], borne: list[Exact] | None = None
+) -> list[Exact]:
+    """`apparent = F + sum w (y - F)` solved on the pieces of the broken line that it is.
+
+    Plays follow what was `borne` where that is not None.
+    """
     opens, widths = mpf(OPENS), [mpf(float(w)) for w in WIDTHS_N]
 
     def play(force: Exact, width: Exact, before: Exact) -> Exact:
@@ -131,31 +173,53 @@ def hysteresis(apparent: list[Exact], parts: list[Exact]) -> list[Exact]:
         a, b = places[right - 1], places[right]
         slope = (lagging(b) - lagging(a)) / (b - a)
         force = a + (value - lagging(a)) / slope
-        plays = [play(force, w, y) for w, y in zip(widths, plays, strict=True)]
         out.append(force)
+        if borne is not None and borne[len(out) - 1] is not None:
+            force = borne[len(out) - 1]
+        plays = [play(force, w, y) for w, y in zip(widths, plays, strict=True)]
     return out
 
 
-def temperature(counts: list[Exact], t_ns: list[int], lag_s: Exact) -> list[Exact]:
-    """`lag x' = chip - x`, chip linear between readings; for half a second a plain mean."""
+def temperature(
+    counts: list[Exact], t_ns: list[int], lag_s: Exact
+) -> tuple[list[Exact], list[Exact]]:
+    """Counts of the gas, and their rise in counts a second.
+
+    `S x' = chip - x` with the chip linear between readings, and `S y' = x - y` with x as linear;
+    for half a second plain means. The gas is x of the time S = lag, where that is 0.1 s or more;
+    below, and ahead of the chip, it goes on by the rise.
+    """
     out: list[Exact] = []
-    now = before = None
+    rises: list[Exact] = []
+    least = mpf(temperature_model.SMOOTH_LEAST_S)
+    behind = lag_s if lag_s >= 0 else -lag_s * mpf(temperature_model.SMOOTH_PART)
+    smooth = max(behind, least)
+    x = y = before = None
     first_ns = last_ns = 0
     for value, at_ns in zip(counts, t_ns, strict=True):
         if value is not None:
-            if now is None:
-                now, first_ns = value, at_ns
+            if x is None:
+                x = y = value
+                first_ns = at_ns
             else:
                 passed = max(mpf(0), mpf(at_ns - last_ns) / 10**9)
                 known = mpf(at_ns - first_ns) / 10**9
-                lag = lag_s if known > mpf("0.5") else min(lag_s, max(passed, known))
+                time = smooth if known > mpf("0.5") else min(smooth, max(passed, known))
                 if passed > 0:
-                    h = passed / lag
+                    h = passed / time
                     decay, mean = mp.exp(-h), (1 - mp.exp(-h)) / h
-                    now = decay * now + (mean - decay) * before + (1 - mean) * value
+                    old = x
+                    x = decay * x + (mean - decay) * before + (1 - mean) * value
+                    y = decay * y + (mean - decay) * old + (1 - mean) * x
             before, last_ns = value, at_ns
-        out.append(now)
-    return out
+        if x is None:
+            out.append(None)
+            rises.append(None)
+            continue
+        rise = ((before - x) if lag_s >= 0 else (x - y)) / smooth
+        out.append(x + (smooth - lag_s) * rise)
+        rises.append(rise)
+    return out, rises
 
 
 def smoothed(kpa: list[Exact], t_ns: list[int]) -> list[Exact]:
@@ -200,6 +264,13 @@ def curve_at_zero(x: list[Exact], y: list[Exact], degree: int) -> tuple[Exact, E
     return value, sum(q0**2 / mp.fdot(q, q) for q, q0 in pairs)
 
 
+def _between(table: Floats, at: Any) -> Any:
+    """Linearly interpolated."""
+    below = min(int(mp.floor(at)), len(table) - 2)
+    first, second = mpf(table[below]), mpf(table[below + 1])
+    return first + (at - below) * (second - first)
+
+
 def denoised(
     values: list[Exact],
     sigmas: list[Exact],
@@ -208,6 +279,7 @@ def denoised(
     at_ns: list[int],
     run: list[int],
     look_ns: int,
+    noise_left: Floats,
 ) -> list[tuple[Exact, Exact] | None]:
     """Growing windows, a parabola and a line in each; the longest that agrees with all shorter."""
     out: list[tuple[Exact, Exact] | None] = []
@@ -241,6 +313,8 @@ def denoised(
                 if found is None:
                     continue
                 value, variance = found
+                variance *= _between(noise_left, 1 / variance)
+                found = value, variance
                 spread = sigma * mp.sqrt(variance)
                 if value - spread > most or value + spread < least:
                     straight, refused = False, degree == 2

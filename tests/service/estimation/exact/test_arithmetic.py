@@ -20,6 +20,7 @@ from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.calibration import TileCalibration, paper_eq2_shape
 from service.estimation.estimates import Estimates
 from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.upper import BOUND_SIGMAS
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
 from tests.builders.calibrations import make_calibration, make_tare, newton_tile
 from tests.builders.estimates import estimate
@@ -100,9 +101,10 @@ def reference(plan: EstimationPlan, frames: FrameBatch, row: int) -> Reference:
         reading = mpf(float(plan.tare.noise_kpa[i])) ** 2
         reading += mpf(float(plan.tare.baseline_sigma_kpa[i])) ** 2
         gauges.append(gauge)
-        forces.append(force)
+        sigma = mp.sqrt(slope**2 * reading + curve_sigma**2)
         saturated = gauge > mpf(entry.range_kpa[1])
-        sigmas.append(None if saturated else mp.sqrt(slope**2 * reading + curve_sigma**2))
+        forces.append(force - mpf(BOUND_SIGMAS) * sigma if saturated else force)
+        sigmas.append(None if saturated else sigma)
     if None in forces:
         return Reference(gauges, forces, sigmas, None, [None, None])
     grf = sum(forces, mpf(0))

@@ -19,6 +19,7 @@ from service.estimation.estimates import EstimateStatus
 from service.estimation.ladder import MODELS
 from service.estimation.models.outliers import FAR
 from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.upper import BOUND_SIGMAS
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
 from tests.builders.estimates import estimate
@@ -73,7 +74,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
     for i in domes:
         warm, curve = effects[i].temperature, effects[i].rubber
         counts = [mpf(c) for c in tadc[i]]
-        of_gas = equations.temperature(counts, t_ns[i], mpf(warm.lag_s.value))
+        of_gas, rise = equations.temperature(counts, t_ns[i], mpf(warm.lag_s.value))
         kpa_per_count = mpf(warm.kpa_per_k.value) / mpf(-5.35)
         lag_ns = mpf(warm.lag_s.value) * 10**9
         away = counts[0] - mpf(float(tare.tadc_counts[i]))
@@ -86,35 +87,47 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             warmed = kpa_per_count * (of_gas[k] - mpf(float(tare.tadc_counts[i])))
             p, head = kpa[i][k], passed * around[k]
             dry.append(None if p is None else p / (1 + warmed / base[i]) - head)
-            late = kpa_per_count * (counts[k] - of_gas[k])
             variance.append(
                 mpf(float(tare.baseline_sigma_kpa[i])) ** 2
                 + (mpf(warm.kpa_per_k.sigma) / mpf(warm.kpa_per_k.value) * warmed) ** 2
-                + (mpf(warm.lag_s.sigma) / mpf(warm.lag_s.value) * late) ** 2
+                + (mpf(warm.lag_s.sigma) * kpa_per_count * rise[k]) ** 2
                 + (doubt * head) ** 2
                 + (kpa_per_count * away * mp.exp(-mpf(t_ns[i][k] - t_ns[i][0]) / lag_ns)) ** 2
             )
         gauge[i] = [None if p is None else p - base[i] for p in dry]
         hot = effects[i].gas
         entry = plan.calibration.of(plan.info.tiles[i].serial)
-        # What was read beyond the chip's end is a bound, which the gas is not told of.
-        end = max(mpf(115), base[i] + mpf(entry.range_kpa[1]))
+        # What was read beyond the chip's end is a guess; the least and the most may have been.
+        high = mpf(entry.range_kpa[1])
+        end = max(mpf(115), base[i] + high)
         hidden = [p is not None and p > end for p in kpa[i]]
-        told = [None if h else p for p, h in zip(dry, hidden, strict=True)]
-        settled = equations.gas(
-            told, t_ns[i], mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i]
+        heats = mpf(hot.gamma.value), mpf(hot.tau_s.value), wall, base[i]
+        end_n, end_slope, _ = _static(entry, high)
+        most_n = 2 * (end_n + end_slope * (end - base[i] - high))
+        most_hot, end_hot = (
+            base[i] * (1 + gauge / base[i]) ** mpf(hot.gamma.value)
+            for gauge in (high + (most_n - end_n) / end_slope, high)
         )
+        least = [dry[k] - (kpa[i][k] - end) if hidden[k] else None for k in range(n)]
+        taken = [min(p, most_hot) if h else p for p, h in zip(dry, hidden, strict=True)]
+        other = [
+            _farthest(p, low, most_hot) if low is not None else p
+            for p, low in zip(taken, least, strict=True)
+        ]
+        guess = equations.gas(taken, t_ns[i], *heats)
+        elsewise = equations.gas(other, t_ns[i], *heats, end_hot)
+        settled = list(guess)
         part = (mpf(hot.gamma.value) - 1) / mpf(hot.gamma.value)
         for k in range(n):
             if hidden[k]:
-                least = dry[k] - (kpa[i][k] - end)
-                settled[k] = least * (base[i] / least) ** part
-        memory_ns = 5 * mpf(hot.gamma.value) * mpf(hot.tau_s.value) * 10**9
+                settled[k] = least[k] * (base[i] / least[k]) ** part
         apparent: list[Exact] = []
         single: list[Exact] = []
         beyond: list[bool] = []
         own: list[Exact] = []
         heat_n: list[Exact] = [None] * n
+        unseen_heat_n: list[Exact] = [None] * n
+        guess_n: list[Exact] = [None] * n
         for k in range(n):
             p = settled[k]
             if p is None:
@@ -126,9 +139,12 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             force, slope, fit = _static(entry, p - base[i])
             apparent.append(force)
             single.append(abs(slope) * noise[i])
-            lately = any(hidden[m] and t_ns[i][k] - t_ns[i][m] < memory_ns for m in range(k))
-            beyond.append(p - base[i] > mpf(entry.range_kpa[1]) or hidden[k] or lately)
-            heat_n[k] = slope * mpf(hot.misfit) * (p - dry[k])
+            beyond.append(p - base[i] > high or hidden[k])
+            if beyond[k]:
+                above = max(guess[k] - base[i] - high, mpf(0))
+                guess_n[k] = min(_static(entry, guess[k] - base[i])[0] + end_slope * above, most_n)
+            heat_n[k] = slope * mpf(hot.misfit) * (guess[k] - dry[k])
+            unseen_heat_n[k] = 0 if hidden[k] else slope * (elsewise[k] - guess[k]) / mp.sqrt(3)
             own.append(slope**2 * variance[k] + fit)
         averaged: list[Any] = equations.denoised(
             [None if b else f for f, b in zip(apparent, beyond, strict=True)],
@@ -138,32 +154,56 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             frame_ns,
             run,
             plan.lag_ns - 1,
+            plan.noise_left[domes.index(i)],
         )
         smooth = [f if a is None else a[0] for f, a in zip(apparent, averaged, strict=True)]
         loop = [mpf(w.value) for w in effects[i].hysteresis.part]
-        unlooped = equations.hysteresis(smooth, loop)
         parts, taus_s = ([mpf(p.value) for p in x] for x in (curve.part, curve.tau_s))
-        force_n = equations.rubber(unlooped, frame_ns, parts, taus_s)
+        unlooped = equations.hysteresis(smooth, loop, guess_n)
+        force_n = equations.rubber(unlooped, frame_ns, parts, taus_s, guess_n)
+        borne = [
+            None if g is None else _farthest(g, f, most_n)
+            for f, g in zip(apparent, guess_n, strict=True)
+        ]
+        unlooped = equations.hysteresis(smooth, loop, borne)
+        else_n = equations.rubber(unlooped, frame_ns, parts, taus_s, borne, end_n)
+        crept_n: list[Exact] = [
+            None if f is None else 0 if b else (other_n - f) / mp.sqrt(3)
+            for f, other_n, b in zip(force_n, else_n, beyond, strict=True)
+        ]
+        rubber_n: list[Exact] = [
+            None
+            if f is None
+            else mpf(curve.misfit) * (min(f, g) if b else f) - mpf(curve.misfit) * s
+            for f, g, b, s in zip(force_n, else_n, beyond, smooth, strict=True)
+        ]
+        own_n: list[Exact] = [None] * n
+        for k in range(n):
+            if force_n[k] is None:
+                continue
+            left = mpf(1) if beyond[k] else averaged[k][1]
+            own_n[k] = mp.sqrt(single[k] ** 2 * left + own[k])
+            if beyond[k]:
+                common = [each[k] ** 2 for each in (heat_n, rubber_n, unseen_heat_n, crept_n)]
+                sigma = mp.sqrt(own_n[k] ** 2 + mp.fsum(common))
+                force_n[k] = min(force_n[k], else_n[k]) - mpf(BOUND_SIGMAS) * sigma
+                own_n[k] = None
         forces.append(force_n)
-        known = [force_n[k] is not None and not beyond[k] for k in range(n)]
-        rubber_n = [
-            mpf(curve.misfit) * (force_n[k] - smooth[k]) if known[k] else None for k in range(n)
-        ]
-        own_n = [
-            mp.sqrt(single[k] ** 2 * averaged[k][1] + own[k]) if known[k] else None
-            for k in range(n)
-        ]
-        errors.append([own_n, heat_n, rubber_n])
+        errors.append([own_n, heat_n, rubber_n, unseen_heat_n, crept_n])
     return SimpleNamespace(gauge_kpa=gauge, force_n=forces, errors=errors)
 
 
 def sigma_of(errors: list[Any], k: int, weights: list[Exact]) -> Exact:
-    """Of a weighted sum over tiles: what is a tile's own adds as squares, gas and rubber as is."""
-    if any(own[k] is None for own, _, _ in errors):
+    """Of a weighted sum over tiles: what is a tile's own adds as squares, the rest as is."""
+    if any(own[k] is None for own, *_ in errors):
         return None
     own = mp.fsum((w * e[0][k]) ** 2 for w, e in zip(weights, errors, strict=True))
-    shared = [mp.fdot(weights, [e[part][k] for e in errors]) for part in (1, 2)]
-    return mp.sqrt(own + shared[0] ** 2 + shared[1] ** 2)
+    shared = [mp.fdot(weights, [e[part][k] for e in errors]) for part in (1, 2, 3, 4)]
+    return mp.sqrt(own + mp.fsum(each**2 for each in shared))
+
+
+def _farthest(of: Exact, *values: Exact) -> Exact:
+    return max(values, key=lambda value: abs(value - of))
 
 
 def _without_spike(kpa: list[Exact], k: int, run: list[int], far: Exact) -> Exact:
@@ -288,5 +328,5 @@ def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int)
         ]
         assert equations.apart(getattr(e, f"cop_sigma_{name}_m")[stated], sigma_m) < 1e-11
     flags = EstimateStatus.OUTLIER_REPLACED, EstimateStatus.GAP, EstimateStatus.SATURATED
-    for flag in (*flags, EstimateStatus.TILE_MISSING):
+    for flag in (*flags, EstimateStatus.TILE_MISSING, EstimateStatus.AFTER_SATURATION):
         assert (e.estimate_status & flag).any(), flag

@@ -13,6 +13,7 @@ from mpmath import mpf
 
 from service.estimation.models import ambient, denoise, gas, rubber, temperature
 from service.estimation.models.hysteresis import Hysteresis
+from service.estimation.tare.noise import left_by_mean
 from tests.service.estimation.exact import equations
 
 GOAL = 1e-9
@@ -107,24 +108,21 @@ def test_hysteresis_is_within_a_nanonewton(
 
 
 @settings(max_examples=15)
-@given(lag_s=st.sampled_from([1e-9, 0.3, 3.3, 30.0, 1e9]), seed=seeds)
+@given(lag_s=st.sampled_from([-30.0, -2.0, -0.3, 0.0, 1e-9, 0.3, 3.3, 30.0, 1e9]), seed=seeds)
 def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     tadc = with_holes(rng, 480.0 - rng.integers(0, 40, 60))
     t_ns = wild_instants(rng, 60)
-    # A kilopascal a count at 1 kPa: what it corrects shows the counts of the gas.
-    ones = np.ones(1)
-    model = temperature.Temperature(
-        ones, 0.0 * ones, np.array([lag_s]), 0.0 * ones, 400.0 * ones, ones
-    )
     state, out = temperature.at_rest(1), []
     for rows in in_two_parts(60):
-        one = np.ones((len(t_ns[rows]), 1))
-        kpa, _, state = model.at_tare(one, tadc[rows, None], t_ns[rows, None], state)
-        out.append(kpa)
-    counts = equations.temperature(equations.exact(tadc), t_ns.tolist(), mpf(lag_s))
-    expected = [None if x is None else 1 / (1 + (x - 400)) for x in counts]
-    assert equations.apart(np.concatenate(out), expected) < GOAL / 100**2
+        both = temperature.followed(tadc[rows, None], t_ns[rows, None], np.array([lag_s]), state)
+        out.append(np.concatenate(both[:2], axis=1))
+        state = both[2]
+    found = np.concatenate(out)
+    for column, expected in enumerate(
+        equations.temperature(equations.exact(tadc), t_ns.tolist(), mpf(lag_s))
+    ):
+        assert equations.apart(found[:, column], expected) < 1e-9
 
 
 @settings(max_examples=15)
@@ -145,9 +143,12 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
 
 @pytest.mark.parametrize("look_ms", [0, 3, 10, 100])
 @pytest.mark.parametrize("kind", ["still", "moving", "uneven", "few", "crowded"])
-def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str) -> None:
+@pytest.mark.parametrize("lasts", [0.0, 0.6])
+def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -> None:
     rng = np.random.default_rng([look_ms, len(kind)])
     n = 90
+    readings = np.maximum(np.arange(denoise.AVERAGED_MAX + 1), 1)
+    noise_left = left_by_mean(np.array([lasts]), np.array([6.0]), readings)
     swing_n = {"still": 0.0, "moving": 25.0, "uneven": 5.0, "few": 1.0, "crowded": 0.0}[kind]
     values = 30.0 + swing_n * np.sin(np.arange(n) / 9.0) + rng.normal(0, 0.3, n)
     steps_ns = np.full(n, 2_000_000)
@@ -173,6 +174,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str) -> None:
         denoise.PAST_NS,
         denoise.REACHES,
         denoise.AGREE,
+        noise_left[None, :],
     )
     found = equations.denoised(
         equations.exact(column),
@@ -182,6 +184,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str) -> None:
         frame_ns.tolist(),
         run.tolist(),
         look_ms * 1_000_000,
+        noise_left,
     )
     assert equations.apart(averaged, [None if x is None else x[0] for x in found]) < GOAL
     assert equations.apart(left, [None if x is None else x[1] for x in found]) < GOAL

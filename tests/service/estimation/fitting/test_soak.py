@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from service.estimation.effects import TemperatureEffect
-from service.estimation.fitting.soak import Soak, fit_soak
+from service.estimation.fitting.soak import LAG_S, Soak, fit_soak
 
 CHIP_LAG_S, GAS_LAG_S, KPA_PER_K, BASE_KPA = 1.2, 3.3, 0.297, 100.3
 STEP_S = 0.00184
@@ -40,6 +41,53 @@ def test_what_was_put_in_is_found_within_what_is_said_about_it() -> None:
     assert (np.abs(off) < 1.96).sum() >= 20, "of 24 values 95 % should be"
     assert (np.abs(off) < 4.0).all()
     assert all(e.kpa_per_k.sigma < 0.01 * KPA_PER_K and e.lag_s.sigma < 0.3 for e in known)
+
+
+def lagged(*, lag_s: float, both: bool = False, seed: int = 0, step_k: float = 4.0) -> Soak:
+    """Chip and gas one behind the other by a signed lag; or both behind the surroundings."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(0.0, 37.0, STEP_S)
+    decay = np.exp(-STEP_S / np.array([CHIP_LAG_S, CHIP_LAG_S + abs(lag_s), abs(lag_s)]))
+    around_k = step_k * (t_s >= WARM_FROM_S)
+    quick_k = lfilter([1 - decay[0]], [1, -decay[0]], around_k)
+    slow_k = (
+        lfilter([1 - decay[1]], [1, -decay[1]], around_k)
+        if both
+        else lfilter([1 - decay[2]], [1, -decay[2]], quick_k)
+    )
+    chip_k, gas_k = (quick_k, slow_k) if lag_s > 0.0 else (slow_k, quick_k)
+    kpa = BASE_KPA + KPA_PER_K * gas_k + rng.normal(0, 0.165, len(t_s))
+    tadc = np.rint(498 - 5.35 * chip_k + rng.normal(0, 0.5, len(t_s)))
+    return Soak(t_s=t_s, kpa=kpa, tadc=tadc, noise_kpa=0.165)
+
+
+@pytest.mark.parametrize("lag_s", [-3.0, -2.0, -0.5, 0.5, 2.0])
+@pytest.mark.parametrize("both", [False, True])
+def test_which_of_chip_and_gas_is_behind_is_found_with_its_interval(
+    lag_s: float, both: bool
+) -> None:
+    for seed in range(3):
+        effect = fit_soak(lagged(lag_s=lag_s, both=both, seed=seed))
+        assert isinstance(effect, TemperatureEffect)
+        assert effect.lag_s.value * lag_s > 0.0
+        low, high = effect.lag_s.interval_95
+        assert low < lag_s < high
+        assert effect.kpa_per_k.value == pytest.approx(KPA_PER_K, rel=0.03)
+
+
+def test_what_one_lag_does_not_describe_makes_it_uncertain() -> None:
+    # One behind the other is what the model has; both behind the surroundings is not quite that.
+    right, wrong = (fit_soak(lagged(lag_s=3.0, both=both)) for both in (False, True))
+    assert isinstance(right, TemperatureEffect)
+    assert isinstance(wrong, TemperatureEffect)
+    assert wrong.lag_s.sigma > 2.0 * right.lag_s.sigma
+
+
+def test_a_lag_at_the_end_of_what_is_looked_for_is_as_uncertain_as_it_would_go_beyond() -> None:
+    effect = fit_soak(lagged(lag_s=-25.0))
+    assert isinstance(effect, TemperatureEffect)
+    assert effect.lag_s.value == LAG_S[0]
+    assert effect.lag_s.sigma > 1.0
 
 
 def test_what_is_missing_of_a_rigid_bubbles_rise_is_the_walls_give() -> None:

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.denoise import AGREE, PAST_NS, REACHES, denoised
+from service.estimation.models.denoise import AGREE, AVERAGED_MAX, PAST_NS, REACHES, denoised
+from service.estimation.tare.noise import left_by_mean
 
 SIGMA_N, PERIOD_NS = 0.3, 1_838_235
 
@@ -23,6 +24,7 @@ def averaged(
     run: Any = None,
     sigma_n: float = SIGMA_N,
     at_ns: Any = None,
+    noise_left: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values, and what is left of the noise's variance."""
     values = np.asarray(values, dtype=float)
@@ -41,6 +43,7 @@ def averaged(
         PAST_NS,
         REACHES,
         AGREE,
+        np.ones((1, AVERAGED_MAX + 1)) if noise_left is None else noise_left[None, :],
     )
     return out[:, 0], left[:, 0]
 
@@ -88,6 +91,35 @@ def test_more_of_the_noise_is_averaged_away_than_it_says(look_ms: float) -> None
     assert 0.6 < np.mean(off_n**2) / np.mean(SIGMA_N**2 * stated) < 1.0
     assert np.mean(off_n**2) < 0.25 * SIGMA_N**2
     assert (stated > 0.0).all()
+
+
+def lasting_noise(n: int, part: float, readings: float, seed: int) -> np.ndarray:
+    """White, and beside it what decays over so many readings; together as great as `noise`."""
+    rng = np.random.default_rng(seed)
+    phi = math.exp(-1.0 / readings)
+    lasts = np.empty(n)
+    lasts[0] = rng.normal()
+    for i in range(1, n):
+        lasts[i] = phi * lasts[i - 1] + math.sqrt(1.0 - phi**2) * rng.normal()
+    return SIGMA_N * (math.sqrt(part) * lasts + math.sqrt(1.0 - part) * rng.normal(size=n))
+
+
+@pytest.mark.parametrize("look_ms", [0, 10, 100])
+@pytest.mark.parametrize(("part", "readings"), [(1.0, 5.5), (0.5, 5.5), (0.3, 30.0), (1.0, 1.0)])
+def test_what_lasts_of_the_noise_is_not_averaged_away_and_it_says_so(
+    look_ms: float, part: float, readings: float
+) -> None:
+    counts = np.maximum(np.arange(AVERAGED_MAX + 1), 1)
+    lasting = left_by_mean(np.array([part]), np.array([readings]), counts)
+
+    def of_what_it_says(noise_left: np.ndarray | None) -> float:
+        found = [averaged(c, look_ms=look_ms, noise_left=noise_left) for c in courses]
+        off_n, stated = (np.array(each)[:, 20:] for each in zip(*found, strict=True))
+        return float(np.mean((off_n - 30.0) ** 2) / np.mean(SIGMA_N**2 * stated))
+
+    courses = [30.0 + lasting_noise(200, part, readings, seed) for seed in range(150)]
+    assert 0.55 < of_what_it_says(lasting) < 1.0
+    assert of_what_it_says(None) > 1.05  # taken for white
 
 
 @pytest.mark.parametrize("step_n", [8.0, -8.0, 60.0])

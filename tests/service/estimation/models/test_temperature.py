@@ -10,14 +10,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.temperature import SETTLE_S, Temperature, at_rest
+from service.estimation.models.temperature import (
+    NOISE_COUNTS,
+    SETTLE_S,
+    Temperature,
+    at_rest,
+    noise_counts,
+)
 
-LAG_S, KPA_PER_COUNT, BASE_KPA, TARE = 3.0, -0.056, 100.0, 480.0
+LAG_S, LAG_SIGMA_S, KPA_PER_COUNT, BASE_KPA, TARE = 3.0, 0.3, -0.056, 100.0, 480.0
 
 
 def model(*, lag_s: float = LAG_S, kpa_per_count: float = KPA_PER_COUNT) -> Temperature:
-    values = (kpa_per_count, 0.02, lag_s, 0.1, TARE, BASE_KPA)
-    return Temperature(*(np.array([x]) for x in values))
+    values = (kpa_per_count, 0.02, lag_s, LAG_SIGMA_S, TARE, BASE_KPA)
+    per_count, relative, lag, lag_sigma, tare, base = (np.array([x]) for x in values)
+    return Temperature(per_count, relative, lag, lag_sigma, tare, base, 0.002)
 
 
 def followed(
@@ -41,6 +48,63 @@ def test_behind_a_chip_that_warms_evenly_the_gas_is_late_by_its_lag() -> None:
     counts, _ = followed(chip, np.concatenate([still_s, still_s[-1] + ramp_s]))
     expected = TARE - 2.0 * (ramp_s - LAG_S * (1 - np.exp(-ramp_s / LAG_S)))
     assert counts[50:] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("lag_s", [-3.0, -0.5, -0.01])
+def test_a_gas_that_leads_its_chip_is_where_an_even_rise_will_have_brought_the_chip(
+    lag_s: float,
+) -> None:
+    t_s = np.arange(0.0, 12.0, 0.002)
+    counts, _ = followed(TARE - 2.0 * np.maximum(t_s - 1.0, 0.0), t_s, lag_s=lag_s)
+    assert counts[-1] == pytest.approx(TARE - 2.0 * (11.0 - 0.002 - lag_s), abs=0.01)
+    assert counts[:500] == pytest.approx(np.full(500, TARE), abs=1e-9)
+
+
+@pytest.mark.parametrize("lag_s", [-10.0, -2.0, -0.3])
+def test_noise_of_a_chip_that_is_behind_its_gas_stays_below_that_of_a_reading(lag_s: float) -> None:
+    rng = np.random.default_rng(1)
+    t_s = np.arange(0.0, 200.0, 0.002)
+    counts, sigma_kpa = followed(TARE + rng.normal(0, NOISE_COUNTS, len(t_s)), t_s, lag_s=lag_s)
+    left = counts[10_000:].std()
+    assert left < NOISE_COUNTS
+    assert left == pytest.approx(noise_counts(np.array([lag_s]), 0.002)[0], rel=0.2)
+    assert np.median(sigma_kpa) >= 0.95 * abs(KPA_PER_COUNT) * left
+
+
+@pytest.mark.parametrize(("lag_s", "left_kpa"), [(-2.0, 0.12), (-1.0, 0.06), (1.0, 0.02)])
+def test_after_a_cold_shock_a_chip_that_is_behind_its_gas_is_nearly_made_up_for(
+    lag_s: float, left_kpa: float
+) -> None:
+    # Two lags one behind the other in closed form, of 1.2 s and of the lag, by 4 K: 1.2 kPa.
+    t_s = np.arange(0.0, 20.0, 0.002)
+    since_s, (a, b) = np.maximum(t_s - 5.0, 0.0), (1.2, abs(lag_s))
+    first = 21.4 * (1 - np.exp(-since_s / a))
+    second = 21.4 * (1 - (a * np.exp(-since_s / a) - b * np.exp(-since_s / b)) / (a - b))
+    chip, gas = (first, second) if lag_s > 0.0 else (second, first)
+    counts, sigma_kpa = followed(TARE + chip, t_s, lag_s=lag_s)
+    off_kpa = np.abs(KPA_PER_COUNT * (counts - TARE - gas))
+    shock = since_s > 0.0
+    assert off_kpa[shock].mean() < left_kpa
+    without_kpa = np.abs(KPA_PER_COUNT * (chip - gas))
+    assert off_kpa[shock].mean() < 0.3 * without_kpa[shock].mean()
+    # A lag that is that uncertain accounts for it.
+    assert (off_kpa[shock] < 1.96 * sigma_kpa[shock] + 0.02).mean() > 0.8
+
+
+@pytest.mark.parametrize("lag_s", [-2.0, 0.05, 3.0])
+def test_cut_anywhere_the_gas_goes_on_to_the_same_bits(lag_s: float) -> None:
+    rng = np.random.default_rng(2)
+    tadc = (TARE + np.cumsum(rng.normal(0, 1, 60)))[:, None]
+    tadc[rng.integers(0, 60, 6)] = math.nan
+    t_ns = np.cumsum(rng.choice([1_838_235, 300_000_000], 60))[:, None]
+    kpa = rng.uniform(98, 110, (60, 1))
+    whole_kpa, whole_sigma, _ = model(lag_s=lag_s).at_tare(kpa, tadc, t_ns, at_rest(1))
+    state, parts = at_rest(1), []
+    for cut in np.split(np.arange(60), [1, 7, 33]):
+        out, sigma, state = model(lag_s=lag_s).at_tare(kpa[cut], tadc[cut], t_ns[cut], state)
+        parts.append((out, sigma))
+    for i, whole in enumerate((whole_kpa, whole_sigma)):
+        assert np.concatenate([part[i] for part in parts]).tobytes() == whole.tobytes()
 
 
 def test_pressure_is_taken_back_in_proportion_to_itself() -> None:
@@ -102,7 +166,7 @@ def test_counts_below_absolute_zero_are_none() -> None:
 @given(
     tadc=st.lists(st.integers(0, 1023), min_size=1, max_size=40),
     step_s=st.sampled_from([0.0, 1e-9, 0.002, 1.0, 60.0, 1e6]),
-    lag_s=st.sampled_from([1e-9, 0.3, 30.0, 1e9]),
+    lag_s=st.sampled_from([0.0, 1e-9, 0.3, 30.0, 1e9]),
 )
 def test_the_gas_is_never_outside_what_its_chip_has_been(
     tadc: list[int], step_s: float, lag_s: float
