@@ -93,6 +93,7 @@ ESTIMATES = (
     Column("force_sigma_n", _F32, "N", "standard uncertainty of force_n", True),
     Column("grf_n", _F32, "N", "ground reaction force: sum of the tile forces"),
     Column("grf_sigma_n", _F32, "N", "standard uncertainty of grf_n"),
+    Column("grf_at_least_n", _F32, "N", "lower bound of the GRF, also where grf_n is not known"),
     Column("cop_x_m", _F32, "m", "centre of pressure, foot frame, x forward"),
     Column("cop_y_m", _F32, "m", "centre of pressure, foot frame, y to the left"),
     Column("cop_sigma_x_m", _F32, "m", "standard uncertainty of cop_x_m"),

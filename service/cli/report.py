@@ -59,6 +59,9 @@ def accuracy_table(a: Accuracy) -> Table:
         "COP not stated", f"{a.cop_masked_frames}{share}", f"{heavy} frames above {COP_FROM_N} N"
     )
     table.add_row("saturated", str(a.saturated_frames), f"{a.frames} frames")
+    if a.bounds.frames:
+        held = f"{100 * a.bounds.share:.2f} % hold"
+        table.add_row("lower bounds of the GRF", held, f"{a.bounds.frames} frames without a GRF")
     after = a.after_saturation
     if after.frames:
         table.add_row(
@@ -97,9 +100,12 @@ _OF_A_STANCE = (
 
 def stances_line(stances: Sequence[Stance]) -> str:
     """How often the foot stood, and how hard."""
+    hidden = [s for s in stances if not math.isfinite(s.peak_n)]
     whole = [s for s in stances if s.begun and s.ended and math.isfinite(s.peak_n)]
     said = f"{len(stances)} stance{'s' if len(stances) != 1 else ''}"
-    if len(whole) < len(stances):
+    if hidden:
+        said += f", {len(hidden)} with a peak that is not known"
+    if len(whole) + len(hidden) < len(stances):
         said += f", {len(whole)} of them from beginning to end"
     if not whole:
         return said

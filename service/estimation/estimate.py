@@ -118,7 +118,7 @@ def _taken(
     forces, lower = apparent_forces(plan, frames, kpa[:n], neighbours, broken, run, state.lower)
     loaded, since_ns, contact_run = seeming(
         plan.contact,
-        summed(forces.apparent_n),
+        _loading_n(plan, forces.apparent_n),
         frames.t_mono_ns,
         _unseen(frames, state),
         state.contact_run,
@@ -161,6 +161,8 @@ def _release(
         state.contact,
     )
     masked = _cop_masked(plan, foot) | (contact == 0)
+    # A bound tells that there is contact, and never that there is none.
+    decided = ~np.isnan(foot.grf_n) | ((contact == 1) & (foot.at_least_n >= plan.contact.on_n))
     gauge_kpa = forces.gauge_kpa[first:stop]
     index_x, index_y = grid_index(plan, gauge_kpa)
     x_m, y_m, z_m = foot.cop_m
@@ -184,10 +186,11 @@ def _release(
         seq=frames.seq[:due],
         t_ns=frames.t_ns[:due],
         gauge_kpa=gauge_kpa,
-        force_n=by_tile(tiles.force_n),
-        force_sigma_n=by_tile(tiles.sigma_n),
+        force_n=by_tile(tiles.stated_n),
+        force_sigma_n=by_tile(tiles.stated_sigma_n),
         grf_n=foot.grf_n,
         grf_sigma_n=foot.grf_sigma_n,
+        grf_at_least_n=foot.at_least_n,
         cop_x_m=shown(x_m),
         cop_y_m=shown(y_m),
         cop_sigma_x_m=shown(foot.cop_sigma_m[0]),
@@ -197,7 +200,7 @@ def _release(
         cop_ground_x_m=shown(ground_x_m),
         cop_ground_y_m=shown(ground_y_m),
         angle_rad=angle,
-        contact=np.where(np.isnan(foot.grf_n), UNKNOWN, contact).astype(np.uint8),
+        contact=np.where(decided, contact, UNKNOWN).astype(np.uint8),
         estimate_status=forces.status[first:stop]
         | np.where(masked, EstimateStatus.COP_MASKED, 0).astype(np.uint16)
         | np.where(tiles.unsettled, EstimateStatus.AFTER_SATURATION, 0).astype(np.uint16),
@@ -217,7 +220,8 @@ def _no_estimates(plan: EstimationPlan) -> Estimates:
         seq=np.empty(0, dtype=np.uint64),
         t_ns=np.empty(0, dtype=np.int64),
         **dict.fromkeys(("gauge_kpa", "force_n", "force_sigma_n"), tiles),
-        **dict.fromkeys(("grf_n", "grf_sigma_n", *COP_COLUMNS, "angle_rad"), none),
+        **dict.fromkeys(("grf_n", "grf_sigma_n", "grf_at_least_n"), none),
+        **dict.fromkeys((*COP_COLUMNS, "angle_rad"), none),
         contact=np.empty(0, dtype=np.uint8),
         estimate_status=np.empty(0, dtype=np.uint16),
     )
@@ -239,6 +243,20 @@ def _cop_masked(plan: EstimationPlan, foot: Foot) -> Bools:
             # Noise about the edge is let through, or the mean of what is left would lie inside.
             good &= beyond_m <= HULL_SIGMAS * sigma_m + 1e-9
     return ~good
+
+
+def _loading_n(plan: EstimationPlan, apparent_n: Floats) -> Floats:
+    """Sum of the apparent forces (n,), by which contact is judged.
+
+    If a tile is missing it is NaN, unless those that are known show contact by themselves.
+    """
+    total_n = summed(apparent_n)
+    if np.isnan(total_n).any():
+        of_known_n = summed(np.nan_to_num(apparent_n))
+        total_n = np.where(
+            np.isnan(total_n) & (of_known_n >= plan.contact.on_n), of_known_n, total_n
+        )
+    return total_n
 
 
 def _unseen(frames: FrameBatch, state: EstimationState) -> Bools:

@@ -27,7 +27,8 @@ class EstimateStatus(IntFlag):
     """Bits of `Estimates.estimate_status`, one value per frame."""
 
     SATURATED = 1
-    """A tile is beyond its calibrated range: force and GRF are lower bounds."""
+    """A tile is beyond what it can tell: its force is a lower bound, and there is no GRF but
+    one."""
     EXTRAPOLATED = 2
     """A tile is below its calibrated range: suction, or a tare that no longer holds."""
     OUTLIER_REPLACED = 4
@@ -36,7 +37,8 @@ class EstimateStatus(IntFlag):
     COP_MASKED = 16
     """No centre of pressure: no contact, or it would be too uncertain."""
     TILE_MISSING = 32
-    """A tile gave no pressure, or no bare one has told what is around, so there is no sum."""
+    """A tile gave no pressure, or no bare one has told what is around, so there is no GRF
+    but a lower bound."""
     ASSUMED_SCALE = 64
     """The calibration's scale is assumed: newtons are not to be trusted."""
     TARE_OLD = 128
@@ -64,6 +66,7 @@ class Estimates(Arrays):
     force_sigma_n: Floats
     grf_n: Floats
     grf_sigma_n: Floats
+    grf_at_least_n: Floats
     cop_x_m: Floats
     cop_y_m: Floats
     cop_sigma_x_m: Floats

@@ -21,7 +21,7 @@ from service.estimation.models import ambient, denoise, gas, skew, temperature
 from service.estimation.models.gas import Gas, GasState
 from service.estimation.models.outliers import despiked
 from service.estimation.models.unwrap import unwrap
-from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
+from service.estimation.plan import SIGMAS, SUCTION_MAX_KPA, TARE_OLD_NS, EstimationPlan
 from service.estimation.tare.tare import has_warmed
 from service.estimation.unseen import EVENLY, Unseen, farthest, was_away
 
@@ -196,6 +196,9 @@ def apparent_forces(
     if ladder.temperature is not None or ladder.ambient is not None:
         gauge_kpa = gauge_kpa.copy()
         gauge_kpa[:, columns] = bearing_kpa - plan.baseline_kpa
+    torn = bearing_kpa - plan.baseline_kpa < -SUCTION_MAX_KPA
+    if torn.any():
+        bearing_kpa = np.where(torn, np.nan, bearing_kpa)
     # The chip's range is judged by what was read, the calibrated one by what the gas settles at.
     hidden = kpa[:, columns] > plan.chip_end_kpa
     # As if the chip's end had been read, with what warmth and surroundings have put into it.

@@ -31,6 +31,9 @@ CONTACT_MIN_NS = 10_000_000  # a shorter change is an outlier or a bounce
 SIGMAS = 5.0
 """COP needs a GRF of so many sigma: below, the first-order variance of a ratio is not valid. And a
 pressure so many sigma below the calibrated range is no noise."""
+SUCTION_MAX_KPA = 10.0
+"""No foot pulls at a dome like that, and 30 kelvins make less: a pressure so far below the baseline
+is a count that wrapped and went on far, a torn dome or another fault, and no force."""
 COP_SIGMA_MAX_M = 0.003  # a quarter of a dome: worse says nothing of where the load is
 TARE_OLD_NS = 1_800_000_000_000
 """Half an hour: at the 0.3 kPa/K of a sealed bubble a degree in that time is half a newton."""

@@ -56,11 +56,12 @@ class TileForces:
     """Force on the bearing tiles and its standard uncertainty, (n, bearing tiles).
 
     Attributes:
-        force_n: forces; where `beyond`, lower bounds.
-        sigma_n: standard uncertainties; NaN for a bound.
-        own_n: their part that is every tile's own.
+        force_n: forces; where `beyond`, what they are at least if nothing is uncertain.
+        sigma_n: their standard uncertainties.
+        own_n: the part of these that is every tile's own.
         common_n: (parts, n, bearing tiles), the rest, of corrections of gas and rubber, and of what
             either did unseen: all tiles share the error, so these are signed.
+        beyond: where forces are only bounds.
         unsettled: (n,), has what was unseen left more than the noise of a reading in any tile?
     """
 
@@ -68,7 +69,18 @@ class TileForces:
     sigma_n: Floats
     own_n: Floats
     common_n: Floats
+    beyond: Bools
     unsettled: Bools
+
+    @property
+    def stated_n(self) -> Floats:
+        """Forces, or bounds that the truth exceeds in 99 of 100 frames."""
+        return np.where(self.beyond, self.force_n - BOUND_SIGMAS * self.sigma_n, self.force_n)
+
+    @property
+    def stated_sigma_n(self) -> Floats:
+        """Standard uncertainties; a bound has none."""
+        return np.where(self.beyond, np.nan, self.sigma_n)
 
 
 def tile_forces(
@@ -115,11 +127,8 @@ def tile_forces(
     rubber_n = ladder.rubber_misfit * (force_n - averaged_n)
     common_n = np.stack([now.gas_n, rubber_n, now.unseen_gas_n, unseen_n])
     sigma_n = np.sqrt(own_n**2 + (common_n**2).sum(axis=0))
-    force_n = np.where(now.beyond, force_n - BOUND_SIGMAS * sigma_n, force_n)
     unsettled = (~now.beyond & (np.hypot(now.unseen_gas_n, unseen_n) > now.noise_n)).any(axis=1)
-    # A lower bound has no standard uncertainty.
-    own_n, sigma_n = (np.where(now.beyond, np.nan, each) for each in (own_n, sigma_n))
-    return TileForces(force_n, sigma_n, own_n, common_n, np.asarray(unsettled)), state
+    return TileForces(force_n, sigma_n, own_n, common_n, now.beyond, np.asarray(unsettled)), state
 
 
 def _undone(
@@ -175,57 +184,81 @@ def _without_loop_and_creep(
 
 @dataclass(frozen=True)
 class Foot:
-    """GRF and centre of pressure of n frames with their standard uncertainties, each (n,)."""
+    """GRF and centre of pressure of n frames with their standard uncertainties, each (n,).
+
+    `at_least_n` is what the truth exceeds in 99 of 100 frames: NaN only if no tile is known.
+    """
 
     grf_n: Floats
     grf_sigma_n: Floats
+    at_least_n: Floats
     cop_m: tuple[Floats, Floats, Floats]
     cop_sigma_m: tuple[Floats, Floats]
 
 
 def foot_of(plan: EstimationPlan, tiles: TileForces) -> Foot:
-    """Sum of the tile forces, and the force-weighted mean of the tiles' places."""
-    columns = _foot(tiles.force_n, tiles.own_n, tiles.common_n, plan.bearing_m)
-    grf_n, sigma_n, x_m, y_m, z_m, sigma_x_m, sigma_y_m = columns.T
-    return Foot(grf_n, sigma_n, (x_m, y_m, z_m), (sigma_x_m, sigma_y_m))
+    """Sum of the tile forces, and the force-weighted mean of the tiles' places.
+
+    Where a tile is missing or saturated there is neither, but a bound: a tile bears at least what
+    it states, and one that states nothing at least nothing.
+    """
+    columns = _foot(tiles.force_n, tiles.own_n, tiles.common_n, tiles.beyond, plan.bearing_m)
+    grf_n, sigma_n, at_least_n, x_m, y_m, z_m, sigma_x_m, sigma_y_m = columns.T
+    return Foot(grf_n, sigma_n, at_least_n, (x_m, y_m, z_m), (sigma_x_m, sigma_y_m))
 
 
 @compiled
-def _foot(force_n: Floats, own_n: Floats, common_n: Floats, places_m: Floats) -> Floats:
-    """GRF and its sigma, centre x, y, z, and the sigmas of x and y, to first order: (n, 7)."""
+def _foot(
+    force_n: Floats, own_n: Floats, common_n: Floats, beyond: Bools, places_m: Floats
+) -> Floats:
+    """GRF, its sigma and bound, centre x, y, z, sigmas of x and y, to first order: (n, 8)."""
     n, tiles = force_n.shape
-    out = np.full((n, 7), math.nan)
+    out = np.full((n, 8), math.nan)
     weights = np.empty(tiles)
     for i in range(n):
-        total = 0.0
+        total, stating, telling = 0.0, 0, 0
         for j in range(tiles):
-            total += force_n[i, j]
-            weights[j] = 1.0
-        out[i, 0], out[i, 1] = total, _sigma(own_n, common_n, i, weights)
+            weights[j] = 0.0
+            if not math.isnan(force_n[i, j]):
+                total += force_n[i, j]
+                weights[j] = 1.0
+                stating += 1
+                telling += not beyond[i, j]
+        sigma = _sigma(own_n, common_n, i, weights)
+        if stating > 0:
+            out[i, 2] = total - BOUND_SIGMAS * sigma
+        if telling < tiles:
+            continue
+        out[i, 0], out[i, 1] = total, sigma
         if total == 0.0:
             continue
         for axis in range(3):
             moment = 0.0
             for j in range(tiles):
                 moment += force_n[i, j] * places_m[j, axis]
-            out[i, 2 + axis] = moment / total
+            out[i, 3 + axis] = moment / total
         for axis in range(2):
             for j in range(tiles):
-                weights[j] = places_m[j, axis] - out[i, 2 + axis]
-            out[i, 5 + axis] = _sigma(own_n, common_n, i, weights) / abs(total)
+                weights[j] = places_m[j, axis] - out[i, 3 + axis]
+            out[i, 6 + axis] = _sigma(own_n, common_n, i, weights) / abs(total)
     return out
 
 
 @compiled
 def _sigma(own_n: Floats, common_n: Floats, i: int, weights: Floats) -> float:
-    """Of a weighted sum over the tiles of frame `i`: own parts add as squares, others as is."""
+    """Of a weighted sum over the tiles of frame `i`: own parts add as squares, others as is.
+
+    A tile without weight may be unknown.
+    """
     variance = 0.0
     for j in range(len(weights)):
-        variance += (weights[j] * own_n[i, j]) ** 2
+        if weights[j] != 0.0:
+            variance += (weights[j] * own_n[i, j]) ** 2
     for part in range(len(common_n)):
         shared = 0.0
         for j in range(len(weights)):
-            shared += weights[j] * common_n[part, i, j]
+            if weights[j] != 0.0:
+                shared += weights[j] * common_n[part, i, j]
         variance += shared * shared
     return math.sqrt(variance)
 

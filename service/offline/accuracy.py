@@ -21,6 +21,7 @@ COMPARED = (
     "t_ns",
     "grf_n",
     "grf_sigma_n",
+    "grf_at_least_n",
     "cop_x_m",
     "cop_y_m",
     "cop_sigma_x_m",
@@ -107,6 +108,8 @@ class Accuracy:
     cop_masked_share: float
     """The same as a part of all frames with more than 3 N of truth."""
     saturated_frames: int
+    bounds: Covered
+    """Frames without a GRF but with a lower bound of it, and in how many the truth is above."""
     after_saturation_mae_n: float
     """Mean absolute error of the GRF in usable frames that carry what was unseen, which are also
     among the others."""
@@ -124,6 +127,8 @@ def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0)
     true_n, error_n = columns["true_grf_n"], columns["grf_n"] - columns["true_grf_n"]
     saturated = (columns["estimate_status"] & EstimateStatus.SATURATED) != 0
     usable = ~saturated & np.isfinite(error_n)
+    at_least_n = columns["grf_at_least_n"]
+    bounded = np.isnan(columns["grf_n"]) & np.isfinite(at_least_n)
     after = usable & ((columns["estimate_status"] & EstimateStatus.AFTER_SATURATION) != 0)
     judged = (true_n > GRF_FROM_N) & usable
     heavy = true_n > COP_FROM_N
@@ -171,6 +176,7 @@ def accuracy_of(columns: Mapping[str, npt.NDArray[Any]], *, lag_ms: float = 0.0)
         cop_masked_frames=cop_masked,
         cop_masked_share=cop_masked / int(heavy.sum()) if heavy.any() else math.nan,
         saturated_frames=int(saturated.sum()),
+        bounds=Covered(int(bounded.sum()), int((bounded & (true_n >= at_least_n)).sum())),
         after_saturation_mae_n=_mean(np.abs(error_n[after])),
         after_saturation=Covered(int(after.sum()), int((after & covered).sum())),
     )

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.frames import FrameBatch
+from service.estimation.estimates import EstimateStatus
 from service.estimation.foot.contact import Stance, Stances
 from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 
@@ -44,7 +45,8 @@ class FindingsOf:
 
     def feed(self, batch: FrameBatch, columns: Columns) -> None:
         """Take the next frames."""
-        self._stances.feed(batch.t_ns, columns["grf_n"], columns["contact"])
+        saturated = (columns["estimate_status"] & EstimateStatus.SATURATED) != 0
+        self._stances.feed(batch.t_ns, columns["grf_n"], columns["contact"], saturated)
         if self._judging:
             known = {"t_ns": batch.t_ns, **columns}
             self._judged.append({name: known[name] for name in COMPARED})

@@ -211,9 +211,9 @@ def test_the_tables_hold_just_the_columns_of_the_contract() -> None:
     raw = "seq t_mono_ns t_ns padc tadc sample_offset_us servo_counts servo_age_us status"
     assert [c.name for c in FRAMES] == [*raw.split(), "frame_status", "reference_force_n"]
     made = (
-        "gauge_kpa force_n force_sigma_n grf_n grf_sigma_n cop_x_m cop_y_m cop_sigma_x_m "
-        "cop_sigma_y_m cop_index_x cop_index_y cop_ground_x_m cop_ground_y_m angle_rad contact "
-        "estimate_status"
+        "gauge_kpa force_n force_sigma_n grf_n grf_sigma_n grf_at_least_n cop_x_m cop_y_m "
+        "cop_sigma_x_m cop_sigma_y_m cop_index_x cop_index_y cop_ground_x_m cop_ground_y_m "
+        "angle_rad contact estimate_status"
     )
     assert [c.name for c in ESTIMATES] == made.split()
     truth = "true_force_n true_grf_n true_plate_n true_cop_x_m true_cop_y_m true_angle_rad"

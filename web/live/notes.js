@@ -10,7 +10,7 @@ const HOLD_MS = 3000;
 const BELOW_RANGE = "Below the calibrated range: suction, or an old tare.";
 const SETTLE_MESSAGES = 15;
 const FROM_ESTIMATE = [
-  [ESTIMATE.TILE_MISSING, "Tile missing: force and COP incomplete."],
+  [ESTIMATE.TILE_MISSING, "Tile missing: of the force only a lower bound is known, and no COP."],
   [ESTIMATE.AFTER_SATURATION, "After a load that was not seen, force is less certain for a while."],
   [ESTIMATE.OVER_RATED, "Above the 115 kPa the chip is rated for, yet calibrated."],
 ];

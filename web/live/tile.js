@@ -57,9 +57,9 @@ export function readTile(node, i, frame, unitChosen) {
   };
 }
 
-/** Both full scale and the value are lower bounds of a saturated tile: say the better one, rounded down. */
+/** Rounded down: of a force what the server says; of a pressure the range's end or what was read. */
 function lowerBound(tile, unit, value) {
-  const bound = Math.max(given(tile, unit) ?? -Infinity, value ?? -Infinity);
+  const bound = unit === "kPa" ? Math.max(given(tile, unit) ?? -Infinity, value ?? -Infinity) : value;
   if (!Number.isFinite(bound)) return "";
   return unit === "kPa" ? (Math.floor(bound * 10) / 10).toFixed(1) : String(Math.floor(bound));
 }

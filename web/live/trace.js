@@ -54,7 +54,8 @@ export class Trace {
     const point = {
       seq: frame.seq, timeS, gap: true, grf: frame.grf_n,
       low: frame.grf_min_n ?? frame.grf_n, high: frame.grf_max_n ?? frame.grf_n,
-      bound: Boolean(frame.estimate_status & 1),
+      // Without a force there may be a bound; one below zero says nothing.
+      bound: !Number.isFinite(frame.grf_n) && frame.grf_at_least_n > 0 ? frame.grf_at_least_n : null,
     };
     if (last && this.points.length) {
       const missingS = Math.max(0, frame.seq - frame.n - last.seq) * periodS;
@@ -76,6 +77,7 @@ export class Trace {
     let low = 0;
     for (const point of this.points) {
       if (point.high > high) high = point.high;
+      if (point.bound > high) high = point.bound;
       if (point.low < low) low = point.low;
     }
     const need = STEPS_N.find((step) => 5 * step >= 1.03 * high && step >= -1.03 * low) ?? STEPS_N.at(-1);
@@ -110,8 +112,7 @@ export class Trace {
     context.beginPath();
     context.rect(box.left, box.top - 4, box.right - box.left, box.bottom - box.top + 4);
     context.clip();
-    let someBound = false;
-    for (const run of this.runs()) {
+    for (const run of this.runs((point) => point.grf)) {
       context.fillStyle = colours.band;
       context.beginPath();
       run.forEach((point) => context.lineTo(x(point.timeS), y(point.high)));
@@ -124,23 +125,55 @@ export class Trace {
       if (run.length === 1) context.arc(x(run[0].timeS), y(run[0].grf), 1, 0, 7); // alone between two gaps
       run.forEach((point) => context.lineTo(x(point.timeS), y(point.grf)));
       context.stroke();
-      context.fillStyle = colours.warn;
-      for (const point of run) {
-        if (!point.bound) continue;
-        someBound = true;
-        context.fillRect(x(point.timeS) - 2, box.top - 4, 4, 6);
-      }
+    }
+    let someBound = false;
+    for (const run of this.runs((point) => point.bound)) {
+      someBound = true;
+      this.above(run.map((point) => [x(point.timeS), y(point.bound)]), box.top - 4);
     }
     context.restore();
     setText(byId("trace-legend"), "line: newest, band: min to max"
-      + (someBound ? ", marks on top: saturated, force is higher" : ""));
+      + (someBound ? ", striped: at least this much" : ""));
   }
 
-  /** Unbroken stretches: a gap in the data is a gap in the line. */
-  *runs() {
+  /** A bound: the force is on its line or anywhere in the stripes above. */
+  above(line, top) {
+    const { context, colours } = this;
+    const left = line[0][0] - 1;
+    const right = line.at(-1)[0] + 1;
+    context.save();
+    context.beginPath();
+    context.moveTo(left, top);
+    context.lineTo(left, line[0][1]);
+    line.forEach(([px, py]) => context.lineTo(px, py));
+    context.lineTo(right, line.at(-1)[1]);
+    context.lineTo(right, top);
+    context.clip();
+    context.strokeStyle = colours.warn;
+    context.lineWidth = 1;
+    context.beginPath();
+    const height = this.canvas.height;
+    for (let at = Math.floor((left - height) / 8) * 8; at < right; at += 8) {
+      context.moveTo(at, height);
+      context.lineTo(at + height, 0);
+    }
+    context.globalAlpha = 0.5;
+    context.stroke();
+    context.restore();
+    context.strokeStyle = colours.warn;
+    context.lineWidth = 2;
+    context.beginPath();
+    context.moveTo(left, line[0][1]);
+    line.forEach(([px, py]) => context.lineTo(px, py));
+    context.lineTo(right, line.at(-1)[1]);
+    context.stroke();
+  }
+
+  /** Unbroken stretches in which there is a value: a gap in the data is a gap in the line. */
+  *runs(valueOf) {
     let run = [];
     for (const point of this.points) {
-      const absent = point.grf === null || point.grf === undefined;
+      const absent = !Number.isFinite(valueOf(point));
       if ((point.gap || absent) && run.length) {
         yield run;
         run = [];

@@ -107,10 +107,10 @@ class Stance:
     Attributes:
         begin_t_ns: UTC of its first frame.
         end_t_ns: UTC of its last.
-        peak_n: greatest GRF; NaN if none is known.
-        peak_t_ns: when that was.
+        peak_n: greatest GRF; NaN if none is known, or a tile was saturated.
+        peak_t_ns: when that was; of such a stance when it began.
         impulse_ns: integral of the GRF by the trapezoidal rule, in newton seconds; straight across
-            frames without one.
+            frames without one. NaN if a tile was saturated.
         unknown_frames: how many those are.
         begun: it began within the recording.
         ended: it ended within the recording.
@@ -137,17 +137,21 @@ class Stances:
     def __init__(self) -> None:
         self._over: list[Stance] = []
         self._pieces: list[tuple[Ints, Floats]] = []
+        self._saturated = False
         self._contact = 0
         self._begun = False
         self._seen = False
 
-    def feed(self, t_ns: Times, grf_n: Floats, contact: npt.NDArray[np.uint8]) -> None:
+    def feed(
+        self, t_ns: Times, grf_n: Floats, contact: npt.NDArray[np.uint8], saturated: Bools
+    ) -> None:
         """Take n more frames.
 
         Args:
             t_ns: (n,), UTC.
             grf_n: (n,), NaN where it is not known.
             contact: (n,), 1, 0, or `UNKNOWN`, which changes nothing.
+            saturated: (n,), frames in which more than can be told is borne.
         """
         known = contact != UNKNOWN
         last = np.maximum.accumulate(np.where(known, np.arange(len(contact)), -1))
@@ -160,6 +164,7 @@ class Stances:
                 if not self._pieces:
                     self._begun = self._seen or bool(known[:begin].any())
                 self._pieces.append((t_ns[begin:end], grf_n[begin:end]))
+                self._saturated = self._saturated or bool(saturated[begin:end].any())
             else:
                 self._close(ended=True)
         if len(loaded):
@@ -178,16 +183,19 @@ class Stances:
         self._pieces = []
         there = np.isfinite(grf_n)
         known_n, known_ns = grf_n[there], t_ns[there]
-        peak = int(np.argmax(known_n)) if len(known_n) else -1
+        # The peak was in what is not known, and no straight line is above it.
+        peak = int(np.argmax(known_n)) if len(known_n) and not self._saturated else -1
+        impulse_ns = float(np.trapezoid(known_n, (known_ns - t_ns[0]) * 1e-9))
         self._over.append(
             Stance(
                 begin_t_ns=int(t_ns[0]),
                 end_t_ns=int(t_ns[-1]),
-                peak_n=float(known_n[peak]) if len(known_n) else float("nan"),
-                peak_t_ns=int(known_ns[peak]) if len(known_n) else int(t_ns[0]),
-                impulse_ns=float(np.trapezoid(known_n, (known_ns - t_ns[0]) * 1e-9)),
+                peak_n=float("nan") if peak < 0 else float(known_n[peak]),
+                peak_t_ns=int(t_ns[0]) if peak < 0 else int(known_ns[peak]),
+                impulse_ns=float("nan") if self._saturated else impulse_ns,
                 unknown_frames=int((~there).sum()),
                 begun=self._begun,
                 ended=ended,
             )
         )
+        self._saturated = False

@@ -15,14 +15,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
+from devices.chips.mpl115a2 import Coefficients, compensate_kpa, padc_of_kpa
 from devices.frames import FrameBatch
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import EstimateStatus
 from service.estimation.lower import ApparentForces
 from service.estimation.plan import make_plan
 from service.estimation.tare.unloaded import take_tare
-from tests.builders.arrays import array_at, make_servo
-from tests.builders.calibrations import make_calibration, newton_tile
+from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
+from tests.builders.calibrations import make_calibration, make_tare, newton_tile
 from tests.builders.estimates import estimate, newton_plan
 from tests.builders.frames import assert_same_bits, loaded_frames
 from tests.service.estimation.feet import SQUARE, held, wild_frames
@@ -131,11 +132,60 @@ def test_contact_is_dated_back_by_the_look_ahead(lag_ms: float, first_in_contact
     assert contact.tolist() == [0] * first_in_contact + [1] * (30 - first_in_contact)
 
 
-def test_contact_is_unknown_where_there_is_no_force_and_goes_on_after_it() -> None:
-    forces_n = held([8] * 4, 20)
-    forces_n[12:15, 2] = np.nan
+def test_contact_is_unknown_where_no_force_shows_it_and_goes_on_after_it() -> None:
+    forces_n = held([8, 0, 0, 0], 20)
+    forces_n[12:15, 0] = np.nan
     contact = estimate(newton_plan(array_at(SQUARE), lag_ms=50), loaded_frames(forces_n)).contact
     assert contact.tolist() == [1] * 12 + [255] * 3 + [1] * 5
+
+
+@pytest.mark.parametrize("lag_ms", [0.0, 50.0])
+def test_contact_is_known_if_the_tiles_that_are_left_show_it(lag_ms: float) -> None:
+    forces_n = np.concatenate([held([0] * 4), held([8] * 4, 20), held([0] * 4)])
+    forces_n[:, 2] = np.nan
+    e = estimate(newton_plan(array_at(SQUARE), lag_ms=lag_ms), loaded_frames(forces_n))
+    begin = 12 if lag_ms else 17
+    assert (e.contact[begin:32] == 1).all()
+    assert (e.contact[:begin] == 255).all()
+    assert (e.contact[32:] == 255).all()  # what is missing may bear all of it
+    assert np.isnan(e.grf_n).all()
+    assert np.isnan(e.cop_x_m).all()
+
+
+def test_a_tile_that_pulls_like_no_foot_does_is_missing() -> None:
+    frames = loaded_frames(held([7, 8, 9, -78]))  # 9.9 kPa below the baseline
+    e = estimate(newton_plan(array_at(SQUARE)), frames)
+    assert (e.estimate_status & EstimateStatus.EXTRAPOLATED).all()
+    assert e.force_n[:, 3] == pytest.approx([-78.0] * 12)
+    e = estimate(newton_plan(array_at(SQUARE)), loaded_frames(held([7, 8, 9, -79])))
+    assert np.isnan(e.force_n[:, 3]).all()
+    assert e.gauge_kpa[:, 3] / COUNT_KPA == pytest.approx([-79.0] * 12)
+    assert (e.estimate_status & EstimateStatus.TILE_MISSING).all()
+    assert e.grf_at_least_n == pytest.approx([24 - 2.33 * 0.5 * np.sqrt(3)] * 12)
+
+
+@pytest.mark.parametrize("chip", [DATA_SHEET_CHIP, FORUM_CHIP])
+@pytest.mark.parametrize("models", [("unwrap", "static"), ("static",)])
+def test_whatever_a_tile_bears_beyond_its_end_no_sum_is_plausible_and_wrong(
+    chip: tuple[int, int, int, int], models: tuple[str, ...]
+) -> None:
+    """Up to twice the greatest load, counts fall through zero, and on, and on."""
+    info = array_at(SQUARE, chips=[chip] * 4)
+    part = Coefficients.from_words(chip)
+    kpa = np.linspace(115.5, 100.0 + 2 * 30.0, 400)
+    padc = np.full((400, 4), round(float(padc_of_kpa(100.0, 480, part))))
+    padc[:, 0] = np.rint(padc_of_kpa(kpa, 480, part)) % 1024
+    unloaded_kpa = compensate_kpa(padc[0, 1], 480, part.a0, part.b1, part.b2, part.c12)
+    tare = make_tare(4, baseline_kpa=unloaded_kpa, noise_kpa=0.05)
+    tiles = [newton_tile(s, range_kpa=(0.0, 14.0)) for s in info.serials]
+    plan = make_plan(info, make_calibration(*tiles), tare, models=models)
+    e = estimate(plan, loaded_frames(np.zeros((400, 4)), padc=padc))
+    true_n = (kpa - 100.0) / COUNT_KPA
+    known = np.isfinite(e.grf_n)
+    assert not known.any()
+    assert (e.grf_at_least_n <= true_n).all()
+    doubt = EstimateStatus.SATURATED | EstimateStatus.TILE_MISSING
+    assert ((e.estimate_status & doubt) != 0).all()
 
 
 def test_a_temperature_that_was_not_read_is_that_of_the_frame_before_and_none_at_first() -> None:
@@ -153,7 +203,8 @@ def test_a_wrapped_tile_is_a_lower_bound_with_unwrap_and_missing_without(padc: i
     frames.padc[:, 0] = padc
     with_it = estimate(newton_plan(array_at(SQUARE)), frames)
     assert with_it.force_n[:, 0] == pytest.approx([150.0 - 2.33 * 0.5] * 12)
-    assert with_it.grf_n == pytest.approx([177.0 - 2.33 * 0.5] * 12)
+    assert np.isnan(with_it.grf_n).all()
+    assert with_it.grf_at_least_n == pytest.approx([177.0 - 2.33] * 12)  # of four tiles: 1 N
     assert (with_it.estimate_status & EstimateStatus.SATURATED).all()
     without = estimate(newton_plan(array_at(SQUARE), models=("static",)), frames)
     assert np.isnan(without.grf_n).all()

@@ -27,6 +27,7 @@ def columns(true_n: list[float], **given: Any) -> dict[str, np.ndarray]:
         "true_cop_x_m": np.zeros(n),
         "true_cop_y_m": np.zeros(n),
         "cop_x_m": np.zeros(n),
+        "grf_at_least_n": np.full(n, np.nan),
         "cop_y_m": np.zeros(n),
         "cop_sigma_x_m": np.full(n, 0.001),
         "estimate_status": np.zeros(n, dtype=np.uint16),
@@ -49,6 +50,14 @@ def test_saturated_and_missing_frames_are_not_judged_and_saturated_ones_are_coun
     a = accuracy_of(columns([50.0, 10.0, 10.0], grf_n=[30.0, np.nan, 10.5], estimate_status=status))
     assert (a.grf_frames, a.saturated_frames) == (1, 1)
     assert a.grf_mae_n == pytest.approx(0.5)
+
+
+def test_bounds_are_counted_where_they_are_all_that_is_known() -> None:
+    nan = np.nan
+    a = accuracy_of(
+        columns([10.0] * 4, grf_n=[10.0, nan, nan, nan], grf_at_least_n=[99.0, 9.0, 11.0, nan])
+    )
+    assert a.bounds == Covered(2, 1)
 
 
 def test_frames_after_what_was_unseen_are_counted_among_the_others_and_by_themselves() -> None:

@@ -70,6 +70,8 @@ SUMS = (
     "saturated_tile_frames",
     "wrongly",
     "held",
+    "grf_bounds",
+    "grf_bounds_held",
     "after_frames",
 )
 

@@ -67,6 +67,8 @@ def judged(
         saturated_tile_frames=int(bounds.sum()),
         wrongly=int((bounds & below_end).sum()),
         held=int((bounds & held).sum()),
+        grf_bounds=accuracy.bounds.frames,
+        grf_bounds_held=accuracy.bounds.within,
         after_frames=accuracy.after_saturation.frames,
         after_within=accuracy.after_saturation.within,
         after_saturation_mae_n=known(accuracy.after_saturation_mae_n),

@@ -154,6 +154,7 @@ def _saturation(rows: Sequence[Row]) -> list[str]:
             *_place(row),
             f"{row.sums['saturated_frames']} of {row.sums['frames']}",
             *(str(row.sums[name]) for name in ("saturated_tile_frames", "wrongly", "held")),
+            f"{row.sums['grf_bounds_held']} of {row.sums['grf_bounds']}",
             str(row.sums["after_frames"]),
             _worst(row.after_saturation_mae_n, 1.0, 2),
         )
@@ -163,12 +164,8 @@ def _saturation(rows: Sequence[Row]) -> list[str]:
     if not cells:
         return ["No frame was called saturated."]
     head = (
-        "frames",
-        "tile frames",
-        "wrongly",
-        "bound holds",
-        "frames after",
-        "GRF mean abs N there",
+        *("frames", "tile frames", "wrongly", "tile's bound holds", "GRF's bound holds"),
+        *("frames after", "GRF mean abs N there"),
     )
     return table(("scene", "condition", "mode", *head), cells)
 

@@ -61,6 +61,8 @@ class Judged(Facts):
     saturated_tile_frames: int
     wrongly: int
     held: int
+    grf_bounds: int
+    grf_bounds_held: int
     after_frames: int
     after_within: int
     after_saturation_mae_n: float | None

@@ -90,13 +90,13 @@ def reference(plan: EstimationPlan, frames: FrameBatch, row: int) -> Reference:
         padc, tadc = int(frames.padc[row, i]), int(frames.tadc[row, i])
         absolute = pressure_kpa(tile.coefficient_words, padc, tadc)
         faulty = int(frames.status[row, i]) & (1 | 2 | 8 | 32) or NOT_READ in (padc, tadc)
-        if faulty or absolute is None:
-            gauges.append(None)
+        gauge = None if faulty or absolute is None else absolute - mpf(plan.tare.baseline_kpa[i])
+        if gauge is None or gauge < -10:  # no foot pulls like that
+            gauges.append(gauge)
             forces.append(None)
             sigmas.append(None)
             continue
         entry = plan.calibration.of(tile.serial)
-        gauge = absolute - mpf(float(plan.tare.baseline_kpa[i]))
         force, slope, curve_sigma = tile_force(entry, gauge)
         reading = mpf(float(plan.tare.noise_kpa[i])) ** 2
         reading += mpf(float(plan.tare.baseline_sigma_kpa[i])) ** 2
@@ -105,7 +105,7 @@ def reference(plan: EstimationPlan, frames: FrameBatch, row: int) -> Reference:
         saturated = gauge > mpf(entry.range_kpa[1])
         forces.append(force - mpf(BOUND_SIGMAS) * sigma if saturated else force)
         sigmas.append(None if saturated else sigma)
-    if None in forces:
+    if None in forces or None in sigmas:
         return Reference(gauges, forces, sigmas, None, [None, None])
     grf = sum(forces, mpf(0))
     cop = [None, None]

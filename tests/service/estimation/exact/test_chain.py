@@ -70,7 +70,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
     effects: list[Any] = [plan.calibration.of(plan.info.tiles[i].serial).effects for i in domes]
     walls = [e.temperature.wall_per_kpa for e in effects]
     doubt = max(mpf(w.sigma) / mpf(w.value) for w in walls)
-    forces, errors = [], []
+    forces, stated, bounds, errors = [], [], [], []
     for i in domes:
         warm, curve = effects[i].temperature, effects[i].rubber
         counts = [mpf(c) for c in tadc[i]]
@@ -178,6 +178,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             for f, g, b, s in zip(force_n, else_n, beyond, smooth, strict=True)
         ]
         own_n: list[Exact] = [None] * n
+        stated_n = list(force_n)
         for k in range(n):
             if force_n[k] is None:
                 continue
@@ -186,17 +187,19 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             if beyond[k]:
                 common = [each[k] ** 2 for each in (heat_n, rubber_n, unseen_heat_n, crept_n)]
                 sigma = mp.sqrt(own_n[k] ** 2 + mp.fsum(common))
-                force_n[k] = min(force_n[k], else_n[k]) - mpf(BOUND_SIGMAS) * sigma
-                own_n[k] = None
+                force_n[k] = min(force_n[k], else_n[k])
+                stated_n[k] = force_n[k] - mpf(BOUND_SIGMAS) * sigma
         forces.append(force_n)
+        stated.append(stated_n)
+        bounds.append(beyond)
         errors.append([own_n, heat_n, rubber_n, unseen_heat_n, crept_n])
-    return SimpleNamespace(gauge_kpa=gauge, force_n=forces, errors=errors)
+    return SimpleNamespace(
+        gauge_kpa=gauge, force_n=forces, stated_n=stated, is_bound=bounds, errors=errors
+    )
 
 
 def sigma_of(errors: list[Any], k: int, weights: list[Exact]) -> Exact:
     """Of a weighted sum over tiles: what is a tile's own adds as squares, the rest as is."""
-    if any(own[k] is None for own, *_ in errors):
-        return None
     own = mp.fsum((w * e[0][k]) ** 2 for w, e in zip(weights, errors, strict=True))
     shared = [mp.fdot(weights, [e[part][k] for e in errors]) for part in (1, 2, 3, 4)]
     return mp.sqrt(own + mp.fsum(each**2 for each in shared))
@@ -308,14 +311,26 @@ def test_the_full_ladder_is_within_a_nanonewton(plan: EstimationPlan, seed: int)
         assert equations.apart(e.gauge_kpa[:, i], exact.gauge_kpa[i]) < 1e-10
     one = [mpf(1)]
     for i in range(3):
-        assert equations.apart(e.force_n[:, i], exact.force_n[i]) < 1e-9
-        sigma_n = [sigma_of(exact.errors[i : i + 1], k, one) for k in range(ROWS)]
+        assert equations.apart(e.force_n[:, i], exact.stated_n[i]) < 1e-9
+        sigma_n = [
+            None if f is None or b else sigma_of(exact.errors[i : i + 1], k, one)
+            for k, (f, b) in enumerate(zip(exact.force_n[i], exact.is_bound[i], strict=True))
+        ]
         assert equations.apart(e.force_sigma_n[:, i], sigma_n) < 1e-9
     by_frame = list(zip(*exact.force_n, strict=True))
-    grf = [None if None in row else sum(row) for row in by_frame]
+    bound = [any(row) for row in zip(*exact.is_bound, strict=True)]
+    grf = [None if None in row or b else sum(row) for row, b in zip(by_frame, bound, strict=True)]
     assert equations.apart(e.grf_n, grf) < 1e-9
-    sigma_n = [sigma_of(exact.errors, k, 3 * one) for k in range(ROWS)]
+    sigma_n = [None if f is None else sigma_of(exact.errors, k, 3 * one) for k, f in enumerate(grf)]
     assert equations.apart(e.grf_sigma_n, sigma_n) < 1e-9
+    least = []
+    for k, row in enumerate(by_frame):
+        known = [i for i, force in enumerate(row) if force is not None]
+        total = mp.fsum(row[i] for i in known)
+        doubt = sigma_of([exact.errors[i] for i in known], k, one * len(known))
+        least.append(total - mpf(BOUND_SIGMAS) * doubt)
+    assert equations.apart(e.grf_at_least_n, least) < 1e-9
+    assert None in grf
     stated = np.flatnonzero(np.isfinite(e.cop_x_m)).tolist()
     assert len(stated) > 20
     for axis, name in enumerate(("x", "y")):

@@ -13,12 +13,17 @@ STEP_NS = 2_000_000
 
 
 def stances_of(
-    grf_n: list[float], contact: list[int], cuts: tuple[int, ...] = ()
+    grf_n: list[float],
+    contact: list[int],
+    cuts: tuple[int, ...] = (),
+    saturated: tuple[int, ...] = (),
 ) -> tuple[Stance, ...]:
     t_ns = np.arange(len(grf_n), dtype=np.int64) * STEP_NS
     gathered = Stances()
+    hidden = np.isin(np.arange(len(grf_n)), saturated)
+    forces_n, contacts = np.array(grf_n), np.array(contact, dtype=np.uint8)
     for rows in np.split(np.arange(len(grf_n)), sorted(cuts)):
-        gathered.feed(t_ns[rows], np.array(grf_n)[rows], np.array(contact, dtype=np.uint8)[rows])
+        gathered.feed(t_ns[rows], forces_n[rows], contacts[rows], hidden[rows])
     return gathered.finish()
 
 
@@ -49,6 +54,16 @@ def test_a_stance_of_which_no_force_is_known_has_no_peak() -> None:
     (one,) = stances_of([0, np.nan, 0], [0, 1, 0])
     assert np.isnan(one.peak_n)
     assert one.impulse_ns == 0.0
+
+
+def test_a_stance_in_which_a_tile_was_saturated_has_neither_peak_nor_impulse_and_the_next_has() -> (
+    None
+):
+    grf_n = [0, 3, np.nan, 4, 0, 5, 0]
+    hidden, whole = stances_of(grf_n, [0, 1, 1, 1, 0, 1, 0], (3,), saturated=(2,))
+    assert np.isnan([hidden.peak_n, hidden.impulse_ns]).all()
+    assert (hidden.peak_t_ns, hidden.unknown_frames) == (STEP_NS, 1)
+    assert whole.peak_n == 5.0
 
 
 def test_a_foot_in_the_air_has_no_stance() -> None:

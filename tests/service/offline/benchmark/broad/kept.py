@@ -36,6 +36,8 @@ def judged(**changes: Any) -> Judged:
         "saturated_tile_frames": 0,
         "wrongly": 0,
         "held": 0,
+        "grf_bounds": 0,
+        "grf_bounds_held": 0,
         "after_frames": 0,
         "after_within": 0,
         "after_saturation_mae_n": None,
