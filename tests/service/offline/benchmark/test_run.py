@@ -17,7 +17,8 @@ def test_draws_in_processes_of_their_own_give_the_same() -> None:
     )
     tasks = [Task(scene, 1.5, draw, rungs(scene.models)) for draw in (0, 1)]
     there = sorted(drawn(tasks, jobs=2), key=lambda d: d.draw)
-    assert there == [run_draw(task) for task in tasks]
+    # Every digit; a figure of nothing is NaN, which is not equal to itself.
+    assert repr(there) == repr([run_draw(task) for task in tasks])
     assert not any(d.failures for d in there)
 
 
