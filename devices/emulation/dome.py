@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -66,9 +67,11 @@ class Domes:
         load: Load,
         scene: EmulationScene,
         surroundings: Surroundings,
+        *,
         label: str,
         bare: Sequence[bool] = (),
     ) -> None:
+        self._again = partial(Domes, parts, serials, load, label=label, bare=bare)
         self._bare = np.flatnonzero(bare)
         self._parts = parts
         self._load = load
@@ -107,6 +110,10 @@ class Domes:
         self._extending = threading.Lock()
         self._step_s = GRID_S
         self._extend(0)
+
+    def again(self, scene: EmulationScene, surroundings: Surroundings) -> Domes:
+        """The same domes under the same load from its first instant on, with other effects."""
+        return self._again(scene, surroundings)
 
     def pressure_kpa(self, dome: int, t_s: float) -> float:
         """Absolute gas pressure of one dome, or around a bare chip.
@@ -241,17 +248,19 @@ class Domes:
             return force_n
         f = force_n[:, self._flowing]
         half_n = 0.5 * _FLOW_PART * np.diff(f, axis=0, prepend=self._last_flow_n[None])
+        self._last_flow_n = f[-1]
         more = _FLOW_POWER - 1.0
-        flow = more * self._step_s * _FLOW_PART * _FLOW_N_PER_S / self._viscous_n**_FLOW_POWER
-        borne_n = np.empty_like(f)
-        s = self._branch_n
-        for k in range(len(f)):
-            s = s + half_n[k]
-            s = s / (1.0 + flow * np.abs(s) ** more) ** (1.0 / more) + half_n[k]
-            borne_n[k] = s
-        self._branch_n, self._last_flow_n = s, f[-1]
         apparent_n = force_n.copy()
-        apparent_n[:, self._flowing] = np.maximum(f - borne_n, 0.0)
+        for i, dome in enumerate(self._flowing.tolist()):
+            per_s = more * _FLOW_PART * _FLOW_N_PER_S / float(self._viscous_n[i]) ** _FLOW_POWER
+            flow, root = per_s * self._step_s, -1.0 / more
+            s, borne_n = float(self._branch_n[i]), []
+            for half in half_n[:, i].tolist():  # a call of numpy for each step would be dear
+                s += half
+                s = s * (1.0 + flow * abs(s) ** more) ** root + half
+                borne_n.append(s)
+            self._branch_n[i] = s
+            apparent_n[:, dome] = np.maximum(f[:, i] - borne_n, 0.0)
         return apparent_n
 
     def _loading_gains(self, force_n: Floats) -> Floats:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from devices.arrays import Floats
 from devices.chips.mpl115a2 import CONVERSION_MAX_NS, PRESSURE_MAX_KPA, Coefficients, padc_of_kpa
 
 
@@ -58,6 +59,12 @@ class DomePart:
     changes by 7.5 N/s; faster loads make it wider."""
     kappa: float = 0.4 / 1.4
     """(gamma - 1) / gamma of the gas: air's, unless vapours of the casting are in it."""
+
+    def felt_n(self, kpa: Floats) -> Floats:
+        """The slow force that would give a pressure, at the temperature of the sealing."""
+        stretched = 1.0 + self.wall_per_kpa * (kpa - self.seal_kpa)
+        lost = 1.0 - self.seal_kpa / (kpa * stretched)
+        return np.asarray(self.knee_n * np.expm1(lost / self.stiffening))
 
 
 def draw_chip(serial: str, parts_seed: int) -> ChipPart:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -41,6 +41,9 @@ from devices.scene.hardware import ServoScene
 _FORESIGHT_S = 0.4  # a thread that is late by less delays no sample
 _GIVE_WAY_S = 0.001
 _LOOKS_MAX = 10
+
+Effect = Literal["gas", "rubber", "hysteresis", "surroundings"]
+"""What makes a dome's pressure differ from the static curve's; the last: warmth, head of water."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +106,13 @@ class World:
         domes = [dome_of(family, serial, parts_seed) for serial in serials]
         # By scene too: a tile on the bench and in the field must not see the same noise again.
         draw = f"{scene.name}/{seed}"
-        surroundings = self._surroundings(draw)
+        self._around = surroundings = self._surroundings(draw)
         bare = [tile.reference for tile in scene.tile]
         self._domes = Domes(
-            domes, serials, self.ground, scene.emulation, surroundings, draw, bare=bare
+            domes, serials, self.ground, scene.emulation, surroundings, label=draw, bare=bare
         )
+        self.domes = tuple(domes)
+        """What the domes are like, to judge an estimate by."""
         self._faults = Faults(scene.fault)
         self._front_ends: list[FrontEnd] = []
 
@@ -248,6 +253,28 @@ class World:
             true_cop_y_m=(weight * self._positions_m[:, 1]).sum(axis=1),
             true_angle_rad=angle_rad,
         )
+
+    def dome_kpa(self, t_mono_ns: Times, without: Collection[Effect] = ()) -> Floats:
+        """True pressure in each dome at rising instants, as it would be without some effects.
+
+        Computed anew from the scene's first instant on. Without "gas" it is what each instant's
+        load would settle at.
+
+        Returns:
+            (n, tiles); of a bare tile what is around it.
+        """
+        emulation = self.scene.emulation
+        off: dict[str, object] = {name: False for name in without if name != "surroundings"}
+        if "surroundings" in without:
+            off |= {"temperature_step_k": 0.0, "head_kpa": 0.0}
+        emulation = emulation.model_copy(update=off)
+        around = Surroundings(emulation) if "surroundings" in without else self._around
+        domes = self._domes.again(emulation, around)
+        pressed = [
+            [domes.pressure_kpa(dome, t_s) for dome in range(len(self.domes))]
+            for t_s in self._seconds(t_mono_ns).tolist()
+        ]
+        return np.array(pressed).reshape(len(t_mono_ns), len(self.domes))
 
     @property
     def mill(self) -> Mill | None:

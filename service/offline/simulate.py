@@ -90,27 +90,27 @@ class Simulation:
         self._options = options
         self.pressed = options.foot.pressed_on(scene)
         self._clock = VirtualClock()
-        self._world = options.foot.world(scene, self._clock, self.pressed)
-        duration_ns = _duration_ns(options, self._world.ground.duration_s)
+        self.world = options.foot.world(scene, self._clock, self.pressed)
+        duration_ns = _duration_ns(options, self.world.ground.duration_s)
         ready = make_ready(
-            open_bus("emulated", self._world.i2c_adapter),
+            open_bus("emulated", self.world.i2c_adapter),
             scene,
             self._clock,
             schedule=options.schedule,
-            recovery=open_recovery_lines(scene, self._clock, self._world),
-            reference_n=open_reference_sensor(scene, self._clock, self._world, stack),
+            recovery=open_recovery_lines(scene, self._clock, self.world),
+            reference_n=open_reference_sensor(scene, self._clock, self.world, stack),
         )
         self.choice = ready.choice
         self.unmeasured = ready.unmeasured
         self.array = ready.array
         # The machine was switched on earlier, the session and its scene begin now.
-        self._world.begin()
+        self.world.begin()
         begin_ns = self._clock.now_ns()
         self._end_ns = begin_ns + duration_ns
         anchor = UtcAnchor.of(begin_ns, START_NS, clock_set=True)
         servo = None
         if scene.servo is not None:
-            servo = _polled_servo(self._world, scene.servo, begin_ns, stack)
+            servo = _polled_servo(self.world, scene.servo, begin_ns, stack)
         self.rate_hz = min(scene.rate_hz or ready.predicted_hz, ready.predicted_hz)
         self.info = describe(
             scene,
@@ -133,14 +133,14 @@ class Simulation:
 
     def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
         """Frames with what the emulation adds: truth if asked for, the mill's notes."""
-        mill = self._world.mill
+        mill = self.world.mill
         batches = self.acquisition.run(lambda: self._clock.now_ns() >= self._end_ns)
         # Nothing is shown live, so frames may gather: batching does not change a bit of the result.
         while gathered := list(islice(batches, _GATHER)):
             batch = FrameBatch.concatenate(gathered)
             extra: dict[str, npt.NDArray[Any]] = {}
             if self._options.truth:
-                extra |= asdict(self._world.truth(batch.t_mono_ns))
+                extra |= asdict(self.world.truth(batch.t_mono_ns))
             if mill is not None:
                 extra |= mill.notes(batch.t_mono_ns)
                 # While nothing is pressed, the sensor's reading is no reference for any tile.

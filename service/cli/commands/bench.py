@@ -12,6 +12,7 @@ import typer
 
 from devices.errors import UsageError, needs_extra
 from devices.scene.file import load_scene
+from service.cli.commands.bench_broad import ARRAYS, QUICK_ARRAYS, bench_broad, is_broad
 from service.cli.options import (
     JsonOption,
     check_emulated,
@@ -37,7 +38,10 @@ REPETITIONS, QUICK_REPETITIONS = 5, 3
 @needs_extra("server", "`foottile bench`")
 def bench_command(
     out: Annotated[
-        Path, typer.Option(help="Folder for bench.json, bench.md and bench.png; made if absent.")
+        Path,
+        typer.Option(
+            help="Folder for bench.json, bench.md and bench.png (broad.*); made if absent."
+        ),
     ],
     scene: Annotated[
         list[str] | None,
@@ -86,6 +90,21 @@ def bench_command(
             help="Correlation time of the emulated noise, instead of the scene's.",
         ),
     ] = None,
+    family: Annotated[
+        str,
+        typer.Option(
+            help="Of emulated parts: default; or broad: arrays of domes nobody has seen, each "
+            f"with its own bench, {ARRAYS} unless --draws says otherwise. A run that was broken "
+            "off goes on, if its folder is the same."
+        ),
+    ] = "default",
+    seeds: Annotated[
+        str,
+        typer.Option(
+            help="Of the broad family's arrays: development; or judgement, from which no constant "
+            "of the estimator may be set."
+        ),
+    ] = "development",
     check_goals: Annotated[
         bool, typer.Option("--check-goals", help="Exit code 3 if a goal is not met.")
     ] = False,
@@ -98,6 +117,27 @@ def bench_command(
     each of its models. Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but something could
     not be measured (or, with --check-goals, a goal is not met).
     """
+    if is_broad(
+        family,
+        {
+            "--scene": scene,
+            "--seconds": seconds,
+            "--frames": frames,
+            "--correlated-ms": correlated_ms,
+            "--whole-only": whole_only or None,
+        },
+    ):
+        with _folder(out) as folder:
+            bench_broad(
+                folder,
+                arrays=draws or (QUICK_ARRAYS if quick else ARRAYS),
+                seeds=seeds,
+                jobs=jobs or os.cpu_count() or 1,
+                repeatability=repeatability,
+                check_goals=check_goals,
+                as_json=as_json,
+            )
+        return
     from service.offline.benchmark.plot import plot_bench
     from service.offline.benchmark.report import markdown
     from service.offline.benchmark.run import BenchOptions, run_bench

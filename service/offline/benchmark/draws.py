@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.chips.compensation import Compensation
+from devices.emulation.world import World
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.file import Scene
@@ -127,7 +128,7 @@ LAGS_MS: Mapping[str, float] = {"live": 10.0, "offline": 100.0}
 SECONDS = 20.0
 """Length of a scene that has no end of its own."""
 
-_TRUTH = tuple(name for name in COMPARED if name.startswith("true_"))
+_TRUTH = (*(name for name in COMPARED if name.startswith("true_")), "true_force_n")
 
 
 @dataclass(frozen=True)
@@ -192,14 +193,24 @@ def record(
     Raises:
         FootTileError: scene or calibration is not usable.
     """
-    serials = [tile.serial for tile in scene.tile if not tile.reference]
     calibration = find_calibration(
         scene.calibration,
-        serials,
+        [tile.serial for tile in scene.tile if not tile.reference],
         parts_seed=draw,
         family=scene.emulation.family,
         progress=progress,
     )
+    return recorded(scene, seconds, draw, calibration)[0]
+
+
+def recorded(
+    scene: Scene, seconds: float | None, draw: int, calibration: Calibration
+) -> tuple[Recording, World]:
+    """Record a scene with tiles of a draw, whose calibration is known, and where it came from.
+
+    Raises:
+        FootTileError: the scene is not usable.
+    """
     with ExitStack() as stack:
         foot = EmulatedFoot(seed=draw, parts_seed=draw)
         options = SimulateOptions(scene, seconds, otherwise_s=SECONDS, truth=True, foot=foot)
@@ -208,16 +219,28 @@ def record(
             (frames, {name: extra[name] for name in _TRUTH})
             for frames, extra in simulation.pieces()
         ]
-    return Recording(
+    recording = Recording(
         simulation.info,
         FrameBatch.concatenate([frames for frames, _ in pieces]),
         joined([truth for _, truth in pieces]),
         calibration,
     )
+    return recording, simulation.world
 
 
 def estimated(recording: Recording, models: tuple[str, ...], lag_ms: float) -> Accuracy:
     """How far off the estimates of a recording are, tared from its lead.
+
+    Raises:
+        FootTileError: no estimate with these models.
+    """
+    return accuracy_of(estimates_of(recording, models, lag_ms, COMPARED), lag_ms=lag_ms)
+
+
+def estimates_of(
+    recording: Recording, models: tuple[str, ...], lag_ms: float, names: Sequence[str]
+) -> dict[str, npt.NDArray[Any]]:
+    """Columns of a recording's estimates and truth, one row per frame.
 
     Raises:
         FootTileError: no estimate with these models.
@@ -227,8 +250,8 @@ def estimated(recording: Recording, models: tuple[str, ...], lag_ms: float) -> A
     judged: list[Mapping[str, npt.NDArray[Any]]] = []
     for frames, columns in stream.run([(recording.frames, recording.truth)]):
         columns["t_ns"] = frames.t_ns
-        judged.append({name: np.asarray(columns[name]) for name in COMPARED})
-    return accuracy_of(joined(judged), lag_ms=lag_ms)
+        judged.append({name: np.asarray(columns[name]) for name in names})
+    return joined(judged)
 
 
 def run_draw(task: Task) -> Drawn:

@@ -30,6 +30,10 @@ ERRORS = (
     ("COP mean mm", "cop_mean_m", 1e3, 2),
     ("COP 95th percentile mm", "cop_p95_m", 1e3, 2),
 )
+_WORDS = {"rung", "mode", "ladder", "of the whole ladder", "met"} | {
+    *("scene", "condition", "figure", "model", "of", "reason")
+}
+"""Heads of columns that are words, not figures."""
 BESIDE = (
     ("in flight, mean N", "flight_mean_n", 1.0, 3),
     ("in flight, mean abs N", "flight_mae_n", 1.0, 3),
@@ -192,6 +196,5 @@ def draws_text(n: int) -> str:
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """A table in Markdown: text to the left, figures to the right."""
-    words = {"rung", "mode", "ladder", "of the whole ladder", "met"}
-    rule = ["---" if title in words else "--:" for title in head]
+    rule = ["---" if title in _WORDS else "--:" for title in head]
     return [f"| {' | '.join(cells)} |" for cells in (head, rule, *rows)]

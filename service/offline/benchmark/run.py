@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import platform
-import signal
-import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +29,7 @@ from service.offline.benchmark.draws import (
     time_rungs,
 )
 from service.offline.benchmark.figures import Goal, SceneFigures, Spread, goals_of, measured_of
+from service.offline.benchmark.processes import spread
 from service.offline.benchmark.rungs import Rung, absent, rungs
 from service.version import SOFTWARE
 
@@ -179,62 +174,11 @@ def _is_assumed(recording: Recording) -> bool:
 
 def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:
     """Every draw as it is finished."""
-    if jobs == 1:
-        yield from map(run_draw, tasks)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ExitStack() as stack:
-        with _interrupts_wait():
-            pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_when_told)
-            stack.enter_context(pool)
-            stack.push(partial(_end_early, pool))
-            futures = {pool.submit(_run_draw, task): task for task in tasks}
-        for future in as_completed(futures):
-            try:
-                yield future.result()
-            except Exception as error:  # one that was killed breaks the pool: all draws left
-                draw = futures[future].draw
-                yield Drawn(draw, 0, {}, (Failure(f"draw {draw}", reason(error)),))
-
-
-def _end_early(pool: ProcessPoolExecutor, kind: type[BaseException] | None, *_: object) -> None:
-    """After an error nobody waits for the draws that are left."""
-    if kind is not None:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-
-
-@contextmanager
-def _interrupts_wait() -> Iterator[None]:
-    """Processes that are started meanwhile know no Ctrl-C: we tell them when to end.
-
-    One that comes meanwhile is not lost, and finds no process half-started.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit it
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        signal.signal(signal.SIGINT, handler)
-    if came:
-        raise KeyboardInterrupt
-
-
-def _end_when_told() -> None:
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-
-
-def _run_draw(task: Task) -> Drawn:
-    try:
-        return run_draw(task)
-    except SystemExit:
-        os._exit(1)  # what it had open is cleaned up; the pool would give it another draw
+    for task, draw in spread(run_draw, tasks, jobs):
+        if isinstance(draw, Drawn):
+            yield draw
+        else:
+            yield Drawn(task.draw, 0, {}, (Failure(f"draw {task.draw}", reason(draw)),))
 
 
 def machine() -> str:

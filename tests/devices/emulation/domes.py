@@ -54,7 +54,7 @@ def domes_of(
     parts = parts or (PART,)
     serials = [f"S{i}" for i in range(len(parts))]
     load = Pressing(force, len(parts))
-    return Domes(parts, serials, load, scene, Surroundings(scene), label)
+    return Domes(parts, serials, load, scene, Surroundings(scene), label=label)
 
 
 def kpa_at(domes: Domes, t_s: npt.ArrayLike, dome: int = 0) -> Floats:

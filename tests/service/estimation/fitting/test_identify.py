@@ -76,7 +76,7 @@ def pressed_by_dome(serial: str, **effects: bool) -> Callable[[np.ndarray, np.nd
         off = {"gas": False, "rubber": False, "hysteresis": False}
         scene = EmulationScene.model_validate(off | effects)
         parts = [draw_dome(serial, 0)]
-        domes = Domes(parts, [serial], Spindle(), scene, Surroundings(scene), "bench")
+        domes = Domes(parts, [serial], Spindle(), scene, Surroundings(scene), label="bench")
         return np.array([domes.pressure_kpa(0, float(t)) for t in t_s])
 
     return press

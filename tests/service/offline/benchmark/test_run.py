@@ -17,7 +17,7 @@ def test_draws_in_processes_of_their_own_give_the_same() -> None:
     )
     tasks = [Task(scene, 1.5, draw, rungs(scene.models)) for draw in (0, 1)]
     there = sorted(drawn(tasks, jobs=2), key=lambda d: d.draw)
-    # Every digit; a figure of nothing is NaN, which is not equal to itself.
+    # By their texts: what is not known in either is no difference.
     assert repr(there) == repr([run_draw(task) for task in tasks])
     assert not any(d.failures for d in there)
 

@@ -1,0 +1,97 @@
+"""`foottile bench --family broad`: arrays of domes nobody has seen, and quantiles of errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import get_args
+
+import typer
+
+from devices.errors import UsageError
+from devices.scene.emulated import Family
+from service.cli.options import json_text, print_json, remark, say
+
+ARRAYS, QUICK_ARRAYS = 200, 3
+
+
+def is_broad(family: str, given: Mapping[str, object]) -> bool:
+    """Whether the broad family is asked for.
+
+    Args:
+        family: its name.
+        given: options that go with the default family only; None where not given.
+
+    Raises:
+        UsageError: there is no such family, or an option does not go with it.
+    """
+    known = get_args(Family)
+    if family not in known:
+        raise UsageError(f"--family {family}", expected=" or ".join(known))
+    asked = [option for option, value in given.items() if value is not None]
+    if family == "broad" and asked:
+        raise UsageError(f"{', '.join(asked)} and --family broad", expected="one or the other")
+    return family == "broad"
+
+
+def bench_broad(
+    folder: Path,
+    *,
+    arrays: int,
+    seeds: str,
+    jobs: int,
+    repeatability: float | None,
+    check_goals: bool,
+    as_json: bool,
+) -> None:
+    """Run the arrays that have no result in the folder yet, and write broad.json, .md and .png.
+
+    Raises:
+        UsageError: there are no such seeds.
+        Exit: 3, if something gave no result, or with `check_goals` a goal is not met.
+    """
+    from service.offline.benchmark.broad.figures import goals_of, models_of, rows_of
+    from service.offline.benchmark.broad.plot import plot_broad
+    from service.offline.benchmark.broad.report import markdown
+    from service.offline.benchmark.broad.results import Seeds
+    from service.offline.benchmark.broad.run import BroadOptions, run_broad
+    from service.offline.plots import new_figure
+    from storage.durable import write_whole
+
+    known: dict[str, Seeds] = {name: name for name in get_args(Seeds)}
+    if seeds not in known:
+        raise UsageError(f"--seeds {seeds}", expected=" or ".join(known))
+    new_figure(1.0, 1.0)  # says what is missing before anything takes time
+    bench = run_broad(BroadOptions(arrays, known[seeds], jobs, folder, repeatability), remark)
+    text = markdown(bench)
+    goals = goals_of(bench.results)
+    content = {
+        "software": bench.software,
+        "code": bench.made_by,
+        "made": bench.made,
+        "machine": bench.machine,
+        "seeds": seeds,
+        "arrays": len(bench.results),
+        "repeatability": repeatability,
+        "goals": goals,
+        "rows": rows_of(bench.results),
+        "models": models_of(bench.results),
+        "results": [result.model_dump() for result in bench.results],
+    }
+    write_whole(folder / "broad.json", json_text(content).encode())
+    write_whole(folder / "broad.md", text.encode())
+    write_whole(folder / "broad.png", plot_broad(bench.results))
+    if as_json:
+        print_json(content)
+    else:
+        say(text)
+        say(f"{folder}: broad.json, broad.md, broad.png")
+    refused = [(f"array {r.number}, {f.what}", f.why) for r in bench.results for f in r.refusals]
+    for what, why in [*refused, *((f.what, f.why) for f in bench.lost)]:
+        remark(f"no result: {what}: {why}")
+    missed = [goal for goal in goals if not goal.met]
+    if check_goals:
+        for goal in missed:
+            remark(f"goal not met: {goal.mode}: {goal.figure}: {goal.value:.3g}")
+    if refused or bench.lost or (check_goals and missed):
+        raise typer.Exit(3)

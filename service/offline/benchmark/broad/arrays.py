@@ -1,0 +1,159 @@
+"""One array: drawn, pressed on its own bench, run through every scene and condition, and judged."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from devices.emulation.parts import random_of
+from devices.scene.file import Scene, load_scene
+from service.estimation.calibration import Calibration
+from service.offline.benchmark.broad.judge import JUDGED, judged, surely_below_end
+from service.offline.benchmark.broad.results import (
+    FIRST_SEED,
+    ArrayResult,
+    Judged,
+    Refusal,
+    Seeds,
+    Tile,
+    key_of,
+)
+from service.offline.benchmark.broad.tiles import tiles_of
+from service.offline.benchmark.draws import LAGS_MS, estimates_of, reason, recorded
+from service.offline.calibrations import BENCH, BENCH_REFERENCE, find_calibration
+
+SCENES = ("rolling", "poppy", "mud")
+SERIALS = ("T01", "T02", "T03", "T04")
+"""Of all three scenes: the same tiles in each."""
+ROLLING_S = 12.0
+"""One pass of the arc, back, and half another."""
+HEAVY = "heavy"
+_HEAVY = {"mass_kg": 3.3, "leg_n_per_m": 2250.0, "strength_n_per_cm3": 1.0}
+"""A leg of 3.3 kg on firmer poppy seeds: 28 N come within 50 ms, which is near or beyond the end of
+the softer domes."""
+CLEAN = "clean"
+REPEATABILITY_MAX = 0.03
+CONDITIONS: Mapping[str, str] = {
+    CLEAN: "repeatability 0, drift 0, white noise",
+    "repeatability": "loadings differ as they did on the array's bench, by 0 to 3 %",
+    "correlated": "noise correlated over 10 ms, of the same variance",
+    "drift": "gains have drifted by up to 1 % since the bench",
+}
+
+
+@dataclass(frozen=True)
+class ArrayTask:
+    """Which array, and how often its loadings are alike; None: drawn."""
+
+    number: int
+    seeds: Seeds
+    made_by: str
+    repeatability: float | None = None
+
+    @property
+    def seed(self) -> int:
+        """Of its parts, noise and grounds."""
+        return FIRST_SEED[self.seeds] + self.number
+
+
+def run_array(task: ArrayTask) -> ArrayResult:
+    """Everything of one array; what fails is reported, not raised."""
+    began_s = time.process_time()
+    repeatability = task.repeatability
+    if repeatability is None:
+        drawn = random_of(f"repeatability/{task.seed}").uniform(0.0, REPEATABILITY_MAX)
+        repeatability = round(float(drawn), 6)
+    calibration, refusals = _bench(task.seed, repeatability)
+    bench_s = time.process_time() - began_s
+    found: dict[str, Judged] = {}
+    tiles: tuple[Tile, ...] = ()
+    if calibration is not None:
+        for scene, condition in _cases(repeatability):
+            try:
+                found_here, tiles_here = _case(scene, condition, task.seed, calibration)
+            except Exception as error:
+                refusals.append(Refusal(what=f"{scene.name}, {condition}", why=reason(error)))
+            else:
+                found |= found_here
+                tiles = tiles_here or tiles
+    return ArrayResult(
+        number=task.number,
+        seeds=task.seeds,
+        made_by=task.made_by,
+        repeatability=repeatability,
+        cpu_bench_s=bench_s,
+        cpu_scenes_s=time.process_time() - began_s - bench_s,
+        tiles=tiles,
+        judged=found,
+        refusals=tuple(refusals),
+    )
+
+
+def _bench(seed: int, repeatability: float) -> tuple[Calibration | None, list[Refusal]]:
+    """The array's calibration, if no tile is refused."""
+    entries: list[Calibration] = []
+    refusals = []
+    with tempfile.TemporaryDirectory(prefix="foottile-broad-") as work:
+        for serial in SERIALS:
+            try:
+                entries.append(
+                    find_calibration(
+                        BENCH,
+                        [serial],
+                        parts_seed=seed,
+                        family="broad",
+                        repeatability=repeatability,
+                        cache=Path(work),
+                    )
+                )
+            except Exception as error:
+                # Without the folder, which is another one each time.
+                why = re.sub(r"\S*/(?=bench-)", "", reason(error))
+                refusals.append(Refusal(what=f"bench of {serial}", why=why))
+    if refusals:
+        return None, refusals
+    tiles = tuple(tile for entry in entries for tile in entry.tiles)
+    whole = Calibration(name=BENCH, reference=BENCH_REFERENCE, date=entries[0].date, tiles=tiles)
+    return whole, []
+
+
+def _cases(repeatability: float) -> Iterator[tuple[Scene, str]]:
+    """Every scene under every condition; the heavy leg under one."""
+    changes: Mapping[str, Mapping[str, Any]] = {
+        CLEAN: {},
+        "repeatability": {"repeatability": repeatability},
+        "correlated": {"correlated_ms": 10.0},
+        "drift": {"gain_drift": 0.01},
+    }
+    for condition in CONDITIONS:
+        for name in SCENES:
+            yield _emulated(load_scene(name), **changes[condition]), condition
+    poppy = load_scene("poppy")
+    ground = poppy.ground.model_copy(update=_HEAVY)
+    yield _emulated(poppy.model_copy(update={"ground": ground})), HEAVY
+
+
+def _emulated(scene: Scene, **changes: Any) -> Scene:
+    """With broad parts, and without the servo, whose angle no figure here needs."""
+    emulation = scene.emulation.model_copy(update={"family": "broad", **changes})
+    return scene.model_copy(update={"emulation": emulation, "servo": None})
+
+
+def _case(
+    scene: Scene, condition: str, seed: int, calibration: Calibration
+) -> tuple[dict[str, Judged], tuple[Tile, ...]]:
+    """One recording in both modes; of clean poppy seeds also what the tiles are."""
+    seconds = ROLLING_S if scene.name == "rolling" else None
+    recording, world = recorded(scene, seconds, seed, calibration)
+    below_end = surely_below_end(recording, world)
+    found = {}
+    for mode, lag_ms in LAGS_MS.items():
+        columns = estimates_of(recording, scene.models, lag_ms, JUDGED)
+        found[key_of(scene.name, condition, mode)] = judged(columns, below_end, lag_ms)
+    is_reference = scene.name == "poppy" and condition == CLEAN
+    return found, tiles_of(recording, world, seed) if is_reference else ()

@@ -1,0 +1,77 @@
+"""Quantiles over arrays, coverage that is pooled, and models that tiles lose or are given."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from service.offline.benchmark.broad.figures import (
+    error_goals,
+    goals_of,
+    models_of,
+    rows_of,
+    sigma_goals,
+)
+from service.offline.benchmark.broad.results import Phase
+from tests.service.offline.benchmark.broad.kept import TILE, judged, result
+
+
+def test_errors_are_quantiles_over_arrays_without_their_signs() -> None:
+    rows = rows_of([result(n, grf_mae_n=0.01 * n, flight_mean_n=-0.01 * n) for n in range(101)])
+    first = rows[0]
+    assert (first.scene, first.condition, first.mode) == ("rolling", "clean", "live")
+    for name in ("grf_mae_n", "flight_mean_n"):
+        assert first.errors[name].median == pytest.approx(0.5)
+        assert first.errors[name].p95 == pytest.approx(0.95)
+    assert len(rows) == 2 * (3 * 4 + 1)
+
+
+def test_coverage_is_pooled_over_frames_and_its_worst_is_of_arrays() -> None:
+    few = Phase(frames=10, within=0, sigma2=0.1, error2=0.4)
+    bad = judged().phases | {"loading": few}
+    row = rows_of([result(), result(phases=bad)])[0]
+    assert row.coverage["loading"].share == pytest.approx(95 / 110)
+    assert row.coverage["all"].share == pytest.approx((380 + 285) / (400 + 310))
+    assert row.coverage_of_arrays["loading"].p5 == pytest.approx(0.05 * 0.95)
+    assert row.sigma_over_rms["loading"].median == pytest.approx((1.0 + 0.5) / 2)
+
+
+def test_an_array_that_gave_nothing_in_a_scene_is_not_counted_there() -> None:
+    silent = result().model_copy(update={"judged": {}})
+    assert rows_of([result(), silent])[0].errors["grf_mae_n"].n == 1
+    assert rows_of([silent]) == []
+
+
+def test_a_tile_loses_a_model_only_if_its_effect_is_too_great_to_do_without() -> None:
+    without = TILE.model_copy(update={"given": ("rubber", "temperature")})
+    counted = {m.name: m for m in models_of([result(tiles=(TILE, without))])}
+    assert (counted["gas"].needed, counted["gas"].lost) == (2, 1)
+    assert (counted["hysteresis"].needed, counted["hysteresis"].lost) == (0, 0)
+    assert (counted["temperature"].needed, counted["temperature"].lost) == (2, 0)
+
+
+def test_a_tile_without_an_effect_that_is_given_its_model_is_counted() -> None:
+    nothing = {**TILE.effect_n, "rubber": 0.0}
+    rigid = TILE.model_copy(update={"effect_n": nothing, "lacks": ("rubber",)})
+    (rubber,) = [m for m in models_of([result(tiles=(rigid,))]) if m.name == "rubber"]
+    assert (rubber.needed, rubber.lacking, rubber.invented) == (0, 1, 1)
+
+
+def test_what_is_good_meets_every_goal_and_what_is_not_misses_its_own() -> None:
+    given = ("gas", "rubber", "temperature")
+    good = result(tiles=(TILE, TILE.model_copy(update={"lacks": ("hysteresis",), "given": given})))
+    assert [goal.figure for goal in goals_of([good]) if not goal.met] == []
+    bad = result(tiles=good.tiles, grf_mae_n=0.6, wrongly=3)
+    missed = {goal.figure for goal in error_goals([bad]) if not goal.met}
+    assert "mud: GRF mean absolute error, N, median" in missed
+    assert all("GRF mean absolute error" in figure for figure in missed)
+    wrongly = [goal for goal in sigma_goals([bad]) if not goal.met]
+    assert {goal.value for goal in wrongly} == {3.0}
+    assert len(wrongly) == len(rows_of([bad]))
+
+
+def test_without_arrays_nothing_is_met() -> None:
+    goals = goals_of([])
+    assert goals
+    assert all(math.isnan(goal.value) and not goal.met for goal in goals)
