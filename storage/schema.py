@@ -110,7 +110,7 @@ ESTIMATES = (
         "bits",
         "1 saturated, 2 extrapolated, 4 outlier_replaced, 8 gap, 16 cop_masked, 32 tile_missing, "
         "64 assumed_scale, 128 tare_old, 256 over_rated, 512 tare_lost, "
-        "1024 after_saturation",
+        "1024 after_saturation, 2048 stuck, 4096 clipped, 8192 baseline_lost",
     ),
 )
 """What the estimator makes of it: `service.estimation.estimates.Estimates`."""

@@ -50,6 +50,12 @@ class EstimateStatus(IntFlag):
     AFTER_SATURATION = 1024
     """What a tile bore unseen, saturated or away, has left more in its sigma than a reading's
     noise."""
+    STUCK = 2048
+    """A tile repeats itself for longer than its noise allows: nothing is known of its force."""
+    CLIPPED = 4096
+    """A tile's readings end at an edge within its chip's range: its force is a lower bound."""
+    BASELINE_LOST = 8192
+    """A tile reads less than without a load, or has warmed or cooled and no model corrects it."""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ from service.estimation.models.unwrap import unwrap
 from service.estimation.plan import SIGMAS, SUCTION_MAX_KPA, TARE_OLD_NS, EstimationPlan
 from service.estimation.tare.tare import has_warmed
 from service.estimation.unseen import EVENLY, Unseen, farthest, was_away
+from service.estimation.watch.baseline import LOST_KPA
+from service.estimation.watch.watch import WatchState
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,7 @@ class ApparentForces(Arrays):
         gas_n: standard uncertainty that the gas' correction leaves, with the correction's sign: all
             tiles err to the same side.
         unseen_gas_n: standard uncertainty from what the gas did unseen, with a sign likewise.
+        warm_n: what warmth that no model corrects makes of the force, signed; likewise.
         sampled_ns: when each tile was sampled, on the monotonic clock.
         beyond: beyond the calibrated range, or the chip's: a lower bound.
         guess_n: what the force may be where there is only that bound; NaN elsewhere.
@@ -115,6 +118,7 @@ class ApparentForces(Arrays):
     sigma_n: Floats
     gas_n: Floats
     unseen_gas_n: Floats
+    warm_n: Floats
     sampled_ns: Times
     beyond: Bools
     guess_n: Floats
@@ -133,6 +137,7 @@ class LowerState:
     gas_else: GasState | None = None
     """After the pressures farthest from those that were taken; None: nothing was unseen."""
     skew: skew.SkewState | None = None
+    watch: WatchState = WatchState()  # noqa: RUF009  # frozen, so one for all is safe
 
 
 def tile_kpa(plan: EstimationPlan, frames: FrameBatch) -> Floats:
@@ -165,6 +170,9 @@ def apparent_forces(
     """
     ladder, columns = plan.ladder, plan.bearing
     status = _frame_status(plan, frames, kpa, broken)
+    stuck, edge_kpa, watched = plan.watch.readings(frames, kpa, state.watch)
+    status[stuck.any(axis=1)] |= np.uint16(EstimateStatus.STUCK)
+    kpa = np.where(stuck, np.nan, kpa)
     if ladder.denoise and neighbours is not None:
         kpa, replaced = despiked(kpa, *neighbours, plan.tare.noise_kpa)
         status[replaced[:, columns].any(axis=1)] |= np.uint16(EstimateStatus.OUTLIER_REPLACED)
@@ -200,9 +208,11 @@ def apparent_forces(
     if torn.any():
         bearing_kpa = np.where(torn, np.nan, bearing_kpa)
     # The chip's range is judged by what was read, the calibrated one by what the gas settles at.
-    hidden = kpa[:, columns] > plan.chip_end_kpa
+    end_kpa = np.minimum(plan.chip_end_kpa, edge_kpa)
+    hidden = kpa[:, columns] > end_kpa
+    status[(kpa[:, columns] > edge_kpa).any(axis=1)] |= np.uint16(EstimateStatus.CLIPPED)
     # As if the chip's end had been read, with what warmth and surroundings have put into it.
-    least_kpa = bearing_kpa - np.where(hidden, kpa[:, columns] - plan.chip_end_kpa, 0.0)
+    least_kpa = bearing_kpa - np.where(hidden, kpa[:, columns] - end_kpa, 0.0)
     settled_kpa = bearing_kpa
     gas_kpa = unseen_kpa = np.zeros(bearing_kpa.shape)
     if ladder.gas is not None:
@@ -216,6 +226,13 @@ def apparent_forces(
     guess_kpa = settled_kpa - plan.baseline_kpa
     settled_kpa = np.where(hidden, least_kpa, settled_kpa)
     static_kpa = settled_kpa - plan.baseline_kpa
+    warmed_kpa, watched = plan.watch.warmed_kpa(frames, sampled_ns, watched)
+    lost_kpa, watched = plan.watch.lost_kpa(
+        np.where(hidden, np.nan, static_kpa), baseline_variance, warmed_kpa, sampled_ns, watched
+    )
+    baseline_variance = baseline_variance + lost_kpa**2
+    astray = (lost_kpa > 0.0) | (np.abs(warmed_kpa) > LOST_KPA)
+    status[astray.any(axis=1)] |= np.uint16(EstimateStatus.BASELINE_LOST)
     static = ladder.curves.force(static_kpa)
     unknown = np.isnan(kpa[:, columns] if plan.tare.is_lost else static.force_n)
     status[unknown.any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
@@ -245,6 +262,7 @@ def apparent_forces(
         sigma_n=np.sqrt(static.slope_n_per_kpa**2 * baseline_variance + static.fit_sigma_n**2),
         gas_n=static.slope_n_per_kpa * ladder.gas_misfit * gas_kpa,
         unseen_gas_n=static.slope_n_per_kpa * unseen_kpa,
+        warm_n=static.slope_n_per_kpa * warmed_kpa,
         sampled_ns=sampled_ns,
         beyond=beyond,
         guess_n=guess_n,
@@ -252,7 +270,7 @@ def apparent_forces(
         run=run,
         status=status,
     )
-    return forces, state
+    return forces, replace(state, watch=watched)
 
 
 def _settled(

@@ -24,6 +24,7 @@ from service.estimation.models import denoise
 from service.estimation.tare.noise import left_by_mean
 from service.estimation.tare.tare import Tare
 from service.estimation.unseen import Unseen, make_unseen
+from service.estimation.watch.watch import Watch, make_watch
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there
 CONTACT_OFF_SIGMA = 3.0  # lower than on, so that noise about a threshold does not chatter
@@ -68,6 +69,7 @@ class EstimationPlan:
     """Absolute pressure above which a chip is not known to tell the pressure: the end of its rated
     range, or of what it told on the bench if that is more, or less because it told no more."""
     unseen: Unseen
+    watch: Watch
     still_kpa: Floats
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
@@ -161,6 +163,14 @@ def make_plan(
         ),
         chip_end_kpa=chip_end_kpa,
         unseen=make_unseen(ladder.curves, ladder.gas, baseline_kpa, chip_end_kpa),
+        watch=make_watch(
+            info,
+            calibration,
+            tare,
+            chip_end_kpa,
+            gas_known=ladder.gas_known & (ladder.gas is not None),
+            warms=ladder.temperature is None,
+        ),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
         hull=hull(positions_m[bearing, :2]),

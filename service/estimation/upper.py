@@ -59,8 +59,9 @@ class TileForces:
         force_n: forces; where `beyond`, what they are at least if nothing is uncertain.
         sigma_n: their standard uncertainties.
         own_n: the part of these that is every tile's own.
-        common_n: (parts, n, bearing tiles), the rest, of corrections of gas and rubber, and of what
-            either did unseen: all tiles share the error, so these are signed.
+        common_n: (parts, n, bearing tiles), the rest, of corrections of gas and rubber, of what
+            either did unseen, and of warmth that nothing corrects: all tiles share the error, so
+            these are signed.
         beyond: where forces are only bounds.
         unsettled: (n,), has what was unseen left more than the noise of a reading in any tile?
     """
@@ -125,7 +126,7 @@ def tile_forces(
     averaged_n = force_n
     force_n, unseen_n, state = _undone(plan, now, averaged_n, at_ns, state)
     rubber_n = ladder.rubber_misfit * (force_n - averaged_n)
-    common_n = np.stack([now.gas_n, rubber_n, now.unseen_gas_n, unseen_n])
+    common_n = np.stack([now.gas_n, rubber_n, now.unseen_gas_n, unseen_n, now.warm_n])
     sigma_n = np.sqrt(own_n**2 + (common_n**2).sum(axis=0))
     unsettled = (~now.beyond & (np.hypot(now.unseen_gas_n, unseen_n) > now.noise_n)).any(axis=1)
     return TileForces(force_n, sigma_n, own_n, common_n, now.beyond, np.asarray(unsettled)), state

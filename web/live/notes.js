@@ -11,6 +11,9 @@ const BELOW_RANGE = "Below the calibrated range: suction, or an old tare.";
 const SETTLE_MESSAGES = 15;
 const FROM_ESTIMATE = [
   [ESTIMATE.TILE_MISSING, "Tile missing: of the force only a lower bound is known, and no COP."],
+  [ESTIMATE.STUCK, "A tile repeats one reading: its force is not known. Unplug it and plug it in again."],
+  [ESTIMATE.CLIPPED, "A tile reads no further than some pressure within its range: force is at least this."],
+  [ESTIMATE.BASELINE_LOST, "A tile reads too little without a load, or has warmed or cooled: force is less certain. Lift the foot, press Tare; if it comes back, the dome may leak."],
   [ESTIMATE.AFTER_SATURATION, "After a load that was not seen, force is less certain for a while."],
   [ESTIMATE.OVER_RATED, "Above the 115 kPa the chip is rated for, yet calibrated."],
 ];

@@ -186,18 +186,23 @@ class TareFrames:
                 )
 
     def refuse_stuck(self, tare: Tare, rows: Bools | slice) -> None:
-        """Refuse a baseline of readings that are all the same, unless the bench saw no noise.
+        """Refuse a baseline of which half is one count in a row, unless the bench saw no noise.
 
         Raises:
             TareError: a tile gave the same count again and again, as a part does that hangs.
         """
-        padc = np.where(np.isfinite(self.kpa[rows]), self.frames.padc[rows], np.nan)
         count_kpa = np.sqrt(12.0) * self.rounding_kpa(tare.tadc_counts)
-        same = np.nanmax(padc, axis=0) == np.nanmin(padc, axis=0)
-        for i in np.flatnonzero(same & ~(self.bench_noise_kpa <= STUCK_COUNTS * count_kpa)):
+        readable = np.isfinite(self.kpa[rows])
+        for i in np.flatnonzero(~(self.bench_noise_kpa <= STUCK_COUNTS * count_kpa)):
+            padc = self.frames.padc[rows][readable[:, i], i]
+            begins = np.flatnonzero(np.diff(padc, prepend=padc[0] ^ 1))
+            lengths = np.diff(begins, append=len(padc))
+            longest = int(np.argmax(lengths))
+            if lengths[longest] < max(FRAMES_MIN, len(padc) / 2):
+                continue
             raise TareError(
-                f"tile {self.serials[i]} gave {int(np.nanmin(padc[:, i]))} counts "
-                f"{int(np.isfinite(padc[:, i]).sum())} times and nothing else",
+                f"tile {self.serials[i]} gave {padc[begins[longest]]} counts "
+                f"{lengths[longest]} times in a row, of {len(padc)}",
                 expected="readings that scatter, as those of a part that converts do",
                 remedy="It seems to hang: unplug it and plug it in again, then tare",
             )
@@ -243,8 +248,10 @@ def take_tare(
         begin_s, end_s = interval_s
         seen = TareFrames(frames, compensation, calibration, serials)
         t_s = seen.since_ns * 1e-9
-        tare = seen.tare((t_s >= begin_s) & (t_s <= end_s), "interval")
+        rows = (t_s >= begin_s) & (t_s <= end_s)
+        tare = seen.tare(rows, "interval")
         seen.refuse_loaded(tare)
+        seen.refuse_stuck(tare, rows)
         return tare
     lead = np.logical_and.accumulate((frames.frame_status & FrameStatus.LEAD) != 0)
     if lead[0]:
@@ -257,9 +264,9 @@ def take_tare(
     last_ns = frames.t_ns[0] + RECOGNISE_WITHIN_NS
     frames = frames.rows(0, int(np.searchsorted(frames.t_ns, last_ns, side="right")))
     seen = TareFrames(frames, compensation, calibration, serials)
-    rows = _recognised(seen, calibration)
-    tare = seen.tare(rows, "recognised")
-    seen.refuse_stuck(tare, rows)
+    found = _recognised(seen, calibration)
+    tare = seen.tare(found, "recognised")
+    seen.refuse_stuck(tare, found)
     return tare
 
 

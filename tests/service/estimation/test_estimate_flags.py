@@ -194,6 +194,9 @@ def test_every_flag_has_a_bit_of_its_own(status: EstimateStatus) -> None:
         "over_rated": 256,
         "tare_lost": 512,
         "after_saturation": 1024,
+        "stuck": 2048,
+        "clipped": 4096,
+        "baseline_lost": 8192,
     }
     assert bits[str(status.name).lower()] == status
 

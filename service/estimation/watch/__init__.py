@@ -1,0 +1,1 @@
+"""What a tile's own readings show to be wrong with it: repeats, a clip, a baseline that is lost."""

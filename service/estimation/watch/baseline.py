@@ -1,0 +1,134 @@
+"""A baseline that is lost: a dome that has leaked, or one that has moved and nobody knows why.
+
+No load makes a dome read less than it does without one. If it stays below its baseline, by more
+than temperature, surroundings and the gas of a released dome explain, then gas is missing, or it is
+colder than its chip says. How much less it has read at most is how wrong it may be.
+
+A leak so fast that air comes back within a moment shows as well: what leaks out under load has to
+come in again, so it reads too little afterwards as much as it has read too much. A sealed dome
+hardly reads too little at all.
+
+A tile that reads too much for good cannot be told from one that bears a load.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Floats, Times
+from service.estimation.compiled import compiled
+
+LOST_KPA = 0.4
+"""Four fifths of a newton; creep and hysteresis leave half of that of a fast release."""
+SMOOTH_S = 0.05
+HELD_NS = 350_000_000
+"""A released dome's gas is back at its wall's temperature: five times 60 ms, and the smoothing."""
+EVEN = 0.08
+"""This part of what was read too much has to be read too little, of a tile whose gas is corrected:
+the longer a leak takes, the more comes back slowly enough to be read. Of 30 ms it is a tenth."""
+EVEN_WITHOUT_GAS = 0.35
+"""The same of one whose gas is not corrected: it is cold after a release, in a fast hop a fifth."""
+EVEN_MIN_KPA_S = 0.3
+"""Less than this is no evidence."""
+FORGET_S = 10.0
+PAUSE_S = 0.5
+"""Of a longer gap in the readings nothing is known."""
+NEVER_NS = -(1 << 62)
+
+STATE = np.dtype(
+    [
+        ("kpa", np.float64),  # smoothed, above the baseline; NaN before the first
+        ("t_ns", np.int64),
+        ("below_ns", np.int64),  # since when it has been below
+        ("deepest_kpa", np.float64),
+        ("highest_kpa", np.float64),
+        ("more_kpa_s", np.float64),
+        ("less_kpa_s", np.float64),
+        ("lost_kpa", np.float64),
+    ]
+)
+"""What is remembered of each tile."""
+
+State = npt.NDArray[np.void]
+
+
+def at_rest(tiles: int) -> State:
+    """Before the first reading."""
+    state = np.zeros(tiles, dtype=STATE)
+    state["kpa"], state["below_ns"] = np.nan, NEVER_NS
+    return state
+
+
+def lost(
+    gauge_kpa: Floats, explained_kpa: Floats, t_ns: Times, even: Floats, state: State
+) -> tuple[Floats, State]:
+    """How wrong each tile's baseline may be, from when it shows until the next tare.
+
+    Args:
+        gauge_kpa: (n, tiles), above the baseline, with all that models correct; NaN where unknown.
+        explained_kpa: (n, tiles), how far from zero it may be without a load.
+        t_ns: (n, tiles), instants.
+        even: (tiles,), `EVEN` or `EVEN_WITHOUT_GAS`.
+        state: from the readings before.
+
+    Returns:
+        (n, tiles), 0 where nothing shows, and the next state.
+    """
+    after = state.copy()
+    lost_kpa = np.empty(gauge_kpa.shape)
+    _follow(
+        np.ascontiguousarray(gauge_kpa),
+        np.ascontiguousarray(explained_kpa),
+        np.ascontiguousarray(t_ns),
+        even,
+        after,
+        lost_kpa,
+    )
+    return lost_kpa, after
+
+
+@compiled
+def _follow(
+    gauge_kpa: Floats,
+    explained_kpa: Floats,
+    t_ns: Times,
+    even: Floats,
+    state: State,
+    lost_kpa: Floats,
+) -> None:
+    n, tiles = gauge_kpa.shape
+    for j in range(tiles):
+        tile = state[j]
+        for i in range(n):
+            now = gauge_kpa[i, j]
+            if not math.isnan(now):
+                step_s = max(0.0, (t_ns[i, j] - tile.t_ns) * 1e-9)
+                if math.isnan(tile.kpa) or step_s > PAUSE_S:
+                    tile.kpa, tile.below_ns, step_s = now, NEVER_NS, 0.0
+                tile.kpa -= math.expm1(-step_s / SMOOTH_S) * (now - tile.kpa)
+                tile.t_ns = t_ns[i, j]
+                bound = LOST_KPA + explained_kpa[i, j]
+                kept = math.exp(-step_s / FORGET_S)
+                tile.more_kpa_s *= kept
+                tile.less_kpa_s *= kept
+                if tile.kpa >= -bound:
+                    tile.below_ns = NEVER_NS
+                    if tile.kpa > bound:
+                        tile.more_kpa_s += step_s * tile.kpa
+                        tile.highest_kpa = max(tile.highest_kpa, tile.kpa)
+                else:
+                    tile.deepest_kpa = max(tile.deepest_kpa, -tile.kpa)
+                    if tile.kpa < -bound - tile.lost_kpa:  # a dip, beyond what has moved for good
+                        tile.less_kpa_s -= step_s * tile.kpa
+                    if tile.below_ns == NEVER_NS:
+                        tile.below_ns = tile.t_ns
+                    if tile.t_ns - tile.below_ns > HELD_NS:
+                        tile.lost_kpa = max(tile.lost_kpa, -tile.kpa)
+                    least = max(EVEN_MIN_KPA_S, even[j] * tile.more_kpa_s)
+                    if tile.less_kpa_s > least and tile.highest_kpa > 0.0:
+                        # Then nothing of it is force.
+                        tile.lost_kpa = max(tile.lost_kpa, tile.highest_kpa, tile.deepest_kpa)
+            lost_kpa[i, j] = tile.lost_kpa

@@ -1,0 +1,156 @@
+"""A chip that reads no further than some level within its range: an edge at the top of loadings.
+
+Of a load that rises and falls, a reading spends little time at its highest, and not at the same
+pressure each time. Behind a clip it does: the histogram ends in a peak, as wide as the noise, with
+less below it, at the same level loading after loading. Whether noise comes before the clip or
+behind it does not matter. Evidence is gathered as in a sequential test (Wald 1945), never below
+zero: how much likelier the level of a loading is behind a clip than without one.
+
+What is at the edge is a lower bound from then on, as it is at the chip's own end.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Floats
+from service.estimation.compiled import compiled
+
+ENOUGH = 11.0
+"""Natural logarithm: after a healthy loading with a flat top the chance of as much is one in
+60 000. A clip gathers it in six."""
+SAME = 0.25
+"""In units of the noise: scatter of the mean at a clip's edge from loading to loading."""
+ELSEWHERE = 0.3
+"""Probability density, per unit of the noise, of such a mean in a healthy tile, which is no top of
+that edge if it is far away. In recorded walking it is 0.2 to 0.3."""
+EDGE = 2.5
+"""In units of the noise: what counts as at the edge, half of that as its middle; as much below it
+again is the slope that leads to it."""
+STEEP = 3.0
+"""How many more readings there are in the middle of an edge than on the slope, which is as wide; at
+the top of half a sine there are twice as many."""
+ROUND = 1.5
+"""A loading with a round top at the same level is so much evidence against a clip."""
+READINGS_MIN = 20
+"""Of a loading, at the edge."""
+OVER = 4.0
+"""In units of the noise: what lies farther above the edge is no reading behind a clip ..."""
+OVER_SHARE = 0.05
+"""... except for so many outliers."""
+BOUND = 3.0
+"""In units of the noise, below the edge: from here on a reading may have been clipped."""
+FOLLOW = 0.5
+"""How much of the way to the mean of a loading the edge is moved."""
+SMOOTH = 8.0
+"""Readings over which the first loading's highest level is averaged."""
+
+STATE = np.dtype(
+    [
+        ("inside", np.int64),  # is it loaded?
+        ("smooth_kpa", np.float64),
+        ("peak_kpa", np.float64),  # of this loading
+        ("at", np.int64),  # readings of this loading at the edge, ...
+        ("middle", np.int64),
+        ("slope", np.int64),
+        ("over", np.int64),
+        ("at_kpa", np.float64),  # ... and the sum of these, relative to the edge
+        ("edge_kpa", np.float64),  # NaN before the first loading
+        ("evidence", np.float64),  # that it is one
+        ("end_kpa", np.float64),  # of what can be told; infinite while there is no clip
+    ]
+)
+"""What is remembered of each tile."""
+
+State = npt.NDArray[np.void]
+
+
+def at_rest(tiles: int) -> State:
+    """Before the first reading."""
+    state = np.zeros(tiles, dtype=STATE)
+    state["edge_kpa"], state["end_kpa"] = np.nan, np.inf
+    return state
+
+
+def end_of_range(
+    kpa: Floats, baseline_kpa: Floats, unloaded_kpa: Floats, noise_kpa: Floats, state: State
+) -> tuple[Floats, State]:
+    """Above which pressure each reading may have been clipped; infinite where nothing shows it.
+
+    Args:
+        kpa: (n, tiles), absolute; NaN where there is none.
+        baseline_kpa: (tiles,).
+        unloaded_kpa: (tiles,), so near the baseline no load is seen.
+        noise_kpa: (tiles,), standard deviation of a reading.
+        state: from the readings before.
+
+    Returns:
+        (n, tiles), absolute pressures, and the next state.
+    """
+    after = state.copy()
+    end_kpa = np.empty(kpa.shape)
+    _follow(np.ascontiguousarray(kpa), baseline_kpa, unloaded_kpa, noise_kpa, after, end_kpa)
+    return end_kpa, after
+
+
+@compiled
+def _follow(
+    kpa: Floats,
+    baseline_kpa: Floats,
+    unloaded_kpa: Floats,
+    noise_kpa: Floats,
+    state: State,
+    end_kpa: Floats,
+) -> None:
+    n, tiles = kpa.shape
+    for j in range(tiles):
+        tile, noise = state[j], noise_kpa[j]
+        for i in range(n):
+            now = kpa[i, j]
+            above = now - baseline_kpa[j]
+            if not math.isnan(above):
+                if tile.inside == 0 and above > 2.0 * unloaded_kpa[j]:
+                    tile.inside, tile.at, tile.middle, tile.slope, tile.over = 1, 0, 0, 0, 0
+                    tile.at_kpa = 0.0
+                    tile.smooth_kpa = tile.peak_kpa = now
+                if tile.inside == 1:
+                    tile.smooth_kpa += (now - tile.smooth_kpa) / SMOOTH
+                    tile.peak_kpa = max(tile.peak_kpa, tile.smooth_kpa)
+                    off = now - tile.edge_kpa
+                    if off > OVER * noise:
+                        tile.over += 1
+                    elif off > -EDGE * noise:
+                        tile.at += 1
+                        tile.at_kpa += off
+                        if abs(off) < 0.5 * EDGE * noise:
+                            tile.middle += 1
+                    elif off > -2.0 * EDGE * noise:
+                        tile.slope += 1
+                    if above < unloaded_kpa[j]:
+                        _end_of_loading(tile, noise)
+            end_kpa[i, j] = tile.end_kpa
+
+
+@compiled
+def _end_of_loading(tile: Any, noise: float) -> None:
+    tile.inside = 0
+    if tile.peak_kpa < tile.edge_kpa - 2.0 * EDGE * noise:
+        return  # too light to say anything
+    if tile.over > OVER_SHARE * tile.at or math.isnan(tile.edge_kpa):
+        tile.edge_kpa, tile.evidence, tile.end_kpa = tile.peak_kpa, 0.0, math.inf
+        return
+    if tile.at < READINGS_MIN:
+        return
+    if tile.middle < STEEP * tile.slope:
+        tile.evidence = max(0.0, tile.evidence - ROUND)
+        return
+    off = tile.at_kpa / (tile.at * noise)
+    likelier = -0.5 * (off / SAME) ** 2 - math.log(SAME * math.sqrt(2.0 * math.pi) * ELSEWHERE)
+    tile.evidence = max(0.0, tile.evidence + likelier)
+    tile.edge_kpa += FOLLOW * off * noise
+    if tile.evidence >= ENOUGH:
+        tile.end_kpa = tile.edge_kpa - BOUND * noise
