@@ -22,7 +22,7 @@ from service.estimation.fitting.model import DomeModel
 from service.estimation.fitting.output_error import Fit, OutputErrorProblem
 from service.estimation.fitting.press import Presses
 from service.estimation.fitting.soak import bounds_of
-from service.estimation.fitting.unknowns import TERMS_MAX, Parts
+from service.estimation.fitting.unknowns import LATE_S, TERMS_MAX, Parts
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _CLEAR = 3.0
@@ -40,6 +40,7 @@ def identify(
     baseline_kpa: float,
     first_curve: Floats,
     soaked: TemperatureEffect | str,
+    delay: Parameter,
 ) -> Effects:
     """What of gas, rubber and hysteresis the recording determines.
 
@@ -49,6 +50,7 @@ def identify(
         baseline_kpa: absolute pressure unloaded.
         first_curve: c1, c2, c3 of the static curve over gauge / `scale_kpa`, to begin with.
         soaked: from the soak, whose wall's give is used; or why it tells nothing.
+        delay: of the reference; `late_s` of the answer has it in it.
     """
     refused: dict[EffectName, str] = {}
     temperature = None
@@ -59,9 +61,9 @@ def identify(
     wall_per_kpa = Effects(temperature=temperature).wall_per_kpa
     static = DomeModel(first_curve, scale_kpa, baseline_kpa, wall_per_kpa)
     problem = OutputErrorProblem(points, static)
-    parts = Parts()
+    parts = Parts(late_s=(delay.value, float(np.hypot(LATE_S, delay.sigma))))
     if int(points.fast.sum()) < _FAST_MIN:
-        parts = replace(parts, late=False, gas=False)
+        parts = replace(parts, late_s=None, gas=False)
         refused["gas"] = "no holds, releases or taps in the recording"
     while True:
         fit = best_creep(problem, parts) if parts.terms else problem.fit(parts)

@@ -23,18 +23,25 @@ holds a load for long."""
 _STEPS_MIN = 3.0  # readings within the shortest time of a creep
 
 
+LATE_S = 0.00025
+"""How well it is known beforehand when a tile is sampled: somewhere in the first part of a
+conversion of 1.6 ms (DS table 7), of which a quarter is assumed."""
+_LATE_MOST = 2.4  # times that: it is possible, but no more
+
+
 @dataclass(frozen=True)
 class Parts:
     """What is fitted beside the curve.
 
     Attributes:
-        late: when the tile is sampled.
+        late_s: by how much later than assumed the tile seems sampled, likely, and how near; None:
+            it is not fitted.
         gas: its heat.
         terms: of the creep.
         hysteresis: the loop.
     """
 
-    late: bool = True
+    late_s: tuple[float, float] | None = (0.0, LATE_S)
     gas: bool = True
     terms: int = 2
     hysteresis: bool = True
@@ -51,9 +58,6 @@ class Unknowns:
     most: tuple[float, ...]
 
 
-_LATE_S = 0.00025
-"""How well it is known beforehand when a tile is sampled: somewhere in the first part of a
-conversion of 1.6 ms (DS table 7), of which a quarter is assumed."""
 # No gas has more than air, which has 1.40; a single time for a sphere's many makes it less
 # (hardware.md 9), and bubbles cool within 5 to 60 ms.
 _GAS = (
@@ -94,9 +98,11 @@ def unknowns_of(parts: Parts, curve: Floats, told_s: tuple[float, float]) -> lis
     # Of the force at the end of the range: the slope at zero is never nothing.
     least = (0.01 * sum(first), -_NO_LIMIT, -_NO_LIMIT)
     unknowns = [Unknowns("curve", first, _NO_LIMIT, least, (_NO_LIMIT,) * 3)]
-    if parts.late:
-        bound = 2.4 * _LATE_S
-        unknowns.append(Unknowns("late_s", (0.0,), _LATE_S, (-bound,), (bound,)))
+    if parts.late_s is not None:
+        likely_s, near_s = parts.late_s
+        most_s = _LATE_MOST * near_s
+        ends = ((likely_s - most_s,), (likely_s + most_s,))
+        unknowns.append(Unknowns("late_s", (likely_s,), near_s, *ends))
     if parts.gas:
         unknowns += _GAS
     if parts.terms:

@@ -283,8 +283,12 @@ def test_a_gas_that_cools_as_fast_as_the_rubber_creeps_is_not_given_up_for_the_c
     gamma_tau_s: float, seed: int
 ) -> None:
     drawn = draw_dome("T01", seed)
-    creep = {"creep_parts": (0.05, 0.03, 0.03), "creep_s": (0.03, 0.4, 3.0)}
-    part = replace(drawn, conduction_s=gamma_tau_s, **creep)
+    part = replace(
+        drawn,
+        conduction_s=gamma_tau_s,
+        creep_parts=(0.05, 0.03, 0.03),
+        creep_s=(0.03, 0.4, 3.0),
+    )
     press = pressed_by_dome("T01", part, **ALL)
     effects = found_in(recorded(press, scatter=0.02, late_s=233e-6, seed=seed))
     assert set(effects.refused) == {"temperature", "ambient"}
@@ -346,7 +350,7 @@ def test_an_effect_that_an_emulated_dome_does_not_have_is_refused_in_words(
     missing: EffectName,
 ) -> None:
     on = {name: name != missing for name in ("gas", "rubber", "hysteresis")}
-    press = pressed_by_dome("T02", **on)
+    press = pressed_by_dome("T02", None, **on)
     effects = found_in(recorded(press, scatter=0.0, strokes=2, holds=2, taps=6))
     assert getattr(effects, missing) is None
     assert effects.refused[missing].endswith("not determined")
