@@ -156,6 +156,16 @@ def test_a_cached_calibration_that_does_not_prove_itself_is_set_aside_and_made_a
     assert len(pressed) == 2
 
 
+def test_each_family_of_parts_and_each_repeatability_has_a_bench_of_its_own(
+    tmp_path: Path, pressed: list[str]
+) -> None:
+    for _ in range(2):
+        find_calibration("bench", ["T01"], cache=tmp_path)
+        find_calibration("bench", ["T01"], cache=tmp_path, family="broad")
+        find_calibration("bench", ["T01"], cache=tmp_path, family="broad", repeatability=0.01)
+    assert pressed == ["bench-T01"] * 3
+
+
 def test_a_cache_that_cannot_be_written_is_said_and_no_reason_to_fail(
     tmp_path: Path, pressed: list[str]
 ) -> None:

@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +151,7 @@ def _case(
     """One recording in both modes; of clean poppy seeds also what the tiles are."""
     seconds = ROLLING_S if scene.name == "rolling" else None
     recording, world = recorded(scene, seconds, seed, calibration)
-    below_end = surely_below_end(recording, world)
+    below_end = cache(partial(surely_below_end, recording, world))
     found = {}
     for mode, lag_ms in LAGS_MS.items():
         columns = estimates_of(recording, scene.models, lag_ms, JUDGED)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -25,14 +25,15 @@ calibration was called saturated wrongly."""
 
 def judged(
     columns: Mapping[str, npt.NDArray[Any]],
-    below_end: npt.NDArray[np.bool_],
+    below_end: Callable[[], npt.NDArray[np.bool_]],
     lag_ms: float,
 ) -> Judged:
     """Errors, coverage and flags.
 
     Args:
         columns: `JUDGED`, of every frame of the recording.
-        below_end: (n, tiles), as `surely_below_end` says.
+        below_end: gives what `surely_below_end` says, (n, tiles); asked only if it matters, since
+            that takes as long as the recording did.
         lag_ms: look-ahead of the estimates.
     """
     accuracy = accuracy_of({name: columns[name] for name in COMPARED}, lag_ms=lag_ms)
@@ -65,7 +66,7 @@ def judged(
         cop_within=accuracy.cop_covered.within,
         saturated_frames=accuracy.saturated_frames,
         saturated_tile_frames=int(bounds.sum()),
-        wrongly=int((bounds & below_end).sum()),
+        wrongly=int((bounds & below_end()).sum()) if bounds.any() else 0,
         held=int((bounds & held).sum()),
         grf_bounds=accuracy.bounds.frames,
         grf_bounds_held=accuracy.bounds.within,

@@ -92,7 +92,9 @@ def test_a_tile_called_saturated_below_its_end_is_counted_and_so_is_a_bound_that
     below_end = np.zeros((20, 2), dtype=bool)
     below_end[:4] = True
     found = judged(
-        columns(force_sigma_n=sigma_n, force_n=force_n, estimate_status=status), below_end, 10.0
+        columns(force_sigma_n=sigma_n, force_n=force_n, estimate_status=status),
+        lambda: below_end,
+        10.0,
     )
     assert (found.saturated_frames, found.saturated_tile_frames) == (10, 10)
     assert (found.wrongly, found.held) == (4, 8)
@@ -101,7 +103,7 @@ def test_a_tile_called_saturated_below_its_end_is_counted_and_so_is_a_bound_that
 
 def test_sums_of_squares_are_of_the_frames_that_count() -> None:
     error_n = np.where(np.arange(20) < 10, 0.3, 0.0)
-    found = judged(columns(grf_n=10.0 + error_n), np.ones((20, 2), dtype=bool), 10.0)
+    found = judged(columns(grf_n=10.0 + error_n), lambda: np.ones((20, 2), dtype=bool), 10.0)
     phase = found.phases["mid_stance"]
     assert (phase.frames, phase.within) == (20, 10)
     assert phase.error2 == pytest.approx(10 * 0.09)
@@ -113,7 +115,7 @@ def test_sums_of_squares_are_of_the_frames_that_count() -> None:
 def test_a_missing_tile_is_no_bound() -> None:
     nothing = np.full((20, 2), np.nan)
     missing = columns(force_n=nothing, force_sigma_n=nothing)
-    assert judged(missing, np.ones((20, 2), dtype=bool), 10.0).saturated_tile_frames == 0
+    assert judged(missing, lambda: np.ones((20, 2), dtype=bool), 10.0).saturated_tile_frames == 0
 
 
 def test_what_a_dome_settles_at_is_the_pressure_without_the_gas() -> None:
