@@ -195,5 +195,13 @@ def test_saturated_and_silent_tiles_cannot_be_mistaken_for_values(
         expect(saturated).to_have_attribute("data-value", "")
         expect(saturated).to_contain_text("saturated")
         expect(page.locator("#grf")).to_have_attribute("data-value", "")  # no sum without T02
+        # What T01, T03 and T04 bear at least, and why it is no more.
+        expect(page.locator("#grf-bound")).to_have_text("at least")
+        at_least_n = float(page.inner_text("#grf"))
+        assert 20.0 < at_least_n < 110.0
+        expect(page.locator("#grf-sigma")).to_contain_text("T02")
+        expect(page.locator("#grf-sigma")).to_contain_text("T03")
+        expect(page.locator("#contact")).to_have_attribute("data-contact", "true")
+        expect(page.locator("#trace-legend")).to_contain_text("at least this much")
     finally:
         field.close()

@@ -56,7 +56,16 @@ def test_a_frame_has_what_the_contract_says(running: Running, tared: FakeNode) -
         frame = next_frame_from(live, tared.seq - 15)
     assert set(frame) >= {
         *("node", "seq", "t_ns", "n", "gauge_kpa", "force_n", "force_min_n", "force_max_n"),
-        *("force_sigma_n", "grf_n", "grf_sigma_n", "grf_min_n", "grf_max_n", "cop_x_m", "cop_y_m"),
+        *(
+            "force_sigma_n",
+            "grf_n",
+            "grf_sigma_n",
+            "grf_at_least_n",
+            "grf_min_n",
+            "grf_max_n",
+            "cop_x_m",
+            "cop_y_m",
+        ),
         *("cop_sigma_x_m", "cop_sigma_y_m", "angle_rad", "servo_age_us", "status"),
         *("frame_status", "estimate_status", "saturated", "contact", "age_ms"),
     }

@@ -23,6 +23,7 @@ def accuracy(error_n: float, frames: int = 20) -> Accuracy:
         "true_grf_n": np.full(frames, 10.0),
         "grf_n": np.full(frames, 10.0 + error_n),
         "grf_sigma_n": np.full(frames, 0.1),
+        "grf_at_least_n": np.full(frames, np.nan),
         "true_cop_x_m": np.zeros(frames),
         "true_cop_y_m": np.zeros(frames),
         "cop_x_m": np.full(frames, error_n * 1e-3),
