@@ -24,7 +24,6 @@ from service.estimation.models.unwrap import unwrap
 from service.estimation.plan import SIGMAS, SUCTION_MAX_KPA, TARE_OLD_NS, EstimationPlan
 from service.estimation.tare.tare import has_warmed
 from service.estimation.unseen import EVENLY, Unseen, farthest, was_away
-from service.estimation.watch.baseline import LOST_KPA
 from service.estimation.watch.watch import WatchState
 
 
@@ -171,8 +170,9 @@ def apparent_forces(
     ladder, columns = plan.ladder, plan.bearing
     status = _frame_status(plan, frames, kpa, broken)
     stuck, edge_kpa, watched = plan.watch.readings(frames, kpa, state.watch)
-    status[stuck.any(axis=1)] |= np.uint16(EstimateStatus.STUCK)
-    kpa = np.where(stuck, np.nan, kpa)
+    if stuck.any():
+        status[stuck.any(axis=1)] |= np.uint16(EstimateStatus.STUCK)
+        kpa = np.where(stuck, np.nan, kpa)
     if ladder.denoise and neighbours is not None:
         kpa, replaced = despiked(kpa, *neighbours, plan.tare.noise_kpa)
         status[replaced[:, columns].any(axis=1)] |= np.uint16(EstimateStatus.OUTLIER_REPLACED)
@@ -208,9 +208,11 @@ def apparent_forces(
     if torn.any():
         bearing_kpa = np.where(torn, np.nan, bearing_kpa)
     # The chip's range is judged by what was read, the calibrated one by what the gas settles at.
-    end_kpa = np.minimum(plan.chip_end_kpa, edge_kpa)
+    end_kpa = plan.chip_end_kpa
+    if edge_kpa is not None:
+        end_kpa = np.minimum(end_kpa, edge_kpa)
+        status[(kpa[:, columns] > edge_kpa).any(axis=1)] |= np.uint16(EstimateStatus.CLIPPED)
     hidden = kpa[:, columns] > end_kpa
-    status[(kpa[:, columns] > edge_kpa).any(axis=1)] |= np.uint16(EstimateStatus.CLIPPED)
     # As if the chip's end had been read, with what warmth and surroundings have put into it.
     least_kpa = bearing_kpa - np.where(hidden, kpa[:, columns] - end_kpa, 0.0)
     settled_kpa = bearing_kpa
@@ -227,12 +229,11 @@ def apparent_forces(
     settled_kpa = np.where(hidden, least_kpa, settled_kpa)
     static_kpa = settled_kpa - plan.baseline_kpa
     warmed_kpa, watched = plan.watch.warmed_kpa(frames, sampled_ns, watched)
-    lost_kpa, watched = plan.watch.lost_kpa(
+    lost_kpa, astray, watched = plan.watch.lost_kpa(
         np.where(hidden, np.nan, static_kpa), baseline_variance, warmed_kpa, sampled_ns, watched
     )
     baseline_variance = baseline_variance + lost_kpa**2
-    astray = (lost_kpa > 0.0) | (np.abs(warmed_kpa) > LOST_KPA)
-    status[astray.any(axis=1)] |= np.uint16(EstimateStatus.BASELINE_LOST)
+    status[astray] |= np.uint16(EstimateStatus.BASELINE_LOST)
     static = ladder.curves.force(static_kpa)
     unknown = np.isnan(kpa[:, columns] if plan.tare.is_lost else static.force_n)
     status[unknown.any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)

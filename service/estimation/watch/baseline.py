@@ -16,13 +16,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from devices.arrays import Floats, Times
+from devices.arrays import Bools, Floats, Times
 from service.estimation.compiled import compiled
+from service.estimation.watch.state import State, copied
 
 LOST_KPA = 0.4
 """Four fifths of a newton; creep and hysteresis leave half of that of a fast release."""
+SIGMAS = 5.0
+"""So many standard uncertainties a baseline may be off that is known to be uncertain ..."""
+WARMTH = 1.5
+"""... and so much of what a kelvin does to it: the wall gives way, and chip and gas differ."""
 SMOOTH_S = 0.05
 HELD_NS = 350_000_000
 """A released dome's gas is back at its wall's temperature: five times 60 ms, and the smoothing."""
@@ -52,8 +56,6 @@ STATE = np.dtype(
 )
 """What is remembered of each tile."""
 
-State = npt.NDArray[np.void]
-
 
 def at_rest(tiles: int) -> State:
     """Before the first reading."""
@@ -63,54 +65,65 @@ def at_rest(tiles: int) -> State:
 
 
 def lost(
-    gauge_kpa: Floats, explained_kpa: Floats, t_ns: Times, even: Floats, state: State
-) -> tuple[Floats, State]:
+    gauge_kpa: Floats,
+    variance: Floats,
+    warmed_kpa: Floats,
+    t_ns: Times,
+    even: Floats,
+    state: State,
+) -> tuple[Floats, Bools, State]:
     """How wrong each tile's baseline may be, from when it shows until the next tare.
 
     Args:
         gauge_kpa: (n, tiles), above the baseline, with all that models correct; NaN where unknown.
-        explained_kpa: (n, tiles), how far from zero it may be without a load.
+        variance: (n, tiles), of the baseline, as far as it is known to be uncertain.
+        warmed_kpa: (n, tiles), what warmth that no model corrects has moved it by.
         t_ns: (n, tiles), instants.
         even: (tiles,), `EVEN` or `EVEN_WITHOUT_GAS`.
         state: from the readings before.
 
     Returns:
-        (n, tiles), 0 where nothing shows, and the next state.
+        (n, tiles), 0 where nothing shows; (n,), frames in which a baseline is lost or has moved by
+        `LOST_KPA`; and the next state.
     """
-    after = state.copy()
-    lost_kpa = np.empty(gauge_kpa.shape)
+    after = copied(state)
+    lost_kpa, astray = np.empty(gauge_kpa.shape), np.zeros(len(gauge_kpa), dtype=np.bool_)
     _follow(
         np.ascontiguousarray(gauge_kpa),
-        np.ascontiguousarray(explained_kpa),
+        np.ascontiguousarray(variance),
+        np.ascontiguousarray(warmed_kpa),
         np.ascontiguousarray(t_ns),
         even,
         after,
         lost_kpa,
+        astray,
     )
-    return lost_kpa, after
+    return lost_kpa, astray, after
 
 
 @compiled
 def _follow(
     gauge_kpa: Floats,
-    explained_kpa: Floats,
+    variance: Floats,
+    warmed_kpa: Floats,
     t_ns: Times,
     even: Floats,
     state: State,
     lost_kpa: Floats,
+    astray: Bools,
 ) -> None:
     n, tiles = gauge_kpa.shape
     for j in range(tiles):
         tile = state[j]
         for i in range(n):
-            now = gauge_kpa[i, j]
+            now, warmed = gauge_kpa[i, j], abs(warmed_kpa[i, j])
             if not math.isnan(now):
                 step_s = max(0.0, (t_ns[i, j] - tile.t_ns) * 1e-9)
                 if math.isnan(tile.kpa) or step_s > PAUSE_S:
                     tile.kpa, tile.below_ns, step_s = now, NEVER_NS, 0.0
                 tile.kpa -= math.expm1(-step_s / SMOOTH_S) * (now - tile.kpa)
                 tile.t_ns = t_ns[i, j]
-                bound = LOST_KPA + explained_kpa[i, j]
+                bound = LOST_KPA + SIGMAS * math.sqrt(variance[i, j]) + WARMTH * warmed
                 kept = math.exp(-step_s / FORGET_S)
                 tile.more_kpa_s *= kept
                 tile.less_kpa_s *= kept
@@ -132,3 +145,4 @@ def _follow(
                         # Then nothing of it is force.
                         tile.lost_kpa = max(tile.lost_kpa, tile.highest_kpa, tile.deepest_kpa)
             lost_kpa[i, j] = tile.lost_kpa
+            astray[i] = astray[i] or tile.lost_kpa > 0.0 or warmed > LOST_KPA

@@ -15,10 +15,10 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from devices.arrays import Floats
 from service.estimation.compiled import compiled
+from service.estimation.watch.state import State, copied
 
 ENOUGH = 11.0
 """Natural logarithm: after a healthy loading with a flat top the chance of as much is one in
@@ -36,6 +36,11 @@ STEEP = 3.0
 the top of half a sine there are twice as many."""
 ROUND = 1.5
 """A loading with a round top at the same level is so much evidence against a clip."""
+OTHER = 0.06
+"""Loadings that stay at the edge equally long, within this part, are one load again and again, and
+say nothing: a plate that rolls over a foot at one speed."""
+RECENT = 0.25
+"""Weight of a new loading in what is usual."""
 READINGS_MIN = 20
 """Of a loading, at the edge."""
 OVER = 4.0
@@ -55,6 +60,8 @@ STATE = np.dtype(
         ("smooth_kpa", np.float64),
         ("peak_kpa", np.float64),  # of this loading
         ("at", np.int64),  # readings of this loading at the edge, ...
+        ("at_usual", np.float64),  # of loadings lately, ...
+        ("at_apart", np.float64),  # ... and how far from it they are
         ("middle", np.int64),
         ("slope", np.int64),
         ("over", np.int64),
@@ -66,8 +73,6 @@ STATE = np.dtype(
 )
 """What is remembered of each tile."""
 
-State = npt.NDArray[np.void]
-
 
 def at_rest(tiles: int) -> State:
     """Before the first reading."""
@@ -78,7 +83,7 @@ def at_rest(tiles: int) -> State:
 
 def end_of_range(
     kpa: Floats, baseline_kpa: Floats, unloaded_kpa: Floats, noise_kpa: Floats, state: State
-) -> tuple[Floats, State]:
+) -> tuple[Floats | None, State]:
     """Above which pressure each reading may have been clipped; infinite where nothing shows it.
 
     Args:
@@ -89,12 +94,14 @@ def end_of_range(
         state: from the readings before.
 
     Returns:
-        (n, tiles), absolute pressures, and the next state.
+        (n, tiles), absolute pressures, or None if nothing shows anywhere, and the next state.
     """
-    after = state.copy()
+    after = copied(state)
     end_kpa = np.empty(kpa.shape)
-    _follow(np.ascontiguousarray(kpa), baseline_kpa, unloaded_kpa, noise_kpa, after, end_kpa)
-    return end_kpa, after
+    shows = _follow(
+        np.ascontiguousarray(kpa), baseline_kpa, unloaded_kpa, noise_kpa, after, end_kpa
+    )
+    return end_kpa if shows else None, after
 
 
 @compiled
@@ -105,8 +112,9 @@ def _follow(
     noise_kpa: Floats,
     state: State,
     end_kpa: Floats,
-) -> None:
+) -> bool:
     n, tiles = kpa.shape
+    shows = False
     for j in range(tiles):
         tile, noise = state[j], noise_kpa[j]
         for i in range(n):
@@ -133,6 +141,8 @@ def _follow(
                     if above < unloaded_kpa[j]:
                         _end_of_loading(tile, noise)
             end_kpa[i, j] = tile.end_kpa
+            shows = shows or tile.end_kpa < math.inf
+    return shows
 
 
 @compiled
@@ -142,6 +152,7 @@ def _end_of_loading(tile: Any, noise: float) -> None:
         return  # too light to say anything
     if tile.over > OVER_SHARE * tile.at or math.isnan(tile.edge_kpa):
         tile.edge_kpa, tile.evidence, tile.end_kpa = tile.peak_kpa, 0.0, math.inf
+        tile.at_usual = tile.at_apart = 0.0
         return
     if tile.at < READINGS_MIN:
         return
@@ -149,8 +160,12 @@ def _end_of_loading(tile: Any, noise: float) -> None:
         tile.evidence = max(0.0, tile.evidence - ROUND)
         return
     off = tile.at_kpa / (tile.at * noise)
+    if tile.at_usual == 0.0:
+        tile.at_usual = tile.at
+    tile.at_apart += RECENT * (abs(tile.at - tile.at_usual) - tile.at_apart)
+    tile.at_usual += RECENT * (tile.at - tile.at_usual)
     likelier = -0.5 * (off / SAME) ** 2 - math.log(SAME * math.sqrt(2.0 * math.pi) * ELSEWHERE)
     tile.evidence = max(0.0, tile.evidence + likelier)
     tile.edge_kpa += FOLLOW * off * noise
-    if tile.evidence >= ENOUGH:
+    if tile.evidence >= ENOUGH and tile.at_apart > OTHER * tile.at_usual:
         tile.end_kpa = tile.edge_kpa - BOUND * noise

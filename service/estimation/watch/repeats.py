@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from devices.arrays import Bools, Floats, Ints
 from service.estimation.compiled import compiled
+from service.estimation.watch.state import State, copied
 
 HOURS = 100.0
 """A healthy array is called stuck once in so many hours, if it repeats as often as it has shown."""
@@ -58,8 +59,6 @@ STATE = np.dtype(
     ]
 )
 """What is remembered of each tile."""
-
-State = npt.NDArray[np.void]
 
 
 def at_rest(tiles: int) -> State:
@@ -151,7 +150,9 @@ def make_limits(noise_counts: Floats, rate_hz: float) -> Limits:
 
 def repeating(
     padc: npt.NDArray[np.uint16],
-    above_kpa: Floats,
+    kpa: Floats,
+    baseline_kpa: Floats,
+    end_kpa: Floats,
     unloaded_kpa: Floats,
     most: Limits,
     state: State,
@@ -160,7 +161,9 @@ def repeating(
 
     Args:
         padc: (n, tiles).
-        above_kpa: (n, tiles), pressure above the baseline; NaN where none could be read.
+        kpa: (n, tiles), absolute pressures; NaN where none could be read.
+        baseline_kpa: (tiles,).
+        end_kpa: (tiles,), from here on a chip may stand still, and is no tile that repeats itself.
         unloaded_kpa: (tiles,), so near the baseline no load is seen.
         most: from `make_limits`.
         state: from the readings before.
@@ -168,11 +171,13 @@ def repeating(
     Returns:
         (n, tiles), and the next state.
     """
-    after = state.copy()
+    after = copied(state)
     found = np.zeros(padc.shape, dtype=np.bool_)
     _follow(
         padc.astype(np.int64, order="C"),  # owned: what is compiled is compiled for that
-        np.ascontiguousarray(above_kpa),
+        np.ascontiguousarray(kpa),
+        baseline_kpa,
+        end_kpa,
         unloaded_kpa,
         most.repeats,
         most.twos,
@@ -188,7 +193,9 @@ def repeating(
 @compiled
 def _follow(
     padc: Ints,
-    above_kpa: Floats,
+    kpa: Floats,
+    baseline_kpa: Floats,
+    end_kpa: Floats,
     unloaded_kpa: Floats,
     supposed_repeats: Floats,
     supposed_twos: Floats,
@@ -203,8 +210,8 @@ def _follow(
     for i in range(n):
         for j in range(tiles):
             tile = state[j]
-            above = above_kpa[i, j]
-            if math.isnan(above):
+            above = kpa[i, j] - baseline_kpa[j]
+            if math.isnan(above) or kpa[i, j] >= end_kpa[j]:
                 tile.quiet = 0
                 continue
             word = padc[i, j]

@@ -11,16 +11,16 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats, Times
+from devices.arrays import Floats, Ints, Times
+from devices.frames import NOT_READ
 from service.estimation.compiled import compiled
+from service.estimation.watch.state import State, copied
 
 SMOOTH_S = 0.5  # long against the noise of half a count
 LAG_S = 5.0  # of the gas behind its chip, at most
 
 STATE = np.dtype([("chip", np.float64), ("gas", np.float64), ("t_ns", np.int64)])
 """What is remembered of each tile: counts from the tare's, NaN before the first."""
-
-State = npt.NDArray[np.void]
 
 
 def at_rest(tiles: int) -> State:
@@ -30,28 +30,50 @@ def at_rest(tiles: int) -> State:
     return state
 
 
-def moved(tadc: Floats, t_ns: Times, state: State) -> tuple[Floats, State]:
-    """Counts that the temperature has moved by since the tare; 0 where not known.
+def moved_kpa(
+    tadc: npt.NDArray[np.uint16],
+    tare_counts: Floats,
+    kpa_per_count: Floats,
+    t_ns: Times,
+    state: State,
+) -> tuple[Floats, State]:
+    """What warmth since the tare has moved baselines by, signed; 0 where it is not known.
 
     Args:
-        tadc: (n, tiles), relative to the tare's; NaN where unknown.
+        tadc: (n, tiles), `NOT_READ` where unknown.
+        tare_counts: (tiles,), at the tare, NaN where not known.
+        kpa_per_count: (tiles,), of the baseline.
         t_ns: (n, tiles), instants.
         state: from the readings before.
     """
-    after = state.copy()
-    counts = np.empty(tadc.shape)
-    _follow(np.ascontiguousarray(tadc), np.ascontiguousarray(t_ns), after, counts)
-    return counts, after
+    after = copied(state)
+    kpa = np.empty(tadc.shape)
+    _follow(
+        tadc.astype(np.int64, order="C"),
+        tare_counts,
+        kpa_per_count,
+        np.ascontiguousarray(t_ns),
+        after,
+        kpa,
+    )
+    return kpa, after
 
 
 @compiled
-def _follow(tadc: Floats, t_ns: Times, state: State, counts: Floats) -> None:
+def _follow(
+    tadc: Ints,
+    tare_counts: Floats,
+    kpa_per_count: Floats,
+    t_ns: Times,
+    state: State,
+    kpa: Floats,
+) -> None:
     n, tiles = tadc.shape
     for j in range(tiles):
         tile = state[j]
         for i in range(n):
-            now = tadc[i, j]
-            if not math.isnan(now):
+            now = tadc[i, j] - tare_counts[j]
+            if tadc[i, j] != NOT_READ and not math.isnan(now):
                 if math.isnan(tile.chip):
                     tile.chip = tile.gas = now
                 else:
@@ -60,4 +82,4 @@ def _follow(tadc: Floats, t_ns: Times, state: State, counts: Floats) -> None:
                     tile.gas -= math.expm1(-step_s / LAG_S) * (tile.chip - tile.gas)
                 tile.t_ns = t_ns[i, j]
             more = tile.chip if abs(tile.chip) > abs(tile.gas) else tile.gas
-            counts[i, j] = 0.0 if math.isnan(more) else more
+            kpa[i, j] = 0.0 if math.isnan(more) else kpa_per_count[j] * more

@@ -13,28 +13,24 @@ import numpy as np
 from devices.arrays import Bools, Floats, Ints, Times
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
-from devices.frames import NOT_READ, ArrayInfo, FrameBatch
+from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.tare.tare import Tare, expected_shift_kpa
 from service.estimation.watch import baseline, clip, repeats, warmth
+from service.estimation.watch.state import State
 
 UNLOADED_SIGMAS = 4.0
 """Of a reading about the baseline: so near it, no load is seen."""
-
-SIGMAS = 5.0
-"""Of a baseline that is known to be uncertain: so far it may be off."""
-WARMTH = 1.5
-"""Of what a kelvin does to a baseline: the wall gives way, and chip and gas differ."""
 
 
 @dataclass(frozen=True)
 class WatchState:
     """What the watch remembers; None before the first frames."""
 
-    repeats: repeats.State | None = None
-    clip: clip.State | None = None
-    baseline: baseline.State | None = None
-    warmth: warmth.State | None = None
+    repeats: State | None = None
+    clip: State | None = None
+    baseline: State | None = None
+    warmth: State | None = None
 
 
 @dataclass(frozen=True)
@@ -46,8 +42,8 @@ class Watch:
         baseline_kpa: (tiles,), at the tare.
         end_kpa: (tiles,), absolute pressure behind which a chip may stand still, and is no tile
             that repeats itself.
-        noise_kpa: (tiles,), standard deviation of a reading.
         unloaded_kpa: (tiles,), so near the baseline no load is seen.
+        bearing_kpa: (bearing tiles,) each: baselines, the same bound, and the noise of a reading.
         most: how often a word may repeat.
         even: (bearing tiles,), for `baseline.lost`.
         tare_counts: (bearing tiles,), `tadc` at the tare.
@@ -57,8 +53,8 @@ class Watch:
     bearing: Ints
     baseline_kpa: Floats
     end_kpa: Floats
-    noise_kpa: Floats
     unloaded_kpa: Floats
+    bearing_kpa: tuple[Floats, Floats, Floats]
     most: repeats.Limits
     even: Floats
     tare_counts: Floats
@@ -66,7 +62,7 @@ class Watch:
 
     def readings(
         self, frames: FrameBatch, kpa: Floats, state: WatchState
-    ) -> tuple[Bools, Floats, WatchState]:
+    ) -> tuple[Bools, Floats | None, WatchState]:
         """Which readings are repeats, and above what pressure they may be clipped.
 
         Args:
@@ -75,21 +71,21 @@ class Watch:
             state: from the frames before.
 
         Returns:
-            (n, tiles), (n, bearing tiles), and the next state.
+            (n, tiles); (n, bearing tiles), or None if nowhere; and the next state.
         """
-        tiles = frames.tile_count
-        before = repeats.at_rest(tiles) if state.repeats is None else state.repeats
-        above_kpa = np.where(kpa < self.end_kpa, kpa - self.baseline_kpa, np.nan)
         stuck, repeated = repeats.repeating(
-            frames.padc, above_kpa, self.unloaded_kpa, self.most, before
+            frames.padc,
+            kpa,
+            self.baseline_kpa,
+            self.end_kpa,
+            self.unloaded_kpa,
+            self.most,
+            repeats.at_rest(frames.tile_count) if state.repeats is None else state.repeats,
         )
-        columns = self.bearing
         end_kpa, clipped = clip.end_of_range(
-            kpa[:, columns],
-            self.baseline_kpa[columns],
-            self.unloaded_kpa[columns],
-            self.noise_kpa[columns],
-            clip.at_rest(len(columns)) if state.clip is None else state.clip,
+            kpa[:, self.bearing],
+            *self.bearing_kpa,
+            clip.at_rest(len(self.bearing)) if state.clip is None else state.clip,
         )
         return stuck, end_kpa, replace(state, repeats=repeated, clip=clipped)
 
@@ -99,11 +95,12 @@ class Watch:
         """What the baselines have moved by since the tare and no model corrects, signed."""
         if self.kpa_per_count is None:
             return np.zeros(t_ns.shape), state
-        tadc = frames.tadc[:, self.bearing]
-        away = np.where(tadc == NOT_READ, np.nan, tadc - self.tare_counts)
         before = warmth.at_rest(len(self.bearing)) if state.warmth is None else state.warmth
-        counts, after = warmth.moved(away, t_ns, before)
-        return self.kpa_per_count * counts, replace(state, warmth=after)
+        tadc = frames.tadc[:, self.bearing]
+        warmed_kpa, after = warmth.moved_kpa(
+            tadc, self.tare_counts, self.kpa_per_count, t_ns, before
+        )
+        return warmed_kpa, replace(state, warmth=after)
 
     def lost_kpa(
         self,
@@ -112,20 +109,13 @@ class Watch:
         warmed_kpa: Floats,
         t_ns: Times,
         state: WatchState,
-    ) -> tuple[Floats, WatchState]:
-        """How wrong each baseline may be by what is read; see `baseline.lost`.
-
-        Args:
-            gauge_kpa: (n, bearing tiles), above the baseline, NaN where unknown.
-            variance: (n, bearing tiles), of the baseline, as far as it is known to be uncertain.
-            warmed_kpa: from `warmed_kpa`.
-            t_ns: (n, bearing tiles), instants.
-            state: from the frames before.
-        """
+    ) -> tuple[Floats, Bools, WatchState]:
+        """How wrong each baseline may be by what is read; see `baseline.lost`."""
         before = baseline.at_rest(len(self.bearing)) if state.baseline is None else state.baseline
-        explained_kpa = SIGMAS * np.sqrt(variance) + WARMTH * np.abs(warmed_kpa)
-        lost_kpa, after = baseline.lost(gauge_kpa, explained_kpa, t_ns, self.even, before)
-        return lost_kpa, replace(state, baseline=after)
+        lost_kpa, astray, after = baseline.lost(
+            gauge_kpa, variance, warmed_kpa, t_ns, self.even, before
+        )
+        return lost_kpa, astray, replace(state, baseline=after)
 
 
 def make_watch(
@@ -158,6 +148,7 @@ def make_watch(
     np.divide(
         tare.noise_kpa, count_kpa, out=noise, where=(count_kpa > 0.0) & np.isfinite(tare.noise_kpa)
     )
+    unloaded_kpa = UNLOADED_SIGMAS * np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)
     per_count = expected_shift_kpa(tare, np.ones(len(tiles)) / TADC_PER_KELVIN)[bearing]
     for at, column in enumerate(bearing):
         entry = calibration.find(tiles[column].serial)
@@ -167,8 +158,8 @@ def make_watch(
         bearing=bearing,
         baseline_kpa=tare.baseline_kpa,
         end_kpa=end_kpa,
-        noise_kpa=tare.noise_kpa,
-        unloaded_kpa=UNLOADED_SIGMAS * np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa),
+        unloaded_kpa=unloaded_kpa,
+        bearing_kpa=(tare.baseline_kpa[bearing], unloaded_kpa[bearing], tare.noise_kpa[bearing]),
         most=repeats.make_limits(noise, info.nominal_rate_hz),
         even=np.where(gas_known, baseline.EVEN, baseline.EVEN_WITHOUT_GAS),
         tare_counts=tare.tadc_counts[bearing],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from devices.arrays import Floats
-from service.estimation.watch.baseline import EVEN, LOST_KPA, at_rest, lost
+from service.estimation.watch.baseline import EVEN, LOST_KPA, SIGMAS, at_rest, lost
 
 RATE_HZ = 447.0
 STEP_NS = round(1e9 / RATE_HZ)
@@ -15,9 +15,11 @@ STEP_NS = round(1e9 / RATE_HZ)
 def judged(gauge_kpa: Floats, explained_kpa: float = 0.03) -> Floats:
     n = len(gauge_kpa)
     t_ns = STEP_NS * np.arange(n, dtype=np.int64)[:, None]
-    found, _ = lost(
-        gauge_kpa[:, None], np.full((n, 1), explained_kpa), t_ns, np.array([EVEN]), at_rest(1)
+    variance = np.full((n, 1), (explained_kpa / SIGMAS) ** 2)
+    found, astray, _ = lost(
+        gauge_kpa[:, None], variance, np.zeros((n, 1)), t_ns, np.array([EVEN]), at_rest(1)
     )
+    assert (astray == (found[:, 0] > 0.0)).all()
     return found[:, 0]
 
 

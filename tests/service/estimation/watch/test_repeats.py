@@ -35,9 +35,11 @@ def found(level: Floats, counts: float, *, n_lead: int = 447) -> npt.NDArray[np.
     tiles = level.shape[1]
     lead = noise(n_lead, tiles, counts, seed=99)
     padc = np.rint(400.0 - np.concatenate([lead, level])).astype(np.uint16)
-    above_kpa = COUNT_KPA * (400.0 - padc.astype(np.float64))
+    kpa = COUNT_KPA * (400.0 - padc.astype(np.float64))
     unloaded_kpa = np.full(tiles, UNLOADED * COUNT_KPA * np.hypot(counts, 0.3))
-    judged, _ = repeating(padc, above_kpa, unloaded_kpa, limits_of(counts, tiles), at_rest(tiles))
+    zero, never = np.zeros(tiles), np.full(tiles, np.inf)
+    most = limits_of(counts, tiles)
+    judged, _ = repeating(padc, kpa, zero, never, unloaded_kpa, most, at_rest(tiles))
     assert not judged[:n_lead].any()
     return judged[n_lead:]
 
@@ -92,7 +94,13 @@ def test_a_quiet_tile_that_bears_nothing_may_stand_still_for_ever() -> None:
 def test_readings_that_cannot_be_read_say_nothing() -> None:
     padc = np.full((500, 1), 65535, dtype=np.uint16)
     judged, state = repeating(
-        padc, np.full((500, 1), np.nan), np.ones(1), limits_of(0.85, 1), at_rest(1)
+        padc,
+        np.full((500, 1), np.nan),
+        np.zeros(1),
+        np.full(1, np.inf),
+        np.ones(1),
+        limits_of(0.85, 1),
+        at_rest(1),
     )
     assert not judged.any()
     assert state["pairs"].tolist() == [0]

@@ -1,0 +1,325 @@
+"""What an estimate makes of tiles that are wrong and answer all the same, and of healthy ones.
+
+    python benchmarks/hard_cases.py [--out docs/results/hard_cases.md] [--healthy ROUNDS --data DIR]
+
+Each case is a fault of an emulated foot of four tiles that walks on the spot: half sines of 0.6 s,
+each as heavy as it likes. Its frames are estimated live (10 ms of look-ahead) twice, with the watch
+and without. Wrong is a GRF that is off by more than 1 N and by more than 1.96 of its own sigma.
+
+With `--healthy` no fault is there, and every flag is a false alarm: built-in scenes and recorded
+loads, with white noise, with noise correlated over 10 ms, and with repeatability 0.03 in turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from devices.arrays import Bools, Floats, Times
+from devices.chips.compensation import Compensation
+from devices.emulation.ground.load_trace import CopTransform, LoadTrace
+from devices.errors import FootTileError
+from devices.frames import ArrayInfo, FrameBatch
+from devices.scene.file import Scene, load_scene
+from service.estimation.calibration import Calibration
+from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimates import Estimates, EstimateStatus
+from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.tare.unloaded import take_tare
+from service.estimation.watch.watch import Watch, WatchState
+from service.offline.calibrations import find_calibration
+from service.offline.simulate import SimulateOptions, Simulation
+from service.rig.emulated import EmulatedFoot
+from storage.formats.load_trace import read_load_trace
+
+LAG_MS = 10.0
+CHUNK = 4096
+MARK = "<!-- table -->"
+WRONG_N = 1.0
+LADDERS = {
+    "static": ("unwrap", "static"),
+    "whole": ("unwrap", "gas", "static", "skew", "denoise", "hysteresis", "rubber"),
+}
+WARM = ("unwrap", "temperature", *LADDERS["whole"][1:])
+JUDGED = EstimateStatus.STUCK | EstimateStatus.CLIPPED | EstimateStatus.BASELINE_LOST
+BEGIN_S = 5.3
+"""When most faults begin, in the middle of a step."""
+
+
+class Blind(Watch):
+    """Sees nothing: what an estimate was before there was a watch."""
+
+    def readings(
+        self, frames: FrameBatch, kpa: Floats, state: WatchState
+    ) -> tuple[Bools, Floats | None, WatchState]:
+        """No repeats, no edge."""
+        return np.zeros(kpa.shape, dtype=bool), None, state
+
+    def lost_kpa(
+        self,
+        gauge_kpa: Floats,
+        variance: Floats,
+        warmed_kpa: Floats,
+        t_ns: Times,
+        state: WatchState,
+    ) -> tuple[Floats, Bools, WatchState]:
+        """Nothing is lost."""
+        return np.zeros(gauge_kpa.shape), np.zeros(len(gauge_kpa), dtype=bool), state
+
+    def warmed_kpa(
+        self, frames: FrameBatch, t_ns: Times, state: WatchState
+    ) -> tuple[Floats, WatchState]:
+        """Nothing has warmed."""
+        return np.zeros(t_ns.shape), state
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Frames of an emulated foot with what was true."""
+
+    info: ArrayInfo
+    frames: FrameBatch
+    true_grf_n: Floats
+    calibration: Calibration
+
+
+def record(scene: Scene, foot: EmulatedFoot, seconds: float | None) -> Recorded:
+    """Run a scene, its tiles calibrated on the emulated bench."""
+    serials = [tile.serial for tile in scene.tile]
+    calibration = find_calibration(scene.calibration, serials, parts_seed=foot.parts_seed)
+    with ExitStack() as stack:
+        options = SimulateOptions(scene, seconds, otherwise_s=20.0, truth=True, foot=foot)
+        simulation = Simulation(options, stack)
+        pieces = list(simulation.pieces())
+    return Recorded(
+        simulation.info,
+        FrameBatch.concatenate([frames for frames, _ in pieces]),
+        np.concatenate([extra["true_grf_n"] for _, extra in pieces]),
+        calibration,
+    )
+
+
+def estimated(plan: EstimationPlan, frames: FrameBatch) -> Estimates:
+    """All estimates of a recording."""
+    state, pieces = EstimationState(), []
+    for begin in range(0, len(frames), CHUNK):
+        part, state = step(plan, frames.rows(begin, min(begin + CHUNK, len(frames))), state)
+        pieces.append(part)
+    last = finish(plan, state)
+    return Estimates.concatenate(pieces if last is None else [*pieces, last])
+
+
+def plan_of(recorded: Recorded, models: Sequence[str], *, blind: bool = False) -> EstimationPlan:
+    """A live estimate's constants, tared from the lead."""
+    info, calibration = recorded.info, recorded.calibration
+    tare = take_tare(recorded.frames, Compensation(info.tiles), calibration, info.serials)
+    plan = make_plan(info, calibration, tare, models=models, lag_ms=LAG_MS)
+    if not blind:
+        return plan
+    watch = Blind(**{f.name: getattr(plan.watch, f.name) for f in fields(Watch)})
+    return replace(plan, watch=watch)
+
+
+def walk(seconds: float) -> LoadTrace:
+    """Steps of 0.6 s, 0.6 s apart, on four tiles, each with a top of its own."""
+    rng = np.random.default_rng(0)
+    t_s = np.arange(0.0, seconds, 0.005)
+    number, at_s = (t_s // 1.2).astype(int), t_s % 1.2
+    tops_n = rng.uniform(9.0, 17.0, (number[-1] + 1, 4))[number]
+    shape = np.where(at_s < 0.6, np.sin(math.pi * np.minimum(at_s, 0.6) / 0.6), 0.0)
+    cells_n = tops_n * shape[:, None]
+    return LoadTrace("steps", t_s, cells_n, None, None, None)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One thing that goes wrong."""
+
+    name: str
+    fault: dict[str, Any] | None = None
+    emulation: dict[str, Any] | None = None
+    begin_s: float = BEGIN_S
+    ladders: tuple[str, ...] = ("whole",)
+
+
+def on_tile(kind: str, seconds: float = 60.0, **keys: Any) -> dict[str, Any]:
+    """A fault of the second tile."""
+    return {"kind": kind, "tile": "T02", "t_s": BEGIN_S, "duration_s": seconds, **keys}
+
+
+def cases() -> list[Case]:
+    """All of them."""
+    step_k = {"temperature_step_s": BEGIN_S}
+    return [
+        Case("nothing", begin_s=0.0),
+        Case("pressure word stands still for 1 s (`frozen`)", on_tile("frozen", 1.0)),
+        Case("pressure word stands still for good", on_tile("frozen")),
+        *(
+            Case(f"dome leaks, {leak_s:g} s (`puncture`)", on_tile("puncture", leak_s=leak_s))
+            for leak_s in (0.03, 0.1, 0.5, 2.0, 10.0, 60.0)
+        ),
+        Case("all chips clip at 106 kPa", emulation={"clip_kpa": 106.0}, begin_s=1.0),
+        Case("all chips clip at 104 kPa", emulation={"clip_kpa": 104.0}, begin_s=1.0),
+        Case("4 K colder", emulation={"temperature_step_k": -4.0, **step_k}),
+        Case("4 K warmer", emulation={"temperature_step_k": 4.0, **step_k}),
+        Case(
+            "4 K colder, `temperature` named",
+            emulation={"temperature_step_k": -4.0, **step_k},
+            ladders=("warm",),
+        ),
+        Case("conversions never end for 1 s (`stale`)", on_tile("stale", 1.0)),
+        Case("no answer for 1 s (`no_answer`)", on_tile("no_answer", 1.0)),
+        Case("pressed past its range for 1 s (`over_range`)", on_tile("over_range", 1.0)),
+    ]
+
+
+def rows(seconds: float) -> Iterator[str]:
+    """A line of the table for each case and ladder."""
+    content = load_scene("standing").model_dump(mode="python", exclude_none=True)
+    content["ground"] = {"kind": "trace"}
+    for case in cases():
+        fault = [] if case.fault is None else [case.fault]
+        emulation = content["emulation"] | (case.emulation or {})
+        scene = Scene.model_validate(content | {"fault": fault, "emulation": emulation})
+        recorded = record(scene, EmulatedFoot(load=walk(seconds), seed=1), seconds)
+        for ladder in case.ladders:
+            models = WARM if ladder == "warm" else LADDERS[ladder]
+            yield row(case, ladder, recorded, models)
+
+
+def row(case: Case, ladder: str, recorded: Recorded, models: Sequence[str]) -> str:
+    """One line of the table."""
+    before = estimated(plan_of(recorded, models, blind=True), recorded.frames)
+    after = estimated(plan_of(recorded, models), recorded.frames)
+    t_s = (recorded.frames.t_ns - recorded.frames.t_ns[0]) * 1e-9
+    wrong = [_wrong(e, recorded.true_grf_n) for e in (before, after)]
+    off_n = np.abs(before.grf_n - recorded.true_grf_n)[t_s >= case.begin_s]
+    flagged = (after.estimate_status & JUDGED) != 0
+    first_s = "-" if not flagged.any() else f"{t_s[flagged][0] - case.begin_s:.2f}"
+    bits = np.bitwise_or.reduce(after.estimate_status & ~np.uint16(_ORDINARY))
+    names = ", ".join(f"`{bit.name.lower()}`" for bit in EstimateStatus if bit & bits and bit.name)
+    seen = np.isfinite(after.grf_sigma_n) & (t_s >= case.begin_s)
+    within = np.abs(after.grf_n - recorded.true_grf_n) <= 1.96 * after.grf_sigma_n
+    covered = f"{100 * within[seen].mean():.0f} %" if seen.any() else "-"
+    worst_n = f"{np.nanmax(off_n):.1f}" if np.isfinite(off_n).any() else "-"
+    silent = [int((w & ~_said(e)).sum()) for w, e in zip(wrong, (before, after), strict=True)]
+    return (
+        f"| {case.name} | {ladder} | {worst_n} | {silent[0]} | {silent[1]} | {names or '-'} "
+        f"| {first_s} | {covered} |"
+    )
+
+
+_ORDINARY = EstimateStatus.COP_MASKED | EstimateStatus.OUTLIER_REPLACED | EstimateStatus.GAP
+_SAYING = JUDGED | EstimateStatus.SATURATED | EstimateStatus.TARE_OLD | EstimateStatus.TILE_MISSING
+
+
+def _said(e: Estimates) -> Bools:
+    return np.asarray((e.estimate_status & _SAYING) != 0)
+
+
+def _wrong(e: Estimates, true_n: Floats) -> Bools:
+    off_n = np.abs(e.grf_n - true_n)
+    return np.asarray((off_n > WRONG_N) & (off_n > 1.96 * e.grf_sigma_n))
+
+
+NOISES: tuple[dict[str, Any], ...] = ({}, {"correlated_ms": 10.0}, {"repeatability": 0.03})
+
+
+def healthy_feet(data: Path, seed: int) -> Iterator[tuple[str, Scene, EmulatedFoot, float | None]]:
+    """Feet that nothing is wrong with."""
+    for name, load, seconds in (
+        ("insole", "insole_walk_left.csv", None),
+        ("insole", "insole_walk_right.csv", None),
+        ("standing", "squat_jump_plate1.csv", None),
+        ("standing", "squat_jump_plate2.csv", None),
+        ("rolling", None, 60.0),
+        ("standing", None, 60.0),
+        ("poppy", None, None),
+        ("mud", None, None),
+    ):
+        content = load_scene(name).model_dump(mode="python", exclude_none=True)
+        emulation = content["emulation"] | NOISES[seed % len(NOISES)]
+        scene = Scene.model_validate(content | {"emulation": emulation})
+        parts = 0 if name == "insole" else seed % 4
+        foot = EmulatedFoot(seed=seed, parts_seed=parts)
+        if load is not None:
+            scale, cop = (0.05, 1.0) if name == "insole" else (0.03, 0.2)
+            trace, transform = read_load_trace(data / load), CopTransform(scale=cop)
+            foot = replace(foot, load=trace, load_scale=scale, cop=transform)
+        yield load or name, scene, foot, seconds
+
+
+def healthy(data: Path, rounds: int) -> Iterator[str]:
+    """A line for each kind of foot: how long, and how many alarms."""
+    found: dict[str, list[float]] = {}
+    for seed in range(rounds):
+        for name, scene, foot, seconds in healthy_feet(data, seed):
+            recorded = record(scene, foot, seconds)
+            count_alarms(name, recorded, found)
+            print(name, seed, found[name], file=sys.stderr)
+    yield from alarm_lines(found)
+
+
+def count_alarms(name: str, recorded: Recorded, found: dict[str, list[float]]) -> None:
+    """Add hours, and onsets of each flag under both ladders, of one recording."""
+    frames = recorded.frames
+    counts = found.setdefault(name, [0.0] * 4)
+    counts[0] += float(frames.t_ns[-1] - frames.t_ns[0]) * 1e-9 / 3600.0
+    # Mud is cold: without the model for it the flag is right.
+    ladders = [load_scene("mud").models] if name == "mud" else list(LADDERS.values())
+    for models in ladders:
+        status = estimated(plan_of(recorded, models), frames).estimate_status
+        for k, bit in enumerate(JUDGED, start=1):
+            there = (status & bit) != 0
+            counts[k] += float((np.diff(there.astype(int), prepend=0) == 1).sum())
+
+
+def alarm_lines(found: dict[str, list[float]]) -> Iterator[str]:
+    """The table's lines, and their sum."""
+    found = {**found, "all": [sum(column) for column in zip(*found.values(), strict=True)]}
+    for name, (hours, *alarms) in found.items():
+        yield f"| {name} | {hours:.2f} | {' | '.join(f'{n:.0f}' for n in alarms)} |"
+
+
+def main() -> None:
+    """Print the tables, or write the first into the page behind its mark."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--healthy", type=int, default=0, metavar="ROUNDS")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    options = parser.parse_args()
+    if options.healthy:
+        print("| foot | hours | stuck | clipped | baseline_lost |\n|---|--:|--:|--:|--:|")
+        print("\n".join(healthy(options.data, options.healthy)))
+        return
+    table = [
+        "| case | ladder | worst error N | wrong and silent before | now | flags | first after s "
+        "| covered |",
+        "|---|---|--:|--:|--:|---|--:|--:|",
+    ]
+    for line in rows(options.seconds):
+        print(line, file=sys.stderr, flush=True)
+        table.append(line)
+    text = "\n".join(table) + "\n"
+    if options.out is None:
+        print(text, end="")
+        return
+    head, _, rest = options.out.read_text().partition(MARK)
+    _, _, tail = rest.partition("\n\n")
+    options.out.write_text(f"{head}{MARK}\n{text}\n{tail}")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except FootTileError as error:
+        sys.exit(str(error))
