@@ -203,5 +203,9 @@ def test_saturated_and_silent_tiles_cannot_be_mistaken_for_values(
         expect(page.locator("#grf-sigma")).to_contain_text("T03")
         expect(page.locator("#contact")).to_have_attribute("data-contact", "true")
         expect(page.locator("#trace-legend")).to_contain_text("at least this much")
+        card, contact = (page.locator(name).bounding_box() for name in ("#grf-card", "#contact"))
+        assert card is not None
+        assert contact is not None
+        assert contact["x"] + contact["width"] <= card["x"] + card["width"]
     finally:
         field.close()

@@ -234,6 +234,7 @@ function whyNoCop(node, frame) {
   if (!node.tare || node.tare.undone) return "not tared";
   if (!node.calibration) return "no calibration";
   if (bits & ESTIMATE.TILE_MISSING) return "tile missing";
+  if (bits & ESTIMATE.SATURATED) return "tile saturated";
   if (frame.contact === false) return "no contact";
   if (bits & ESTIMATE.COP_MASKED) return "too uncertain";
   return "not determined";

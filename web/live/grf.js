@@ -38,5 +38,5 @@ function named(which, bearing, what) {
   if (!which.length) return "";
   if (which.length === bearing.length) return `all tiles ${what}`;
   const names = which.length < 3 ? which.map(({ tile }) => tile.serial).join(", ") : `${which.length} tiles`;
-  return `${names.replaceAll(" ", "\u00a0")}\u00a0${what}`;
+  return `${names} ${what}`;
 }
