@@ -91,6 +91,7 @@ def run_array(task: ArrayTask) -> ArrayResult:
         cpu_scenes_s=time.process_time() - began_s - bench_s,
         tiles=tiles,
         judged=found,
+        tiles_refused=0 if calibration is not None else len(refusals),
         refusals=tuple(refusals),
     )
 

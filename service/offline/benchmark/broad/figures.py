@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from service.offline.accuracy import PHASES, Covered
-from service.offline.benchmark.broad.arrays import CLEAN, CONDITIONS, HEAVY, SCENES
+from service.offline.benchmark.broad.arrays import CLEAN, CONDITIONS, HEAVY, SCENES, SERIALS
 from service.offline.benchmark.broad.results import ArrayResult, Judged, Phase, Tile, key_of
 from service.offline.benchmark.draws import LAGS_MS
 from service.offline.benchmark.figures import (
@@ -184,6 +184,10 @@ def sigma_goals(results: Sequence[ArrayResult]) -> list[Goal]:
 def error_goals(results: Sequence[ArrayResult]) -> list[Goal]:
     """Of errors, which have goals in clean scenes only, and of models."""
     goals = [goal for row in rows_of(results) if row.condition == CLEAN for goal in _errors(row)]
+    pressed, refused = len(SERIALS) * len(results), sum(r.tiles_refused for r in results)
+    share = 100.0 * refused / pressed if pressed else math.nan
+    figure = "tiles that their bench refuses, %"
+    goals.append(Goal("", figure, share, None, 100.0 * _MODELS_SHARE))
     for title, of, part in (
         ("tiles that lose a model whose effect exceeds 0.1 N, %", "needed", "lost"),
         ("tiles without an effect that are given its model, %", "lacking", "invented"),

@@ -111,6 +111,8 @@ class ArrayResult(Facts):
     tiles: tuple[Tile, ...]
     judged: dict[str, Judged]
     """By scene, condition and mode: `key_of`."""
+    tiles_refused: int
+    """By their bench; then the array gives nothing."""
     refusals: tuple[Refusal, ...]
 
 

@@ -61,6 +61,7 @@ def result(number: int = 0, tiles: tuple[Tile, ...] = (TILE,), **changes: Any) -
             for scene, condition in [*places, ("poppy", HEAVY)]
             for mode in ("live", "offline")
         },
+        tiles_refused=0,
         refusals=(),
     )
 
