@@ -35,7 +35,10 @@ STEEP = 3.0
 """How many more readings there are in the middle of an edge than on the slope, which is as wide; at
 the top of half a sine there are twice as many."""
 ROUND = 1.5
-"""A loading with a round top at the same level is so much evidence against a clip."""
+"""A loading with a round top at the same level is so much evidence against a clip, and so is one
+that ends below it ..."""
+NEAR = 12.0
+"""... by so little, in units of the noise: loads end there for themselves."""
 OTHER = 0.06
 """Loadings that stay at the edge equally long, within this part, are one load again and again, and
 say nothing: a plate that rolls over a foot at one speed."""
@@ -149,7 +152,9 @@ def _follow(
 def _end_of_loading(tile: Any, noise: float) -> None:
     tile.inside = 0
     if tile.peak_kpa < tile.edge_kpa - 2.0 * EDGE * noise:
-        return  # too light to say anything
+        if tile.peak_kpa > tile.edge_kpa - NEAR * noise:
+            tile.evidence = max(0.0, tile.evidence - ROUND)
+        return  # a lighter one says nothing
     if tile.over > OVER_SHARE * tile.at or math.isnan(tile.edge_kpa):
         tile.edge_kpa, tile.evidence, tile.end_kpa = tile.peak_kpa, 0.0, math.inf
         tile.at_usual = tile.at_apart = 0.0
