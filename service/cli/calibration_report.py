@@ -184,6 +184,8 @@ def _tile_json(tile: TileCalibration) -> dict[str, object]:
         "student_t_95": student_t_95(tile.repeats) if tile.repeats > 1 else None,
         "effects": {
             "late_us": _parameter(effects.late_s, 1e6),
+            "late_common_sigma_us": 1e6 * effects.late_common_s,
+            "reference_late_us": 1e6 * effects.reference_late_s,
             "gamma": _parameter(gamma),
             "gas_tau_ms": _parameter(tau, 1e3),
             "creep_part": [_parameter(part) for part in rubber.part] if rubber else None,

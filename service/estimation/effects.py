@@ -129,6 +129,10 @@ class Effects(CalibrationPart):
     late_s: Parameter | None = None
     """How much later the tile is sampled than its frames say: where in a conversion the chip does
     so is not documented. None: no fast loads told."""
+    late_common_s: NotNegative = 0.0
+    """Standard uncertainty that all tiles' `late_s` share: that of the reference's own delay."""
+    reference_late_s: Number = 0.0
+    """How late the reference was taken to be: the bench saw the tile later by `late_s` and that."""
     at_bound: Annotated[tuple[Text, ...], Some] = ()
     """Parameters that were found at the end of what is possible."""
     refused: dict[EffectName, Text] = Field(default={})

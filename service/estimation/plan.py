@@ -65,6 +65,10 @@ class EstimationPlan:
     """(bearing tiles, n), how much more of it an average of n readings leaves than of white."""
     late_ns: Ints
     """How much later a tile is sampled than its frames say."""
+    late_sigma_s: Floats
+    """Its standard uncertainty, every tile's own; ..."""
+    late_common_s: Floats
+    """... and what all tiles share of it."""
     chip_end_kpa: Floats
     """Absolute pressure above which a chip is not known to tell the pressure: the end of its rated
     range, or of what it told on the bench if that is more, or less because it told no more."""
@@ -161,6 +165,10 @@ def make_plan(
             ],
             dtype=np.int64,
         ),
+        late_sigma_s=np.array(
+            [late.sigma if (late := e.effects.late_s) is not None else 0.0 for e in entries]
+        ),
+        late_common_s=np.array([e.effects.late_common_s for e in entries]),
         chip_end_kpa=chip_end_kpa,
         unseen=make_unseen(ladder.curves, ladder.gas, baseline_kpa, chip_end_kpa),
         watch=make_watch(

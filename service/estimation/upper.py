@@ -7,7 +7,7 @@ round in another order, and a matrix product does for one row and for many.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -49,6 +49,10 @@ class UpperState:
     dome: DomeState = DomeState()  # frozen, so one for all is safe
     dome_else: DomeState | None = None
     """After the forces farthest from those that were taken; None: nothing was unseen."""
+    last_n: Floats | None = None
+    """Forces of the frame before, ..."""
+    last_ns: Times | None = None
+    """... and its instants; None: there was none."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +64,8 @@ class TileForces:
         sigma_n: their standard uncertainties.
         own_n: the part of these that is every tile's own.
         common_n: (parts, n, bearing tiles), the rest, of corrections of gas and rubber, of what
-            either did unseen, and of warmth that nothing corrects: all tiles share the error, so
-            these are signed.
+            either did unseen, of warmth that nothing corrects, and of when the bench's reference
+            was read: all tiles share the error, so these are signed.
         beyond: where forces are only bounds.
         unsettled: (n,), has what was unseen left more than the noise of a reading in any tile?
     """
@@ -126,7 +130,10 @@ def tile_forces(
     averaged_n = force_n
     force_n, unseen_n, state = _undone(plan, now, averaged_n, at_ns, state)
     rubber_n = ladder.rubber_misfit * (force_n - averaged_n)
-    common_n = np.stack([now.gas_n, rubber_n, now.unseen_gas_n, unseen_n, now.warm_n])
+    rate_n_per_s, state = _rate(force_n, at_ns, state)
+    own_n = np.hypot(own_n, rate_n_per_s * plan.late_sigma_s)
+    late_n = rate_n_per_s * plan.late_common_s
+    common_n = np.stack([now.gas_n, rubber_n, now.unseen_gas_n, unseen_n, now.warm_n, late_n])
     sigma_n = np.sqrt(own_n**2 + (common_n**2).sum(axis=0))
     unsettled = (~now.beyond & (np.hypot(now.unseen_gas_n, unseen_n) > now.noise_n)).any(axis=1)
     return TileForces(force_n, sigma_n, own_n, common_n, now.beyond, np.asarray(unsettled)), state
@@ -160,7 +167,18 @@ def _undone(
         out_n = np.where(now.beyond, np.minimum(out_n, else_n), out_n)
         if after_else.is_same(after):
             after_else = None
-    return out_n, unseen_n, UpperState(after, after_else)
+    return out_n, unseen_n, replace(state, dome=after, dome_else=after_else)
+
+
+def _rate(force_n: Floats, at_ns: Times, state: UpperState) -> tuple[Floats, UpperState]:
+    """How fast forces rise since the frame before in N/s; 0 where that is not known."""
+    first_n = force_n[:1] if state.last_n is None else state.last_n[None]
+    first_ns = at_ns[:1] if state.last_ns is None else state.last_ns[None]
+    step_s = 1e-9 * np.diff(at_ns, axis=0, prepend=first_ns)
+    rise_n = np.diff(force_n, axis=0, prepend=first_n)
+    known = np.isfinite(rise_n) & (step_s > 0.0)
+    rate = np.where(known, rise_n, 0.0) / np.where(known, step_s, 1.0)
+    return rate, replace(state, last_n=force_n[-1].copy(), last_ns=at_ns[-1].copy())
 
 
 def _without_loop_and_creep(

@@ -15,9 +15,11 @@ from devices.errors import CalibrationError
 from devices.frames import NOT_READ, FrameBatch
 from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.effects import Parameter
 from service.estimation.fitting.effects_fit import fit_effects
 from service.estimation.fitting.fit import fit_tile
 from service.estimation.fitting.indentation import Indentation, pressed_in
+from service.estimation.fitting.timing import UNKNOWN_DELAY, resolved
 from storage.sessions.file import SessionReader
 
 
@@ -37,6 +39,7 @@ def calibrate_recordings(
     *,
     name: str,
     reference: str,
+    delay: Parameter = UNKNOWN_DELAY,
     progress: Callable[[str], None] = lambda message: None,
 ) -> Calibration:
     """Fit every tile that was pressed.
@@ -49,6 +52,7 @@ def calibrate_recordings(
         recordings: of each serial.
         name: for people.
         reference: the force sensor.
+        delay: of its readings behind the force, in seconds.
         progress: told of every tile what was found.
 
     Raises:
@@ -58,7 +62,7 @@ def calibrate_recordings(
     refused: dict[str, str] = {}
     for number, (serial, pressed) in enumerate(recordings.items(), start=1):
         try:
-            tiles.append(_fitted(pressed))
+            tiles.append(_fitted(pressed, delay))
             found = _in_words(tiles[-1])
         except CalibrationError as error:
             if len(recordings) == 1:
@@ -71,6 +75,11 @@ def calibrate_recordings(
             "no tile has a curve: "
             + "; ".join(f"{serial}: {reason}" for serial, reason in refused.items())
         )
+    apart = resolved([tile.effects for tile in tiles], delay)
+    tiles = [
+        tile.model_copy(update={"effects": effects})
+        for tile, effects in zip(tiles, apart, strict=True)
+    ]
     newest_ns = max(
         int(pressed.indentation.t_ns[-1]) for all_of in recordings.values() for pressed in all_of
     )
@@ -142,13 +151,13 @@ def _refuse_contradiction(first: Pressed, second: Pressed) -> None:
         )
 
 
-def _fitted(pressed: Sequence[Pressed]) -> TileCalibration:
+def _fitted(pressed: Sequence[Pressed], delay: Parameter) -> TileCalibration:
     recordings = [each.indentation for each in pressed]
     tile = fit_tile(*pressed_in(recordings))
     return tile.model_copy(
         update={
             "coefficient_words": pressed[0].chip,
-            "effects": fit_effects(recordings, tile),
+            "effects": fit_effects(recordings, tile, delay),
         }
     )
 

@@ -7,8 +7,11 @@ from typing import Annotated
 
 import typer
 
-from devices.errors import needs_extra
+from devices.errors import UsageError, needs_extra
 from service.cli.options import JsonOption, output_path, print_json, progress, remark, stdout
+
+DELAY_MAX_MS = 1000.0
+"""No reference of use here is later."""
 
 
 @needs_extra("server", "`foottile calibrate`")
@@ -28,6 +31,13 @@ def calibrate_command(
     reference: Annotated[
         str, typer.Option(help="The force sensor that the scale comes from.")
     ] = "not stated",
+    reference_delay_ms: Annotated[
+        float | None,
+        typer.Option(help="How late its readings are; default: not known, which costs certainty."),
+    ] = None,
+    reference_delay_sigma_ms: Annotated[
+        float, typer.Option(min=0.0, max=1000.0, help="Standard uncertainty of that.")
+    ] = 0.1,
     as_json: JsonOption = False,
 ) -> None:
     """Fit every tile that was pressed in the recordings, and say how good the fit is.
@@ -38,16 +48,25 @@ def calibrate_command(
     usage, 3 written, but a tile was refused.
     """
     from service.cli.calibration_report import calibration_json, calibration_tables
+    from service.estimation.effects import Parameter
+    from service.estimation.fitting.timing import UNKNOWN_DELAY
     from service.offline.calibrate import calibrate_recordings, read_recordings
     from service.offline.calibrations import write_calibration
     from storage.durable import write_whole
 
+    delay = UNKNOWN_DELAY
+    if reference_delay_ms is not None:
+        if not abs(reference_delay_ms) <= DELAY_MAX_MS:
+            raise UsageError(
+                f"--reference-delay-ms {reference_delay_ms:g}", expected=f"within {DELAY_MAX_MS:g}"
+            )
+        delay = Parameter(value=1e-3 * reference_delay_ms, sigma=1e-3 * reference_delay_sigma_ms)
     path = output_path(out, *recordings)
     plot_path = output_path(plot, out, *recordings) if plot is not None else None
     with progress("fitting"):
         pressed = read_recordings(recordings)
         calibration = calibrate_recordings(
-            pressed, name=path.stem, reference=reference, progress=remark
+            pressed, name=path.stem, reference=reference, delay=delay, progress=remark
         )
         png = None
         if plot_path is not None:

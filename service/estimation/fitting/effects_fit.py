@@ -9,23 +9,27 @@ import numpy as np
 
 from devices.arrays import Bools, Floats, Ints
 from service.estimation.calibration import TileCalibration, is_monotonic
-from service.estimation.effects import Effects, TemperatureEffect, values
+from service.estimation.effects import Effects, Parameter, TemperatureEffect, values
 from service.estimation.fitting.identify import identify
 from service.estimation.fitting.indentation import Indentation, pressed_in, soak, unloaded
 from service.estimation.fitting.model import DomeModel, load
 from service.estimation.fitting.press import Presses, joined, presses
 from service.estimation.fitting.soak import fit_soak
+from service.estimation.fitting.timing import UNKNOWN_DELAY
 
 _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])
 """Takes a cubic in x = gauge / range without constant term to u = 2 x - 1, as far as it varies."""
 
 
-def fit_effects(recordings: Sequence[Indentation], tile: TileCalibration) -> Effects:
+def fit_effects(
+    recordings: Sequence[Indentation], tile: TileCalibration, delay: Parameter = UNKNOWN_DELAY
+) -> Effects:
     """Gas, rubber, hysteresis and temperature, as far as the recordings determine them.
 
     Args:
         recordings: of the tile on the bench, all on one chip.
         tile: its static curve, from the same recordings.
+        delay: of the reference, which is in the `late_s` of the answer: see `resolved`.
     """
     points, baseline_kpa = loadings(recordings)
     noise_kpa = float(np.mean([unloaded(each).noise_kpa for each in pressed_in(recordings)]))
@@ -36,6 +40,7 @@ def fit_effects(recordings: Sequence[Indentation], tile: TileCalibration) -> Eff
         baseline_kpa=baseline_kpa,
         first_curve=curve_over_range(tile.coefficients),
         soaked=soaked,
+        delay=delay,
     )
     rubber = effects.rubber
     if rubber is None:
@@ -115,7 +120,8 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
     # The slow strokes' mean curve has creep and loop in it already.
     static_curve = curve_over_range(tile.coefficients)
 
-    late_s = 0.0 if effects.late_s is None else effects.late_s.value
+    late_s = effects.reference_late_s
+    late_s += 0.0 if effects.late_s is None else effects.late_s.value
     static = DomeModel(static_curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa)
     model = replace(static, curve=curve)
     if gas is not None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -17,15 +19,16 @@ from service.estimation.effects import (
     TemperatureEffect,
 )
 from service.estimation.fitting.model import DomeModel
-from service.estimation.fitting.output_error import Fit, Fitted, OutputErrorProblem
+from service.estimation.fitting.output_error import Fit, OutputErrorProblem
 from service.estimation.fitting.press import Presses
 from service.estimation.fitting.soak import bounds_of
+from service.estimation.fitting.unknowns import LATE_S, TERMS_MAX, Parts
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _CLEAR = 3.0
 """An effect is determined if it differs from zero by this many standard uncertainties."""
-_LN_SIGMA_MAX = 0.7
-"""A time constant is determined within a factor of two."""
+_TOLD = 2.0
+"""A term of creep beside others is one by this many: less depends on it."""
 _FAST_MIN = 50
 """Least number of readings of holds, releases and taps that determine fast effects."""
 
@@ -37,6 +40,7 @@ def identify(
     baseline_kpa: float,
     first_curve: Floats,
     soaked: TemperatureEffect | str,
+    delay: Parameter,
 ) -> Effects:
     """What of gas, rubber and hysteresis the recording determines.
 
@@ -46,6 +50,7 @@ def identify(
         baseline_kpa: absolute pressure unloaded.
         first_curve: c1, c2, c3 of the static curve over gauge / `scale_kpa`, to begin with.
         soaked: from the soak, whose wall's give is used; or why it tells nothing.
+        delay: of the reference; `late_s` of the answer has it in it.
     """
     refused: dict[EffectName, str] = {}
     temperature = None
@@ -56,26 +61,26 @@ def identify(
     wall_per_kpa = Effects(temperature=temperature).wall_per_kpa
     static = DomeModel(first_curve, scale_kpa, baseline_kpa, wall_per_kpa)
     problem = OutputErrorProblem(points, static)
-    free: frozenset[Fitted] = frozenset({"late", "gas", "rubber", "hysteresis"})
+    parts = Parts(late_s=(delay.value, float(np.hypot(LATE_S, delay.sigma))))
     if int(points.fast.sum()) < _FAST_MIN:
-        free -= {"gas", "late"}
+        parts = replace(parts, late_s=None, gas=False)
         refused["gas"] = "no holds, releases or taps in the recording"
     while True:
-        fit = problem.fit(free)
-        reasons = _undetermined(fit, free)
+        fit = best_creep(problem, parts) if parts.terms else problem.fit(parts)
+        reasons = _undetermined(fit)
         if not reasons:
             break
         # One at a time: without the worst effect, the others may be determined.
         worst = next(name for name in ("gas", "hysteresis", "rubber") if name in reasons)
         refused[worst] = reasons[worst]
-        free -= {worst}
+        parts = replace(parts, **_WITHOUT[worst])
     misfits, model, sigma = problem.misfits(fit), fit.model, fit.sigma
     gas = rubber = hysteresis = None
-    if "gas" in free:
+    if "gamma" in sigma:
         (gamma,) = _parameters([model.gamma], sigma["gamma"])
         (tau_s,) = _parameters([model.tau_s], model.tau_s * sigma["ln_tau"])
         gas = GasEffect(gamma=gamma, tau_s=tau_s, misfit=misfits.gas)
-    if "rubber" in free:
+    if "part" in sigma:
         c1, c2, c3 = model.curve.tolist()
         rubber = RubberEffect(
             part=_parameters(model.part, sigma["part"]),
@@ -86,10 +91,10 @@ def identify(
             misfit=misfits.rubber,
             curve_misfit_n=misfits.curve_n,
         )
-    if "hysteresis" in free:
+    if "loop" in sigma:
         hysteresis = HysteresisEffect(part=_parameters(model.loop, sigma["loop"]))
     late_s = None
-    if "late" in free:
+    if "late_s" in sigma:
         (late_s,) = _parameters([model.late_s], sigma["late_s"])
     return Effects(
         gas=gas,
@@ -102,26 +107,48 @@ def identify(
     )
 
 
-def _undetermined(fit: Fit, free: frozenset[Fitted]) -> dict[EffectName, str]:
+def best_creep(problem: OutputErrorProblem, parts: Parts) -> Fit:
+    """With as many terms of creep as foretell best a loading that was not fitted.
+
+    A further term has to lower the squares of the loadings held out, in sum, by more than chance
+    would from the one loading to the other, and none may be nothing: else there are too few
+    loadings to tell it.
+    """
+    many = problem.fit(replace(parts, terms=TERMS_MAX))
+    fits = [problem.fit(replace(parts, terms=n), many.scatter) for n in range(1, TERMS_MAX)]
+    best, *others = [*fits, many]
+    for more in others:
+        better = best.unseen - more.unseen
+        told = (more.model.part > _TOLD * more.sigma["part"]).all()
+        if told and better.sum() > np.sqrt(len(better)) * better.std():
+            best = more
+    return best
+
+
+def _undetermined(fit: Fit) -> dict[EffectName, str]:
     """Why a fitted effect cannot be told from zero."""
     model, sigmas = fit.model, fit.sigma
     reasons: dict[EffectName, str] = {}
-    if "gas" in free:
-        sigma, ln_sigma = float(sigmas["gamma"][0]), float(sigmas["ln_tau"][0])
-        if model.gamma - 1.0 < _CLEAR * sigma or ln_sigma > _LN_SIGMA_MAX:
-            reasons["gas"] = (
-                f"gamma {model.gamma:.3f} +- {sigma:.3f}, tau {model.tau_s * 1e3:.1f} ms within a "
-                f"factor of {np.exp(ln_sigma):.1f}: not determined"
-            )
-    if "rubber" in free:
+    if "gamma" in sigmas:
+        sigma = float(sigmas["gamma"][0])
+        if model.gamma - 1.0 < _CLEAR * sigma:
+            reasons["gas"] = f"gamma {model.gamma:.3f} +- {sigma:.3f}: not determined"
+    if "part" in sigmas:
         total, sigma = float(model.part.sum()), float(sigmas["part_sum"][0])
         if total < _CLEAR * sigma:
             reasons["rubber"] = f"creeping part {total:.3f} +- {sigma:.3f}: not determined"
-    if "hysteresis" in free:
+    if "loop" in sigmas:
         width_n, sigma = float(model.loop @ WIDTHS_N), float(sigmas["loop_n"][0])
         if width_n < _CLEAR * sigma:
             reasons["hysteresis"] = f"half width {width_n:.2f} +- {sigma:.2f} N: not determined"
     return reasons
+
+
+_WITHOUT: Mapping[EffectName, Mapping[str, Any]] = {
+    "gas": {"gas": False},
+    "hysteresis": {"hysteresis": False},
+    "rubber": {"terms": 0},
+}
 
 
 def _parameters(values: Iterable[float], sigmas: Floats) -> tuple[Parameter, ...]:

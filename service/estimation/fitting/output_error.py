@@ -8,63 +8,24 @@ force. Every loading may have a gain of its own about one, because loadings do n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from scipy.optimize import nnls
 
 from devices.arrays import Bools, Floats
-from service.estimation.effects import EffectName
-from service.estimation.fitting.confidence import fit_covariance
-from service.estimation.fitting.least_squares import least_squares
+from service.estimation.fitting.confidence import beyond_bounds, fit_covariance
+from service.estimation.fitting.least_squares import Found, least_squares
 from service.estimation.fitting.model import DomeModel, load
 from service.estimation.fitting.press import Presses
+from service.estimation.fitting.unknowns import Parts, told_s, unknowns_of
 from service.estimation.models.hysteresis import WIDTHS_N
 
-TERMS = 2  # of the creep: one fast, one slow
 _SCATTER = (0.003, 0.03)
 """Least scatter of loadings that is believed; and the paper's scatter, to begin with."""
 _ROUNDS = 2  # the second one knows how much loadings scatter
-_NO_LIMIT = 1e3  # newtons: no coefficient of a curve of 30 N comes near
 _BINS = 15  # parts of the range that systematic errors are averaged over
 _OPENS_N = 0.1
 """A tile with less force is at rest."""
-
-
-Fitted = EffectName | Literal["late"]
-"""What is fitted beside the curve."""
-_LATE_S = 0.00025
-"""How well it is known beforehand when a tile is sampled: somewhere in the first part of a
-conversion of 1.6 ms (DS table 7), of which a quarter is assumed."""
-
-
-@dataclass(frozen=True)
-class _Unknowns:
-    """Unknowns of an effect: where the search begins, and its bounds."""
-
-    effect: Fitted
-    name: str
-    start: tuple[float, ...]
-    least: tuple[float, ...]
-    most: tuple[float, ...]
-
-
-_UNKNOWNS = (
-    _Unknowns("late", "late_s", (0.0,), (-0.0006,), (0.0006,)),
-    # No gas has more than air, which has 1.40; a single time for a sphere's many makes it less.
-    _Unknowns("gas", "gamma", (1.3,), (1.001,), (1.4,)),
-    _Unknowns("gas", "ln_tau", (np.log(0.012),), (-6.5,), (-2.0,)),
-    _Unknowns("rubber", "part", (0.04,) * TERMS, (0.0,) * TERMS, (0.4,) * TERMS),
-    # A fast and a slow time, whose ranges meet: two times that may change places are not unique.
-    _Unknowns(
-        "rubber",
-        "ln_creep",
-        (np.log(0.08), np.log(1.2)),
-        (np.log(0.015), np.log(0.3)),
-        (np.log(0.3), np.log(6.0)),
-    ),
-    _Unknowns("hysteresis", "loop", *((x,) * len(WIDTHS_N) for x in (0.05, 0.0, 0.3))),
-)
 
 
 @dataclass(frozen=True)
@@ -81,6 +42,9 @@ class Fit:
             trade with one another only the sum: "part_sum", "loop_n".
         curve_covariance: (3, 3), of the curve's coefficients.
         at_bound: unknowns that are at the end of what is possible.
+        unseen: (loadings,), squares of what each would be off if the others alone were fitted.
+        unsure: how uncertain the corrections of gas and of creep are by their parameters alone,
+            relative, root mean square on the bench: "gas", "rubber".
     """
 
     model: DomeModel
@@ -90,6 +54,8 @@ class Fit:
     sigma: dict[str, Floats]
     curve_covariance: Floats
     at_bound: tuple[str, ...]
+    unseen: Floats
+    unsure: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -119,47 +85,111 @@ class OutputErrorProblem:
         self._weight = np.where(self._usable, points.weight, 0.0)
         self._gauge_kpa = np.where(self._usable, gauge_kpa, 0.0)
         self._load = load(points.t_s, points.force_n)
+        self._told_s = told_s(points)
 
-    def fit(self, free: frozenset[Fitted]) -> Fit:
-        """Fit the curve and the effects that are `free`."""
-        curve = self._static.curve
-        low, high = np.full(3, -_NO_LIMIT), np.full(3, _NO_LIMIT)
-        low[0] = 0.01 * float(curve.sum())  # of the force at the end of the range
-        x = curve
-        at = {"curve": slice(0, 3)}
-        for unknowns in _UNKNOWNS:
-            if unknowns.effect in free:
-                at[unknowns.name] = slice(len(x), len(x) + len(unknowns.start))
-                x = np.append(x, unknowns.start)
-                low, high = np.append(low, unknowns.least), np.append(high, unknowns.most)
-        # What readings hardly tell is known as well as its bounds say.
-        known = (high - low) / np.sqrt(12.0)
-        scatter = _SCATTER[1]
-        for _ in range(_ROUNDS):
+    def fit(self, parts: Parts, scatter: float | None = None) -> Fit:
+        """Fit the curve and these parts.
+
+        Args:
+            parts: what is fitted.
+            scatter: of the loadings, where it is known; else it is found.
+        """
+        unknowns = unknowns_of(parts, self._static.curve, self._told_s)
+        likely = np.concatenate([u.likely for u in unknowns])
+        within = np.concatenate([np.full(len(u.likely), u.within) for u in unknowns])
+        low = np.concatenate([u.least for u in unknowns])
+        high = np.concatenate([u.most for u in unknowns])
+        at: dict[str, slice] = {}
+        stop = 0
+        for each in unknowns:
+            at[each.name] = slice(stop, stop + len(each.likely))
+            stop += len(each.likely)
+        x = np.clip(likely, low, high)
+        known = scatter is not None
+        scatter = _SCATTER[1] if scatter is None else scatter
+        for _ in range(1 if known else _ROUNDS):
 
             def residual(x: Floats, scatter: float = scatter) -> Floats:
-                return self.residual(self._model(x, at), scatter)
+                off = self.residual(self._model(x, at), scatter)
+                return np.concatenate([off, (x - likely) / within])
 
-            found = least_squares(residual, x, low, high, known)
+            found = least_squares(residual, x, low, high, within)
             x = found.x
             model = self._model(x, at)
             gains, modelled = self._gains(model, scatter)
             # Gains scatter about their mean, which the curve should have taken: not quite, and
             # there are few of them.
-            scatter = max(_SCATTER[0], float(np.sqrt(np.mean((gains - 1.0) ** 2))))
-        covariance = fit_covariance(found.jacobian, known)
-        every = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+            if not known:
+                scatter = max(_SCATTER[0], float(np.sqrt(np.mean((gains - 1.0) ** 2))))
+        read = slice(0, len(found.residual) - len(x))
+        jacobian, off = found.jacobian[read], found.residual[read]
+        covariance = fit_covariance(jacobian, within)
+        every = np.hypot(
+            np.sqrt(np.maximum(np.diag(covariance), 0.0)),
+            beyond_bounds(jacobian, off, within, found.at_bound),
+        )
         sigma = {name: every[where] for name, where in at.items()}
         for name, total, weights in (
-            ("part", "part_sum", np.ones(TERMS)),
+            ("part", "part_sum", np.ones(parts.terms)),
             ("loop", "loop_n", WIDTHS_N),
         ):
             if name in at:
                 variance = float(weights @ covariance[at[name], at[name]] @ weights)
                 sigma[total] = np.array([np.sqrt(max(0.0, variance))])
-        at_bound = tuple(name for name, where in at.items() if found.at_bound[where].any())
-        curve_covariance = covariance[at["curve"], at["curve"]]
-        return Fit(model, gains, scatter, modelled, sigma, curve_covariance, at_bound)
+        return Fit(
+            model=model,
+            gains=gains,
+            scatter=scatter,
+            modelled=modelled,
+            sigma=sigma,
+            curve_covariance=covariance[at["curve"], at["curve"]],
+            at_bound=tuple(name for name, where in at.items() if found.at_bound[where].any()),
+            unseen=self._unseen(found, within),
+            unsure=self._unsure(jacobian, covariance, modelled, model, at),
+        )
+
+    def _unseen(self, found: Found, within: Floats) -> Floats:
+        """What each loading is off by if only the others are fitted, squared, to first order.
+
+        Without its residuals r and their slopes J, the unknowns would move by
+        (all J'J - J'J)^-1 J'r: that is what leaving it out and fitting again comes to.
+        """
+        free = ~found.at_bound
+        slopes = found.jacobian[:, free] * within[free]
+        normal = slopes.T @ slopes
+        m, n = len(self._points.loading), self._points.loadings
+        squares = np.zeros(n)
+        # Points in the order of time, then the gains: loading by loading is row by row.
+        begins = np.searchsorted(self._points.loading, np.arange(n + 1))
+        for k in range(n):
+            rows = np.append(np.arange(begins[k], begins[k + 1]), m + k)
+            own, off = slopes[rows], found.residual[rows]
+            moved = np.linalg.solve(normal - own.T @ own, own.T @ off)
+            squares[k] = float(((off + own @ moved) ** 2).sum())
+        return squares
+
+    def _unsure(
+        self,
+        jacobian: Floats,
+        covariance: Floats,
+        modelled: Floats,
+        model: DomeModel,
+        at: dict[str, slice],
+    ) -> dict[str, float]:
+        """See `Fit`."""
+        x = (modelled[:, 1] - model.baseline_kpa) / model.scale_kpa
+        corrected = {
+            "gas": (("gamma", "ln_tau"), modelled[:, 0] - modelled[:, 1]),
+            "rubber": (("part", "ln_creep", "loop"), modelled[:, 2] / _n_per_kpa(model, x)),
+        }
+        unsure = {}
+        for name, (names, kpa) in corrected.items():
+            columns = [i for each in names if each in at for i in range(*at[each].indices(1000))]
+            slopes = jacobian[: len(x), columns]
+            variance = ((slopes @ covariance[np.ix_(columns, columns)]) * slopes).sum()
+            square = float(((self._weight * kpa) ** 2).sum())
+            unsure[name] = float(np.sqrt(variance / square)) if square > 0.0 else 0.0
+        return unsure
 
     def misfits(self, fit: Fit) -> Misfits:
         """What the fit leaves of the measured pressures, as parts of what was corrected."""
@@ -168,8 +198,7 @@ class OutputErrorProblem:
         residual_kpa = (fit.gains[points.loading] * gauge_kpa - self._gauge_kpa)[rows]
         gas_kpa = (fit.modelled[:, 0] - fit.modelled[:, 1])[rows]
         x = (fit.modelled[:, 1] - model.baseline_kpa)[rows] / model.scale_kpa
-        c1, c2, c3 = model.curve
-        n_per_kpa = (c1 + x * (2.0 * c2 + x * 3.0 * c3)) / model.scale_kpa
+        n_per_kpa = _n_per_kpa(model, x)
         residual_n = residual_kpa * n_per_kpa
         curve_n = _systematic_n(residual_n, points.force_n[rows], points.fast[rows])
         # Squares beyond those of noise and curve, over the squares of the corrections. The noise is
@@ -180,7 +209,7 @@ class OutputErrorProblem:
         rubber_kpa = fit.modelled[rows, 2] / n_per_kpa
         parts = np.stack([gas_kpa**2, rubber_kpa**2], axis=1) / variance[:, None]
         shares, _ = nnls(parts, residual_kpa**2 / variance - 1.0)
-        gas, rubber = np.sqrt(shares)
+        gas, rubber = np.hypot(np.sqrt(shares), [fit.unsure["gas"], fit.unsure["rubber"]])
         return Misfits(gas=float(gas), rubber=float(rubber), curve_n=curve_n)
 
     def _model(self, x: Floats, at: dict[str, slice]) -> DomeModel:
@@ -206,11 +235,17 @@ class OutputErrorProblem:
         return (product + prior) / (square + prior), modelled
 
     def residual(self, model: DomeModel, scatter: float) -> Floats:
-        """What is fitted: pressures, gains and priors off, in their standard uncertainties."""
+        """What is fitted: pressures and gains off, in their standard uncertainties."""
         gains, modelled = self._gains(model, scatter)
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
         off = (gains[self._points.loading] * gauge_kpa - self._gauge_kpa) * self._weight
-        return np.concatenate([off, (gains - 1.0) / scatter, [model.late_s / _LATE_S]])
+        return np.concatenate([off, (gains - 1.0) / scatter])
+
+
+def _n_per_kpa(model: DomeModel, x: Floats) -> Floats:
+    """Slope of the curve at parts of its range."""
+    c1, c2, c3 = model.curve
+    return np.asarray((c1 + x * (2.0 * c2 + x * 3.0 * c3)) / model.scale_kpa)
 
 
 def _systematic_n(residual_n: Floats, force_n: Floats, fast: Bools) -> float:

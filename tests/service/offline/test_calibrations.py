@@ -90,7 +90,7 @@ def pressed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     names: list[str] = []
 
-    def of_serial(recordings: object, *, name: str, reference: str) -> Calibration:
+    def of_serial(recordings: object, *, name: str, **how: object) -> Calibration:
         names.append(name)
         return CALIBRATION.model_copy(update={"tiles": (newton_tile(name[-3:]),)})
 

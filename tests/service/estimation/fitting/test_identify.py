@@ -17,10 +17,12 @@ from devices.emulation.parts import DomePart, draw_dome
 from devices.emulation.surroundings import Surroundings
 from devices.scene.emulated import EmulationScene
 from service.estimation.effects import WALL_PER_KPA, EffectName, Effects
-from service.estimation.fitting.effects_fit import fit_effects
+from service.estimation.fitting.effects_fit import curve_over_range, fit_effects, loadings
 from service.estimation.fitting.fit import fit_tile
 from service.estimation.fitting.indentation import Indentation
-from service.estimation.fitting.model import pressed
+from service.estimation.fitting.model import DomeModel, pressed
+from service.estimation.fitting.output_error import OutputErrorProblem
+from service.estimation.fitting.unknowns import Parts
 from service.estimation.models.hysteresis import WIDTHS_N
 from tests.builders.calibrations import make_calibration
 
@@ -65,8 +67,10 @@ def pressed_by_model(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     return np.asarray(kpa[:, 0])
 
 
-def pressed_by_dome(serial: str, **effects: bool) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Pressures of an emulated dome in which only these effects are on."""
+def pressed_by_dome(
+    serial: str, part: DomePart | None = None, **effects: bool
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Pressures of an emulated dome, drawn or given, in which only these effects are on."""
 
     def press(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
         class Spindle:
@@ -75,7 +79,7 @@ def pressed_by_dome(serial: str, **effects: bool) -> Callable[[np.ndarray, np.nd
 
         off = {"gas": False, "rubber": False, "hysteresis": False}
         scene = EmulationScene.model_validate(off | effects)
-        parts = [draw_dome(serial, 0)]
+        parts = [draw_dome(serial, 0) if part is None else part]
         domes = Domes(parts, [serial], Spindle(), scene, Surroundings(scene), label="bench")
         return np.array([domes.pressure_kpa(0, float(t)) for t in t_s])
 
@@ -270,12 +274,83 @@ def test_a_dome_that_is_sampled_at_another_instant_keeps_its_gas(
     assert effects.late_s.value == pytest.approx(late_s, abs=200e-6)
 
 
+ALL = {"gas": True, "rubber": True, "hysteresis": True}
+
+
+@pytest.mark.parametrize("gamma_tau_s", [0.036, 0.012])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gas_that_cools_as_fast_as_the_rubber_creeps_is_not_given_up_for_the_creep(
+    gamma_tau_s: float, seed: int
+) -> None:
+    drawn = draw_dome("T01", seed)
+    part = replace(
+        drawn,
+        conduction_s=gamma_tau_s,
+        creep_parts=(0.05, 0.03, 0.03),
+        creep_s=(0.03, 0.4, 3.0),
+    )
+    press = pressed_by_dome("T01", part, **ALL)
+    effects = found_in(recorded(press, scatter=0.02, late_s=233e-6, seed=seed))
+    assert set(effects.refused) == {"temperature", "ambient"}
+    assert effects.gas is not None
+    assert 1.15 < effects.gas.gamma.value <= 1.4
+    assert effects.rubber is not None
+    total = sum(p.value for p in effects.rubber.part)
+    assert total == pytest.approx(0.11, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("parts", "times_s", "terms"),
+    [
+        ((0.08,), (0.5,), {1, 2}),
+        ((0.05, 0.05), (0.05, 2.0), {2}),
+        ((0.04, 0.04, 0.04), (0.03, 0.4, 4.0), {3}),
+        ((0.03, 0.03, 0.04, 0.04), (0.015, 0.1, 0.8, 6.0), {3}),
+    ],
+)
+def test_as_many_terms_of_creep_are_found_as_the_bench_can_tell_apart(
+    parts: tuple[float, ...], times_s: tuple[float, ...], terms: set[int]
+) -> None:
+    part = replace(draw_dome("T02", 0), creep_parts=parts, creep_s=times_s)
+    press = pressed_by_dome("T02", part, **ALL)
+    effects = found_in(recorded(press, scatter=0.01))
+    assert effects.rubber is not None
+    assert len(effects.rubber.part) in terms
+    # What of a force has come after 0.1 s, and after a second, is what matters of it.
+    for at_s in (0.1, 1.0):
+        found = sum(
+            g.value * np.exp(-at_s / tau.value)
+            for g, tau in zip(effects.rubber.part, effects.rubber.tau_s, strict=True)
+        )
+        true = sum(g * np.exp(-at_s / tau) for g, tau in zip(parts, times_s, strict=True))
+        assert found == pytest.approx(true, abs=0.012)
+
+
+def test_what_a_loading_is_off_by_if_it_is_held_out_is_what_a_fit_without_it_says() -> None:
+    recording = recorded(strokes=3, holds=3, taps=6)
+    tile = fit_tile(recording)
+    points, baseline_kpa = loadings([recording])
+    static = DomeModel(
+        curve_over_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, WALL_PER_KPA
+    )
+    problem, parts = OutputErrorProblem(points, static), Parts(terms=2)
+    fit = problem.fit(parts)
+    seen = problem.fit(parts, fit.scatter)
+    for held in (1, 4, 8):
+        weight = np.where(points.loading == held, 0.0, points.weight)
+        without = OutputErrorProblem(replace(points, weight=weight), static)
+        model = without.fit(parts, fit.scatter).model
+        off = problem.residual(model, fit.scatter)
+        rows = np.append(np.flatnonzero(points.loading == held), len(points.t_s) + held)
+        assert seen.unseen[held] == pytest.approx(float((off[rows] ** 2).sum()), rel=0.05, abs=1.0)
+
+
 @pytest.mark.parametrize("missing", ["gas", "rubber", "hysteresis"])
 def test_an_effect_that_an_emulated_dome_does_not_have_is_refused_in_words(
     missing: EffectName,
 ) -> None:
     on = {name: name != missing for name in ("gas", "rubber", "hysteresis")}
-    press = pressed_by_dome("T02", **on)
+    press = pressed_by_dome("T02", None, **on)
     effects = found_in(recorded(press, scatter=0.0, strokes=2, holds=2, taps=6))
     assert getattr(effects, missing) is None
     assert effects.refused[missing].endswith("not determined")

@@ -14,6 +14,7 @@ from service.estimation.fitting.fit import fit_tile
 from service.estimation.fitting.least_squares import least_squares
 from service.estimation.fitting.model import DomeModel
 from service.estimation.fitting.output_error import OutputErrorProblem
+from service.estimation.fitting.unknowns import Parts, told_s, unknowns_of
 from tests.service.estimation.fitting.test_identify import recorded
 
 _WIDE = np.full(3, 100.0)
@@ -73,24 +74,28 @@ def test_a_tiles_fit_is_that_of_a_long_search_within_a_small_part_of_its_sigma()
         curve_over_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, WALL_PER_KPA
     )
     problem = OutputErrorProblem(points, static)
-    fit = problem.fit(frozenset({"late", "gas", "rubber", "hysteresis"}))
-    rows = ("late_s", "gamma", "tau_s", "part", "creep_s", "loop")
-    stated = [getattr(fit.model, name) for name in rows]
-    sigma = [
-        *fit.sigma["late_s"], *fit.sigma["gamma"], *fit.sigma["ln_tau"] * fit.model.tau_s,
-        *fit.sigma["part"], *fit.sigma["ln_creep"] * fit.model.creep_s, *fit.sigma["loop"],
-    ]  # fmt: skip
+    fit = problem.fit(Parts(terms=2))
+    unknowns = unknowns_of(Parts(terms=2), static.curve, told_s(points))
+    likely = np.concatenate([each.likely for each in unknowns])
+    within = np.concatenate([np.full(len(each.likely), each.within) for each in unknowns])
+    model = fit.model
+    x = np.concatenate(
+        [
+            model.curve, [model.late_s, model.gamma, np.log(model.tau_s)], model.part,
+            np.log(model.creep_s), model.loop,
+        ]
+    )  # fmt: skip
+    names = ("late_s", "gamma", "ln_tau", "part", "ln_creep", "loop")
     curve_sigma = np.sqrt(np.diag(fit.curve_covariance))
-    unit = np.concatenate([curve_sigma, sigma])
-    x = np.concatenate([fit.model.curve, *(np.atleast_1d(part) for part in stated)])
+    sigma = np.concatenate([curve_sigma, *(fit.sigma[name] for name in names)])
 
     def residual(steps: np.ndarray) -> np.ndarray:
-        at = x + steps * unit
-        model = DomeModel(
+        at = x + steps * sigma
+        tried = DomeModel(
             at[:3], static.scale_kpa, baseline_kpa, WALL_PER_KPA, late_s=at[3], gamma=at[4],
-            tau_s=at[5], part=at[6:8], creep_s=at[8:10], loop=at[10:],
+            tau_s=np.exp(at[5]), part=at[6:8], creep_s=np.exp(at[8:10]), loop=at[10:],
         )  # fmt: skip
-        return problem.residual(model, fit.scatter)
+        return np.concatenate([problem.residual(tried, fit.scatter), (at - likely) / within])
 
     other = scipy.optimize.least_squares(
         residual, np.zeros(len(x)), ftol=1e-12, xtol=1e-12, gtol=1e-12,

@@ -1,0 +1,49 @@
+"""When tiles are sampled, told apart from when the reference is.
+
+The bench sees each tile against the reference, and so the sum of two delays. What tiles have of
+their own differs between them; what they share may be the tiles' or the reference's, and only
+somebody who knows the reference can say how much is which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from service.estimation.effects import Effects, Parameter
+from service.estimation.fitting.unknowns import LATE_S
+
+UNKNOWN_DELAY = Parameter(value=0.0, sigma=0.0005)
+"""Of a load cell behind an amplifier of some 300 Hz, of which no more is known."""
+
+
+def resolved(effects: Sequence[Effects], delay: Parameter) -> list[Effects]:
+    """Tiles of one bench, with when they are sampled by themselves, in the order given.
+
+    The mean over tiles is divided between tiles and reference as their uncertainties are to one
+    another; what is left uncertain of it is common to all tiles.
+
+    Args:
+        effects: of the tiles, with `late_s` as it was seen against the reference.
+        delay: of the reference.
+    """
+    seen = [each.late_s.value for each in effects if each.late_s is not None]
+    if not seen:
+        return list(effects)
+    shared_s = float(np.mean(seen)) - delay.value
+    of_tiles = LATE_S**2 / (LATE_S**2 + delay.sigma**2)
+    reference_s = delay.value + (1.0 - of_tiles) * shared_s
+    common_s = float(np.sqrt(of_tiles)) * delay.sigma
+    return [
+        each
+        if each.late_s is None
+        else each.model_copy(
+            update={
+                "late_s": Parameter(value=each.late_s.value - reference_s, sigma=each.late_s.sigma),
+                "late_common_s": common_s,
+                "reference_late_s": reference_s,
+            }
+        )
+        for each in effects
+    ]

@@ -1,0 +1,126 @@
+"""What is fitted of a tile, and what is known of it beforehand.
+
+Effects that look alike, as a gas that cools and a fast creep, are kept apart by what is known of
+them: every unknown has a value that it is likely near, and how near. Where readings tell, that is
+next to nothing; where they do not, it is the answer, and as uncertain as that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from devices.arrays import Floats
+from service.estimation.fitting.press import Presses
+from service.estimation.models.hysteresis import WIDTHS_N
+
+_NO_LIMIT = 1e3  # newtons: no coefficient of a curve of 30 N comes near
+TERMS_MAX = 3  # of the creep
+_CREEP_S = (0.01, 10.0)
+"""Times that are looked for: a foot's loads come and go within some ten milliseconds, and no bench
+holds a load for long."""
+_STEPS_MIN = 3.0  # readings within the shortest time of a creep
+
+
+LATE_S = 0.00025
+"""How well it is known beforehand when a tile is sampled: somewhere in the first part of a
+conversion of 1.6 ms (DS table 7), of which a quarter is assumed."""
+_LATE_MOST = 2.4  # times that: it is possible, but no more
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What is fitted beside the curve.
+
+    Attributes:
+        late_s: by how much later than assumed the tile seems sampled, likely, and how near; None:
+            it is not fitted.
+        gas: its heat.
+        terms: of the creep.
+        hysteresis: the loop.
+    """
+
+    late_s: tuple[float, float] | None = (0.0, LATE_S)
+    gas: bool = True
+    terms: int = 2
+    hysteresis: bool = True
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Unknowns of a name: what they are likely near, how near, and what is possible."""
+
+    name: str
+    likely: tuple[float, ...]
+    within: float
+    least: tuple[float, ...]
+    most: tuple[float, ...]
+
+
+# No gas has more than air, which has 1.40; a single time for a sphere's many makes it less
+# (hardware.md 9), and bubbles cool within 5 to 60 ms.
+_GAS = (
+    Unknowns("gamma", (1.25,), 0.1, (1.001,), (1.4,)),
+    Unknowns("ln_tau", (np.log(0.015),), 0.8, (np.log(0.0015),), (np.log(0.135),)),
+)
+_PART = (0.03, 0.05, 0.4)  # of a term: likely, how near, and at most
+_LOOP = (0.05, 0.1, 0.3)  # of a play
+
+
+def _creep(terms: int, told_s: tuple[float, float]) -> tuple[Unknowns, ...]:
+    """Parts and times: each term has its share of the times that can be told, and half the next."""
+    least, most = np.log(told_s)
+    share = (most - least) / terms
+    centre = least + share * (np.arange(terms) + 0.5)
+    likely, within, greatest = _PART
+    return (
+        Unknowns("part", (likely,) * terms, within, (0.0,) * terms, (greatest,) * terms),
+        Unknowns(
+            "ln_creep",
+            tuple(centre.tolist()),
+            share / 2.0,
+            tuple(np.maximum(centre - share, least).tolist()),
+            tuple(np.minimum(centre + share, most).tolist()),
+        ),
+    )
+
+
+def unknowns_of(parts: Parts, curve: Floats, told_s: tuple[float, float]) -> list[Unknowns]:
+    """What has to be found, the curve first.
+
+    Args:
+        parts: what is fitted.
+        curve: c1, c2, c3 to begin with.
+        told_s: shortest and longest time of a creep that can be told.
+    """
+    first = tuple(curve.tolist())
+    # Of the force at the end of the range: the slope at zero is never nothing.
+    least = (0.01 * sum(first), -_NO_LIMIT, -_NO_LIMIT)
+    unknowns = [Unknowns("curve", first, _NO_LIMIT, least, (_NO_LIMIT,) * 3)]
+    if parts.late_s is not None:
+        likely_s, near_s = parts.late_s
+        most_s = _LATE_MOST * near_s
+        ends = ((likely_s - most_s,), (likely_s + most_s,))
+        unknowns.append(Unknowns("late_s", (likely_s,), near_s, *ends))
+    if parts.gas:
+        unknowns += _GAS
+    if parts.terms:
+        unknowns += _creep(parts.terms, told_s)
+    if parts.hysteresis:
+        plays = len(WIDTHS_N)
+        likely, within, most = _LOOP
+        unknowns.append(
+            Unknowns("loop", (likely,) * plays, within, (0.0,) * plays, (most,) * plays)
+        )
+    return unknowns
+
+
+def told_s(points: Presses) -> tuple[float, float]:
+    """Shortest and longest time of a creep that the points can tell."""
+    step_s = float(np.median(np.diff(points.t_s)))
+    begins = np.searchsorted(points.loading, np.arange(points.loadings))
+    longest_s = float(np.diff(np.append(points.t_s[begins], points.t_s[-1])).max())
+    least, most = _CREEP_S
+    least = max(least, _STEPS_MIN * step_s)
+    return least, max(4.0 * least, min(most, longest_s))
