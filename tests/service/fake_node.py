@@ -247,8 +247,9 @@ class FakeNode:
     ) -> FrameBatch:
         """The next `n` frames under a force; `now`: leaping to this instant.
 
-        Readings that are all the same are those of a part that hangs, so in a lead, and in frames
-        that are `alive`, one is a count higher and one a count lower: the mean stays exact.
+        Readings that are all the same are those of a part that hangs, so at the end of a lead, and
+        of frames that are `alive`, one in fifteen is a count higher and the next one lower: the
+        mean stays exact.
         """
         if now:
             self.next_t_mono_ns = max(self.next_t_mono_ns, time.monotonic_ns())
@@ -258,7 +259,9 @@ class FakeNode:
         counts = UNLOADED_COUNTS - np.broadcast_to(np.asarray(force_n), shape)
         counts = counts + random.integers(-noise, noise + 1, shape)
         if lead or alive:
-            counts[-30:-28] += [[1], [-1]]
+            moved = np.arange(-15, -min(n, 100), -15)
+            counts[moved] += 1
+            counts[moved + 1] -= 1
         batch = make_frames(
             np.arange(self.seq, self.seq + n),
             self.tiles,

@@ -59,7 +59,9 @@ def plot_broad(results: Sequence[ArrayResult]) -> bytes:
         *([], []), "o", color=GREY, markersize=3.5, markerfacecolor="white", label=others
     )
     figure.legend(loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(f"{len(results)} arrays of domes nobody has seen", fontsize=14)
+    refused = sum(result.tiles_refused > 0 for result in results)
+    but = f", {refused} of them without a calibration" if refused else ""
+    figure.suptitle(f"{len(results)} arrays of domes nobody has seen{but}", fontsize=14)
     return png_of(figure)
 
 
