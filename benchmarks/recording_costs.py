@@ -21,9 +21,9 @@ from recording_data import Recording, batches
 from devices.acquisition import FrameRow
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.intervals import Intervals
-from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal
-from storage.journal.node_journal import SYNC_S, NodeJournal
+from storage.journal.node.in_flight import InFlight
+from storage.journal.node.journal import SYNC_S, NodeJournal
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, decode, encode
 

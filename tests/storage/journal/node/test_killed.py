@@ -13,10 +13,19 @@ from devices.errors import StorageError
 from devices.frames import TileStatus
 from storage.checked_json import read_checked, write_checked
 from storage.intervals import Intervals
-from storage.journal import in_flight, node_journal, node_stream, retention
 from storage.journal.journal import Journal
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
+from storage.journal.node import (
+    in_flight,
+    retention,
+)
+from storage.journal.node import (
+    journal as node_journal,
+)
+from storage.journal.node import (
+    stream as node_stream,
+)
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from tests.builders.arrays import make_array
 from tests.storage.faulty_disk import before_each_sync_of_frames, refusing

@@ -19,10 +19,10 @@ from pathlib import Path
 from devices.errors import DamagedFileError, StorageError
 from storage.durable import put_aside
 from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, union
-from storage.journal.in_flight import IN_FLIGHT_FILE, delete_in_flight, read_in_flight
 from storage.journal.journal import Journal
+from storage.journal.node.in_flight import IN_FLIGHT_FILE, delete_in_flight, read_in_flight
+from storage.journal.node.wanted import Wanted
 from storage.journal.stream_notes import PROMISE_S, StreamNotes, unsynced_tail_max
-from storage.journal.wanted import Wanted
 from storage.wire import EncodedBatch, messages_of
 
 RECENT_BYTES = 4 << 20
