@@ -28,10 +28,10 @@ from service.server.screens.views import NodeView, SessionView
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from storage.intervals import Intervals, OpenPairs
-from storage.journal.in_flight import InFlight
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
-from storage.journal.wanted import ServerWants
+from storage.journal.node.in_flight import InFlight
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
+from storage.journal.node.wanted import ServerWants
 from storage.server_id import SERVER_ID_NAME
 from storage.sessions.folder import SessionFolder
 from storage.wire import messages_of
