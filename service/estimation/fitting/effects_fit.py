@@ -122,6 +122,8 @@ def dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> 
         model = replace(model, part=values(rubber.part), creep_s=values(rubber.tau_s))
     if loop is not None:
         model = replace(model, loop=values(loop.part))
+        if (flow := loop.flow) is not None:
+            model = replace(model, flow_part=flow.part.value, flow_n=flow.stress_n.value)
     return model
 
 
