@@ -41,7 +41,7 @@ def judged(**changes: Any) -> Judged:
         "after_frames": 0,
         "after_within": 0,
         "after_saturation_mae_n": None,
-        "seconds": 36.0,
+        "seconds": 3600.0,
         "alarms": 0,
     }
     return Judged(**(numbers | changes))

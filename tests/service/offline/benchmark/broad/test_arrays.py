@@ -116,8 +116,8 @@ def test_each_time_that_a_tile_is_said_to_be_wrong_is_an_alarm() -> None:
     status = np.zeros(20, dtype=np.uint16)
     status[0:2] = EstimateStatus.STUCK
     status[5:9] = EstimateStatus.BASELINE_LOST | EstimateStatus.SATURATED
-    status[7:12] |= EstimateStatus.CLIPPED
-    status[15:] |= EstimateStatus.CLIPPED
+    status[7:12] |= np.uint16(EstimateStatus.CLIPPED)
+    status[15:] |= np.uint16(EstimateStatus.CLIPPED)
     found = judged(columns(estimate_status=status), lambda: np.ones((20, 2), dtype=bool), 10.0)
     assert found.alarms == 4
     assert found.seconds == pytest.approx(0.19)
