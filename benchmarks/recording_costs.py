@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import statistics
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -16,18 +17,21 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from recording_data import Recording, batches
+from recording_data import FULL_RATE_HZ, Extent, Recording, batches, emulated, lengthened
+from side_by_side import note, spread, table
 
 from devices.acquisition import FrameRow
 from devices.frames import FRAME_COLUMNS, FrameBatch
 from storage.intervals import Intervals
-from storage.journal.in_flight import InFlight
 from storage.journal.journal import Journal
-from storage.journal.node_journal import SYNC_S, NodeJournal
+from storage.journal.node.in_flight import InFlight
+from storage.journal.node.journal import SYNC_S, NodeJournal
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, decode, encode
 
 SYNCS_PER_S = 4
+GOAL = 0.01
+"""Share of a core that the journal may take beyond a bare write."""
 Batches = list[tuple[FrameBatch, bytes]]
 
 
@@ -226,3 +230,61 @@ def _whole_seconds(costs: Mapping[str, Cost], *others: list[float]) -> None:
 
 def _nothing() -> None:
     """Nothing is to be synced."""
+
+
+def appending(extent: Extent, folder: Path) -> list[str]:
+    """What keeping frames costs while they are taken."""
+    pattern = emulated(8, extent.seconds)
+    recording = lengthened(pattern, extent.cost_s, FULL_RATE_HZ)
+    every = encoded(recording)
+    rows = []
+    met = []
+    for paced in (True, False):
+        note(f"appending, {'paced' if paced else 'one after another'}")
+        found = append_costs(recording, folder / f"append-{paced}", paced=paced)
+        rows += _cost_rows(found, "every 25 ms" if paced else "at once", len(every), recording)
+        more = statistics.median(found["Journal.append"].beyond(found["bare write"]))
+        met.append(f"{100 * more:.2f} % {'paced' if paced else 'one after another'}")
+    note("the node's journal")
+    found = node_costs(recording, folder / "node")
+    rows += _cost_rows(found, "every 25 ms, 5 syncs/s", len(every), recording)
+    note("frames in flight")
+    flight = in_flight_costs(recording, folder / "flight")
+    scale = 1e6 / round(recording.rate_hz)
+    head = ("job", "pace", "CPU us a batch", "of it syncing", "wall us a batch", "% of a core",
+            "% of a core beyond the bare write")  # fmt: skip
+    return [
+        *table(head, rows, 2),
+        "",
+        *table(
+            ("each frame", "CPU us", "% of a core"),
+            [
+                (f"`{name}`", spread(cost.cpu_s, scale, 2), spread(cost.cpu_s, 100, 3))
+                for name, cost in flight.items()
+            ],
+        ),
+        "",
+        f"8 tiles at {recording.rate_hz:.0f} Hz, {len(every)} batches of "
+        f"{statistics.mean(len(p) for _, p in every):.0f} bytes, {extent.cost_s:g} s; "
+        "medians over seconds of the recording, and the least and the greatest of them. "
+        f"`Journal.append` beyond the bare write: {', '.join(met)}; the goal is {100 * GOAL:g} %.",
+    ]
+
+
+def _cost_rows(
+    found: dict[str, Cost], pace: str, batch_count: int, recording: Recording
+) -> list[tuple[str, ...]]:
+    scale = 1e6 * recording.seconds / batch_count
+    bare = found["bare write"]
+    return [
+        (
+            name if name == "bare write" else f"`{name}`" if "." in name else name,
+            pace,
+            spread(cost.cpu_s, scale, 0),
+            spread(cost.sync_cpu_s, scale, 0) if any(cost.sync_cpu_s) else "-",
+            spread(cost.wall_s, scale, 0) if "thread" not in name else "-",
+            spread(cost.cpu_s, 100, 2),
+            "-" if cost is bare else spread(cost.beyond(bare), 100, 2),
+        )
+        for name, cost in found.items()
+    ]

@@ -1,4 +1,4 @@
-"""What is recorded in `recording.py`: emulated arrays, and a walk that was measured on a person."""
+"""What `recording.py` records, and how much: emulated arrays, and a walk measured on a person."""
 
 from __future__ import annotations
 
@@ -25,6 +25,39 @@ FULL_RATE_HZ = 544.0
 WALK = "insole_walk_left.csv"
 _ARC_M, _APART_RAD = 0.150, 0.0931
 _BATCH_FRAMES_MAX = 64
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much is measured.
+
+    Attributes:
+        seconds: length of each recording.
+        real_s: of the one on a real clock; 0: none.
+        cost_s: recorded seconds over which appending is measured, twice.
+        sealed_s: length of the journal that is sealed.
+        sliced_s: length of the session from which a slice is read.
+        turns: how often each job is timed.
+        hours: length of the long journal.
+        with_ladder: with all models, which need a calibration from the bench.
+        walk: folder of the measured walk.
+    """
+
+    seconds: float = 120.0
+    real_s: float = 60.0
+    cost_s: float = 60.0
+    sealed_s: float = 120.0
+    sliced_s: float = 3600.0
+    turns: int = 5
+    hours: float = 0.2
+    with_ladder: bool = True
+    walk: Path = Path("../shared/data")
+
+
+QUICK = Extent(
+    seconds=3.0, real_s=2.0, cost_s=3.0, sealed_s=3.0, sliced_s=60.0, turns=2, hours=0.01,
+    with_ladder=False,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

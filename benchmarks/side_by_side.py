@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,3 +39,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], texts: int = 1) ->
     """A Markdown table; the first `texts` columns are words, the others numbers."""
     rule = "|" + "|".join(["---"] * texts + ["--:"] * (len(head) - texts)) + "|"
     return [f"| {' | '.join(head)} |", rule, *(f"| {' | '.join(row)} |" for row in rows)]
+
+
+def note(text: str) -> None:
+    """Say what is measured now, to who waits."""
+    print(f"  {text} ...", file=sys.stderr, flush=True)

@@ -35,8 +35,8 @@ from service.link import (
 )
 from service.node.options import NodeOptions
 from service.node.sending import Greeted, Sending
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
 
 STATUS_EVERY_S = 1.0
 """Interval of status messages, which are for people to read."""

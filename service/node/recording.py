@@ -18,8 +18,8 @@ from service.sessions.begin import begun, numbered, taken_up
 from service.sessions.ends import SessionStream, at_end, broken_off
 from storage.durable import remove_stale_temporaries
 from storage.intervals import NO_END, Intervals
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
 from storage.sessions.folder import Part, Session, SessionFolder
 from storage.sessions.ledger import ledger_of, numbers_of, states_of
 

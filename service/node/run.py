@@ -18,9 +18,9 @@ from service.node.options import NodeOptions
 from service.node.publisher import Publisher
 from service.node.recording import NodeRecording
 from service.node.sending import Source
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
-from storage.journal.wanted import ServerWants
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
+from storage.journal.node.wanted import ServerWants
 
 _LOOK_S = 0.02
 """Between two looks whether the server has everything."""

@@ -20,7 +20,7 @@ from devices.errors import DamagedFramesError, LinkError, StorageError
 from service.link import FramesOf, Hello, Status, Wanted, Welcome, say, with_check
 from service.node.flow import Flow
 from storage.intervals import NO_END, Intervals, closed, union
-from storage.journal.node_stream import NodeStream
+from storage.journal.node.stream import NodeStream
 from storage.wire import EncodedBatch
 
 _ASK_EVERY_S = 0.5

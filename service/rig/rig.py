@@ -32,7 +32,7 @@ from service.rig.description import describe
 from service.rig.emulated import EmulatedFoot
 from service.rig.lead import Lead
 from service.rig.pace import Pace, undisturbed_hz
-from storage.journal.in_flight import InFlight, open_in_flight
+from storage.journal.node.in_flight import InFlight, open_in_flight
 
 if TYPE_CHECKING:
     from devices.emulation.world import World

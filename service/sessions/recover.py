@@ -26,7 +26,7 @@ from service.sessions.tares import TareHistory
 from storage.clock.log import ClockLog
 from storage.durable import remove_stale_temporaries, set_aside
 from storage.intervals import NO_END, Intervals
-from storage.journal.node_journal import settle_left_over
+from storage.journal.node.journal import settle_left_over
 from storage.journal.segment import UNREAD_SUFFIX
 from storage.sessions.beside import EVENTS_NAME, read_events, write_events
 from storage.sessions.folder import Ledger, Part, Session, SessionFolder, new_session_id

@@ -1,18 +1,21 @@
-"""When the frames at the ends of what a journal holds were taken: what comes between has to fit.
+"""When the frames that a journal holds were taken, by the records of its segments.
 
-Frames come newest first and from behind, so what a message has to follow, or to precede, may be far
-away in the files. Only the ends of what is held count, and they are looked up once.
+A frame of an instant, and the instant of a frame, are searched for in the records. What comes has
+to fit between the frames that are there: those may be far away in the files, for frames come newest
+first and from behind. Only the ends of what is held count, and they are looked up once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from devices.frames import FrameBatch
 from storage.frame_rules import runs_back
 from storage.intervals import Intervals
+from storage.journal.segment import Segment
+from storage.journal.segment_format import RECORD, numbers
 from storage.wire import EncodedBatch
 
 
@@ -73,3 +76,84 @@ class Instants:
         if end not in self._known:
             self._known[end] = self._look_up(*end)
         return self._known[end]
+
+
+def first_seq_since(segments: Iterable[Segment], t_ns: int) -> int | None:
+    """The first number of a batch of which anything was taken at `t_ns` or later, if there is one.
+
+    Raises:
+        StorageError: an index cannot be read; so for all that search.
+    """
+    young = []
+    for segment in segments:
+        if segment.t_ns_first >= t_ns:
+            young.append(segment.span[0])
+        elif segment.t_ns_last >= t_ns:
+            records = segment.records()
+            young += records["seq_first"][records["t_ns_last"] >= t_ns].tolist()
+    return min(young, default=None)
+
+
+def t_ns_near(segments: Sequence[Segment], seq: int, *, newest: bool) -> int | None:
+    """Node's UTC of the end of the batch with `seq`, or of its beginning.
+
+    The record of a batch may be damaged: then the nearest one before, or after, that is whole
+    tells; None if there is none.
+    """
+    holding = [segment for segment in segments if segment.held.within(seq, seq)]
+    found = _nearest(holding, seq, newest=newest) or _nearest(segments, seq, newest=newest)
+    return (max(found) if newest else min(found))[1] if found else None
+
+
+def _nearest(segments: Iterable[Segment], seq: int, *, newest: bool) -> list[tuple[int, int]]:
+    """First number and instant of each segment's last batch up to `seq`, or first from it on."""
+    found: list[tuple[int, int]] = []
+    for segment in segments:
+        records = segment.records()
+        if newest:
+            records = records[records["seq_first"] <= seq][-1:]
+        else:
+            records = records[records["seq_first"] + records["count"] > seq][:1]
+        name = "t_ns_last" if newest else "t_ns_first"
+        found += [(int(record["seq_first"]), int(record[name])) for record in records]
+    return found
+
+
+def last_seq_until(
+    segments: Iterable[Segment],
+    t_ns: int,
+    *,
+    at_least: int,
+    read: Callable[[int, int], Iterable[FrameBatch]],
+) -> int | None:
+    """The last number taken at `t_ns` or before, as `Journal.last_seq_until` says.
+
+    Args:
+        segments: of the journal.
+        t_ns: node's UTC.
+        at_least: batches before this number are not looked at.
+        read: gives the frames of a batch by its first and last number.
+    """
+    segments = [segment for segment in segments if segment.span[1] >= at_least]
+    if all(segment.t_ns_last <= t_ns for segment in segments):
+        return None
+    # Among segments that end before `t_ns` only the last one counts.
+    before = max((s.span[1] for s in segments if s.t_ns_last <= t_ns), default=None)
+    records = np.concatenate(
+        [np.zeros(0, RECORD)]
+        + [
+            segment.records()
+            for segment in segments
+            if segment.span[1] == before or segment.t_ns_first <= t_ns < segment.t_ns_last
+        ]
+    )
+    records = records[records["seq_first"] + records["count"] > at_least]
+    is_later_known = any(segment.t_ns_first > t_ns for segment in segments)
+    if not is_later_known and not (records["t_ns_last"] > t_ns).any():
+        return None
+    early = records[records["t_ns_first"] <= t_ns]
+    if not len(early):
+        return at_least - 1
+    newest = numbers(early[early["seq_first"].argmax()])
+    rows = sum(int(np.searchsorted(batch.t_ns, t_ns, side="right")) for batch in read(*newest))
+    return max(at_least - 1, newest[0] + rows - 1)

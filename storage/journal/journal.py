@@ -12,7 +12,7 @@ import errno
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from devices.words import printable
 from storage.durable import make_folder, storage_errors
 from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
+from storage.journal import instants
 from storage.journal.instants import Instants
 from storage.journal.open_segments import OpenSegments
 from storage.journal.segment import (
@@ -33,7 +34,7 @@ from storage.journal.segment import (
     set_aside_no_files,
     unread_of,
 )
-from storage.journal.segment_format import INDEX_SUFFIX, RECORD, numbers, payload_of, read_header
+from storage.journal.segment_format import INDEX_SUFFIX, numbers, payload_of, read_header
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import array_info, wire_schema
 from storage.wire import FRAMES_MAX, EncodedBatch, decode, encode
@@ -230,14 +231,7 @@ class Journal:
 
         By whole batches, so up to one batch earlier; None if nothing so young is held.
         """
-        young = []
-        for segment in self._segments:
-            if segment.t_ns_first >= t_ns:
-                young.append(segment.span[0])
-            elif segment.t_ns_last >= t_ns:
-                records = segment.records()
-                young += records["seq_first"][records["t_ns_last"] >= t_ns].tolist()
-        return min(young, default=None)
+        return instants.first_seq_since(self._segments, t_ns)
 
     def t_ns_near(self, seq: int, *, newest: bool) -> int | None:
         """Node's UTC of the newest frame held up to `seq`, or of the oldest from `seq` on.
@@ -245,14 +239,7 @@ class Journal:
         By whole batches; None if there is no such frame.
         """
         near = self.held.within(0, seq).last if newest else self.held.within(seq, NO_END).first
-        if near is None:
-            return None
-        holding = [segment for segment in self._segments if segment.held.within(near, near)]
-        # The record of a batch may be damaged: then the nearest one that is whole tells.
-        found = _nearest(holding, near, newest=newest) or _nearest(
-            self._segments, near, newest=newest
-        )
-        return (max(found) if newest else min(found))[1] if found else None
+        return None if near is None else instants.t_ns_near(self._segments, near, newest=newest)
 
     def last_seq_until(self, t_ns: int, *, at_least: int) -> int | None:
         """The last number taken at `t_ns` or before, if frames after `t_ns` are held too.
@@ -260,31 +247,7 @@ class Journal:
         None while the stream has not passed `t_ns`. Batches before `at_least` are not looked at;
         `at_least` - 1 if all of them were taken later.
         """
-        segments = [segment for segment in self._segments if segment.span[1] >= at_least]
-        if all(segment.t_ns_last <= t_ns for segment in segments):
-            return None
-        # Among segments that end before `t_ns` only the last one counts.
-        before = max((s.span[1] for s in segments if s.t_ns_last <= t_ns), default=None)
-        records = np.concatenate(
-            [np.zeros(0, RECORD)]
-            + [
-                segment.records()
-                for segment in segments
-                if segment.span[1] == before or segment.t_ns_first <= t_ns < segment.t_ns_last
-            ]
-        )
-        records = records[records["seq_first"] + records["count"] > at_least]
-        is_later_known = any(segment.t_ns_first > t_ns for segment in segments)
-        if not is_later_known and not (records["t_ns_last"] > t_ns).any():
-            return None
-        early = records[records["t_ns_first"] <= t_ns]
-        if not len(early):
-            return at_least - 1
-        newest = numbers(early[early["seq_first"].argmax()])
-        rows = sum(
-            int(np.searchsorted(batch.t_ns, t_ns, side="right")) for batch in self.read(*newest)
-        )
-        return max(at_least - 1, newest[0] + rows - 1)
+        return instants.last_seq_until(self._segments, t_ns, at_least=at_least, read=self.read)
 
     def prune(self, before_t_ns: int, keep: Intervals) -> Intervals:
         """Delete segments that end before `before_t_ns` and hold nothing of `keep`; their numbers.
@@ -389,17 +352,3 @@ def _described(folder: Path) -> ArrayInfo | None:
             if schema is not None:
                 return array_info(schema, where=str(path))
     return None
-
-
-def _nearest(segments: Iterable[Segment], seq: int, *, newest: bool) -> list[tuple[int, int]]:
-    """First number and instant of each segment's last batch up to `seq`, or first from it on."""
-    found: list[tuple[int, int]] = []
-    for segment in segments:
-        records = segment.records()
-        if newest:
-            records = records[records["seq_first"] <= seq][-1:]
-        else:
-            records = records[records["seq_first"] + records["count"] > seq][:1]
-        name = "t_ns_last" if newest else "t_ns_first"
-        found += [(int(record["seq_first"]), int(record[name])) for record in records]
-    return found

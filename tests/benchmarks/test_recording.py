@@ -19,6 +19,10 @@ def recording(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("recording")
 
 
+def part(name: str) -> ModuleType:
+    return importlib.import_module(f"recording_{name}")
+
+
 def tiny(recording: ModuleType, walk: Path) -> object:
     return recording.Extent(
         seconds=1.5, real_s=0.0, cost_s=3.0, sealed_s=1.5, sliced_s=10.0, turns=1, hours=0.001,
@@ -45,7 +49,7 @@ def test_a_walk_that_is_not_there_is_said_to_be_missing(
 def test_every_job_of_keeping_frames_is_measured_second_by_second(
     recording: ModuleType, tmp_path: Path
 ) -> None:
-    costs, data = recording.costs, recording.data
+    costs, data = part("costs"), part("data")
     frames = data.lengthened(data.emulated(4, 1.5), 4.0, data.FULL_RATE_HZ)
     for found in (
         costs.append_costs(frames, tmp_path / "append", paced=False),
@@ -59,7 +63,7 @@ def test_every_job_of_keeping_frames_is_measured_second_by_second(
 def test_a_long_journal_is_built_opened_read_and_sealed_whole(
     recording: ModuleType, tmp_path: Path
 ) -> None:
-    hours, data = recording.long_journal, recording.data
+    hours, data = part("hours"), part("data")
     pattern = data.emulated(8, 1.5)
     with hours.SessionWriter(tmp_path / "pattern.parquet", pattern.info, {}) as writer:
         writer.append(pattern.frames, {})
@@ -76,7 +80,7 @@ def test_sections_are_replaced_in_the_page_and_the_rest_of_it_stays(recording: M
 
 
 def test_the_code_of_the_bound_takes_what_such_numbers_must_take(recording: ModuleType) -> None:
-    code_bits = recording.entropy.code_bits
+    code_bits = part("entropy").code_bits
     rng = np.random.default_rng(0)
     n = 20_000
     assert code_bits(np.full(n, 7)) == 0.0
@@ -91,12 +95,13 @@ def test_the_code_of_the_bound_takes_what_such_numbers_must_take(recording: Modu
 def test_the_bound_of_a_smooth_load_under_noise_is_little_more_than_the_noise(
     recording: ModuleType,
 ) -> None:
-    frames = recording.data.lengthened(recording.data.emulated(4, 1.5), 30.0).frames
+    data = part("data")
+    frames = data.lengthened(data.emulated(4, 1.5), 30.0).frames
     n = len(frames)
     slow = 400.0 + 100.0 * np.sin(np.arange(n)[:, None] / 500.0 + np.arange(4))
     noise = np.random.default_rng(0).normal(0.0, 2.6, (n, 4))
     counts = np.rint(slow + noise).astype(np.uint16)
-    bound = recording.entropy.bytes_per_frame(replace(frames, padc=counts))
+    bound = part("entropy").bytes_per_frame(replace(frames, padc=counts))
     noise_bits = np.log2(2.6 * np.sqrt(2.0 * np.pi * np.e))
     assert noise_bits < bound["padc"] * 8 / 4 < noise_bits + 0.3
     assert bound["t_ns"] < 0.05  # t_mono_ns says it already

@@ -17,7 +17,7 @@ from service.sessions.recover import recover
 from service.sessions.tares import TareHistory
 from storage.checked_json import write_checked
 from storage.clock.log import ClockLog, ClockOffset
-from storage.journal.wanted import ServerWants, Wanted
+from storage.journal.node.wanted import ServerWants, Wanted
 from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.file import SessionReader

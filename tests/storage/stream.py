@@ -8,7 +8,7 @@ import numpy as np
 
 from devices.acquisition import FrameRow
 from devices.frames import ArrayInfo, FrameBatch
-from storage.journal.in_flight import InFlight
+from storage.journal.node.in_flight import InFlight
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, encode
 from tests.builders.arrays import PERIOD_NS, make_array

@@ -30,15 +30,13 @@ _NOTICES_MAX = 256
 _DIGITS = {"kpa": 4, "n": 4, "m": 6, "rad": 5}
 _PER_TILE = ("gauge_kpa", "force_n", "force_sigma_n")
 _PER_FRAME = (
-    *(
-        "grf_n",
-        "grf_sigma_n",
-        "grf_at_least_n",
-        "cop_x_m",
-        "cop_y_m",
-        "cop_sigma_x_m",
-        "cop_sigma_y_m",
-    ),
+    "grf_n",
+    "grf_sigma_n",
+    "grf_at_least_n",
+    "cop_x_m",
+    "cop_y_m",
+    "cop_sigma_x_m",
+    "cop_sigma_y_m",
     "angle_rad",
 )
 

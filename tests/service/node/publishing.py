@@ -18,7 +18,7 @@ from service.link import (
 from service.node.publisher import Publisher
 from service.node.sending import Source
 from storage.intervals import Intervals
-from storage.journal.node_stream import NodeStream
+from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from storage.wire import EncodedBatch
 from tests.service.fake_node import FakeNode

@@ -11,7 +11,7 @@ from service.link import Status
 from service.node.connection import hello_of
 from service.node.options import NodeOptions
 from service.rig.rig import RigOptions
-from storage.journal.node_journal import NodeJournal
+from storage.journal.node.journal import NodeJournal
 from tests.builders.arrays import make_array
 from tests.builders.scenes import make_scene
 from tests.storage.journal.journals import filled

@@ -18,8 +18,8 @@ import pytest
 
 from devices.frames import NO_SERVO_COUNTS, FrameStatus, TileStatus
 from storage.intervals import Intervals
-from storage.journal.in_flight import read_in_flight
 from storage.journal.journal import Journal
+from storage.journal.node.in_flight import read_in_flight
 from storage.journal.stream_notes import StreamNotes
 from tests.service.process import Start
 from tests.service.running import Running

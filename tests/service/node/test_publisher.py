@@ -10,7 +10,7 @@ import pytest
 
 import service.node.sending
 import service.server
-from storage.journal.node_stream import NodeStream
+from storage.journal.node.stream import NodeStream
 from storage.wire import EncodedBatch
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.node.publishing import Publishing, assert_all_arrived

@@ -33,9 +33,9 @@ from service.link import (
 )
 from service.node.dial import ingest_url
 from storage.intervals import Intervals
-from storage.journal.node_stream import NodeStream
+from storage.journal.node.stream import NodeStream
+from storage.journal.node.wanted import Wanted as NodeWanted
 from storage.journal.stream_notes import StreamNotes
-from storage.journal.wanted import Wanted as NodeWanted
 from storage.schema import wire_schema
 from storage.wire import decode
 from tests.faults.proxy import Proxy

@@ -10,7 +10,7 @@ import pytest
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo
 from service.node.recording import NodeRecording
-from storage.journal.node_journal import NodeJournal
+from storage.journal.node.journal import NodeJournal
 from storage.sessions.folder import Session, SessionFolder
 from tests.builders.arrays import make_array
 

@@ -18,10 +18,10 @@ from service.server.nodes import ServerNodes
 from service.server.server import Server
 from service.sessions.tares import TareHistory
 from storage import durable
-from storage.journal.in_flight import IN_FLIGHT_FILE, InFlight
-from storage.journal.node_journal import NodeJournal
+from storage.journal.node.in_flight import IN_FLIGHT_FILE, InFlight
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.wanted import ServerWants, Wanted
 from storage.journal.stream_notes import StreamNotes
-from storage.journal.wanted import ServerWants, Wanted
 from tests.builders.arrays import make_array
 from tests.builders.calibrations import make_calibration, make_tare
 from tests.service.fake_node import FakeNode

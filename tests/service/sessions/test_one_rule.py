@@ -26,7 +26,7 @@ from service.sessions.tares import TareHistory
 from storage.clock.log import ClockOffset
 from storage.intervals import Losses
 from storage.journal.journal import Journal
-from storage.journal.node_journal import NodeJournal
+from storage.journal.node.journal import NodeJournal
 from storage.journal.stream_notes import StreamNotes
 from storage.sessions.folder import Part, Session, SessionFolder
 from storage.sessions.ledger import ledger_of, states_of

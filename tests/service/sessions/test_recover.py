@@ -18,7 +18,7 @@ from service.sessions.recover import recover
 from service.sessions.sealing import seal
 from storage.clock.log import ClockOffset
 from storage.durable import locked
-from storage.journal.in_flight import InFlight
+from storage.journal.node.in_flight import InFlight
 from storage.journal.stream_notes import unsynced_tail_max
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event, Part, Session, SessionFolder
@@ -104,7 +104,7 @@ def test_after_another_start_of_the_machine_what_was_in_flight_is_gone(
 ) -> None:
     folder = stream(tmp_path, info_of(), (0, 99), closed=False)
     InFlight(folder, info_of()).close()
-    monkeypatch.setattr("storage.journal.in_flight.kernel_boot_id", lambda: "another")
+    monkeypatch.setattr("storage.journal.node.in_flight.kernel_boot_id", lambda: "another")
     session(tmp_path)
     assert recover(tmp_path).sessions[0].ledger == loaded(tmp_path).ledger
     ledger = loaded(tmp_path).ledger

@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from storage.journal import node_journal, retention
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
+from storage.journal.node import journal as node_journal
+from storage.journal.node import retention
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
 from tests.builders.arrays import make_array
 from tests.storage.journal.node.leg import Start
 

@@ -6,8 +6,8 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
 from tests.storage.stream import message
 from tests.waiting import until
 

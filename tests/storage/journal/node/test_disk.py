@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 
 from storage.intervals import Intervals
-from storage.journal import node_journal, segment
+from storage.journal import segment
 from storage.journal.journal import Journal
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
+from storage.journal.node import journal as node_journal
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
 from tests.builders.arrays import make_array
 from tests.storage.faulty_disk import (
     IO_ERROR,

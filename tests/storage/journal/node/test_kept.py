@@ -9,10 +9,11 @@ import pytest
 
 from devices.errors import StorageError
 from storage.intervals import NO_END, Intervals
-from storage.journal import node_journal, retention
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
-from storage.journal.wanted import ServerWants
+from storage.journal.node import journal as node_journal
+from storage.journal.node import retention
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
+from storage.journal.node.wanted import ServerWants
 from tests.builders.arrays import make_array
 from tests.storage.journal.node.leg import Start, fill, given, store
 from tests.waiting import until

@@ -13,10 +13,11 @@ from devices.errors import StorageError
 from devices.frames import TileStatus
 from storage.checked_json import read_checked, write_checked
 from storage.intervals import Intervals
-from storage.journal import in_flight, node_journal, node_stream, retention
 from storage.journal.journal import Journal
-from storage.journal.node_journal import NodeJournal
-from storage.journal.node_stream import NodeStream
+from storage.journal.node import in_flight, retention
+from storage.journal.node import journal as node_journal
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from tests.builders.arrays import make_array
 from tests.storage.faulty_disk import before_each_sync_of_frames, refusing
@@ -150,7 +151,7 @@ def test_frames_in_flight_that_cannot_be_read_now_are_waited_for(
     take_in_flight(stream.folder, frames(0, 99))
     with monkeypatch.context() as patched:
         refuse = refusing(StorageError, "cannot be read: Too many open files")
-        patched.setattr(node_stream, "read_in_flight", refuse)
+        patched.setattr(in_flight, "read_in_flight", refuse)
         stream.end()
         assert not journal.settle(0.2)
     assert journal.settle()

@@ -8,9 +8,9 @@ from pathlib import Path
 from devices.errors import DamagedFileError, FileFormatError
 from storage.durable import put_aside
 from storage.intervals import DISK_SLOW
-from storage.journal.in_flight import IN_FLIGHT_FILE, kernel_boot_id, read_in_flight
 from storage.journal.journal import Journal
-from storage.journal.node_stream import NodeStream
+from storage.journal.node.in_flight import IN_FLIGHT_FILE, kernel_boot_id, read_in_flight
+from storage.journal.node.stream import NodeStream
 from storage.journal.stream_notes import StreamNotes
 from storage.wire import messages_of
 

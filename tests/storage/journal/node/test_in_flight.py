@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from devices.errors import DamagedFileError
 from devices.frames import FrameBatch
-from storage.journal import in_flight
-from storage.journal.in_flight import (
+from storage.journal.node import in_flight
+from storage.journal.node.in_flight import (
     ROWS,
     InFlight,
     delete_in_flight,
@@ -113,7 +113,7 @@ import json, sys
 from pathlib import Path
 from devices.acquisition import FrameRow
 from devices.frames import ArrayInfo
-from storage.journal.in_flight import InFlight
+from storage.journal.node.in_flight import InFlight
 info = ArrayInfo.model_validate_json(sys.stdin.readline())
 keeper = InFlight(Path(sys.argv[1]), info)
 for seq in range(10_000_000):

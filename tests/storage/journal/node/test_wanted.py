@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from storage.intervals import NO_END, Intervals
-from storage.journal.wanted import ServerWants, Wanted
+from storage.journal.node.wanted import ServerWants, Wanted
 
 
 def test_a_servers_word_outlives_the_process(tmp_path: Path) -> None:

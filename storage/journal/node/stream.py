@@ -10,8 +10,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
@@ -19,10 +18,11 @@ from pathlib import Path
 from devices.errors import DamagedFileError, StorageError
 from storage.durable import put_aside
 from storage.intervals import CORRUPT, EVICTED, NODE_BUSY, Intervals, Losses, union
-from storage.journal.in_flight import IN_FLIGHT_FILE, delete_in_flight, read_in_flight
 from storage.journal.journal import Journal
+from storage.journal.node.batch_queue import BatchQueue
+from storage.journal.node.in_flight import IN_FLIGHT_FILE, delete_in_flight, read_in_flight_from
+from storage.journal.node.wanted import Wanted
 from storage.journal.stream_notes import PROMISE_S, StreamNotes, unsynced_tail_max
-from storage.journal.wanted import Wanted
 from storage.wire import EncodedBatch, messages_of
 
 RECENT_BYTES = 4 << 20
@@ -59,13 +59,13 @@ class NodeStream:
         self._noted_lost = notes.lost
         self._lost = Losses(notes.lost)
         self._acked_by: dict[str, Intervals] = {}
-        self._waiting = _Queue()
+        self._waiting = BatchQueue()
         """Not in the journal yet."""
         self._unsynced: list[EncodedBatch] = []
         """In the journal, but perhaps not on the disk yet."""
         self._waiting_since_s: float | None = None
         """When the oldest frame came that may not be on the disk yet."""
-        self._recent = _Queue()
+        self._recent = BatchQueue()
         if journal is not None:
             self._lost.found(journal.held)
             for reason, numbers in journal.lost.by_reason.items():
@@ -331,7 +331,7 @@ class NodeStream:
         # Only now: until the end is noted, the frames in flight may be needed again.
         delete_in_flight(self.folder)
         with self._lock:
-            self._recent = _Queue()
+            self._recent = BatchQueue()
             self.is_settled = True
 
     def disown(self, damaged: Intervals, wanted: Wanted) -> None:
@@ -369,48 +369,16 @@ class NodeStream:
             StorageError: they cannot be read now.
         """
         try:
-            left = read_in_flight(self.folder)
+            new = read_in_flight_from(self.folder, self.next_seq)
         except DamagedFileError as error:
             problems.append(put_aside(self.folder / IN_FLIGHT_FILE, error))
             self.lose_in_flight()
             return False
-        if left is None or left[1] is None or int(left[1].seq[-1]) < self.next_seq:
+        if new is None:
             return False
-        frames = left[1]
-        new = frames.rows(max(0, self.next_seq - int(frames.seq[0])), len(frames))
         for batch in messages_of(new, self.info):
             self.put(batch)
         return True
 
     def _acked(self) -> Intervals:
         return union(self._acked_by.values())
-
-
-class _Queue:
-    """Batches, oldest first, and what they take in memory."""
-
-    def __init__(self) -> None:
-        self.batches: deque[EncodedBatch] = deque()
-        self.size_bytes = 0
-
-    @property
-    def frames(self) -> int:
-        """How many frames there are in them."""
-        return sum(batch.seq_last - batch.seq_first + 1 for batch in self.batches)
-
-    def append(self, batch: EncodedBatch) -> None:
-        """Add the newest one."""
-        self.batches.append(batch)
-        self.size_bytes += len(batch.payload)
-
-    def popleft(self) -> EncodedBatch:
-        """Take out the oldest one."""
-        batch = self.batches.popleft()
-        self.size_bytes -= len(batch.payload)
-        return batch
-
-    def give_back(self, batches: Iterable[EncodedBatch]) -> None:
-        """Put back what was taken out, before all others."""
-        given = list(batches)
-        self.batches.extendleft(reversed(given))
-        self.size_bytes += sum(len(batch.payload) for batch in given)

@@ -136,6 +136,20 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     return info, frames
 
 
+def read_in_flight_from(folder: Path, seq: int) -> FrameBatch | None:
+    """What a killed process left from frame `seq` on; None if there is no such frame.
+
+    Raises:
+        DamagedFileError: it is not what was written.
+        StorageError: it cannot be read now.
+    """
+    left = read_in_flight(folder)
+    frames = None if left is None else left[1]
+    if frames is None or int(frames.seq[-1]) < seq:
+        return None
+    return frames.rows(max(0, seq - int(frames.seq[0])), len(frames))
+
+
 def delete_in_flight(folder: Path) -> None:
     """Delete the file once its frames are in the journal."""
     with suppress(OSError):

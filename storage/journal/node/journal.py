@@ -21,12 +21,12 @@ from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo
 from storage.durable import locked, make_folder, storage_errors
 from storage.intervals import DISK_FULL, DISK_SLOW, READ_ONLY, Intervals
-from storage.journal.in_flight import kernel_boot_id
-from storage.journal.left_over import recover_stream
-from storage.journal.node_stream import NodeStream
-from storage.journal.retention import BUDGET_BYTES, Retention
+from storage.journal.node.in_flight import kernel_boot_id
+from storage.journal.node.left_over import recover_stream
+from storage.journal.node.retention import BUDGET_BYTES, Retention
+from storage.journal.node.stream import NodeStream
+from storage.journal.node.wanted import ServerWants, Wanted
 from storage.journal.stream_notes import StreamNotes
-from storage.journal.wanted import ServerWants, Wanted
 from storage.wire import EncodedBatch
 
 log = logging.getLogger("foottile.journal")

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from devices.errors import StorageError
 from storage.journal.journal import RING_NS
-from storage.journal.node_stream import NodeStream
-from storage.journal.wanted import Wanted
+from storage.journal.node.stream import NodeStream
+from storage.journal.node.wanted import Wanted
 
 BUDGET_BYTES = 4 << 30
 """A day and a half of four tiles at full rate."""
