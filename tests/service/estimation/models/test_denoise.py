@@ -80,7 +80,7 @@ def test_on_a_straight_course_it_is_unbiased_and_in_a_bend_by_a_fraction_of_the_
     standard_error_n = off_n.std(axis=0) / math.sqrt(150)
     in_bend_n = 0.2 * SIGMA_N if course == "parabola" else 0.0
     assert (np.abs(off_n.mean(axis=0)) < 4.5 * standard_error_n + in_bend_n).all()
-    assert np.abs(off_n.mean()) < 0.004 + 0.5 * in_bend_n
+    assert np.abs(off_n.mean()) < 0.004 + 0.6 * in_bend_n
 
 
 @pytest.mark.parametrize("look_ms", [0, 10, 100])
@@ -118,7 +118,7 @@ def test_what_lasts_of_the_noise_is_not_averaged_away_and_it_says_so(
         return float(np.mean((off_n - 30.0) ** 2) / np.mean(SIGMA_N**2 * stated))
 
     courses = [30.0 + lasting_noise(200, part, readings, seed) for seed in range(150)]
-    assert 0.55 < of_what_it_says(lasting) < 1.0
+    assert 0.55 < of_what_it_says(lasting) < 1.1  # without look-ahead sigma is up to 4 % too small
     assert of_what_it_says(None) > 1.05  # taken for white
 
 
@@ -129,6 +129,19 @@ def test_nothing_of_a_step_shows_before_it_or_after_it(step_n: float) -> None:
     assert np.abs(off_n).max() < 5.5 * SIGMA_N
     # A reading beside it may be taken for one of the other side, with a small part of its weight.
     assert np.abs(off_n.mean(axis=0)).max() < SIGMA_N
+
+
+def test_beside_a_step_the_window_grows_on_the_side_away_from_it() -> None:
+    # As far behind as ahead there would be seven readings before the step is reached.
+    values = np.where(np.arange(200) < 100, 20.0, 0.0)
+    off_n = np.array([averaged(values + noise(200, s), look_ms=100)[0][103] for s in range(150)])
+    assert np.mean(off_n**2) < SIGMA_N**2 / 7
+
+
+def test_chance_alone_seldom_ends_a_window() -> None:
+    # If it never did, 0.01 would be left; windows compared with single readings left 0.18.
+    off_n = np.array([averaged(30.0 + noise(400, s), look_ms=100)[0][200] for s in range(300)]) - 30
+    assert np.mean(off_n**2) < 0.14 * SIGMA_N**2
 
 
 def test_a_kink_is_not_rounded_by_more_than_the_noise() -> None:
@@ -206,5 +219,6 @@ def test_a_reading_alone_is_as_uncertain_as_it_was() -> None:
 def test_any_instants_give_finite_values_among_the_readings(t_ns: list[int], seed: int) -> None:
     values = 30.0 + noise(len(t_ns), seed)
     out, left = averaged(values, t_ns=np.cumsum(t_ns))
-    assert np.abs(out - values).max() <= 2.0 * SIGMA_N + 1e-9  # it agrees with every reading
+    # Of a window of many, a little less: what it averages away is less than a reading's noise.
+    assert np.abs(out - values).max() <= AGREE * SIGMA_N + 1e-9
     assert (left > 0.0).all()
