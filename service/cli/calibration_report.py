@@ -141,14 +141,16 @@ def _effects(calibration: Calibration) -> Table:
 
 
 def loop_half_width_n(effects: Effects) -> Parameter | None:
-    """Half width of a wide open hysteresis loop: the plays' parts times their half widths.
+    """Half width of a hysteresis loop that is wide open, in a slow stroke.
 
-    Its uncertainty takes the parts as independent, which errs on the wide side: neighbouring plays
-    trade with one another.
+    The plays' parts times their half widths, and what the branch that flows bears. Its uncertainty
+    takes these as independent, which errs on the wide side: they trade with one another.
     """
     if effects.hysteresis is None:
         return None
     parts = list(zip(effects.hysteresis.part, WIDTHS_N.tolist(), strict=False))
+    if (flow := effects.hysteresis.flow) is not None:
+        parts.append((flow.stress_n, 1.0))
     return Parameter(
         value=sum(part.value * width for part, width in parts),
         sigma=sum((part.sigma * width) ** 2 for part, width in parts) ** 0.5,

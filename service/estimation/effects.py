@@ -91,10 +91,35 @@ class RubberEffect(CalibrationPart):
         return self
 
 
+PART_MOST = 0.4
+"""Of a change of force: up to here the force is found from what appears of it, come what may."""
+STRESS_LEAST_N = 0.01
+"""What bears less is not seen, and its fourth power is still a number."""
+
+
+class FlowEffect(CalibrationPart):
+    """Of the model `hysteresis`: its branch that flows."""
+
+    part: Parameter
+    """Of a change of force, that the branch bears at first."""
+    stress_n: Parameter
+    """What it bears of a force that changes as in a slow stroke."""
+
+    @model_validator(mode="after")
+    def _can_be_undone(self) -> Self:
+        if not (0.0 <= self.part.value <= PART_MOST and self.stress_n.value >= STRESS_LEAST_N):
+            raise ValueError(
+                f"a branch that flows has a part of 0 to {PART_MOST:g} and bears "
+                f"{STRESS_LEAST_N:g} N or more"
+            )
+        return self
+
+
 class HysteresisEffect(CalibrationPart):
-    """Of the model `hysteresis`: parts of its plays."""
+    """Of the model `hysteresis`: parts of its plays, and the branch that flows; None: none does."""
 
     part: Annotated[tuple[Parameter, ...], Some]
+    flow: FlowEffect | None = None
 
     @model_validator(mode="after")
     def _can_be_undone(self) -> Self:

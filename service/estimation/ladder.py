@@ -20,6 +20,7 @@ from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import EffectName, GasEffect, RubberEffect, values
 from service.estimation.models.ambient import Ambient
+from service.estimation.models.flow import Flow
 from service.estimation.models.gas import Gas
 from service.estimation.models.hysteresis import WIDTHS_N, Hysteresis
 from service.estimation.models.rubber import Rubber
@@ -62,6 +63,7 @@ class Ladder:
         skew: are tiles taken to the frame's instant?
         denoise: is noise averaged away, and are outliers replaced?
         hysteresis: of the rubber.
+        flow: the part of it that flows; None if no tile's bench tells of one.
         rubber: its creep.
         rubber_misfit: part of creep's and loop's correction that is uncertain.
     """
@@ -76,6 +78,7 @@ class Ladder:
     skew: bool
     denoise: bool
     hysteresis: Hysteresis | None
+    flow: Flow | None
     rubber: Rubber | None
     rubber_misfit: Floats
 
@@ -114,6 +117,7 @@ def make_ladder(
         skew="skew" in models,
         denoise="denoise" in models,
         hysteresis=_hysteresis(tiles) if "hysteresis" in models else None,
+        flow=_flow(tiles) if "hysteresis" in models else None,
         rubber=_rubber(tiles) if "rubber" in models else None,
         rubber_misfit=_misfit([tile.effects.rubber for tile in tiles], unknown=0.0),
     )
@@ -201,6 +205,17 @@ def _hysteresis(tiles: Sequence[TileCalibration]) -> Hysteresis:
     found = [tile.effects.hysteresis for tile in tiles]
     none = np.zeros(len(WIDTHS_N))
     return Hysteresis(np.array([none if e is None else values(e.part) for e in found]))
+
+
+def _flow(tiles: Sequence[TileCalibration]) -> Flow | None:
+    """What a tile lacks is no part of any force."""
+    found = [None if (e := tile.effects.hysteresis) is None else e.flow for tile in tiles]
+    if all(effect is None for effect in found):
+        return None
+    return Flow(
+        part=np.array([0.0 if effect is None else effect.part.value for effect in found]),
+        stress_n=np.array([1.0 if effect is None else effect.stress_n.value for effect in found]),
+    )
 
 
 def _rubber(tiles: Sequence[TileCalibration]) -> Rubber:

@@ -182,7 +182,7 @@ def apparent_forces(
     sampled_ns = t_mono_ns[:, None] + offset_ns + plan.late_ns
     gauge_kpa = kpa - plan.tare.baseline_kpa
     bearing_kpa = np.ascontiguousarray(kpa[:, columns])
-    baseline_variance = np.broadcast_to(plan.baseline_sigma_kpa**2, bearing_kpa.shape)
+    baseline_variance = np.zeros(bearing_kpa.shape) + plan.baseline_sigma_kpa**2
     if ladder.temperature is not None:
         before = state.temperature or temperature.at_rest(len(columns))
         tadc = np.where(frames.tadc == NOT_READ, np.nan, frames.tadc.astype(np.float64))

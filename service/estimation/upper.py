@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from devices.arrays import Bools, Floats, Times
+from devices.arrays import Arrays, Bools, Floats, Times
 from service.estimation.compiled import compiled
 from service.estimation.ladder import Ladder
 from service.estimation.lower import ApparentForces
 from service.estimation.models import denoise
+from service.estimation.models.flow import FlowState
 from service.estimation.models.rubber import RubberState
 from service.estimation.plan import EstimationPlan
 from service.estimation.unseen import EVENLY, farthest, was_away
@@ -29,6 +30,7 @@ class DomeState:
     """What a dome remembers; None for models that are not named, or have not begun."""
 
     plays_n: Floats | None = None
+    flow: FlowState | None = None
     rubber: RubberState | None = None
 
     def is_same(self, other: DomeState) -> bool:
@@ -37,9 +39,13 @@ class DomeState:
             plays = np.array_equal(self.plays_n, other.plays_n)
         else:
             plays = self.plays_n is other.plays_n
-        if self.rubber is not None and other.rubber is not None:
-            return plays and self.rubber.is_same(other.rubber)
-        return plays and self.rubber is other.rubber
+        return plays and _same(self.flow, other.flow) and _same(self.rubber, other.rubber)
+
+
+def _same(one: Arrays | None, other: Arrays | None) -> bool:
+    if one is not None and other is not None:
+        return one.is_same(other)
+    return one is other
 
 
 @dataclass(frozen=True)
@@ -152,8 +158,8 @@ def _undone(
         borne_n = now.guess_n
     out_n, after = _without_loop_and_creep(ladder, force_n, at_ns, before, borne_n, None)
     last_ns = at_ns[0]
-    if before.rubber is not None:
-        last_ns = np.where(np.isnan(before.rubber.force_n), last_ns, before.rubber.t_ns)
+    if (last := before.rubber or before.flow) is not None:
+        last_ns = np.where(np.isnan(last.force_n), last_ns, last.t_ns)
     unseen_n = np.zeros(out_n.shape)
     if other is not None or beyond or was_away(~np.isnan(force_n), at_ns, last_ns):
         if beyond:
@@ -189,7 +195,12 @@ def _without_loop_and_creep(
     borne_n: Floats | None,
     away_n: Floats | None,
 ) -> tuple[Floats, DomeState]:
-    plays_n, crept = state.plays_n, state.rubber
+    plays_n, flow, crept = state.plays_n, state.flow, state.rubber
+    if ladder.flow is not None:
+        flow = ladder.flow.at_rest() if flow is None else flow
+        force_n, flow = ladder.flow.compensated(
+            force_n, at_ns, flow, borne_n=borne_n, away_n=away_n
+        )
     if ladder.hysteresis is not None:
         plays_n = ladder.hysteresis.at_rest() if plays_n is None else plays_n
         force_n, plays_n = ladder.hysteresis.compensated(force_n, plays_n, borne_n=borne_n)
@@ -198,7 +209,7 @@ def _without_loop_and_creep(
         force_n, crept = ladder.rubber.compensated(
             force_n, at_ns, crept, borne_n=borne_n, away_n=away_n
         )
-    return force_n, DomeState(plays_n, crept)
+    return force_n, DomeState(plays_n, flow, crept)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from devices.frames import (
 from service.estimation.calibration import Calibration, paper_eq2_shape
 from service.estimation.effects import (
     Effects,
+    FlowEffect,
     GasEffect,
     HysteresisEffect,
     Parameter,
@@ -87,7 +88,9 @@ def _calibration() -> Calibration:
             misfit=0.1,
             curve_misfit_n=0.1,
         ),
-        hysteresis=HysteresisEffect(part=(tenth,) * len(WIDTHS_N)),
+        hysteresis=HysteresisEffect(
+            part=(tenth,) * len(WIDTHS_N), flow=FlowEffect(part=tenth, stress_n=tenth)
+        ),
         temperature=TemperatureEffect(kpa_per_k=tenth, lag_s=tenth, wall_per_kpa=tenth),
     )
     tiles = tuple(

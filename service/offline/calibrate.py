@@ -172,8 +172,9 @@ def _in_words(tile: TileCalibration) -> str:
         terms = zip(rubber.part, rubber.tau_s, strict=True)
         each = (f"{100 * part.value:.1f} % in {tau.value:.2g} s" for part, tau in terms)
         found.append("creep " + " and ".join(each))
-    if effects.hysteresis is not None:
-        found.append("loop")
+    if (loop := effects.hysteresis) is not None:
+        flows = "" if loop.flow is None else f", {loop.flow.stress_n.value:.2f} N of it flows"
+        found.append(f"loop{flows}")
     if (warm := effects.temperature) is not None:
         found.append(f"{warm.kpa_per_k.value:.3f} kPa/K")
     return ", ".join([*found, *(f"no {name}" for name in effects.refused)])

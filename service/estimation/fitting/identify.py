@@ -12,6 +12,7 @@ from devices.arrays import Floats
 from service.estimation.effects import (
     EffectName,
     Effects,
+    FlowEffect,
     GasEffect,
     HysteresisEffect,
     Parameter,
@@ -68,6 +69,9 @@ def identify(
     while True:
         fit = best_creep(problem, parts) if parts.terms else problem.fit(parts)
         reasons = _undetermined(fit)
+        if not reasons and parts.flow and not _flows(fit):
+            parts = replace(parts, flow=False)
+            continue
         if not reasons:
             break
         # One at a time: without the worst effect, the others may be determined.
@@ -92,7 +96,12 @@ def identify(
             curve_misfit_n=misfits.curve_n,
         )
     if "loop" in sigma:
-        hysteresis = HysteresisEffect(part=_parameters(model.loop, sigma["loop"]))
+        flow = None
+        if "flow_part" in sigma:
+            (part,) = _parameters([model.flow_part], sigma["flow_part"])
+            (flow_n,) = _parameters([model.flow_n], model.flow_n * sigma["ln_flow_n"])
+            flow = FlowEffect(part=part, stress_n=flow_n)
+        hysteresis = HysteresisEffect(part=_parameters(model.loop, sigma["loop"]), flow=flow)
     late_s = None
     if "late_s" in sigma:
         (late_s,) = _parameters([model.late_s], sigma["late_s"])
@@ -137,16 +146,24 @@ def _undetermined(fit: Fit) -> dict[EffectName, str]:
         total, sigma = float(model.part.sum()), float(sigmas["part_sum"][0])
         if total < _CLEAR * sigma:
             reasons["rubber"] = f"creeping part {total:.3f} +- {sigma:.3f}: not determined"
-    if "loop" in sigmas:
+    if "loop" in sigmas and not _flows(fit):
         width_n, sigma = float(model.loop @ WIDTHS_N), float(sigmas["loop_n"][0])
         if width_n < _CLEAR * sigma:
             reasons["hysteresis"] = f"half width {width_n:.2f} +- {sigma:.2f} N: not determined"
     return reasons
 
 
+def _flows(fit: Fit) -> bool:
+    """Does the recording tell that a branch flows, and how much it bears?"""
+    if "flow_part" not in fit.sigma:
+        return False
+    clear = fit.model.flow_part > _CLEAR * float(fit.sigma["flow_part"][0])
+    return clear and float(fit.sigma["ln_flow_n"][0]) < 1.0 / _CLEAR
+
+
 _WITHOUT: Mapping[EffectName, Mapping[str, Any]] = {
     "gas": {"gas": False},
-    "hysteresis": {"hysteresis": False},
+    "hysteresis": {"hysteresis": False, "flow": False},
     "rubber": {"terms": 0},
 }
 

@@ -16,6 +16,7 @@ from scipy.interpolate import PchipInterpolator
 
 from devices.arrays import Floats
 from service.estimation.compiled import compiled
+from service.estimation.models.flow import flow_per_s, flowed
 from service.estimation.models.hysteresis import WIDTHS_N, played
 from service.estimation.models.rubber import crept_parts
 
@@ -43,6 +44,8 @@ class DomeModel:
         part: (terms,) of the creep.
         creep_s: (terms,) its times.
         loop: (plays,) parts of the plays of half widths `WIDTHS_N`.
+        flow_part: of the branch that flows; 0 for none.
+        flow_n: what it bears in a slow stroke.
         late_s: how much later than its instant says the tile is sampled; the forces given to
             `pressed` are those of that time, from `load`.
     """
@@ -56,6 +59,8 @@ class DomeModel:
     part: Floats = field(default_factory=lambda: np.zeros(0))
     creep_s: Floats = field(default_factory=lambda: np.zeros(0))
     loop: Floats = field(default_factory=lambda: np.zeros(0))
+    flow_part: float = 0.0
+    flow_n: float = 1.0
     late_s: float = 0.0
 
     def pressed(self, t_s: Floats, force_n: Floats) -> Floats:
@@ -73,6 +78,8 @@ class DomeModel:
             self.creep_s,
             self.loop,
             WIDTHS_N[: len(self.loop)],
+            self.flow_part,
+            flow_per_s(self.flow_part, self.flow_n),
         )
 
 
@@ -137,6 +144,8 @@ def pressed(
     creep_s: Floats,
     loop: Floats,
     widths: Floats,
+    flow_part: float,
+    flow_per_s: float,
 ) -> Floats:
     """Pressures of one tile under forces that are linear between instants.
 
@@ -153,6 +162,8 @@ def pressed(
         creep_s: its times.
         loop: parts of the plays.
         widths: their half widths.
+        flow_part: of the branch that flows.
+        flow_per_s: how fast it flows under a newton.
 
     Returns:
         (n, 3): pressure, pressure without the gas' heat, and the part of the force that creep and
@@ -166,6 +177,7 @@ def pressed(
     flattest = _FLATTEST * c1
     k = (gamma - 1.0) / gamma
     x, warm, force, time = 0.0, 1.0, 0.0, t_s[0]
+    stress, through = 0.0, 0.0
     ln_p = math.log(baseline_kpa)
     for i in range(n):
         dt = t_s[i] - time
@@ -179,6 +191,10 @@ def pressed(
             plays[m] = played(apparent, widths[m], plays[m])
             lag += loop[m] * (plays[m] - apparent)
         apparent += lag
+        if flow_part > 0.0:
+            stress = flowed(stress, flow_part, flow_per_s, apparent - through, dt)
+            through = apparent
+            apparent -= stress
         for _ in range(_NEWTON_STEPS):
             inside = min(max(x, 0.0), 1.0)
             slope = max(flattest, c1 + inside * (2.0 * c2 + 3.0 * c3 * inside))

@@ -27,6 +27,7 @@ _MODEL = 0.01
 """Part of a pressure that no model explains: a tenth of what is corrected, which is a tenth.
 Without it readings under great loads would have the curve err under small ones."""
 _BINS = 15  # parts of the range that systematic errors are averaged over
+_OF_RUBBER = ("part", "ln_creep", "loop", "flow_part", "ln_flow_n")
 _OPENS_N = 0.1
 """A tile with less force is at rest."""
 
@@ -41,8 +42,8 @@ class Fit:
         scatter: standard deviation of the gains.
         modelled: (m, 3), as `pressed` gives it.
         sigma: standard uncertainties by the name of the unknown: "late_s", "gamma", "ln_tau",
-            "part", "ln_creep", "loop", as far as they were fitted; and of what neighbouring terms
-            trade with one another only the sum: "part_sum", "loop_n".
+            "part", "ln_creep", "loop", "flow_part", "ln_flow_n", as far as they were fitted; and of
+            what neighbouring terms trade with one another only the sum: "part_sum", "loop_n".
         curve_covariance: (3, 3), of the curve's coefficients.
         at_bound: unknowns that are at the end of what is possible.
         unseen: (loadings,), squares of what each would be off if the others alone were fitted.
@@ -185,7 +186,7 @@ class OutputErrorProblem:
         x = (modelled[:, 1] - model.baseline_kpa) / model.scale_kpa
         corrected = {
             "gas": (("gamma", "ln_tau"), modelled[:, 0] - modelled[:, 1]),
-            "rubber": (("part", "ln_creep", "loop"), modelled[:, 2] / _n_per_kpa(model, x)),
+            "rubber": (_OF_RUBBER, modelled[:, 2] / _n_per_kpa(model, x)),
         }
         unsure = {}
         for name, (names, kpa) in corrected.items():
@@ -226,6 +227,9 @@ class OutputErrorProblem:
             model = replace(model, gamma=gamma, tau_s=tau_s)
         if "part" in at:
             model = replace(model, part=x[at["part"]], creep_s=np.exp(x[at["ln_creep"]]))
+        if "flow_part" in at:
+            part, flow_n = float(x[at["flow_part"]][0]), float(np.exp(x[at["ln_flow_n"]][0]))
+            model = replace(model, flow_part=part, flow_n=flow_n)
         return replace(model, loop=x[at["loop"]]) if "loop" in at else model
 
     def _gains(self, model: DomeModel, scatter: float) -> tuple[Floats, Floats]:

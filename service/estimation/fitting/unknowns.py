@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
+from service.estimation.effects import PART_MOST, STRESS_LEAST_N
 from service.estimation.fitting.press import Presses
 from service.estimation.models.hysteresis import WIDTHS_N
 
@@ -39,12 +40,14 @@ class Parts:
         gas: its heat.
         terms: of the creep.
         hysteresis: the loop.
+        flow: the part of the loop that flows.
     """
 
     late_s: tuple[float, float] | None = (0.0, LATE_S)
     gas: bool = True
     terms: int = 2
     hysteresis: bool = True
+    flow: bool = True
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,12 @@ _GAS = (
 )
 _PART = (0.03, 0.05, 0.4)  # of a term: likely, how near, and at most
 _LOOP = (0.05, 0.1, 0.3)  # of a play
+# Loops are 1 to 5 % of full scale from branch to branch, any part of it viscous (hardware.md 9);
+# the part is as little known as that of a creep.
+_FLOW = (
+    Unknowns("flow_part", (0.05,), 0.05, (0.0,), (PART_MOST,)),
+    Unknowns("ln_flow_n", (np.log(0.2),), 1.0, (np.log(2.0 * STRESS_LEAST_N),), (np.log(2.0),)),
+)
 
 
 def _creep(terms: int, told_s: tuple[float, float]) -> tuple[Unknowns, ...]:
@@ -113,6 +122,8 @@ def unknowns_of(parts: Parts, curve: Floats, told_s: tuple[float, float]) -> lis
         unknowns.append(
             Unknowns("loop", (likely,) * plays, within, (0.0,) * plays, (most,) * plays)
         )
+    if parts.flow:
+        unknowns += _FLOW
     return unknowns
 
 

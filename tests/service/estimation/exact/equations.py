@@ -141,6 +141,54 @@ def rubber(
     return out
 
 
+def flow(
+    apparent: list[Exact],
+    t_ns: list[int],
+    part: Exact,
+    stress: Exact,
+    borne: list[Exact] | None = None,
+    away: Exact = None,
+) -> list[Exact]:
+    """`apparent = F - s`, `s' = g F' - 10 g (s/S)^4 sign(s)`: the flow between two half changes.
+
+    The branch flows under what was `borne` where that is not None. While nothing was read it bore
+    `away`, or nothing, the farther one, until just now: long enough for the branch to be at rest.
+    """
+    s, before, before_ns = mpf(0), mpf(0), None
+    out: list[Exact] = []
+    for value, now_ns in zip(apparent, t_ns, strict=True):
+        if value is None:
+            out.append(None)
+            continue
+        passed = max(mpf(0), mpf(now_ns - (now_ns if before_ns is None else before_ns)) / 10**9)
+        if away is not None and passed * 10**9 > AWAY_NS:
+            before = max((away, mpf(0)), key=lambda f: abs(f - (before + value) / 2))
+            s, passed = mpf(0), mpf(0)
+
+        def after(
+            force: Exact, s: Exact = s, before: Exact = before, passed: Exact = passed
+        ) -> Exact:
+            half = part * (force - before) / 2
+            between = s + half
+            if between != 0:  # s^-3 grows evenly
+                cubed = 1 / (abs(between) ** -3 + 3 * 10 * part * passed / stress**4)
+                between = mp.sign(between) * mp.cbrt(cubed)
+            return between + half
+
+        # What is added to the apparent force hardly changes with it: that comes to rest.
+        force = value
+        for _ in range(400):
+            better = value + after(force)
+            if better == force:
+                break
+            force = better
+        out.append(force)
+        if borne is not None and borne[len(out) - 1] is not None:
+            force = borne[len(out) - 1]
+        s, before, before_ns = after(force), force, now_ns
+    return out
+
+
 def hysteresis(
     apparent: list[Exact], parts: list[Exact], borne: list[Exact] | None = None
 ) -> list[Exact]:

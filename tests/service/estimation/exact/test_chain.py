@@ -15,6 +15,7 @@ from mpmath import mp, mpf
 
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.calibration import TileCalibration
+from service.estimation.effects import FlowEffect, Parameter
 from service.estimation.estimates import EstimateStatus
 from service.estimation.ladder import MODELS
 from service.estimation.models.outliers import FAR
@@ -159,13 +160,17 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         smooth = [f if a is None else a[0] for f, a in zip(apparent, averaged, strict=True)]
         loop = [mpf(w.value) for w in effects[i].hysteresis.part]
         parts, taus_s = ([mpf(p.value) for p in x] for x in (curve.part, curve.tau_s))
-        unlooped = equations.hysteresis(smooth, loop, guess_n)
+        flows = effects[i].hysteresis.flow
+        branch = mpf(flows.part.value), mpf(flows.stress_n.value)
+        sprung = equations.flow(smooth, frame_ns, *branch, guess_n)
+        unlooped = equations.hysteresis(sprung, loop, guess_n)
         force_n = equations.rubber(unlooped, frame_ns, parts, taus_s, guess_n)
         borne = [
             None if g is None else _farthest(g, f, most_n)
             for f, g in zip(apparent, guess_n, strict=True)
         ]
-        unlooped = equations.hysteresis(smooth, loop, borne)
+        sprung = equations.flow(smooth, frame_ns, *branch, borne, end_n)
+        unlooped = equations.hysteresis(sprung, loop, borne)
         else_n = equations.rubber(unlooped, frame_ns, parts, taus_s, borne, end_n)
         crept_n: list[Exact] = [
             None if f is None else 0 if b else (other_n - f) / mp.sqrt(3)
@@ -247,6 +252,7 @@ def plan() -> EstimationPlan:
     known = make_effects()
     assert known.gas is not None
     assert known.rubber is not None
+    assert known.hysteresis is not None
     tiles = []
     for i in range(3):
         curve = (0.0, 13.25 + i, 1.0 / 3.0, 4.7 - 0.3 * i)
@@ -254,6 +260,11 @@ def plan() -> EstimationPlan:
         covariance = ((4e-3, 1e-3, -2e-3), (1e-3, 2e-3, 0.0), (-2e-3, 0.0, 3e-3))
         rubber = known.rubber.model_copy(update={"coefficients": curve, "covariance": covariance})
         gas = known.gas.model_copy(update={"tau_s": tau_s})
+        flow = FlowEffect(
+            part=Parameter(value=0.07 + 0.01 * i, sigma=0.01),
+            stress_n=Parameter(value=0.11 * (1 + i), sigma=0.01),
+        )
+        loop = known.hysteresis.model_copy(update={"flow": flow})
         tiles.append(
             newton_tile(
                 info.serials[i],
@@ -261,7 +272,7 @@ def plan() -> EstimationPlan:
                 p_offset_kpa=9.37,
                 p_scale_kpa=9.37,
                 range_kpa=(0.0, 18.74),
-                effects=known.model_copy(update={"gas": gas, "rubber": rubber}),
+                effects=known.model_copy(update={"gas": gas, "rubber": rubber, "hysteresis": loop}),
             )
         )
     tare = make_tare(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from mpmath import mpf
 
 from service.estimation.models import ambient, denoise, gas, rubber, temperature
+from service.estimation.models.flow import Flow
 from service.estimation.models.hysteresis import Hysteresis
 from service.estimation.tare.noise import left_by_mean
 from tests.service.estimation.exact import equations
@@ -82,6 +83,28 @@ def test_rubber_is_within_a_nanonewton(
         [mpf(g) for g in parts],
         [mpf(tau) for tau in taus_s],
     )
+    assert equations.apart(np.concatenate(out), expected) < GOAL
+
+
+@settings(max_examples=15)
+@given(
+    part=st.sampled_from([0.0, 1e-9, 0.08, 0.4]),
+    stress_n=st.sampled_from([0.01, 0.3, 2.0]),
+    swing_n=st.sampled_from([0.01, 0.5, 5.0]),
+    seed=seeds,
+)
+def test_flow_is_within_a_nanonewton(
+    part: float, stress_n: float, swing_n: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    apparent_n = with_holes(rng, 3.0 + np.cumsum(rng.normal(0, swing_n, 40)))
+    t_ns = wild_instants(rng, 40)
+    model = Flow(np.array([part]), np.array([stress_n]))
+    state, out = model.at_rest(), []
+    for rows in in_two_parts(40):
+        force_n, state = model.compensated(apparent_n[rows, None], t_ns[rows, None], state)
+        out.append(force_n)
+    expected = equations.flow(equations.exact(apparent_n), t_ns.tolist(), mpf(part), mpf(stress_n))
     assert equations.apart(np.concatenate(out), expected) < GOAL
 
 

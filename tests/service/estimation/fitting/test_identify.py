@@ -28,11 +28,13 @@ from tests.builders.calibrations import make_calibration
 
 pytestmark = pytest.mark.slow
 
+ALL = {"gas": True, "rubber": True, "hysteresis": True}
 STEP_S = 0.00184
 FULL_N, SCALE_KPA, BASE_KPA = 30.0, 16.0, 100.3
 CURVE = np.array([22.0, 5.0, 5.0])
 GAMMA, TAU_S = 1.28, 0.011
 PART, CREEP_S, LOOP = (0.05, 0.04), (0.08, 1.2), (0.03, 0.04, 0.05)
+FLOW_PART, FLOW_N = 0.07, 0.35
 NOISE_KPA = 0.165
 
 
@@ -62,9 +64,19 @@ def pressed_by_model(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
     kpa = pressed(
         t_s, force_n, CURVE, SCALE_KPA, BASE_KPA, GAMMA, TAU_S, WALL_PER_KPA, part, creep_s, loop,
-        WIDTHS_N,
+        WIDTHS_N, 0.0, 0.0,
     )  # fmt: skip
     return np.asarray(kpa[:, 0])
+
+
+def flowing(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
+    """Pressures of a dome that has a branch that flows as well."""
+    part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
+    model = DomeModel(
+        CURVE, SCALE_KPA, BASE_KPA, WALL_PER_KPA, GAMMA, TAU_S, part, creep_s, loop, FLOW_PART,
+        FLOW_N,
+    )  # fmt: skip
+    return np.asarray(model.pressed(t_s, force_n)[:, 0])
 
 
 def pressed_by_dome(
@@ -154,6 +166,19 @@ def test_parameters_that_were_put_in_lie_within_their_intervals(known: list[Effe
     # Of 36 values 34 should be. Measured over 32 recordings: 91 % are, none of the nine is biased.
     assert (off < 1.96).sum() >= 29
     assert off.max() < 4.5
+
+
+def test_a_branch_that_flows_is_found_beside_plays_and_creep_and_only_where_there_is_one(
+    known: list[Effects],
+) -> None:
+    loops = [effects.hysteresis for effects in known]
+    assert [loop.flow for loop in loops if loop is not None] == [None] * len(known)
+    loop = found_in(recorded(flowing)).hysteresis
+    assert loop is not None
+    assert loop.flow is not None
+    for parameter, true in ((loop.flow.part, FLOW_PART), (loop.flow.stress_n, FLOW_N)):
+        assert abs(parameter.value - true) < 3.0 * parameter.sigma
+        assert parameter.sigma < 0.2 * true
 
 
 def test_taps_and_releases_tell_the_gas_to_a_few_percent(known: list[Effects]) -> None:
@@ -260,6 +285,17 @@ def test_of_an_emulated_dome_all_effects_are_found_about_as_great_as_they_are() 
     assert width_n == pytest.approx(part.loop_n, rel=0.35)
 
 
+def test_of_an_emulated_dome_the_flowing_part_of_its_loop_is_found() -> None:
+    part = replace(draw_dome("T02", 0), loop_n=0.1, viscous_n=0.3)
+    effects = found_in(recorded(pressed_by_dome("T02", part, **ALL), scatter=0.0))
+    assert effects.hysteresis is not None
+    flow = effects.hysteresis.flow
+    assert flow is not None
+    # As wide as `viscous_n` at 7.5 N/s; a stroke of 10 N/s is wider by the fourth root.
+    assert flow.stress_n.value == pytest.approx(0.3 * (10.0 / 7.5) ** 0.25, rel=0.2)
+    assert 0.04 < flow.part.value < 0.12
+
+
 @pytest.mark.parametrize("late_s", [-300e-6, 233e-6])
 @pytest.mark.parametrize("serial", ["T01", "T03", "T04", "T05"])
 def test_a_dome_that_is_sampled_at_another_instant_keeps_its_gas(
@@ -272,9 +308,6 @@ def test_a_dome_that_is_sampled_at_another_instant_keeps_its_gas(
     assert effects.gas.gamma.value <= 1.4
     assert effects.late_s is not None
     assert effects.late_s.value == pytest.approx(late_s, abs=200e-6)
-
-
-ALL = {"gas": True, "rubber": True, "hysteresis": True}
 
 
 @pytest.mark.parametrize("gamma_tau_s", [0.036, 0.012])
