@@ -5,7 +5,8 @@ the bubble -> gas temperature -> absolute pressure. The gas is heat conduction i
 isothermal wall, eight modes; the rubber Prony terms, as many as the part has, and four play
 operators, and where the part has it a branch that flows (Bergstrom and Boyce 1998: filled rubbers
 lose energy in chains that creep past one another, at a rate that is a high power of their stress,
-so that the loop grows slowly with speed). None of these equations or numbers is the estimator's.
+so that the loop grows slowly with speed; there about the fourth). None of these equations is the
+estimator's but that one, whose power is each part's own here and fixed there; and no number is.
 
 Everything is computed ahead of the bus in blocks of time on a fine grid, for all domes at once, and
 interpolated where a chip samples: the physics does not know who asks, or when.
@@ -38,8 +39,6 @@ _KELVIN = 273.15
 _MODES = np.arange(1, 9)
 _MODE_WEIGHTS = 6.0 / (np.pi * _MODES) ** 2  # of the mean temperature of a heated sphere
 _PLAY_WIDTHS_N = np.array([0.5, 1.0, 2.0, 4.0])
-_FLOW_POWER = 4.0  # of the rate of flow over stress (Bergstrom and Boyce 1998: about 4)
-_FLOW_PART = 0.08  # of a change of force that the flowing branch bears at first
 _FLOW_N_PER_S = 7.5  # where the loop is as wide as the part says: 30 N within 4 s
 _UNLOADED_N = 0.05  # a dome that bears less is not touched: the next touch is a new loading
 _MANY_LAGS = 128
@@ -95,6 +94,8 @@ class Domes:
         viscous_n = np.array([part.viscous_n for part in parts])
         self._flowing = np.flatnonzero(viscous_n > 0.0)
         self._viscous_n = viscous_n[self._flowing]
+        self._flow_part = np.array([part.flow_part for part in parts])[self._flowing]
+        self._flow_power = np.array([part.flow_power for part in parts])[self._flowing]
         self._branch_n = np.zeros(len(self._flowing))
         self._last_flow_n = np.zeros(len(self._flowing))
         self._loading_gain = np.ones(n)
@@ -247,12 +248,13 @@ class Domes:
         if not self._scene.hysteresis or not len(self._flowing):
             return force_n
         f = force_n[:, self._flowing]
-        half_n = 0.5 * _FLOW_PART * np.diff(f, axis=0, prepend=self._last_flow_n[None])
+        half_n = 0.5 * self._flow_part * np.diff(f, axis=0, prepend=self._last_flow_n[None])
         self._last_flow_n = f[-1]
-        more = _FLOW_POWER - 1.0
         apparent_n = force_n.copy()
         for i, dome in enumerate(self._flowing.tolist()):
-            per_s = more * _FLOW_PART * _FLOW_N_PER_S / float(self._viscous_n[i]) ** _FLOW_POWER
+            part, power = float(self._flow_part[i]), float(self._flow_power[i])
+            more = power - 1.0
+            per_s = more * part * _FLOW_N_PER_S / float(self._viscous_n[i]) ** power
             flow, root = per_s * self._step_s, -1.0 / more
             s, borne_n = float(self._branch_n[i]), []
             for half in half_n[:, i].tolist():  # a call of numpy for each step would be dear

@@ -57,6 +57,10 @@ class DomePart:
     viscous_n: float = 0.0
     """Half width of the loop that the rubber's viscosity makes beside it, in newtons, where a force
     changes by 7.5 N/s; faster loads make it wider."""
+    flow_part: float = 0.08
+    """Of a change of force that the viscous branch bears at first."""
+    flow_power: float = 4.0
+    """Of the branch's rate of flow over its stress."""
     kappa: float = 0.4 / 1.4
     """(gamma - 1) / gamma of the gas: air's, unless vapours of the casting are in it."""
 

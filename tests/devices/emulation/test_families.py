@@ -69,6 +69,8 @@ def test_the_loop_is_1_to_5_percent_and_any_part_of_it_viscous() -> None:
     full_n = [full_scale_n(part) for part in looped]
     fills([2 * n / full for n, full in zip(half_n, full_n, strict=True)], 0.01, 0.05)
     fills([part.viscous_n / n for part, n in zip(looped, half_n, strict=True)], 0.0, 1.0)
+    fills([part.flow_part for part in DOMES], 0.04, 0.12)
+    fills([part.flow_power for part in DOMES], 3.0, 6.0)
 
 
 def test_the_chip_is_before_or_behind_its_gas_by_up_to_3_s() -> None:

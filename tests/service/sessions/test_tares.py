@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,66 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import StorageError, UnknownError
-from devices.frames import ArrayInfo
-from service.estimation.tare.tare import Source, Tare
-from service.sessions.tare_file import RecordedTare
 from service.sessions.tares import KEPT_MAX, TareHistory
-from storage.checked_json import read_checked
-from tests.builders.arrays import make_array, make_tile
-from tests.builders.calibrations import make_tare
+from tests.service.sessions.tares import (
+    INFO,
+    OTHERS,
+    array,
+    as_older,
+    history,
+    instants,
+    same,
+    tare,
+)
 from tests.storage.faulty_disk import NO_SPACE, refusing
-
-
-def array(*serials: str) -> ArrayInfo:
-    return make_array([make_tile(i, serial=serial) for i, serial in enumerate(serials)])
-
-
-INFO = array("T01", "T02")
-OTHERS = (array("T01", "T03"), array("T02", "T01"), array("T01"), array("T01", "T02", "T03"))
-
-
-def tare(t_ns: int = 0, *, tiles: int = 2, source: Source = "unloaded") -> Tare:
-    return make_tare(
-        tiles,
-        baseline_kpa=100.0 + np.arange(tiles) / 3,
-        noise_kpa=1 / 7,
-        tadc_counts=480.0 + np.arange(tiles) / 7,
-        t_ns=t_ns,
-        source=source,
-    )
-
-
-def same(one: RecordedTare, other: RecordedTare) -> None:
-    assert (one.id, one.serials, one.undone) == (other.id, other.serials, other.undone)
-    assert (one.reason, one.chips) == (other.reason, other.chips)
-    for f in fields(Tare):
-        a, b = getattr(one.tare, f.name), getattr(other.tare, f.name)
-        if isinstance(a, np.ndarray):
-            assert (a.dtype, a.tobytes()) == (b.dtype, b.tobytes()), f.name
-        else:
-            assert (type(a), a) == (type(b), b), f.name
-
-
-def history(tmp_path: Path, *t_ns: int) -> TareHistory:
-    made = TareHistory(tmp_path / "node" / "tares.json")
-    for t in t_ns:
-        made.add(tare(t), INFO)
-    return made
-
-
-def as_older(path: Path, change: Callable[[Any], None] = lambda _: None) -> None:
-    """The file as it was written before there were hashes, with a change."""
-    content = json.loads(path.read_bytes())["tares"]
-    for entry in content:
-        for name in ("number", "of", "sha256"):
-            del entry[name]
-    change(content)
-    path.write_text(json.dumps(content))
-
-
-def instants(tares: Sequence[Tare]) -> list[int]:
-    return [one.t_ns for one in tares]
-
 
 # --- in force -------------------------------------------------------------------------------------
 
@@ -308,100 +257,3 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None
     (tmp_path / "node").write_bytes(b"")
     with pytest.raises(StorageError):
         TareHistory(tmp_path / "node" / "more" / "tares.json").add(tare(), INFO)
-
-
-# --- of an older version --------------------------------------------------------------------------
-
-
-def assert_lost(path: Path) -> None:
-    found = TareHistory(path)
-    assert found.all == []
-    assert found.in_force(INFO) is None
-    assert found.is_lost(INFO)
-    assert [tare.is_lost for tare in found.during(INFO, 0, 9)] == [True]
-    assert path.with_name("tares.json.damaged-1").exists()
-    assert found.problem is not None
-    assert "tares.json.damaged-1" in found.problem
-
-
-def test_tares_of_an_older_version_are_read_called_unproven_and_written_with_hashes(
-    tmp_path: Path,
-) -> None:
-    before = history(tmp_path, 1, 2).all
-    path = tmp_path / "node" / "tares.json"
-    as_older(path)
-    found = TareHistory(path)
-    for one, other in zip(before, found.all, strict=True):
-        same(one, other)
-    assert found.problem is not None
-    assert "unproven" in found.problem
-    again = TareHistory(path)
-    assert again.problem is None
-    assert read_checked(path).is_proven
-
-
-DAMAGES: dict[str, dict[str, Any]] = {
-    "a baseline less": {"tare": {"baseline_kpa": [100.0]}},
-    "a baseline that is not known": {"tare": {"baseline_kpa": [100.0, None]}},
-    "words for baselines": {"tare": {"baseline_kpa": "none"}},
-    "no baselines": {"tare": {"baseline_kpa": None}},
-    "noise that is no number": {"tare": {"noise_kpa": [1.0, float("nan")]}},
-    "one noise for all": {"tare": {"noise_kpa": 1.0}},
-    "a temperature too many": {"tare": {"tadc_counts": [1.0, 2.0, 3.0]}},
-    "words for temperatures": {"tare": {"tadc_counts": ["warm", "cold"]}},
-    "another shape": {"tare": {"baseline_sigma_kpa": [[1.0, 1.0]]}},
-    "words for an instant": {"tare": {"t_ns": "yesterday"}},
-    "no instant": {"tare": {"t_ns": None}},
-    "an instant of no time": {"tare": {"t_ns": 2**63}},
-    "a source that is none": {"tare": {"source": "flighu"}},
-    "other tiles": {"serials": ["T01", "T02", "T03"]},
-    "words for chips": {"chips": [["a"], ["b"]]},
-    "a number for chips": {"chips": 7},
-    "a number for serials": {"serials": 7},
-}
-
-
-@pytest.mark.parametrize("change", DAMAGES.values(), ids=DAMAGES.keys())
-def test_an_older_list_with_what_is_no_tare_of_its_tiles_is_lost(
-    tmp_path: Path, change: dict[str, Any]
-) -> None:
-    history(tmp_path, 1)
-    path = tmp_path / "node" / "tares.json"
-
-    def changed(content: Any) -> None:
-        for name, value in change.items():
-            content[0][name] = content[0][name] | value if name == "tare" else value
-
-    as_older(path, changed)
-    assert_lost(path)
-
-
-@pytest.mark.parametrize(
-    "missing", ["id", "serials", "undone", "tare", "baseline_kpa", "t_ns", "source", "frames"]
-)
-def test_an_older_list_with_a_tare_that_lacks_something_is_lost(
-    tmp_path: Path, missing: str
-) -> None:
-    history(tmp_path, 1)
-    path = tmp_path / "node" / "tares.json"
-
-    def without(content: Any) -> None:
-        del (content[0] if missing in content[0] else content[0]["tare"])[missing]
-
-    as_older(path, without)
-    assert_lost(path)
-
-
-def test_tares_of_an_older_version_have_no_temperature_and_are_readable(tmp_path: Path) -> None:
-    history(tmp_path, 1)
-    path = tmp_path / "node" / "tares.json"
-
-    def without(content: Any) -> None:
-        del content[0]["tare"]["tadc_counts"]
-
-    as_older(path, without)
-    (old,) = history(tmp_path).all
-    assert np.isnan(old.tare.tadc_counts).tolist() == [True, True]
-    history(tmp_path).add(tare(2), INFO)  # and can be written again, as JSON that has no NaN
-    json.loads(path.read_bytes(), parse_constant=pytest.fail)
-    assert np.isnan(history(tmp_path).all[0].tare.tadc_counts).all()

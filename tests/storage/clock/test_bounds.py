@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -16,79 +14,17 @@ from scipy.optimize import linprog
 from devices.facts import OFFSET_NS_END, T_MONO_NS_END
 from storage.clock.bounds import CRYSTAL, FAST, WANDER, ClockMap, Rows, Stretch
 from storage.clock.table import UNCERTAINTY_END_NS
-
-SECOND = 1_000_000_000
-HOUR = 3600 * SECOND
-BEGIN_NS = 77 * SECOND
-Int64 = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Clock:
-    """The true offset: rates in ppm between knots ten seconds apart, and steps."""
-
-    rates_ppm: tuple[float, ...]
-    offset_ns: int = 0
-    steps: tuple[tuple[int, int], ...] = ()
-    """Instants after `BEGIN_NS`, and by how many ns."""
-
-    def at(self, t_mono_ns: Int64) -> Int64:
-        x = (t_mono_ns - BEGIN_NS).astype(np.float64)
-        knots = np.arange(len(self.rates_ppm) + 1) * 10.0 * SECOND
-        rates = np.array(self.rates_ppm) * 1e-6
-        values = np.concatenate(([0.0], np.cumsum(rates * 10.0 * SECOND)))
-        k = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(rates) - 1)
-        offset = self.offset_ns + np.rint(values[k] + rates[k] * (x - knots[k])).astype(np.int64)
-        for after_ns, jump_ns in self.steps:
-            offset += np.where(t_mono_ns - BEGIN_NS > after_ns, jump_ns, 0)
-        return offset
-
-    def measured(self, t_mono_ns: Int64, seed: int, *, slow_ns: float = 3e6) -> Rows:
-        """Best of eight probes at each instant: ways back take three times as long as ways there.
-
-        The server is read when the probe arrives; the row is about the middle of the round trip.
-        """
-        random = np.random.default_rng(seed)
-        shape = (len(t_mono_ns), 8)
-        go = np.rint(3e5 + random.exponential(slow_ns, shape)).astype(np.int64)
-        back = np.rint(3e5 + random.exponential(3 * slow_ns, shape)).astype(np.int64)
-        best = np.argmin(go + back, axis=1)
-        rows = np.arange(len(t_mono_ns))
-        go, back = go[rows, best], back[rows, best]
-        sent, came = t_mono_ns, t_mono_ns + go + back
-        middle = (sent + came) // 2
-        server = sent + go + self.at(sent + go)
-        return Rows(middle, server - middle, (came - sent + 1) // 2)
-
-
-def every(seconds: float, n: int) -> Int64:
-    return BEGIN_NS + np.arange(n, dtype=np.int64) * round(seconds * SECOND)
-
-
-def rows_of(*rows: tuple[int, int, int]) -> Rows:
-    return Rows(*np.array(rows, dtype=np.int64).T.copy())
-
-
-def anywhere(rows: Rows, seed: int, n: int = 500, beyond_ns: int = 0) -> Int64:
-    random = np.random.default_rng(seed + 1)
-    begin, end = int(rows.t_mono_ns.min()), int(rows.t_mono_ns.max())
-    drawn = random.integers(begin - beyond_ns, end + beyond_ns + 1, n)
-    return np.concatenate((drawn, rows.t_mono_ns))
-
-
-RATES = st.tuples(
-    st.floats(-80, 80), st.floats(0, WANDER * 1e6), st.integers(2, 40), st.integers(0, 2**32)
+from tests.storage.clock.clocks import (
+    BEGIN_NS,
+    HOUR,
+    RATES,
+    SECOND,
+    Clock,
+    anywhere,
+    every,
+    rows_of,
+    wandering,
 )
-
-
-def wandering(drawn: tuple[float, float, int, int]) -> Clock:
-    """Rates that wander about their mean, which is drawn."""
-    mean, wander, n, seed = drawn
-    rates = np.random.default_rng(seed).uniform(-1, 1, n)
-    rates -= rates.mean()
-    rates *= wander / max(np.abs(rates).max(), 1e-9)
-    return Clock(tuple(mean + rates), offset_ns=seed * 1000 - HOUR)
-
 
 # --- the truth is within --------------------------------------------------------------------------
 
@@ -237,109 +173,6 @@ def test_the_assumptions_are_those_that_users_are_told() -> None:
         (FAST, "to {} ppm"),
     ):
         assert where.format(round(rate * 1e6)) in told
-
-
-# --- drift ----------------------------------------------------------------------------------------
-
-
-@given(drift_ppm=st.floats(-99, 99), n=st.integers(2, 60), seed=st.integers(0, 2**32))
-def test_the_drift_is_within_its_bounds(drift_ppm: float, n: int, seed: int) -> None:
-    (stretch,) = ClockMap(Clock((drift_ppm,)).measured(every(10, n), seed)).stretches
-    slowest, fastest = stretch.mean_rate
-    assert slowest - 1e-12 <= drift_ppm * 1e-6 <= fastest + 1e-12
-
-
-def test_the_drift_of_ten_hours_is_known_to_a_part_in_ten_million() -> None:
-    (stretch,) = ClockMap(Clock((40.0,)).measured(every(10, 3600), 1)).stretches
-    assert stretch.drift_bounds is not None
-    slowest, fastest = stretch.drift_bounds
-    assert slowest < 40e-6 < fastest
-    assert fastest - slowest < 0.3e-6
-
-
-def test_one_row_has_no_drift_and_grows_by_a_crystals() -> None:
-    clock = ClockMap(rows_of((BEGIN_NS, 5, 1000)))
-    assert clock.stretches[0].drift_bounds is None
-    offset, bound = clock.at(BEGIN_NS + np.array([-100, 0, 100]) * SECOND)
-    assert offset.tolist() == [5, 5, 5]
-    assert bound[1] in (1001, 1002)
-    assert bound[0] == bound[2] == pytest.approx(1001 + 100 * SECOND * CRYSTAL, abs=2)
-
-
-def test_a_rate_that_moves_more_than_is_assumed_widens_the_bound_and_is_no_step() -> None:
-    rates = (*(30.0,) * 30, *(-30.0,) * 30)  # the node has gone from the sun into the mud
-    clock = Clock(rates)
-    rows = clock.measured(every(10, 60), 1, slow_ns=1e4)
-    mapped = ClockMap(rows)
-    assert len(mapped.stretches) == 1
-    assert not mapped.stretches[0].steady
-    t_mono_ns = anywhere(rows, 1)
-    offset, bound = mapped.at(t_mono_ns)
-    assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
-
-
-@pytest.mark.parametrize("drift_ppm", [-400.0, 150.0, 480.0])
-def test_a_clock_that_is_far_off_but_steady_has_not_stepped(drift_ppm: float) -> None:
-    clock = Clock((drift_ppm,))
-    rows = clock.measured(every(10, 200), 1)
-    mapped = ClockMap(rows)
-    assert len(mapped.stretches) == 1
-    slowest, fastest = mapped.stretches[0].mean_rate
-    assert slowest < drift_ppm * 1e-6 < fastest
-    t_mono_ns = anywhere(rows, 1)
-    offset, bound = mapped.at(t_mono_ns)
-    assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
-
-
-# --- steps ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("jump_ns", [HOUR, -HOUR, 50_000_000, -(10**18)])
-def test_a_clock_that_stepped_is_seen_as_two_stretches(jump_ns: int) -> None:
-    clock = Clock((20.0,), steps=((305 * SECOND, jump_ns),))
-    rows = clock.measured(every(10, 60), 1)
-    mapped = ClockMap(rows)
-    one, other = mapped.stretches
-    assert (len(one.rows), len(other.rows)) == (31, 29)
-    middle = (one.end_ns + other.begin_ns) // 2
-    offset, bound = mapped.at(np.array([one.end_ns, middle, other.begin_ns]))
-    assert bound[0] < 10_000_000
-    assert bound[2] < 10_000_000
-    assert bound[1] > abs(jump_ns) / 2  # it is not known where the step was
-    assert abs((offset[2] - offset[0]) - jump_ns) < 20_000_000
-
-
-def test_rows_too_vague_to_belong_to_either_side_leave_open_where_the_step_was() -> None:
-    ms = 1_000_000
-    rows = rows_of(
-        *((BEGIN_NS + i * 10 * SECOND, 0, ms) for i in range(5)),
-        *((BEGIN_NS + i * 10 * SECOND, 0, 900 * ms) for i in range(5, 8)),
-        *((BEGIN_NS + i * 10 * SECOND, 500 * ms, ms) for i in range(8, 12)),
-    )
-    mapped = ClockMap(rows)
-    one, other = mapped.stretches
-    assert (len(one.rows), len(other.rows)) == (5, 4)
-    _, bound = mapped.at(rows.t_mono_ns)
-    assert (bound[5:8] > 250 * ms).all()
-    assert (bound[5:8] < 255 * ms).all()
-
-
-def test_a_step_between_the_first_two_rows_is_no_fast_clock() -> None:
-    clock = Clock((20.0,), steps=((5 * SECOND, 4_000_000),))
-    mapped = ClockMap(clock.measured(every(10, 60), 1, slow_ns=1e4))
-    assert [len(stretch.rows) for stretch in mapped.stretches] == [1, 59]
-    _, bound = mapped.at(BEGIN_NS - np.array([100 * SECOND]))
-    assert bound[0] < 100 * SECOND * CRYSTAL + 2_000_000
-
-
-def test_a_clock_set_forth_and_back_has_three_stretches() -> None:
-    clock = Clock((5.0,), steps=((105 * SECOND, HOUR), (205 * SECOND, -HOUR)))
-    assert len(ClockMap(clock.measured(every(10, 30), 1)).stretches) == 3
-
-
-def test_a_step_at_every_row_is_a_stretch_for_every_row() -> None:
-    rows = Rows(every(10, 2000), np.arange(2000) % 2 * HOUR, np.full(2000, 1000))
-    assert len(ClockMap(rows).stretches) == 2000
 
 
 # --- edges ----------------------------------------------------------------------------------------

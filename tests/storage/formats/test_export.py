@@ -2,114 +2,37 @@
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv as pacsv
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, ArrayInfo, FrameBatch
+from devices.frames import NO_SERVO_COUNTS, NOT_READ, ArrayInfo
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
 from storage.formats.export import FORMATS, MEDIA_TYPES, Format, export
 from storage.formats.slice import Slice
-from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, FRAMES, Array
+from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, FRAMES
 from storage.sessions.file import NOTES_KEY
 from tests.builders.arrays import PERIOD_NS, make_array
-from tests.builders.frames import make_frames
-
-BEGIN_NS = 10**18 + 123
-ROWS = 50
-NOTES: dict[str, object] = {"seed": 7, "scene": {"name": "mud"}}
-
-Piece = tuple[FrameBatch, dict[str, Array]]
-
-
-def frames(rows: int = ROWS, tiles: int = 2) -> FrameBatch:
-    """Frames of which some values are not known."""
-    rng = np.random.default_rng(5)
-    padc = rng.integers(250, 420, (rows, tiles))
-    padc[rng.random((rows, tiles)) < 0.2] = NOT_READ
-    servo_counts = rng.integers(-5000, 5000, rows)
-    servo_counts[::7] = NO_SERVO_COUNTS
-    return make_frames(
-        np.arange(rows) + 2**60,
-        tiles,
-        t_mono_ns=123 + PERIOD_NS * np.arange(rows),
-        padc=padc,
-        tadc=rng.integers(470, 490, (rows, tiles)),
-        sample_offset_us=rng.integers(-100, 3000, (rows, tiles)),
-        servo_counts=servo_counts,
-        servo_age_us=np.where(servo_counts == NO_SERVO_COUNTS, NO_SERVO_AGE, 5),
-        status=rng.integers(0, 64, (rows, tiles)),
-        frame_status=rng.integers(0, 32, rows),
-    )
-
-
-def extra(rows: int = ROWS, tiles: int = 2) -> dict[str, Array]:
-    rng = np.random.default_rng(6)
-    force_n = rng.normal(0.0, 20.0, (rows, tiles))
-    force_n[rng.random((rows, tiles)) < 0.2] = np.nan
-    contact = rng.integers(0, 2, rows).astype(np.uint8)
-    contact[::5] = CONTACT_UNKNOWN
-    return {
-        "part": np.zeros(rows, dtype=np.uint16),
-        "force_n": force_n,
-        "grf_n": force_n.sum(axis=1),
-        "contact": contact,
-        "estimate_status": rng.integers(0, 512, rows).astype(np.uint16),
-        "phase": np.array(["rest, or 'not'" if i % 3 else 'a "tap"' for i in range(rows)]),
-    }
-
-
-def cut(batch: FrameBatch, columns: Mapping[str, Array], every: int) -> Iterator[Piece]:
-    for a in range(0, len(batch), every):
-        yield (
-            batch.rows(a, a + every),
-            {name: values[a : a + every] for name, values in columns.items()},
-        )
-
-
-def exported(to: Format, part: Slice | None = None, *, every: int = 20) -> bytes:
-    pieces = cut(frames(), extra(), every)
-    return b"".join(export(pieces, make_array(), NOTES, to, part or Slice()))
-
-
-def read(content: bytes, to: Format) -> pa.Table:
-    if to == "parquet":
-        return pq.read_table(io.BytesIO(content))
-    if to == "arrow":
-        return pa.ipc.open_stream(content).read_all()
-    return pacsv.read_csv(
-        io.BytesIO(content),
-        # A row of which the one column asked for is not known is an empty line.
-        parse_options=pacsv.ParseOptions(ignore_empty_lines=False),
-        convert_options=pacsv.ConvertOptions(
-            null_values=[""],
-            strings_can_be_null=False,
-        ),
-    )
-
-
-def values(table: pa.Table) -> dict[str, list[object]]:
-    """Values by column, floats in the precision of the file's type."""
-    return {
-        name: [np.float32(v) if isinstance(v, float) else v for v in table.column(name).to_pylist()]
-        for name in table.column_names
-    }
-
-
-def names(part: Slice, to: Format = "arrow") -> list[str]:
-    return read(exported(to, part), to).column_names
-
+from tests.storage.formats.exports import (
+    NOTES,
+    ROWS,
+    Piece,
+    cut,
+    exported,
+    extra,
+    frames,
+    names,
+    read,
+    values,
+)
 
 # --- the same in every format ---------------------------------------------------------------------
 
@@ -286,92 +209,6 @@ def test_the_servers_time_is_not_there_unless_it_is_asked_for() -> None:
     assert "t_server_ns" not in names(Slice())
     with pytest.raises(UsageError, match="clock `server`"):
         exported("csv", Slice(columns=("t_server_ns",)))
-
-
-# --- rows -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("start_s", "end_s", "first", "last"),
-    [
-        (0.0, 0.02, 0, 9),
-        (0.02, 0.04, 10, 19),  # what ends where another begins shares no frame with it
-        (0.021, 0.0399, 11, 19),
-        (None, 0.002, 0, 0),
-        (0.098, None, 49, 49),
-        (0.0, 1e9, 0, 49),
-    ],
-)
-def test_a_slice_begins_with_its_start_and_ends_before_its_end(
-    start_s: float | None, end_s: float | None, first: int, last: int
-) -> None:
-    table = read(exported("arrow", Slice(start_s, end_s, ("seq",))), "arrow")
-    assert table.column("seq").to_pylist() == [2**60 + i for i in range(first, last + 1)]
-
-
-@pytest.mark.parametrize("to", FORMATS)
-@pytest.mark.parametrize("every", [20, ROWS])
-def test_a_slice_between_two_frames_still_has_a_header(to: Format, every: int) -> None:
-    part = Slice(0.051, 0.0515, ("t_ns", "force_n"))
-    table = read(exported(to, part, every=every), to)
-    assert table.num_rows == 0
-    assert table.column_names == ["t_ns", "force_n_0", "force_n_1"]
-
-
-def test_seconds_count_from_the_first_frame_whatever_the_pieces_are() -> None:
-    part = Slice(0.03, 0.07, ("seq",))
-    assert len({exported("csv", part, every=every) for every in (1, 13, ROWS)}) == 1
-
-
-def test_only_a_slice_of_everything_is_all() -> None:
-    assert Slice().is_all
-    assert not Slice(start_s=0.0).is_all
-    assert not Slice(columns=("seq",)).is_all
-
-
-# --- columns --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("to", FORMATS)
-@pytest.mark.parametrize(
-    ("asked", "expected"),
-    [
-        (("grf_n",), "grf_n"),
-        (("force_n",), "force_n_0 force_n_1"),
-        (("force_n_1",), "force_n_1"),
-        (("t_ns", "seq"), "t_ns seq"),
-        (("force_n_1", "seq", "force_n_0"), "force_n_1 seq force_n_0"),
-        (("force_n_1", "grf_n", "force_n"), "force_n_1 grf_n force_n_0"),
-        (("grf_n", "grf_n", "seq", "grf_n"), "grf_n seq"),
-        (("phase", "padc", "phase"), "phase padc_0 padc_1"),
-    ],
-)
-def test_columns_are_asked_for_by_tile_or_for_all_tiles_and_keep_their_order(
-    to: Format, asked: tuple[str, ...], expected: str
-) -> None:
-    assert names(Slice(columns=asked), to) == expected.split()
-
-
-@pytest.mark.parametrize(
-    "unknown", ["magic", "force_n_2", "force_n_", "FORCE_N", "", "true_grf_n", "x" * 10_000, "a\0"]
-)
-@pytest.mark.parametrize("to", FORMATS)
-def test_a_column_that_is_not_there_is_refused_before_the_first_chunk(
-    to: Format, unknown: str
-) -> None:
-    chunks = export(
-        cut(frames(), extra(), 20), make_array(), {}, to, Slice(columns=("seq", unknown))
-    )
-    with pytest.raises(UsageError, match="no column") as caught:
-        next(chunks)
-    assert len(str(caught.value)) < 1000
-    assert "force_n" in caught.value.expected
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.lists(st.sampled_from([f for c in FRAMES for f in c.flat_names(2)]), min_size=1))
-def test_any_choice_of_columns_is_that_choice_without_repetitions(asked: Sequence[str]) -> None:
-    assert names(Slice(columns=tuple(asked))) == list(dict.fromkeys(asked))
 
 
 # --- in pieces ------------------------------------------------------------------------------------

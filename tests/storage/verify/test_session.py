@@ -7,112 +7,29 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
-from devices.frames import ArrayInfo, FrameBatch
 from service.sessions.sealing import seal
 from service.sessions.sources import Sources
-from storage.checked_json import with_check
-from storage.clock.log import ClockOffset
-from storage.intervals import Losses
-from storage.journal.journal import Journal
-from storage.journal.stream_notes import StreamNotes
-from storage.sessions.folder import Event, Part, Session, SessionFolder
-from storage.sessions.ledger import StreamState, ledger_of
+from storage.sessions.folder import Part, Session
+from storage.sessions.ledger import ledger_of
 from storage.verify.data import verdict_of, verify
 from storage.verify.file import verify_file
 from storage.verify.session import SessionReport, verify_session
-from tests.builders.arrays import UTC_NS, make_array
-from tests.builders.frames import make_frames
-
-ID = "20200101T000000Z-00000a"
-OTHER_ID = "20200101T000000Z-00000b"
-BOOTS = ("a" * 32, "b" * 32)
-EVENTS = (Event(id="e1", label="slip", t_ns=UTC_NS + 5),)
-
-
-def array(boot: int = 0) -> ArrayInfo:
-    return make_array(1, boot_id=BOOTS[boot], utc_offset_ns=UTC_NS + boot)
-
-
-def frames(first: int, last: int, boot: int = 0) -> FrameBatch:
-    return make_frames(np.arange(first, last + 1), 1, utc_offset_ns=UTC_NS + boot)
-
-
-def journal(data: Path, boot: int, *runs: tuple[int, int], **notes: Any) -> Journal:
-    folder = data / "journal" / "bench" / BOOTS[boot]
-    held = Journal(folder, array(boot))
-    for first, last in runs:
-        for begin in range(first, last + 1, 5):
-            held.append(frames(begin, min(begin + 4, last), boot))
-    held.close()
-    StreamNotes(array_info=array(boot), **notes).save(folder)
-    return held
-
-
-def session(session_id: str = ID, **changes: Any) -> Session:
-    content: dict[str, Any] = {
-        "id": session_id,
-        "name": "walk",
-        "node": "bench",
-        "state": "sealing",
-        "started_t_ns": UTC_NS,
-        "stopped_t_ns": UTC_NS + 10**9,
-        "parts": (
-            Part(boot_id=BOOTS[0], seq_first=10, seq_last=49),
-            Part(boot_id=BOOTS[1], seq_first=0, seq_last=19),
-        ),
-        "scene": "test",
-        "notes": "first try",
-        "events": EVENTS,
-        "clock": (
-            ClockOffset(boot_id=BOOTS[0], t_mono_ns=1, server_minus_node_ns=2, uncertainty_ns=3),
-        ),
-    }
-    return Session(**content | changes)
-
-
-def keep(data: Path, kept: Session, *, place: str = "sessions") -> Path:
-    """As a server keeps it, with the hash of its own text."""
-    SessionFolder(data / place).save(kept)
-    return data / place / kept.id
-
-
-def sealed(data: Path, session_id: str = ID, **changes: Any) -> Path:
-    """A sealed session of two parts, of which frames 20 to 24 of the first are lost."""
-    begun = session(session_id, **changes)
-    journals = {
-        BOOTS[0]: journal(data, 0, (0, 19), (25, 60)),
-        BOOTS[1]: journal(data, 1, (0, 19)),
-    }
-    lost = {BOOTS[0]: Losses({"disk_full": [(20, 24)]})}
-    states = {
-        boot_id: StreamState(held=held.held, lost=lost.get(boot_id, Losses()))
-        for boot_id, held in journals.items()
-    }
-    ledger = ledger_of(begun.parts, states, finished=True)
-    notes = {"lost": {boot_id: losses.as_pairs() for boot_id, losses in lost.items()}}
-    folder = keep(data, begun)
-    done = seal(Sources(begun, array(), journals, None, "none", (), notes), folder, ledger)
-    return keep(data, done)
-
-
-def problems(folder: Path) -> str:
-    return "; ".join(verify_session(folder).problems)
-
-
-def edited(folder: Path, change: Any) -> None:
-    path = folder / "session.json"
-    content = json.loads(path.read_bytes())
-    content.pop("check", None)
-    change(content)
-    path.write_bytes(with_check(json.dumps(content).encode()))
-
+from tests.storage.verify.folders import (
+    BOOTS,
+    ID,
+    OTHER_ID,
+    array,
+    edited,
+    journal,
+    keep,
+    problems,
+    raised,
+    sealed,
+    session,
+)
 
 # --- what is whole --------------------------------------------------------------------------------
 
@@ -188,143 +105,6 @@ def test_a_lone_file_says_what_it_cannot_prove(tmp_path: Path) -> None:
     assert report.as_dict()["id"] == ID
     assert verdict_of(report) == "lossy"
     assert "session.json" in " ".join(report.unproven)
-
-
-# --- damage ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        ("frames.parquet", "frames.parquet is missing"),
-        ("session.json", "session.json is missing"),
-        ("events.parquet", "events.parquet is missing"),
-        ("clock.parquet", "clock.parquet is missing"),
-    ],
-)
-def test_a_file_that_is_missing_is_damage(tmp_path: Path, name: str, said: str) -> None:
-    folder = sealed(tmp_path)
-    (folder / name).unlink()
-    assert said in problems(folder)
-    report = verify_session(folder)
-    assert report.as_dict()["id"] == ID
-    assert verdict_of(report) == "damaged"
-
-
-@pytest.mark.parametrize("name", ["session.json", "frames.parquet", "events.parquet"])
-def test_a_file_of_another_session_in_its_place_is_seen(tmp_path: Path, name: str) -> None:
-    one = sealed(tmp_path / "one")
-    two = sealed(tmp_path / "two", OTHER_ID, events=(EVENTS[0].model_copy(update={"id": "e2"}),))
-    shutil.copy(two / name, one / name)
-    assert problems(one)
-    assert problems(two) == ""
-
-
-def test_a_session_in_another_one_s_folder_is_seen(tmp_path: Path) -> None:
-    folder = sealed(tmp_path)
-    folder.rename(folder.with_name(OTHER_ID))
-    report = verify(tmp_path)
-    assert any("lies in the folder of" in said for said in report.as_dict()["problems"])
-
-
-@settings(max_examples=120, deadline=None)
-@given(st.data())
-def test_one_flipped_bit_in_its_description_or_frames_is_found(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
-    base = tmp_path_factory.getbasetemp() / "flipped_session"
-    folder = base / "sessions" / ID
-    if not folder.exists():
-        sealed(base)
-    path = folder / data.draw(st.sampled_from(["session.json", "frames.parquet"]))
-    whole = path.read_bytes()
-    content = bytearray(whole)
-    at = data.draw(st.integers(0, len(content) - 1))
-    content[at] ^= 1 << data.draw(st.integers(0, 7))
-    try:
-        path.write_bytes(content)
-        assert verify_session(folder).problems != []
-    finally:
-        path.write_bytes(whole)
-
-
-@pytest.mark.parametrize("name", ["session.json", "frames.parquet"])
-def test_a_file_that_was_cut_anywhere_is_damage(tmp_path: Path, name: str) -> None:
-    path = sealed(tmp_path) / name
-    whole = path.read_bytes()
-    for size in (*range(0, len(whole), 211), len(whole) - 1):
-        path.write_bytes(whole[:size])
-        assert verify_session(path.parent).problems != [], size
-
-
-def raised(name: str, value: Any) -> Any:
-    def change(content: dict[str, Any]) -> None:
-        content[name] = value
-
-    return change
-
-
-def in_ledger(name: str, value: Any) -> Any:
-    def change(content: dict[str, Any]) -> None:
-        content["ledger"]["parts"][0][name] = value
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (raised("id", OTHER_ID), "says id"),
-        (raised("node", "other"), "says node"),
-        (raised("frames", 54), "says frames 54"),
-        (raised("bytes", 54), "says bytes 54"),
-        (raised("sha256", "0" * 64), "not the file that session.json names"),
-        (raised("sha256", None), "not the file that session.json names"),
-        (raised("duration_s", 3.0), "lasted 3.0 s"),
-        (raised("stopped_t_ns", 5), "says stopped_t_ns"),
-        (raised("calibration_id", "x"), "says calibration_id"),
-        (raised("absolute_scale", "measured"), "says absolute_scale"),
-        (raised("ledger", None), "its ledger is missing"),
-        (raised("events", []), "other events"),
-        (lambda c: c["clock"][0].update(uncertainty_ns=4), "clock.parquet has other rows"),
-        (in_ledger("recorded", 40), "ledgers of session.json and frames.parquet"),
-        (in_ledger("lost", {}), "ledgers of session.json and frames.parquet"),
-        (in_ledger("pending", 5), "still to come"),
-        (lambda c: c["parts"].pop(), "not of the same parts"),
-        (lambda c: c["parts"][0].update(seq_last=50), "not of the same parts"),
-    ],
-)
-def test_an_edit_that_forges_the_check_is_held_against_the_file(
-    tmp_path: Path, change: Any, said: str
-) -> None:
-    folder = sealed(tmp_path)
-    edited(folder, change)
-    assert said in problems(folder)
-
-
-def test_an_edited_note_is_seen_by_the_check_alone(tmp_path: Path) -> None:
-    folder = sealed(tmp_path)
-    path = folder / "session.json"
-    text = path.read_bytes()
-    path.write_bytes(text.replace(b"first try", b"third try"))
-    assert "was changed" in problems(folder)
-    content = json.loads(text)
-    del content["check"]
-    path.write_text(json.dumps(content))
-    report = verify_session(folder)
-    assert report.problems == []
-    assert "notes" in " ".join(report.unproven)
-
-
-def test_a_damaged_table_beside_it_is_seen(tmp_path: Path) -> None:
-    folder = sealed(tmp_path)
-    for name in ("events.parquet", "clock.parquet"):
-        whole = (folder / name).read_bytes()
-        (folder / name).write_bytes(whole[:-9])
-        assert name in problems(folder)
-        pq.write_table(pq.read_table(folder / "frames.parquet").select(["seq"]), folder / name)
-        assert name in problems(folder)
-        (folder / name).write_bytes(whole)
 
 
 # --- not sealed -----------------------------------------------------------------------------------

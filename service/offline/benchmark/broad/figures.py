@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from scipy.special import chdtri
+
 from service.offline.accuracy import PHASES, Covered
 from service.offline.benchmark.broad.arrays import CLEAN, CONDITIONS, HEAVY, SCENES, SERIALS
 from service.offline.benchmark.broad.results import ArrayResult, Judged, Phase, Tile, key_of
@@ -74,6 +76,8 @@ SUMS = (
     "grf_bounds_held",
     "after_frames",
 )
+ALARMS_PER_HOUR = 1.0
+"""Said of healthy tiles, that they are stuck, clipped or off their baseline: beyond doubt less."""
 
 
 def rows_of(results: Sequence[ArrayResult]) -> list[Row]:
@@ -181,11 +185,35 @@ def sigma_goals(results: Sequence[ArrayResult]) -> list[Goal]:
     return goals
 
 
+@dataclass(frozen=True)
+class Alarms:
+    """False alarms of the live estimates of all recordings."""
+
+    alarms: int
+    hours: float
+
+    @property
+    def most_per_hour(self) -> float:
+        """What their rate is below, with 95 % confidence (Poisson)."""
+        return float(chdtri(2 * (self.alarms + 1), 0.05)) / 2.0 / self.hours
+
+
+def alarms_of(results: Sequence[ArrayResult]) -> Alarms:
+    """Over all scenes and conditions."""
+    live = [j for r in results for key, j in r.judged.items() if key.endswith("/live")]
+    return Alarms(sum(j.alarms for j in live), sum(j.seconds for j in live) / 3600.0)
+
+
 def error_goals(results: Sequence[ArrayResult]) -> list[Goal]:
     """Of errors, which have goals in clean scenes only, and of models."""
     goals = [goal for row in rows_of(results) if row.condition == CLEAN for goal in _errors(row)]
     pressed, refused = len(SERIALS) * len(results), sum(r.tiles_refused for r in results)
     share = 100.0 * refused / pressed if pressed else math.nan
+    if (alarms := alarms_of(results)).hours > 0.0:
+        figure = (
+            f"false alarms an hour at most (95 %): {alarms.alarms} within {alarms.hours:.1f} hours"
+        )
+        goals.append(Goal("live", figure, alarms.most_per_hour, None, ALARMS_PER_HOUR))
     figure = "tiles that their bench refuses, %"
     goals.append(Goal("", figure, share, None, 100.0 * _MODELS_SHARE))
     for title, of, part in (

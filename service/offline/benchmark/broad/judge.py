@@ -18,6 +18,8 @@ from service.offline.benchmark.broad.results import Judged, Phase
 from service.offline.benchmark.draws import Recording
 
 JUDGED = (*COMPARED, "force_n", "force_sigma_n", "true_force_n")
+WRONG_TILE = (EstimateStatus.STUCK, EstimateStatus.CLIPPED, EstimateStatus.BASELINE_LOST)
+"""Flags of tiles that answer and are wrong."""
 NOISES = 4.0
 """A tile whose settled pressure is that many standard deviations of a reading below the end of its
 calibration was called saturated wrongly."""
@@ -73,6 +75,16 @@ def judged(
         after_frames=accuracy.after_saturation.frames,
         after_within=accuracy.after_saturation.within,
         after_saturation_mae_n=known(accuracy.after_saturation_mae_n),
+        seconds=float(columns["t_ns"][-1] - columns["t_ns"][0]) * 1e-9,
+        alarms=_alarms(status),
+    )
+
+
+def _alarms(status: npt.NDArray[np.uint16]) -> int:
+    """How often one of `WRONG_TILE` comes on."""
+    return sum(
+        int((np.diff((status & bit) != 0, prepend=False) & ((status & bit) != 0)).sum())
+        for bit in WRONG_TILE
     )
 
 

@@ -66,6 +66,10 @@ class Judged(Facts):
     after_frames: int
     after_within: int
     after_saturation_mae_n: float | None
+    seconds: float
+    """That were recorded."""
+    alarms: int
+    """How often a tile was said to be stuck, clipped or off its baseline. None is."""
 
 
 class Tile(Facts):

@@ -41,6 +41,8 @@ def judged(**changes: Any) -> Judged:
         "after_frames": 0,
         "after_within": 0,
         "after_saturation_mae_n": None,
+        "seconds": 3600.0,
+        "alarms": 0,
     }
     return Judged(**(numbers | changes))
 

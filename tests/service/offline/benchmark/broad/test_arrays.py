@@ -112,6 +112,17 @@ def test_sums_of_squares_are_of_the_frames_that_count() -> None:
     assert found.wrongly == 0, "no tile was called saturated"
 
 
+def test_each_time_that_a_tile_is_said_to_be_wrong_is_an_alarm() -> None:
+    status = np.zeros(20, dtype=np.uint16)
+    status[0:2] = EstimateStatus.STUCK
+    status[5:9] = EstimateStatus.BASELINE_LOST | EstimateStatus.SATURATED
+    status[7:12] |= np.uint16(EstimateStatus.CLIPPED)
+    status[15:] |= np.uint16(EstimateStatus.CLIPPED)
+    found = judged(columns(estimate_status=status), lambda: np.ones((20, 2), dtype=bool), 10.0)
+    assert found.alarms == 4
+    assert found.seconds == pytest.approx(0.19)
+
+
 def test_a_missing_tile_is_no_bound() -> None:
     nothing = np.full((20, 2), np.nan)
     missing = columns(force_n=nothing, force_sigma_n=nothing)

@@ -7,6 +7,7 @@ import math
 import pytest
 
 from service.offline.benchmark.broad.figures import (
+    alarms_of,
     error_goals,
     goals_of,
     models_of,
@@ -41,6 +42,19 @@ def test_an_array_that_gave_nothing_in_a_scene_is_not_counted_there() -> None:
     silent = result().model_copy(update={"judged": {}})
     assert rows_of([result(), silent])[0].errors["grf_mae_n"].n == 1
     assert rows_of([silent]) == []
+
+
+def test_false_alarms_are_those_of_live_estimates_and_none_within_three_hours_are_below_one() -> (
+    None
+):
+    # 13 recordings an array; of none the limit is -ln(0.05) within the hours there are.
+    hours = alarms_of([result(seconds=36.0)] * 25)
+    assert hours.alarms == 0
+    assert hours.hours == pytest.approx(3.25)
+    assert hours.most_per_hour == pytest.approx(-math.log(0.05) / 3.25)
+    (goal,) = [g for g in error_goals([result(alarms=2, seconds=36.0)]) if "false alarms" in g.figure]
+    assert "26 within 0.1 hours" in goal.figure
+    assert not goal.met
 
 
 def test_a_tile_loses_a_model_only_if_its_effect_is_too_great_to_do_without() -> None:

@@ -1,0 +1,52 @@
+"""Emulated feet that are switched on, and what is asked of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.array.array import TileArray
+from devices.array.budget import BusTiming
+from devices.array.self_test import identify
+from devices.buses.i2c import open_bus
+from devices.clock import VirtualClock
+from devices.emulation.world import World
+from devices.frames import TileInfo
+from devices.scene.file import Scene
+from tests.devices.rigs import Plugs
+
+TWO: Plugs = ((0x70, 0), (0x70, 1))
+EPOCH_NS = 5_000_000_000
+
+
+def switched_on(scene: Scene, **options: Any) -> tuple[World, TileArray, VirtualClock]:
+    """A world and its driver, at a time that is not zero."""
+    clock = VirtualClock(EPOCH_NS)
+    world = World(scene, clock, **options)
+    bus = open_bus("emulated", world.i2c_adapter)
+    tiles = identify(bus, scene.tile)
+    timing = BusTiming(400_000, (3.0e-3,) * len(tiles), tuple(tile.mux for tile in tiles))
+    array = TileArray(
+        bus, tiles, clock, schedule="simultaneous", timing=timing, broadcast_channels=64
+    )
+    return world, array, clock
+
+
+def identified(scene: Scene, **options: Any) -> tuple[TileInfo, ...]:
+    return switched_on(scene, **options)[1].tiles
+
+
+def counts(scene: Scene, frames: int = 30, **options: Any) -> npt.NDArray[np.int64]:
+    """`padc` and `tadc`, (frames, 2, tiles), as the driver reads them."""
+    _, array, _ = switched_on(scene, **options)
+    scans = [array.scan() for _ in range(frames)]
+    assert all(scan.status == [0] * len(scene.tile) for scan in scans)
+    return np.array([(scan.padc, scan.tadc) for scan in scans])
+
+
+def moved_to(scene: Scene, tile: int, **changes: Any) -> Scene:
+    tiles = list(scene.tile)
+    tiles[tile] = tiles[tile].model_copy(update=changes)
+    return scene.model_copy(update={"tile": tuple(tiles)})

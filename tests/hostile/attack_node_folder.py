@@ -1,0 +1,135 @@
+"""A node on its own, of which a file is not what was written."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from devices.acquisition import FrameRow
+from devices.errors import FootTileError
+from devices.frames import FrameBatch
+from storage.intervals import Intervals, OpenPairs
+from storage.journal.node.in_flight import InFlight
+from storage.journal.node.journal import NodeJournal
+from storage.journal.node.stream import NodeStream
+from storage.journal.node.wanted import ServerWants
+from storage.wire import messages_of
+from tests.builders.arrays import make_array
+from tests.builders.frames import make_frames
+from tests.hostile.attack import Outcome, Play, attack
+from tests.hostile.damages import DAMAGES, plays
+from tests.hostile.data_folders import copied, digest, sha
+from tests.waiting import until
+
+BOOTS = ("a" * 32, "b" * 32)
+_NODE_SAYS = ("wanted.json", "stream.json")
+
+
+def node_folder(folder: Path) -> Path:
+    """The state of a node that was killed: a stream that ended, one in flight, what is wanted."""
+    live = folder.with_name(f"{folder.name}-live")
+    journal = NodeJournal(live, "leg")
+    journal.start()
+    wants: dict[str, OpenPairs] = {BOOTS[0]: ((0, 49),), BOOTS[1]: ((100, None),)}
+    journal.want("laptop", ServerWants(streams=wants, recording=True, known=BOOTS))
+    for boot_id in BOOTS:
+        info = make_array(node="leg", boot_id=boot_id)
+        stream = journal.begin(info)
+        in_flight = InFlight(stream.folder, info)
+        for first in range(0, 200, 10):
+            frames = make_frames(np.arange(first, first + 10))
+            for row in rows_of(frames):
+                in_flight.put(row)
+            for message in messages_of(frames, info):
+                journal.put(stream, message)
+        in_flight.close()
+        until(partial(_is_stored, stream))
+    until((live / "journal" / "leg" / "wanted.json").exists)
+    until(lambda: not (live / "journal" / "leg" / BOOTS[0] / "in_flight").exists())
+    shutil.copytree(live, folder)  # as SIGKILL leaves it
+    journal.close()
+    return folder
+
+
+@attack(
+    "every file of a node's folder, damaged in every way",
+    tries=30,
+    soak_tries=2_000,
+    is_alone=False,
+)
+def folder_of_a_node(play: Play) -> Outcome:
+    """One file of a node's state is damaged, then its journal is opened, goes on and is tidied.
+
+    Failures: it does not open; a frame is other than it was; a frame of a stream that is not
+    damaged is gone; what says what is wanted, or of a stream, is damaged and no problem names it; a
+    new stream is not kept.
+    """
+    outcome = Outcome()
+    data = node_folder(play.folder / "node")
+    for path, damage in plays(data, play.tries, play.random):
+        what = f"{path} {damage}"
+        copy = copied(data, play.folder / "copy")
+        DAMAGES[damage](copy / path, play.random)
+        is_same = (copy / path).is_file() and sha(copy / path) == sha(data / path)
+        is_same = is_same and not (copy / path).is_symlink()
+        try:
+            wrong, said = _goes_on(copy, [boot for boot in BOOTS if boot not in path.parts])
+        except FootTileError as error:
+            outcome.failed(f"{what}: {error}")
+            continue
+        is_named = any(path.name in text for text in said)
+        if wrong:
+            outcome.failed(f"{what}: {wrong}")
+        elif path.name in _NODE_SAYS and not is_same and not is_named:
+            outcome.failed(f"{what}: nothing is said of it: {said}")
+        else:
+            outcome.saw("said by name, and it goes on" if is_named else "it goes on")
+    return outcome
+
+
+def _goes_on(root: Path, undamaged: Sequence[str]) -> tuple[str, list[str]]:
+    """What is wrong with a node's journal that is opened now, and what it says."""
+    journal = NodeJournal(root, "leg")
+    journal.start()
+    try:
+        info = make_array(node="leg", boot_id="c" * 32)
+        stream = journal.begin(info)
+        for message in messages_of(make_frames(np.arange(10)), info):
+            journal.put(stream, message)
+        until(lambda: stream.stored.last == 9)
+        known = {each.boot_id: each for each in journal.streams}
+        for boot_id in undamaged:
+            if boot_id not in known or known[boot_id].held != Intervals([(0, 199)]):
+                return f"stream {boot_id} is not whole", journal.problems
+        for each in known.values():
+            read = 0
+            try:
+                for batch in each.journal.read(0, 199) if each.journal else ():
+                    taken = make_frames(batch.seq.astype(np.int64))
+                    if digest(batch) != digest(taken):
+                        return "other frames", journal.problems
+                    read += len(batch)
+            except FootTileError as error:
+                if each.boot_id in undamaged:
+                    return f"stream {each.boot_id}: {error}", journal.problems
+            if each.boot_id in undamaged and read != 200:
+                return f"of stream {each.boot_id} only {read} are read", journal.problems
+        return "", list(journal.problems)
+    finally:
+        journal.close()
+
+
+def _is_stored(stream: NodeStream) -> bool:
+    return stream.stored.last == 199 and stream.is_synced
+
+
+def rows_of(frames: FrameBatch) -> list[FrameRow]:
+    """Frames one by one, as acquisition has them."""
+    return [
+        FrameRow(*(getattr(frames, name)[i].tolist() for name in FrameRow._fields))
+        for i in range(len(frames))
+    ]
