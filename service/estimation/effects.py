@@ -19,6 +19,10 @@ WALL_PER_KPA = 0.00124
 """Part of the bubble's volume that the wall gives way for a kPa: elastic estimate for Vytaflex 60
 (hardware.md 9), where a soak at two temperatures does not tell."""
 
+MISFIT_MIN = 0.1
+"""No correction is better than this, however well it fits a bench: a single time stands for a
+sphere's many, two terms for a spectrum, three plays for a continuum."""
+
 EffectName = Literal["temperature", "ambient", "gas", "rubber", "hysteresis"]
 
 

@@ -18,7 +18,7 @@ from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.effects import EffectName, GasEffect, RubberEffect, values
+from service.estimation.effects import MISFIT_MIN, EffectName, GasEffect, RubberEffect, values
 from service.estimation.models.ambient import Ambient
 from service.estimation.models.flow import Flow
 from service.estimation.models.gas import Gas
@@ -40,11 +40,6 @@ MODELS = (
     "rubber",
 )
 """Names of all models, in the order of their use."""
-
-
-MISFIT_MIN = 0.1
-"""No correction is better than this, however well it fits a bench: a single time stands for a
-sphere's many, two terms for a spectrum, three plays for a continuum."""
 
 
 @dataclass(frozen=True)

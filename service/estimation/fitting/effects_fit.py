@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -9,12 +10,19 @@ import numpy as np
 
 from devices.arrays import Bools, Floats, Ints
 from service.estimation.calibration import TileCalibration, is_monotonic
-from service.estimation.effects import Effects, Parameter, TemperatureEffect, values
+from service.estimation.effects import (
+    MISFIT_MIN,
+    Effects,
+    Parameter,
+    RubberEffect,
+    TemperatureEffect,
+    values,
+)
 from service.estimation.fitting.identify import identify
 from service.estimation.fitting.indentation import Indentation, pressed_in, soak, unloaded
 from service.estimation.fitting.model import DomeModel, load
 from service.estimation.fitting.press import Presses, joined, presses
-from service.estimation.fitting.soak import fit_soak
+from service.estimation.fitting.soak import Soak, fit_soak
 from service.estimation.fitting.timing import UNKNOWN_DELAY
 
 _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])
@@ -42,6 +50,85 @@ def fit_effects(
         soaked=soaked,
         delay=delay,
     )
+    effects = _centred(effects)
+    if not isinstance(soaked, TemperatureEffect):
+        return effects
+    # What the dome gives back of the presses before a soak is no warmth.
+    model = dome_model(effects, tile, baseline_kpa)
+    pressed = pressed_in(recordings)
+    soaks = [_recovered(each, pressed, noise_kpa, model) for each in recordings]
+    again = _best([fit_soak(each) for each in soaks])
+    if not isinstance(again, TemperatureEffect):
+        return effects
+    return effects.model_copy(update={"temperature": _as_doubtful(again, soaked, effects.rubber)})
+
+
+def _recovered(
+    recording: Indentation, pressed: Sequence[Indentation], noise_kpa: float, model: DomeModel
+) -> Soak:
+    """A recording's soak without what is left in the dome of the presses before it."""
+    soaking = soak(recording, noise_kpa)
+    if not len(soaking.t_s):
+        return soaking
+    soak_ns = recording.t_ns[recording.phase == "soak"]
+    ends_ns = [_last_ns(each) for each in pressed]
+    before = [i for i, end_ns in enumerate(ends_ns) if end_ns <= soak_ns[0]]
+    if not before:
+        return soaking
+    last = max(before, key=lambda i: ends_ns[i])
+    points = presses(pressed[last], unloaded(pressed[last]))
+    since_s = (soak_ns - ends_ns[last]) * 1e-9
+    t_s = np.concatenate([points.t_s, points.t_s[-1] + since_s])
+    force_n = np.concatenate([points.force_n, np.zeros(len(since_s))])
+    left_kpa = model.pressed(t_s, force_n)[len(points.t_s) :, 0] - model.baseline_kpa
+    return replace(soaking, kpa=soaking.kpa - left_kpa)
+
+
+def _last_ns(pressed: Indentation) -> int:
+    """When the tile was last under the spindle."""
+    return int(pressed.t_ns[pressed.under_spindle & (pressed.phase != "soak")][-1])
+
+
+def _as_doubtful(
+    now: TemperatureEffect, before: TemperatureEffect, rubber: RubberEffect | None
+) -> TemperatureEffect:
+    """As uncertain, too, as the recovery is of which it has been rid."""
+    doubt = max(MISFIT_MIN, 0.0 if rubber is None else rubber.misfit)
+
+    def doubted(a: Parameter, b: Parameter) -> Parameter:
+        return Parameter(value=a.value, sigma=math.hypot(a.sigma, doubt * (a.value - b.value)))
+
+    return TemperatureEffect(
+        kpa_per_k=doubted(now.kpa_per_k, before.kpa_per_k),
+        lag_s=doubted(now.lag_s, before.lag_s),
+        wall_per_kpa=doubted(now.wall_per_kpa, before.wall_per_kpa),
+    )
+
+
+def dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> DomeModel:
+    """What was found of a tile, to say what it reads.
+
+    Args:
+        effects: with its curve in the tile's variable.
+        tile: its static curve, which stands where there is no creep.
+        baseline_kpa: absolute pressure unloaded.
+    """
+    gas, rubber, loop = effects.gas, effects.rubber, effects.hysteresis
+    curve = curve_over_range(tile.coefficients if rubber is None else rubber.coefficients)
+    model = DomeModel(curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa)
+    if gas is not None:
+        model = replace(model, gamma=gas.gamma.value, tau_s=gas.tau_s.value)
+    if rubber is not None:
+        model = replace(model, part=values(rubber.part), creep_s=values(rubber.tau_s))
+    if loop is not None:
+        model = replace(model, loop=values(loop.part))
+        if (flow := loop.flow) is not None:
+            model = replace(model, flow_part=flow.part.value, flow_n=flow.stress_n.value)
+    return model
+
+
+def _centred(effects: Effects) -> Effects:
+    """With the curve in the variable of the tile's own."""
     rubber = effects.rubber
     if rubber is None:
         return effects
@@ -115,21 +202,13 @@ def replays(recordings: Sequence[Indentation], tile: TileCalibration) -> dict[st
         return {}
     points, baseline_kpa = loadings(recordings)
     effects = tile.effects
-    gas, rubber, loop = effects.gas, effects.rubber, effects.hysteresis
-    curve = curve_over_range(tile.coefficients if rubber is None else rubber.coefficients)
     # The slow strokes' mean curve has creep and loop in it already.
-    static_curve = curve_over_range(tile.coefficients)
-
+    static = DomeModel(
+        curve_over_range(tile.coefficients), tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa
+    )
+    model = dome_model(effects, tile, baseline_kpa)
     late_s = effects.reference_late_s
     late_s += 0.0 if effects.late_s is None else effects.late_s.value
-    static = DomeModel(static_curve, tile.range_kpa[1], baseline_kpa, effects.wall_per_kpa)
-    model = replace(static, curve=curve)
-    if gas is not None:
-        model = replace(model, gamma=gas.gamma.value, tau_s=gas.tau_s.value)
-    if rubber is not None:
-        model = replace(model, part=values(rubber.part), creep_s=values(rubber.tau_s))
-    if loop is not None:
-        model = replace(model, loop=values(loop.part))
     force_n = load(points.t_s, points.force_n)(points.t_s + late_s)
     static_kpa, modelled_kpa = (
         each.pressed(points.t_s, force_n)[:, 0] - baseline_kpa for each in (static, model)

@@ -1,9 +1,11 @@
 """`denoise`: noise averaged away over as long as nothing happens.
 
 Around every sample a line and a parabola are fitted to windows that grow, up to the look-ahead on
-one side and `PAST_NS` on the other. The longest one is taken whose value still agrees with those of
-all shorter ones (intersection of confidence intervals, Goldenshluger and Nemirovski 1997; Katkovnik
-1999). A window never crosses a gap.
+one side and `PAST_NS` on the other. Each side grows by itself, until what it brings does not agree
+with all shorter windows: beside a contact the window goes on growing on the side away from it. The
+value with the least noise is taken (Lepski's method; Goldenshluger and Nemirovski 1997). Two
+windows, one within the other, agree if their values differ by no more than what the longer one
+averages away would explain. A window never crosses a gap.
 """
 
 from __future__ import annotations
@@ -20,9 +22,12 @@ REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
 """How far the windows reach to either side, in samples."""
 AVERAGED_MAX = 2 * int(REACHES[-1]) + 2
 """Readings in the longest window, and one."""
-AGREE = 1.0
-"""In standard uncertainties: how far the value of a longer window may be from that of any shorter
-one. A compromise between noise in quiet stance and lag at an impact."""
+AGREE = 2.25
+"""How far the values of two windows may be apart, in standard uncertainties of their difference:
+chance makes it more in one of forty. A compromise between noise in quiet stance and lag at an
+impact."""
+SAME = 1e-6
+"""Of a variance: a longer window that averages less than that away is the same but for rounding."""
 SINGULAR = 1e-5
 """A determinant so small, relative to its first term, says that samples lie too close together for
 such a curve, as at two instants a parabola; for windows of equal steps it is a hundred times more.
@@ -44,7 +49,7 @@ def denoised(
     reaches: Times,
     agree: float,
     noise_left: Floats,
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Averaged values of rows `first` to `stop`.
 
     Args:
@@ -65,12 +70,17 @@ def denoised(
 
     Returns:
         Values (stop - first, tiles), and their squared standard uncertainty in units of that of a
-        single one: what is left of the noise, and what curvature within the window adds.
+        single one: what is left of the noise, and what curvature within the window adds. And how
+        far they are from those of a window of half the length, with the variance that noise gives
+        that, in the same units: for `shared_bend`.
     """
     n, tiles = values.shape
     out = np.full((stop - first, tiles), math.nan)
     left = np.full((stop - first, tiles), math.nan)
-    moments = np.empty(8)
+    bend = np.full((stop - first, tiles), math.nan)
+    of_bend = np.full((stop - first, tiles), math.nan)
+    moments, trial = np.empty(8), np.empty(8)
+    kept = np.empty((4 * len(reaches) + 1, 3))
     newest = oldest = first
     while oldest > 0 and frame_t_ns[oldest - 1] >= frame_t_ns[first] - past_ns:
         oldest -= 1
@@ -84,54 +94,119 @@ def denoised(
             if math.isnan(values[i, j]):
                 continue
             sigma = sigmas[i, j]
-            moments[:] = 0.0
             # Times relative to the instant asked for, in milliseconds.
+            moments[:] = 0.0
             _add(moments, (t_ns[i, j] - at_ns[i, j]) * 1e-6, values[i, j])
             best = shorter = shortest = values[i, j]
             variance = shorter_variance = shortest_variance = 1.0
-            least, most = best - agree * sigma, best + agree * sigma
+            kept[0, 0], kept[0, 1], kept[0, 2] = best, variance, 1.0
+            stored = 1
             low = high = i
-            straight, agrees = True, True
+            open_low = open_high = straight = True
             for reach in reaches:
-                before_low, before_high = low, high
-                while low > max(oldest, i - reach) and run[low - 1] == run[i]:
-                    low -= 1
-                    if not math.isnan(values[low, j]):
-                        _add(moments, (t_ns[low, j] - at_ns[i, j]) * 1e-6, values[low, j])
-                while high < min(newest, i + reach) and run[high + 1] == run[i]:
-                    high += 1
-                    if not math.isnan(values[high, j]):
-                        _add(moments, (t_ns[high, j] - at_ns[i, j]) * 1e-6, values[high, j])
-                if low == before_low and high == before_high:
-                    break
-                accepted, remains = math.nan, 0.0
-                for bent in (True, False):
-                    if not bent and not straight:
-                        break
-                    value, of_noise = _parabola(moments) if bent else _line(moments)
-                    if math.isnan(value):
+                before, before_variance = best, variance
+                for ahead in (False, True):
+                    if not (open_high if ahead else open_low):
                         continue
-                    of_noise *= _left(noise_left[j], of_noise)
-                    spread = agree * sigma * math.sqrt(of_noise)
-                    if value - spread > most or value + spread < least:
-                        straight = False
-                        agrees = not bent
-                        break
-                    least, most = max(least, value - spread), min(most, value + spread)
-                    accepted, remains = value, of_noise
-                if not agrees:
-                    break
-                if not math.isnan(accepted) and remains < variance:
+                    way, edge = (1, high) if ahead else (-1, low)
+                    end = min(newest, i + reach) if ahead else max(oldest, i - reach)
+                    trial[:] = moments
+                    at = edge
+                    while at != end and run[at + way] == run[i]:
+                        at += way
+                        if not math.isnan(values[at, j]):
+                            _add(trial, (t_ns[at, j] - at_ns[i, j]) * 1e-6, values[at, j])
+                    if at == edge:
+                        continue
+                    accepted, remains = math.nan, 0.0
+                    agrees = True
+                    for bent in (True, False):
+                        if not bent and not straight:
+                            break
+                        value, of_noise = _parabola(trial) if bent else _line(trial)
+                        if math.isnan(value):
+                            continue
+                        of_noise *= _left(noise_left[j], of_noise)
+                        if not _agree(kept, stored, value, of_noise, bent, (agree * sigma) ** 2):
+                            agrees = not bent
+                            straight = False
+                            break
+                        kept[stored, 0], kept[stored, 1], kept[stored, 2] = value, of_noise, bent
+                        stored += 1
+                        accepted, remains = value, of_noise
+                    if not agrees:
+                        if ahead:
+                            open_high = False
+                        else:
+                            open_low = False
+                        continue
+                    moments[:] = trial
+                    if ahead:
+                        high = at
+                    else:
+                        low = at
+                    if not math.isnan(accepted) and remains < (1.0 - SAME) * variance:
+                        best, variance = accepted, remains
+                if variance < before_variance:
                     shortest, shortest_variance = shorter, shorter_variance
-                    shorter, shorter_variance = best, variance
-                    best, variance = accepted, remains
+                    shorter, shorter_variance = before, before_variance
+                if not open_low and not open_high:
+                    break
             # A window of half the length gives the same but for noise; if not, neither curve is a
             # good description of what happens here.
+            bend[i - first, j] = best - shortest
+            of_bend[i - first, j] = shortest_variance - variance
             if sigma > 0.0:
                 off = ((best - shortest) / sigma) ** 2
                 variance += max(0.0, off - (shortest_variance - variance))
             out[i - first, j], left[i - first, j] = best, variance
-    return out, left
+    return out, left, bend, of_bend
+
+
+@compiled
+def shared_bend(bend_n: Floats, noise_n: Floats) -> Floats:
+    """What of the tiles' bends is more than noise in their sum, (n, tiles), signed.
+
+    Tiles bear the same load: what a window smooths away of it, it does in all of them, to the same
+    side. One tile does not show that above its noise; their sum may.
+
+    Args:
+        bend_n: (n, tiles), how far averages are from those of shorter windows; NaN: there is none.
+        noise_n: standard deviations that noise gives that.
+    """
+    n, tiles = bend_n.shape
+    out = np.zeros((n, tiles))
+    for i in range(n):
+        total, variance = 0.0, 0.0
+        for j in range(tiles):
+            if not math.isnan(bend_n[i, j]):
+                total += bend_n[i, j]
+                variance += noise_n[i, j] * noise_n[i, j]
+        if total * total > AGREE * AGREE * variance:
+            part = math.sqrt(1.0 - variance / (total * total))
+            for j in range(tiles):
+                if not math.isnan(bend_n[i, j]):
+                    out[i, j] = part * bend_n[i, j]
+    return out
+
+
+@compiled
+def _agree(
+    kept: Floats, stored: int, value: float, of_noise: float, bent: bool, most: float
+) -> bool:
+    """Does a window's value agree with the first `stored` of shorter ones, value, variance, bent?
+
+    A shorter line is not a part of a longer parabola: their noise is taken for independent.
+    """
+    for m in range(stored):
+        apart = value - kept[m, 0]
+        if kept[m, 2] > 0.0 or not bent:
+            of_difference = max(kept[m, 1] - of_noise, SAME * kept[m, 1])
+        else:
+            of_difference = kept[m, 1] + of_noise
+        if apart * apart > most * of_difference:
+            return False
+    return True
 
 
 @compiled

@@ -319,6 +319,17 @@ def _between(table: Floats, at: Any) -> Any:
     return first + (at - below) * (second - first)
 
 
+def _agree(value: Any, variance: Any, degree: int, shorter: list[Any], sigma: Exact) -> bool:
+    """With each of the shorter windows' (value, variance, degree)."""
+    for before, of_before, degree_before in shorter:
+        nested = degree <= degree_before
+        less = max(of_before - variance, mpf(denoise.SAME) * of_before)
+        allowed = less if nested else of_before + variance
+        if (value - before) ** 2 > (denoise.AGREE * sigma) ** 2 * allowed:
+            return False
+    return True
+
+
 def denoised(
     values: list[Exact],
     sigmas: list[Exact],
@@ -328,9 +339,9 @@ def denoised(
     run: list[int],
     look_ns: int,
     noise_left: Floats,
-) -> list[tuple[Exact, Exact] | None]:
-    """Growing windows, a parabola and a line in each; the longest that agrees with all shorter."""
-    out: list[tuple[Exact, Exact] | None] = []
+) -> list[tuple[Exact, Exact, Exact, Exact] | None]:
+    """Windows that grow on either side, a parabola and a line in each, as long as they agree."""
+    out: list[tuple[Exact, Exact, Exact, Exact] | None] = []
     for i, own in enumerate(values):
         if own is None:
             out.append(None)
@@ -345,36 +356,54 @@ def denoised(
             <= max(frame_ns[i] + look_ns, frame_ns[i])
         ]
         history = [(own, mpf(1))] * 3
-        least, most = own - sigma, own + sigma
-        straight, window = True, [i]
+        shorter = [(own, mpf(1), 2)]
+        straight, window, growing = True, {i}, [-1, 1]
         for reach in denoise.REACHES:
-            wider = [j for j in reachable if abs(j - i) <= reach]
-            if wider == window:
-                break
-            window = wider
-            good = [j for j in window if values[j] is not None]
-            x = [mpf(t_ns[j] - at_ns[i]) / 10**6 for j in good]
-            y = [values[j] for j in good]
-            accepted, refused = None, False
-            for degree in (2, 1) if straight else (2,):
-                found = curve_at_zero(x, y, degree)
-                if found is None:
+            best = history[-1]
+            for side in (-1, 1):
+                wider = window | {j for j in reachable if 0 <= side * (j - i) <= reach}
+                if side not in growing or wider == window:
                     continue
-                value, variance = found
-                variance *= _between(noise_left, 1 / variance)
-                found = value, variance
-                spread = sigma * mp.sqrt(variance)
-                if value - spread > most or value + spread < least:
-                    straight, refused = False, degree == 2
-                    break
-                least, most = max(least, value - spread), min(most, value + spread)
-                accepted = found
-            if refused:
-                break
-            if accepted is not None and accepted[1] < history[-1][1]:
-                history = [*history[1:], accepted]
-        (best, variance), (old, old_variance) = history[-1], history[0]
+                good = [j for j in sorted(wider) if values[j] is not None]
+                x = [mpf(t_ns[j] - at_ns[i]) / 10**6 for j in good]
+                y = [values[j] for j in good]
+                accepted = None
+                for degree in (2, 1) if straight else (2,):
+                    found = curve_at_zero(x, y, degree)
+                    if found is None:
+                        continue
+                    value, variance = found
+                    variance *= _between(noise_left, 1 / variance)
+                    if not _agree(value, variance, degree, shorter, sigma):
+                        straight = False
+                        if degree == 2:
+                            growing.remove(side)
+                        break
+                    shorter.append((value, variance, degree))
+                    accepted = value, variance
+                if side not in growing:
+                    continue
+                window = wider
+                if accepted is not None and accepted[1] < (1 - mpf(denoise.SAME)) * best[1]:
+                    best = accepted
+            if best[1] < history[-1][1]:
+                history = [*history[1:], best]
+        (value, variance), (old, old_variance) = history[-1], history[0]
+        bend, of_bend = value - old, old_variance - variance
         if sigma > 0:
-            variance += max(mpf(0), ((best - old) / sigma) ** 2 - (old_variance - variance))
-        out.append((best, variance))
+            variance += max(mpf(0), (bend / sigma) ** 2 - of_bend)
+        out.append((value, variance, bend, of_bend))
+    return out
+
+
+def shared_bend(bends_n: list[list[Exact]], noises_n: list[list[Exact]]) -> list[list[Exact]]:
+    """Of each tile's bends what is more than noise in the sum over tiles; None: there is none."""
+    out = [[mpf(0)] * len(bends_n[0]) for _ in bends_n]
+    for k in range(len(bends_n[0])):
+        there = [i for i, bends in enumerate(bends_n) if bends[k] is not None]
+        total = mp.fsum(bends_n[i][k] for i in there)
+        variance = mp.fsum(noises_n[i][k] ** 2 for i in there)
+        if total**2 > mpf(denoise.AGREE) ** 2 * variance:
+            for i in there:
+                out[i][k] = mp.sqrt(1 - variance / total**2) * bends_n[i][k]
     return out
