@@ -143,7 +143,12 @@ def bench(run: Run, kept: Path) -> bytes:
         (["--calibration", "paper-eq2-shape", "--models", "magic"], 2, ["magic"]),
         (["--calibration", "paper-eq2-shape", "--lag-ms", "-1"], 2, ["look-ahead"]),
         (["--calibration", "paper-eq2-shape", "--tare-s", "1"], 2, ["--tare-s"]),
-        (["--calibration", "paper-eq2-shape", "--tare-s", "5,6"], 1, ["T01", "--tare-s"]),
+        (
+            ["--calibration", "paper-eq2-shape", "--models", "static", "--tare-s", "5,6"],
+            1,
+            ["T01", "--tare-s"],
+        ),
+        (["--calibration", "paper-eq2-shape"], 1, ["'gas'", "T01", "Leave the model out"]),
         (["--calibration", "paper-eq2-shape", "--tare-s", "1,0"], 2, ["--tare-s"]),
         (
             ["--scene", "rolling", "--calibration", "paper-eq2-shape", "--scene", "insole"],

@@ -52,7 +52,9 @@ def test_false_alarms_are_those_of_live_estimates_and_none_within_three_hours_ar
     assert hours.alarms == 0
     assert hours.hours == pytest.approx(3.25)
     assert hours.most_per_hour == pytest.approx(-math.log(0.05) / 3.25)
-    (goal,) = [g for g in error_goals([result(alarms=2, seconds=36.0)]) if "false alarms" in g.figure]
+    (goal,) = [
+        g for g in error_goals([result(alarms=2, seconds=36.0)]) if "false alarms" in g.figure
+    ]
     assert "26 within 0.1 hours" in goal.figure
     assert not goal.met
 
