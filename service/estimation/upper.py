@@ -70,8 +70,9 @@ class TileForces:
         sigma_n: their standard uncertainties.
         own_n: the part of these that is every tile's own.
         common_n: (parts, n, bearing tiles), the rest, of corrections of gas and rubber, of what
-            either did unseen, of warmth that nothing corrects, and of when the bench's reference
-            was read: all tiles share the error, so these are signed.
+            either did unseen, of what averages smooth away of the load, of warmth that nothing
+            corrects, and of when the bench's reference was read: all tiles share the error, so
+            these are signed.
         beyond: where forces are only bounds.
         unsettled: (n,), has what was unseen left more than the noise of a reading in any tile?
     """
@@ -108,6 +109,7 @@ def tile_forces(
     """
     ladder, now = plan.ladder, apparent.rows(first, stop)
     force_n, noise_n, at_ns = now.apparent_n, now.noise_n, now.sampled_ns
+    bend_n = np.zeros(force_n.shape)
     if ladder.denoise:
         # A lower bound would be averaged with what is no bound.
         usable_n = np.where(apparent.beyond, np.nan, apparent.apparent_n)
@@ -115,7 +117,7 @@ def tile_forces(
         if ladder.skew:
             asked_ns = np.broadcast_to(apparent.t_mono_ns[:, None], asked_ns.shape)
             at_ns = asked_ns[first:stop]
-        averaged_n, left = denoise.denoised(
+        averaged_n, left, bend_n, of_bend = denoise.denoised(
             np.ascontiguousarray(usable_n),
             np.ascontiguousarray(apparent.noise_n),
             np.ascontiguousarray(apparent.sampled_ns),
@@ -131,6 +133,7 @@ def tile_forces(
             plan.noise_left,
         )
         force_n = np.where(np.isnan(averaged_n), force_n, averaged_n)
+        bend_n = denoise.shared_bend(bend_n, noise_n * np.sqrt(of_bend))
         noise_n = noise_n * np.sqrt(np.where(np.isnan(left), 1.0, left))
     own_n = np.sqrt(noise_n**2 + now.sigma_n**2)
     averaged_n = force_n
@@ -139,7 +142,9 @@ def tile_forces(
     rate_n_per_s, state = _rate(force_n, at_ns, state)
     own_n = np.hypot(own_n, rate_n_per_s * plan.late_sigma_s)
     late_n = rate_n_per_s * plan.late_common_s
-    common_n = np.stack([now.gas_n, rubber_n, now.unseen_gas_n, unseen_n, now.warm_n, late_n])
+    common_n = np.stack(
+        [now.gas_n, rubber_n, now.unseen_gas_n, unseen_n, bend_n, now.warm_n, late_n]
+    )
     sigma_n = np.sqrt(own_n**2 + (common_n**2).sum(axis=0))
     unsettled = (~now.beyond & (np.hypot(now.unseen_gas_n, unseen_n) > now.noise_n)).any(axis=1)
     return TileForces(force_n, sigma_n, own_n, common_n, now.beyond, np.asarray(unsettled)), state

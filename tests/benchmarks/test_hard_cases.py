@@ -13,7 +13,8 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
 @pytest.fixture
-def hard(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def hard(monkeypatch: pytest.MonkeyPatch, bench_cache: Path) -> ModuleType:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(bench_cache))
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     return importlib.import_module("hard_cases")
 

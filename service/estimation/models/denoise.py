@@ -49,7 +49,7 @@ def denoised(
     reaches: Times,
     agree: float,
     noise_left: Floats,
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Averaged values of rows `first` to `stop`.
 
     Args:
@@ -70,11 +70,15 @@ def denoised(
 
     Returns:
         Values (stop - first, tiles), and their squared standard uncertainty in units of that of a
-        single one: what is left of the noise, and what curvature within the window adds.
+        single one: what is left of the noise, and what curvature within the window adds. And how
+        far they are from those of a window of half the length, with the variance that noise gives
+        that, in the same units: for `shared_bend`.
     """
     n, tiles = values.shape
     out = np.full((stop - first, tiles), math.nan)
     left = np.full((stop - first, tiles), math.nan)
+    bend = np.full((stop - first, tiles), math.nan)
+    of_bend = np.full((stop - first, tiles), math.nan)
     moments, trial = np.empty(8), np.empty(8)
     kept = np.empty((4 * len(reaches) + 1, 3))
     newest = oldest = first
@@ -150,11 +154,40 @@ def denoised(
                     break
             # A window of half the length gives the same but for noise; if not, neither curve is a
             # good description of what happens here.
+            bend[i - first, j] = best - shortest
+            of_bend[i - first, j] = shortest_variance - variance
             if sigma > 0.0:
                 off = ((best - shortest) / sigma) ** 2
                 variance += max(0.0, off - (shortest_variance - variance))
             out[i - first, j], left[i - first, j] = best, variance
-    return out, left
+    return out, left, bend, of_bend
+
+
+@compiled
+def shared_bend(bend_n: Floats, noise_n: Floats) -> Floats:
+    """What of the tiles' bends is more than noise in their sum, (n, tiles), signed.
+
+    Tiles bear the same load: what a window smooths away of it, it does in all of them, to the same
+    side. One tile does not show that above its noise; their sum may.
+
+    Args:
+        bend_n: (n, tiles), how far averages are from those of shorter windows; NaN: there is none.
+        noise_n: standard deviations that noise gives that.
+    """
+    n, tiles = bend_n.shape
+    out = np.zeros((n, tiles))
+    for i in range(n):
+        total, variance = 0.0, 0.0
+        for j in range(tiles):
+            if not math.isnan(bend_n[i, j]):
+                total += bend_n[i, j]
+                variance += noise_n[i, j] * noise_n[i, j]
+        if total * total > AGREE * AGREE * variance:
+            part = math.sqrt(1.0 - variance / (total * total))
+            for j in range(tiles):
+                if not math.isnan(bend_n[i, j]):
+                    out[i, j] = part * bend_n[i, j]
+    return out
 
 
 @compiled

@@ -168,8 +168,8 @@ def _figures(
 
 
 def _is_assumed(recording: Recording) -> bool:
-    entries = [recording.calibration.of(serial) for serial in recording.info.serials]
-    return any(entry.absolute_scale == "assumed" for entry in entries)
+    bearing = [tile.serial for tile in recording.info.tiles if not tile.reference]
+    return any(recording.calibration.of(serial).absolute_scale == "assumed" for serial in bearing)
 
 
 def drawn(tasks: Sequence[Task], jobs: int) -> Iterator[Drawn]:

@@ -45,7 +45,10 @@ def test_a_cut_anywhere_keeps_every_whole_message_before_it(tmp_path: Path) -> N
     for first, last in ((0, 9), (10, 10), (11, 12)):
         edges.append(edges[-1] + len(encode(part(first, last), SCHEMA)))
     assert edges[-1] == len(content)
-    cuts = [*range(0, header, 97), *range(edges[1] - 9, len(content) + 1)]
+    # At every byte near an edge, and at every seventh within the messages.
+    near = {cut for edge in edges[1:] for cut in range(edge - 40, edge + 41)}
+    cuts = sorted({*range(0, header, 97), *range(edges[1], len(content), 7)} | near)
+    cuts = [cut for cut in cuts if cut <= len(content)]
     for cut in cuts:
         folder = tmp_path / f"cut-{cut}"
         folder.mkdir()

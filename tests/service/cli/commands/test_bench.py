@@ -16,7 +16,7 @@ from tests.service.cli.outcome import Run, scene_text, static_only
 
 pytestmark = pytest.mark.slow
 
-QUICK = ("--quick", "--frames", 2000, "--seconds", 2, "--jobs", 1)
+QUICK = ("--quick", "--frames", 500, "--seconds", 2, "--jobs", 1)
 
 
 @pytest.fixture

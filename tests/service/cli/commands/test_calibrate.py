@@ -34,7 +34,7 @@ def test_calibrate_merges_files_and_its_tables_fit_a_narrow_terminal(
     assert max(len(line) for line in outcome.out.splitlines()) <= 80
     twice = run("calibrate", "1.parquet", "1.parquet", "--out", "twice.json")
     twice.fails(1, "the same frames are given twice")
-    parts = ("--parts-seed", 9, "--out", "parts.parquet")
+    parts = ("--parts-seed", 9, "--seconds", 3, "--out", "parts.parquet")
     run("simulate", "--scene", "short.toml", "--tiles", "T01", *parts)
     other = run("calibrate", "1.parquet", "parts.parquet", "--out", "other.json")
     other.fails(1, "tile T01 has another chip")

@@ -339,9 +339,9 @@ def denoised(
     run: list[int],
     look_ns: int,
     noise_left: Floats,
-) -> list[tuple[Exact, Exact] | None]:
+) -> list[tuple[Exact, Exact, Exact, Exact] | None]:
     """Windows that grow on either side, a parabola and a line in each, as long as they agree."""
-    out: list[tuple[Exact, Exact] | None] = []
+    out: list[tuple[Exact, Exact, Exact, Exact] | None] = []
     for i, own in enumerate(values):
         if own is None:
             out.append(None)
@@ -389,7 +389,21 @@ def denoised(
             if best[1] < history[-1][1]:
                 history = [*history[1:], best]
         (value, variance), (old, old_variance) = history[-1], history[0]
+        bend, of_bend = value - old, old_variance - variance
         if sigma > 0:
-            variance += max(mpf(0), ((value - old) / sigma) ** 2 - (old_variance - variance))
-        out.append((value, variance))
+            variance += max(mpf(0), (bend / sigma) ** 2 - of_bend)
+        out.append((value, variance, bend, of_bend))
+    return out
+
+
+def shared_bend(bends_n: list[list[Exact]], noises_n: list[list[Exact]]) -> list[list[Exact]]:
+    """Of each tile's bends what is more than noise in the sum over tiles; None: there is none."""
+    out = [[mpf(0)] * len(bends_n[0]) for _ in bends_n]
+    for k in range(len(bends_n[0])):
+        there = [i for i, bends in enumerate(bends_n) if bends[k] is not None]
+        total = mp.fsum(bends_n[i][k] for i in there)
+        variance = mp.fsum(noises_n[i][k] ** 2 for i in there)
+        if total**2 > mpf(denoise.AGREE) ** 2 * variance:
+            for i in there:
+                out[i][k] = mp.sqrt(1 - variance / total**2) * bends_n[i][k]
     return out

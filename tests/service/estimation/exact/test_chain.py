@@ -72,6 +72,8 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
     walls = [e.temperature.wall_per_kpa for e in effects]
     doubt = max(mpf(w.sigma) / mpf(w.value) for w in walls)
     forces, stated, bounds, errors = [], [], [], []
+    bends: list[list[Exact]] = []
+    of_bends: list[list[Exact]] = []
     for i in domes:
         warm, curve = effects[i].temperature, effects[i].rubber
         counts = [mpf(c) for c in tadc[i]]
@@ -198,6 +200,15 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         stated.append(stated_n)
         bounds.append(beyond)
         errors.append([own_n, heat_n, rubber_n, unseen_heat_n, crept_n])
+        bends.append([None if a is None else a[2] for a in averaged])
+        of_bends.append(
+            [
+                None if a is None else s * mp.sqrt(a[3])
+                for a, s in zip(averaged, single, strict=True)
+            ]
+        )
+    for of_tile, bend_n in zip(errors, equations.shared_bend(bends, of_bends), strict=True):
+        of_tile.append(bend_n)
     return SimpleNamespace(
         gauge_kpa=gauge, force_n=forces, stated_n=stated, is_bound=bounds, errors=errors
     )
@@ -206,7 +217,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
 def sigma_of(errors: list[Any], k: int, weights: list[Exact]) -> Exact:
     """Of a weighted sum over tiles: what is a tile's own adds as squares, the rest as is."""
     own = mp.fsum((w * e[0][k]) ** 2 for w, e in zip(weights, errors, strict=True))
-    shared = [mp.fdot(weights, [e[part][k] for e in errors]) for part in (1, 2, 3, 4)]
+    shared = [mp.fdot(weights, [e[part][k] for e in errors]) for part in (1, 2, 3, 4, 5)]
     return mp.sqrt(own + mp.fsum(each**2 for each in shared))
 
 

@@ -184,7 +184,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -
     missing = rng.random(n) < (0.6 if kind == "few" else 0.05)
     run = np.arange(n) // 10 if kind == "crowded" else np.cumsum(rng.random(n) < 0.03)
     column = np.where(missing, NAN, values)
-    averaged, left = denoise.denoised(
+    averaged, left, bend, of_bend = denoise.denoised(
         column[:, None],
         np.full((n, 1), 0.3),
         t_ns[:, None],
@@ -211,3 +211,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -
     )
     assert equations.apart(averaged, [None if x is None else x[0] for x in found]) < GOAL
     assert equations.apart(left, [None if x is None else x[1] for x in found]) < GOAL
+    there = [x for x in found if x is not None]
+    known = np.isfinite(averaged[:, 0])
+    assert equations.apart(bend[known], [x[2] for x in there]) < GOAL
+    assert equations.apart(of_bend[known], [x[3] for x in there]) < GOAL

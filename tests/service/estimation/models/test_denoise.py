@@ -10,7 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.denoise import AGREE, AVERAGED_MAX, PAST_NS, REACHES, denoised
+from service.estimation.models.denoise import (
+    AGREE,
+    AVERAGED_MAX,
+    PAST_NS,
+    REACHES,
+    denoised,
+    shared_bend,
+)
 from service.estimation.tare.noise import left_by_mean
 
 SIGMA_N, PERIOD_NS = 0.3, 1_838_235
@@ -30,7 +37,7 @@ def averaged(
     values = np.asarray(values, dtype=float)
     n = len(values)
     frame_ns = PERIOD_NS * np.arange(n) if t_ns is None else np.asarray(t_ns)
-    out, left = denoised(
+    out, left, _, _ = denoised(
         values[:, None],
         np.full((n, 1), sigma_n),
         frame_ns[:, None].copy(),
@@ -222,3 +229,49 @@ def test_any_instants_give_finite_values_among_the_readings(t_ns: list[int], see
     # Of a window of many, a little less: what it averages away is less than a reading's noise.
     assert np.abs(out - values).max() <= AGREE * SIGMA_N + 1e-9
     assert (left > 0.0).all()
+
+
+def test_what_windows_smooth_away_of_a_load_is_found_in_the_sum_of_its_tiles() -> None:
+    # Two sigma are nothing in a tile alone, and four in the sum of four.
+    noise_n = np.full((1, 4), SIGMA_N)
+    alone = np.array([[2.0 * SIGMA_N, math.nan, math.nan, math.nan]])
+    assert not shared_bend(alone, noise_n).any()
+    shared = shared_bend(np.full((1, 4), 2.0 * SIGMA_N), noise_n)
+    assert shared == pytest.approx(2.0 * SIGMA_N * math.sqrt(1.0 - 1.0 / 16.0))
+    # To different sides it is noise, however many tiles there are.
+    assert not shared_bend(np.array([[2.0, -2.0, 2.0, -2.0]]) * SIGMA_N, noise_n).any()
+    gone = np.array([[2.0, math.nan, 2.0, 2.0]]) * SIGMA_N
+    assert (shared_bend(gone, noise_n) == 0.0).tolist() == [[False, True, False, False]]
+
+
+@pytest.mark.parametrize(("shakes_n", "own", "whole"), [(0.0, 0.95, 0.95), (0.45, 0.5, 0.7)])
+def test_a_load_that_shakes_all_tiles_makes_their_sum_less_certain_and_a_still_one_does_not(
+    shakes_n: float, own: float, whole: float
+) -> None:
+    n, tiles = 4000, 4
+    t_ns = PERIOD_NS * np.arange(n)
+    load_n = 6.0 + shakes_n * np.sin(2 * math.pi * 35.0 * 1e-9 * t_ns)
+    rng = np.random.default_rng(3)
+    sampled_ns = np.repeat(t_ns[:, None], tiles, axis=1)
+    out, left, bend, of_bend = denoised(
+        load_n[:, None] + rng.normal(0.0, SIGMA_N, (n, tiles)),
+        np.full((n, tiles), SIGMA_N),
+        sampled_ns,
+        t_ns,
+        sampled_ns,
+        np.zeros(n, dtype=np.int64),
+        0,
+        n,
+        100_000_000,
+        PAST_NS,
+        REACHES,
+        AGREE,
+        np.ones((tiles, AVERAGED_MAX + 1)),
+    )
+    off_n = (out - load_n[:, None]).sum(axis=1)
+    own_n2 = (SIGMA_N**2 * left).sum(axis=1)
+    shared_n = shared_bend(bend, SIGMA_N * np.sqrt(of_bend)).sum(axis=1)
+    actual_n = np.sqrt((off_n**2).mean())
+    # Of a shake that a tile cannot tell from its noise half is stated with the sum, a quarter not.
+    assert own < np.sqrt(own_n2.mean()) / actual_n < own + 0.15
+    assert whole < np.sqrt((own_n2 + shared_n**2).mean()) / actual_n < 1.2

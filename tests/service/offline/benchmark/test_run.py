@@ -6,7 +6,7 @@ import pytest
 
 from devices.scene.file import load_scene
 from service.offline.benchmark.draws import Task, run_draw
-from service.offline.benchmark.run import drawn
+from service.offline.benchmark.run import BenchOptions, drawn, run_bench
 from service.offline.benchmark.rungs import rungs
 
 
@@ -28,3 +28,22 @@ def test_a_draw_that_cannot_be_made_is_a_failure_and_no_end() -> None:
     assert not result.accuracy
     assert [f.what for f in result.failures] == ["draw 7"]
     assert "nowhere.json" in result.failures[0].why
+
+
+def test_a_foot_with_a_bare_tile_is_measured_and_timed() -> None:
+    scene = load_scene("mud").model_copy(
+        update={"calibration": "paper-eq2-shape", "models": ("unwrap", "static")}
+    )
+    said: list[str] = []
+    bench = run_bench(
+        BenchOptions(
+            scenes=(scene,), draws=1, jobs=1, seconds=1.5, live_frames=20, offline_frames=100,
+            repetitions=1, whole_only=True,
+        ),
+        said.append,
+    )  # fmt: skip
+    (figures,) = bench.scenes
+    assert figures.assumed_scale
+    assert not figures.failures
+    assert [row.ns_per_frame.n for row in figures.measured.values()] == [1, 1]
+    assert said == ["mud: 1 of 1 draws", "mud: timing"]
