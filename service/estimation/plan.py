@@ -18,7 +18,7 @@ from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.foot.contact import ContactRule
-from service.estimation.foot.geometry import grid_indices, hull
+from service.estimation.foot.geometry import grid_indices, hull, lost_by_tilt
 from service.estimation.ladder import MODELS, Ladder, make_ladder
 from service.estimation.models import denoise
 from service.estimation.tare.noise import left_by_mean
@@ -78,6 +78,8 @@ class EstimationPlan:
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
     """(bearing tiles, 3)."""
+    tilted: Floats
+    """Part of a tile's force that may not be along the segment, for its axis is not."""
     hull: tuple[Floats, Floats]
     grid: tuple[Floats, Floats] | None
     contact: ContactRule
@@ -181,6 +183,7 @@ def make_plan(
         ),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
+        tilted=lost_by_tilt(positions_m[bearing]),
         hull=hull(positions_m[bearing, :2]),
         grid=grid_indices(positions_m[bearing, :2]),
         contact=ContactRule(

@@ -237,7 +237,10 @@ def foot_of(plan: EstimationPlan, tiles: TileForces) -> Foot:
     Where a tile is missing or saturated there is neither, but a bound: a tile bears at least what
     it states, and one that states nothing at least nothing.
     """
-    columns = _foot(tiles.force_n, tiles.own_n, tiles.common_n, tiles.beyond, plan.bearing_m)
+    # Whether the ground pushes along the axes of tiles or along the segment, no tile can tell.
+    tilted_n = plan.tilted * tiles.force_n
+    common_n = np.concatenate([tiles.common_n, tilted_n[None]])
+    columns = _foot(tiles.force_n, tiles.own_n, common_n, tiles.beyond, plan.bearing_m)
     grf_n, sigma_n, at_least_n, x_m, y_m, z_m, sigma_x_m, sigma_y_m = columns.T
     return Foot(grf_n, sigma_n, at_least_n, (x_m, y_m, z_m), (sigma_x_m, sigma_y_m))
 

@@ -12,6 +12,7 @@ from devices.arrays import Floats
 from devices.frames import ServoInfo
 
 _SAME_PLACE_M = 1e-6  # tiles that differ by less stand in one line
+_CURVED_TILES = 3  # places along x that show how a sole is curved
 
 
 def hull(positions_m: Floats) -> tuple[Floats, Floats]:
@@ -50,6 +51,20 @@ def grid_indices(
     if len(places) != len(positions_m) or len(places) != len(columns) * len(rows):
         return None
     return x.astype(np.float64) + 1.0, y.astype(np.float64) + 1.0
+
+
+def lost_by_tilt(positions_m: Floats) -> Floats:
+    """Part of a force along each tile's axis that is not along the segment, (tiles,).
+
+    1 - cos of the angle between them: tiles stand upright on their sole, whose shape along x is a
+    parabola through their places (tiles, 3). Nothing, if these do not show how it is curved.
+    """
+    x_m, z_m = positions_m[:, 0], positions_m[:, 2]
+    if len(np.unique(np.round(x_m / _SAME_PLACE_M))) < _CURVED_TILES:
+        return np.zeros(len(positions_m))
+    design = np.stack([np.ones(len(x_m)), x_m, x_m**2], axis=1)
+    (_, slope, bend), *_ = np.linalg.lstsq(design, z_m, rcond=None)
+    return np.asarray(1.0 - np.cos(np.arctan(slope + 2.0 * bend * x_m)))
 
 
 def angle_rad(servo: ServoInfo, servo_counts: Floats) -> Floats:

@@ -243,3 +243,19 @@ def test_an_angle_goes_on_over_the_end_of_a_turn() -> None:
     angle_rad = estimate(plan, loaded_frames(held([9] * 4), servo_counts=counts)).angle_rad
     expected = [0.1 * (c - 2048) / 4096 * 2 * math.pi for c in counts]
     assert angle_rad == pytest.approx(expected, abs=1e-15)
+
+
+def test_the_sum_of_tiles_on_an_arc_is_less_certain_by_what_their_axes_leave_open() -> None:
+    arc_rad = np.array([-0.2, -0.07, 0.07, 0.2])
+    arc = [(0.15 * math.sin(a), 0.0, -0.15 * math.cos(a)) for a in arc_rad.tolist()]
+    forces_n = [5.0, 20.0, 20.0, 5.0]
+    flat, curved = (
+        estimate(newton_plan(array_at(places)), loaded_frames(held(forces_n)))
+        for places in ([(x, y, -0.15) for x, y, _ in arc], arc)
+    )
+    assert curved.grf_n.tolist() == flat.grf_n.tolist()
+    more_n = math.sqrt(float(curved.grf_sigma_n[-1] ** 2 - flat.grf_sigma_n[-1] ** 2))
+    lost_n = sum(f * (1.0 - math.cos(a)) for f, a in zip(forces_n, arc_rad.tolist(), strict=True))
+    assert more_n == pytest.approx(lost_n, rel=0.1)
+    # A tile's own force is along its own axis.
+    assert curved.force_sigma_n.tolist() == flat.force_sigma_n.tolist()

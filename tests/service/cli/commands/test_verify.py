@@ -360,7 +360,7 @@ def test_verify_says_what_it_may_not_read(
     def guarded(path: object, *args: Any, **options: Any) -> Any:
         if str(path) in forbidden:
             raise PermissionError(errno.EACCES, "Permission denied")
-        return opened(path, *args, **options)  # type: ignore[call-overload]
+        return opened(path, *args, **options)  # type: ignore[call-overload]  # as given
 
     monkeypatch.setattr(builtins, "open", guarded)
     monkeypatch.setattr(io, "open", guarded)

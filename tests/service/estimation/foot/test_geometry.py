@@ -11,7 +11,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from devices.frames import ServoInfo
-from service.estimation.foot.geometry import angle_rad, grid_indices, hull, to_ground_x_m
+from service.estimation.foot.geometry import (
+    angle_rad,
+    grid_indices,
+    hull,
+    lost_by_tilt,
+    to_ground_x_m,
+)
 from tests.builders.arrays import make_servo
 
 coordinates = st.integers(-100, 100).map(lambda mm: mm / 1000)
@@ -175,3 +181,17 @@ def test_where_the_ankle_goes_unknown_the_ground_frame_is_unknown() -> None:
     assert math.isnan(ground_x_m(0.02, -0.15, 0.1, None))
     assert math.isnan(ground_x_m(0.02, -0.15, math.nan, 0.15))
     assert math.isnan(ground_x_m(math.nan, -0.15, 0.1, 0.15))
+
+
+def test_tiles_on_an_arc_push_along_its_radii_and_on_a_plane_along_the_segment() -> None:
+    arc_rad = np.array([-0.14, -0.047, 0.047, 0.14])
+    arc_m = 0.15 * np.stack([np.sin(arc_rad), 0 * arc_rad, -np.cos(arc_rad)], axis=1)
+    assert lost_by_tilt(arc_m) == pytest.approx(1.0 - np.cos(arc_rad), rel=0.05, abs=1e-5)
+    flat_m = arc_m * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.15]
+    assert lost_by_tilt(flat_m) == pytest.approx(np.zeros(4), abs=1e-12)
+
+
+@pytest.mark.parametrize("x_m", [[0.0], [0.0, 0.02], [0.0, 0.0, 0.02, 0.02]])
+def test_too_few_places_do_not_show_how_a_sole_is_curved(x_m: list[float]) -> None:
+    positions_m = np.array([[x, 0.01 * i, -0.15 + x] for i, x in enumerate(x_m)])
+    assert (lost_by_tilt(positions_m) == 0.0).all()
