@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from storage.sessions.folder import FRAMES_NAME, SessionFolder
+from tests.service.cli.outcome import static_only
 from tests.service.process import Process
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,7 +55,7 @@ def test_a_node_that_records_alone_seals_raw_frames_and_estimates_are_added_late
     tmp_path: Path, without_server: dict[str, str]
 ) -> None:
     scene = (ROOT / "devices" / "scene" / "builtin" / "standing.toml").read_text()
-    (tmp_path / "foot.toml").write_text('calibration = "paper-eq2-shape"\n' + scene)
+    (tmp_path / "foot.toml").write_text('calibration = "paper-eq2-shape"\n' + static_only(scene))
     words = ("--scene", tmp_path / "foot.toml", "--record", "trial", "--journal", tmp_path / "node")
     with closing(Process("node", *words, folder=tmp_path / "run", **without_server)) as node:
         node.said("tiles at")

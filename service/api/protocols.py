@@ -66,7 +66,7 @@ class Http(HttpToolsProtocol):
     _is_too_long = False
     _is_upgraded = False
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
         """It waits now."""
         super().connection_made(transport)
         self._asked: deque[RequestResponseCycle] = deque()

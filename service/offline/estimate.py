@@ -11,6 +11,7 @@ from devices.errors import CalibrationError, FileFormatError, TareError, UsageEr
 from devices.frames import ArrayInfo
 from devices.scene.emulated import Family
 from devices.scene.file import Scene, load_scene
+from service.estimation.asked import Asking
 from service.estimation.calibration import Calibration
 from service.estimation.plan import EstimationPlan
 from service.estimation.tare.tare import Tare
@@ -29,6 +30,8 @@ class Estimated:
     frames: int
     plan: EstimationPlan
     findings: Findings
+    asked: Mapping[str, float]
+    """Models that it asks for and that were not named, with the newtons expected of each."""
 
 
 def estimate_session(
@@ -60,6 +63,7 @@ def estimate_session(
         kept = [c.name for c in (*PARTS, *TRUTH, *MILL) if session.has(c.name)]
         stream = EstimateStream(info, options)
         found = FindingsOf(judging=all(c.name in kept for c in TRUTH))
+        asking = Asking(info, options.calibration, options.models)
         frames = 0
         with SessionWriter(out, info, session.notes) as writer:
             ordered = in_order(session.batches(*kept), where=str(source))
@@ -69,9 +73,11 @@ def estimate_session(
                 writer.append(batch, extra)
                 frames += len(batch)
                 found.feed(batch, extra)
+                if stream.tare is not None:
+                    asking.feed(stream.tare, batch, extra["contact"] == 1)
     if stream.plan is None:
         raise FileFormatError("the session has no frames", where=str(source))
-    return Estimated(frames, stream.plan, found.finish(stream.plan))
+    return Estimated(frames, stream.plan, found.finish(stream.plan), asking.finish())
 
 
 def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:

@@ -71,10 +71,16 @@ class EstimateRun:
 
 
 class EstimateStream:
-    """Estimates of one stream; `plan` is there once the tare is known."""
+    """Estimates of one stream; `plan` is there once the tare is known.
+
+    Attributes:
+        plan: what the estimates begin with.
+        tare: in force in the frames that came last.
+    """
 
     def __init__(self, info: ArrayInfo, options: EstimateOptions) -> None:
         self.plan: EstimationPlan | None = None
+        self.tare: Tare | None = None
         self._info = info
         self._options = options
         # Refuse now what would fail later: unknown models, tiles without calibration.
@@ -103,6 +109,7 @@ class EstimateStream:
             self.plan = self._make_plan(self._find_tare([frames for frames, _ in taken]))
             pieces = chain(taken, pieces)
         run = EstimateRun(self.plan)
+        self.tare = self.plan.tare
         last_t_mono_ns = 0
         for frames, extra in pieces:
             rest, rest_of = frames, extra
@@ -121,6 +128,7 @@ class EstimateStream:
                     rest_of = {name: v[at:] for name, v in rest_of.items()}
                 yield from run.finish()
                 run = EstimateRun(self._make_plan(tare))
+                self.tare = tare
             if len(rest):
                 yield from run.feed(rest, rest_of)
         yield from run.finish()

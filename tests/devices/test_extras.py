@@ -17,7 +17,7 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(
         pytest.raises(MissingExtraError, match=r"an emulated array needs scipy.*'foottile\[emul"),
         needs_extra("emulation", "an emulated array"),
     ):
-        import scipy.signal  # noqa: F401
+        import scipy.signal  # noqa: F401  # that it cannot be is the test
 
 
 def test_a_mistake_of_ours_is_no_missing_package() -> None:

@@ -73,7 +73,7 @@ class _Durable:
     def take(self, event: Mapping[str, Any]) -> None:
         kind = event["e"]
         if kind == "base":
-            self.__init__()  # type: ignore[misc]
+            self.__init__()  # type: ignore[misc]  # all begins anew
             for folder, names in event["folders"].items():
                 for name, inode in names.items():
                     self.names[int(folder), name] = _inode(inode)

@@ -7,7 +7,7 @@ and folders; `--only SEED` plays one again. Not everything in it is drawn: the m
 is not, so a seed that failed may have to be played more than once.
 """
 
-# ruff: noqa: T201
+# ruff: noqa: E402, T201  # imports come after the path is set; a command prints
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ ROOT = Path(__file__).resolve().parents[2]
 if str(ROOT) not in sys.path:  # run as a script
     sys.path.insert(0, str(ROOT))
 
-from tests.faults.alone import Alone  # noqa: E402
-from tests.faults.checks import findings, summary_of  # noqa: E402
-from tests.faults.machines import RoundError  # noqa: E402
-from tests.faults.product import Product, product  # noqa: E402
-from tests.faults.stage import Stage  # noqa: E402
-from tests.faults.stories import Story, draw_story  # noqa: E402
+from tests.faults.alone import Alone
+from tests.faults.checks import findings, summary_of
+from tests.faults.machines import RoundError
+from tests.faults.product import Product, product
+from tests.faults.stage import Stage
+from tests.faults.stories import Story, draw_story
 
 ROUND_S = 150.0
 """A round that takes longer is ended and has failed."""

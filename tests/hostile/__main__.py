@@ -10,7 +10,7 @@ Exits with 1 if the product did what it must not do, each such try is said with 
 attack could not be played.
 """
 
-# ruff: noqa: T201
+# ruff: noqa: T201  # a command prints
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def many_screens(play: Play) -> Outcome:
             while time.monotonic() < end_s:
                 for key, _ in readers.select(0.2):
                     with suppress(OSError):
-                        received += len(key.fileobj.recv(1 << 20))  # type: ignore[union-attr]
+                        received += len(key.fileobj.recv(1 << 20))  # type: ignore[union-attr]  # a socket
             readers.close()
             outcome.figures["received by those that read"] = f"{received / 1e6:.1f} MB"
             outcome.figures["RSS of the server"] = f"{served.rss_mb - before_mb:+.1f} MB"

@@ -31,7 +31,9 @@ def served(server: Server) -> Served:
         for boot_id, stream in node.streams.items():
             numbers = list(stream.held)
             try:
-                frames = [digest(b) for n in numbers for b in stream.journal.read(*n)]  # type: ignore[union-attr]
+                journal = stream.journal
+                assert journal is not None
+                frames = [digest(b) for n in numbers for b in journal.read(*n)]
             except FootTileError as error:
                 frames = [f"damaged: {error}"]
             found[f"stream {boot_id}"] = (node.name, numbers, frames)

@@ -161,7 +161,7 @@ class _Foreign(ABC):
     async def connected(self, query: str = "") -> ClientConnection:
         return await connect(
             self._url + self.path + query,
-            subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]
+            subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]  # a NewType of str
             compression=None,
             ping_interval=None,
             proxy=None,

@@ -53,7 +53,7 @@ def _record(folder: Path) -> None:
                 node.deliver(100, 7.0)
                 node.leave()
                 newest_ns = node.next_t_mono_ns
-                until(lambda newest_ns=newest_ns: time.monotonic_ns() > newest_ns)  # type: ignore[misc]
+                until(lambda newest_ns=newest_ns: time.monotonic_ns() > newest_ns)  # type: ignore[misc]  # bound here
                 pending.stop()
                 assert pending.now()["state"] == "pending"
     finally:

@@ -128,7 +128,7 @@ def _compressed(random: Random, info: ArrayInfo, frames: FrameBatch) -> bytes:
     rows = random.choice([10, 4096, 1_000_000])
     zeros = make_frames(np.zeros(rows), len(info.tiles), utc_offset_ns=info.utc_offset_ns)
     codec = random.choice(["zstd", "lz4"])
-    options = pa.ipc.IpcWriteOptions(compression=codec)  # type: ignore[arg-type]
+    options = pa.ipc.IpcWriteOptions(compression=codec)  # type: ignore[arg-type]  # both it knows
     return _stream_of(to_record_batch(zeros, wire_schema(info)), options)
 
 

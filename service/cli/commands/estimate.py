@@ -53,6 +53,7 @@ def estimate_command(
     that can be recognised as unloaded. Exit codes: 0 good, 1 failed, 2 wrong usage.
     """
     from service.cli.report import findings_json, tell_findings
+    from service.estimation.asked import SEEN
     from service.offline.estimate import estimate_session
 
     # The session itself may be the output: it is replaced whole, and nothing raw is lost.
@@ -82,6 +83,7 @@ def estimate_command(
                     "begin_s": plan.tare.begin_s,
                     "end_s": plan.tare.end_s,
                 },
+                "asks_for": result.asked,
                 **findings_json(result.findings),
             }
         )
@@ -92,3 +94,8 @@ def estimate_command(
         f"{plan.tare.begin_s:.2f} to {plan.tare.end_s:.2f} s"
     )
     tell_findings(result.findings)
+    for name, newtons in result.asked.items():
+        remark(
+            f"{SEEN[name]}: model {name!r} is not named, and is good for {newtons:.2f} N of the "
+            "GRF here; the calibration offers it"
+        )

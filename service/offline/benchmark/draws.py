@@ -204,15 +204,26 @@ def record(
 
 
 def recorded(
-    scene: Scene, seconds: float | None, draw: int, calibration: Calibration
+    scene: Scene,
+    seconds: float | None,
+    draw: int,
+    calibration: Calibration,
+    foot: EmulatedFoot = EmulatedFoot(),  # noqa: B008  # frozen, so one for all is safe
 ) -> tuple[Recording, World]:
     """Record a scene with tiles of a draw, whose calibration is known, and where it came from.
+
+    Args:
+        scene: what to run.
+        seconds: its length, as for `record`.
+        draw: seed of tiles and of noise.
+        calibration: of the tiles.
+        foot: what presses it; its seeds are those of the draw.
 
     Raises:
         FootTileError: the scene is not usable.
     """
     with ExitStack() as stack:
-        foot = EmulatedFoot(seed=draw, parts_seed=draw)
+        foot = replace(foot, seed=draw, parts_seed=draw)
         options = SimulateOptions(scene, seconds, otherwise_s=SECONDS, truth=True, foot=foot)
         simulation = Simulation(options, stack)
         pieces = [

@@ -18,7 +18,7 @@ from devices.scene.hardware import RecoveryScene
 
 pytestmark = pytest.mark.process
 
-gpiod = pytest.importorskip("gpiod")
+gpiod = pytest.importorskip("gpiod", reason="lines of GPIO need the extra `gpio`")
 ACTIVE, INACTIVE = gpiod.line.Value.ACTIVE, gpiod.line.Value.INACTIVE
 
 

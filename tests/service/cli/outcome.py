@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
@@ -40,6 +41,11 @@ def scene_text(name: str, tiles: int | None = None) -> str:
     head, *each = text.split("[[tile]]")
     _, begin, rest = each[-1].partition("\n[")
     return "[[tile]]".join([head, *each[:tiles]]) + begin + rest
+
+
+def static_only(text: str) -> str:
+    """A scene's text with the models that need no bench with holds, releases and taps."""
+    return re.sub(r"(?m)^models = .*$", 'models = ["unwrap", "static"]', text)
 
 
 def faulty(kind: str, *, t_s: float = 0.0, duration_s: float = 1000.0, **keys: object) -> str:

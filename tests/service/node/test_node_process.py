@@ -21,6 +21,7 @@ from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.node.in_flight import read_in_flight
 from storage.journal.stream_notes import StreamNotes
+from tests.service.cli.outcome import static_only
 from tests.service.process import Start
 from tests.service.running import Running
 from tests.waiting import until
@@ -33,7 +34,7 @@ def scene(tmp_path: Path) -> Path:
     """The built-in scene with a calibration that need not be pressed on the bench first."""
     text = (resources.files("devices.scene") / "builtin" / "standing.toml").read_text("utf-8")
     path = tmp_path / "standing.toml"
-    path.write_text('calibration = "paper-eq2-shape"\n' + text)
+    path.write_text('calibration = "paper-eq2-shape"\n' + static_only(text))
     return path
 
 

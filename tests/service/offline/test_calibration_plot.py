@@ -85,7 +85,7 @@ def test_a_soak_in_a_file_of_its_own_tells_the_same_of_warmth(bench: Bench) -> N
 
 @pytest.mark.parametrize("tiles", [1, 5])
 def test_a_picture_holds_any_number_of_tiles(bench: Bench, tiles: int) -> None:
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason="pictures need the extra `plot`")
     from service.offline.calibration_plot import plot_calibration
 
     calibration, recordings = bench

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import pytest
@@ -193,7 +194,7 @@ def test_two_rows_at_the_same_instant_that_contradict_each_other_are_a_step_ther
 
 
 @given(st.randoms(use_true_random=False))
-def test_the_order_in_which_rows_came_does_not_matter(random) -> None:  # type: ignore[no-untyped-def]
+def test_the_order_in_which_rows_came_does_not_matter(random: Random) -> None:
     rows = Clock((20.0,), steps=((95 * SECOND, HOUR),)).measured(every(10, 20), 1)
     order = np.array(random.sample(range(20), 20))
     shuffled = Rows(rows.t_mono_ns[order], rows.offset_ns[order], rows.uncertainty_ns[order])

@@ -38,7 +38,10 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "demo": ("--scene", "gone.toml"),
     "doctor": ("--bus", "emulated"),
     "domes": (),
-    "estimate": ("s.parquet", "--out", "x.parquet", "--calibration", "paper-eq2-shape"),
+    "estimate": (
+        *("s.parquet", "--out", "x.parquet"),
+        *("--calibration", "paper-eq2-shape", "--models", "static"),
+    ),
     "export": ("s.parquet", "--format", "csv", "--out", "x.csv"),
     "node": ("--scene", "gone.toml"),
     "pull": ("20200101T000000Z-000000", "--out", "x", "--server", "http://127.0.0.1:1"),
@@ -180,7 +183,10 @@ READ: dict[tuple[str, str], tuple[object, ...]] = {
 WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
     ("calibrate", "out"): ("s.parquet", "--out", "{}"),
     ("calibrate", "plot"): ("s.parquet", "--out", "cal.json", "--plot", "{}"),
-    ("estimate", "out"): ("s.parquet", "--out", "{}", "--calibration", "paper-eq2-shape"),
+    ("estimate", "out"): (
+        *("s.parquet", "--out", "{}"),
+        *("--calibration", "paper-eq2-shape", "--models", "static"),
+    ),
     ("export", "out"): ("s.parquet", "--format", "csv", "--out", "{}"),
     ("simulate", "out"): (*SHORT[1:-1], "{}"),
 }

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from tests.builders.calibrations import make_calibration
-from tests.service.cli.outcome import Run, scene_text
+from tests.service.cli.outcome import Run, scene_text, static_only
 
-STANDING = scene_text("standing")
+STANDING = static_only(scene_text("standing"))
 GOOD_TRACE = "time_s,fz_n,cop_x_m,cop_y_m\n" + "".join(
     f"{0.01 * i:.2f},{10 + i},0.0,0.0\n" for i in range(50)
 )
@@ -143,7 +143,12 @@ def bench(run: Run, kept: Path) -> bytes:
         (["--calibration", "paper-eq2-shape", "--models", "magic"], 2, ["magic"]),
         (["--calibration", "paper-eq2-shape", "--lag-ms", "-1"], 2, ["look-ahead"]),
         (["--calibration", "paper-eq2-shape", "--tare-s", "1"], 2, ["--tare-s"]),
-        (["--calibration", "paper-eq2-shape", "--tare-s", "5,6"], 1, ["T01", "--tare-s"]),
+        (
+            ["--calibration", "paper-eq2-shape", "--models", "static", "--tare-s", "5,6"],
+            1,
+            ["T01", "--tare-s"],
+        ),
+        (["--calibration", "paper-eq2-shape"], 1, ["'gas'", "Leave the model out"]),
         (["--calibration", "paper-eq2-shape", "--tare-s", "1,0"], 2, ["--tare-s"]),
         (
             ["--scene", "rolling", "--calibration", "paper-eq2-shape", "--scene", "insole"],

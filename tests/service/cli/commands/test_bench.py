@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from devices.errors import FootTileError
 from service.estimation.calibration import Calibration
 from service.offline.benchmark import draws
 from service.offline.calibrations import find_calibration
-from tests.service.cli.outcome import Run, scene_text
+from tests.service.cli.outcome import Run, scene_text, static_only
 
 pytestmark = pytest.mark.slow
 
@@ -24,8 +23,7 @@ QUICK = ("--quick", "--frames", 500, "--seconds", 2, "--jobs", 1)
 def scene(tmp_path: Path) -> Path:
     """`rolling` with the paper's curve, and the models that go with it."""
     path = tmp_path / "rolling.toml"
-    text = re.sub(r"(?m)^models = .*$", 'models = ["unwrap", "static"]', scene_text("rolling"))
-    path.write_text('calibration = "paper-eq2-shape"\n' + text)
+    path.write_text('calibration = "paper-eq2-shape"\n' + static_only(scene_text("rolling")))
     return path
 
 

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from storage.file_hash import FORMAT_KEY, FORMAT_WITHOUT_HASH
-from tests.service.cli.outcome import Run, scene_text
+from tests.service.cli.outcome import Run, scene_text, static_only
 
 pytestmark = pytest.mark.slow
 
@@ -63,7 +63,7 @@ def test_a_tile_without_a_curve_is_named_and_the_others_are_written(run: Run, be
 
 
 def test_an_assumed_scale_is_said_in_text_json_and_file(run: Run) -> None:
-    scene = 'calibration = "paper-eq2-shape"\n' + scene_text("standing")
+    scene = 'calibration = "paper-eq2-shape"\n' + static_only(scene_text("standing"))
     Path("paper.toml").write_text(scene)
     arguments = ("simulate", "--scene", "paper.toml", "--seconds", 1, "--out", "paper.parquet")
     assert "scale of this calibration is assumed" in run(*arguments).out

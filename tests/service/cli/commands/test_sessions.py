@@ -12,7 +12,7 @@ import pytest
 
 from service.offline.simulate import START_NS
 from storage.schema import ESTIMATES, FRAMES, TRUTH
-from tests.service.cli.outcome import Run, faulty, scene_text
+from tests.service.cli.outcome import Run, faulty, scene_text, static_only
 
 pytestmark = pytest.mark.slow
 
@@ -87,7 +87,7 @@ def test_bench_to_session_to_estimate_closes_on_a_quiet_dome(run: Run, tmp_path:
     assert run("simulate", "--scene", "bench.toml", "--out", "bench.parquet").code == 0
     outcome = run("calibrate", "bench.parquet", "--out", "cal.json", "--json")
     assert min(tile["r2"] for tile in outcome.printed()["tiles"]) > 0.9999
-    (tmp_path / "foot.toml").write_text(scene_text("standing") + QUIET)
+    (tmp_path / "foot.toml").write_text(static_only(scene_text("standing")) + QUIET)
     options = ("--seconds", 5, "--truth", "--no-estimates", "--out", "s.parquet")
     run("simulate", "--scene", "foot.toml", *options)
     outcome = run(
@@ -132,6 +132,24 @@ def test_measured_walking_is_pressed_cell_by_cell(
         np.testing.assert_allclose(pressed, wanted, atol=1e-6)
 
 
+def test_estimate_says_which_models_a_recording_asks_for_and_what_they_are_good_for(
+    run: Run, recording: Callable[[str], Path]
+) -> None:
+    jumps = ("--load", recording("squat_jump_plate1.csv"), "--load-scale", 0.03, "--cop-scale", 0.2)
+    run("simulate", "--scene", "standing", *jumps, "--truth", "--out", "s.parquet")
+    whole = run("estimate", "s.parquet", "--out", "e.parquet", "--json").printed()
+    assert whole["asks_for"] == {}
+    few = ("estimate", "s.parquet", "--models", "unwrap,static,denoise", "--out", "e.parquet")
+    bare = run(*few, "--json").printed()
+    assert {"rubber", "hysteresis"} <= set(bare["asks_for"]) <= {"gas", "rubber", "hysteresis"}
+    said = run(*few).err
+    for name, newtons in bare["asks_for"].items():
+        assert f"model {name!r} is not named, and is good for {newtons:.2f} N" in said
+    # Each is expected beside all others, so together they are more than what is gained.
+    gained_n = bare["accuracy"]["grf_mae_n"] - whole["accuracy"]["grf_mae_n"]
+    assert 0.5 * gained_n < sum(bare["asks_for"].values()) < 4.0 * gained_n
+
+
 def test_estimating_anew_gives_the_bits_of_the_simulation(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "rolling", "--seconds", 4, "--out", "s.parquet")
     assert run("estimate", "s.parquet", "--out", "e.parquet").code == 0
@@ -142,7 +160,8 @@ def test_estimating_anew_gives_the_bits_of_the_simulation(run: Run, tmp_path: Pa
 
 def test_an_assumed_scale_is_said_on_the_terminal_and_in_the_file(run: Run, tmp_path: Path) -> None:
     run("simulate", "--scene", "standing", "--seconds", 2, "--no-estimates", "--out", "s.parquet")
-    outcome = run("estimate", "s.parquet", "--out", "e.parquet", "--calibration", "paper-eq2-shape")
+    paper = ("--calibration", "paper-eq2-shape", "--models", "unwrap,static")
+    outcome = run("estimate", "s.parquet", "--out", "e.parquet", *paper)
     assert outcome.code == 0, outcome.err
     assert "assumed" in outcome.out
     table = pq.read_table(tmp_path / "e.parquet")
@@ -180,7 +199,7 @@ def test_a_tile_pressed_until_its_count_wraps_is_a_lower_bound_and_no_light_touc
     assert wrapped.sum() > 100
     assert (table["status_0"].to_numpy()[wrapped] & 16 == 16).all()
     assert (table["estimate_status"].to_numpy()[pressed] & 1 == 1).all()
-    assert (table["force_n_0"].to_numpy()[pressed] > 25.0).all()
+    assert (table["force_n_0"].to_numpy()[pressed] > 15.0).all()  # as creep may have left it
     assert np.isnan(table["force_sigma_n_0"].to_numpy()[pressed]).all()
     # Without the model it is no force at all.
     outcome = run("estimate", "s.parquet", "--models", "static", "--out", "e.parquet")

@@ -186,7 +186,7 @@ def test_streams_are_in_order_even_if_the_notes_of_one_are_damaged(
     for number, name in enumerate(names):
         stream = journal.begin(make_array(boot_id=name))
         fill(journal, stream, 1000 * number, 1000 * number + 99)  # later by their instants
-        until(lambda stream=stream: stream.stored.count == 100)  # type: ignore[misc]
+        until(lambda stream=stream: stream.stored.count == 100)  # type: ignore[misc]  # bound here
     journal.close()
     (tmp_path / "journal" / "leg" / names[damaged] / "stream.json").write_bytes(b"{")
     again = start()

@@ -1,0 +1,205 @@
+"""Which models the built-in scenes should name: error against time of every ladder, load by load.
+
+    python benchmarks/ladders.py --data DIR [--draws N] [--case NAME] [--out FILE]
+
+`foottile bench` compares what a scene names; here a scene may have every model that its
+calibration offers. Ladders are built up to all of them, and each is left out of the whole; recorded
+loads of DIR are pressed on the emulated domes where a scene has no ground of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from devices.emulation.ground.load_trace import CopTransform
+from devices.scene.file import Scene, load_scene
+from service.estimation.calibration import PRESETS
+from service.estimation.ladder import MODELS
+from service.offline.benchmark.draws import (
+    BATCH,
+    LAGS_MS,
+    Drawn,
+    Recording,
+    estimated,
+    recorded,
+    time_rungs,
+)
+from service.offline.benchmark.figures import Measured, measured_of, pareto
+from service.offline.benchmark.rungs import Rung, rungs
+from service.offline.calibrations import find_calibration
+from service.rig.emulated import EmulatedFoot
+from storage.formats.load_trace import read_load_trace
+
+MARK = "<!-- tables -->"
+FRAMES = {"live": 1000, "offline": 8 * BATCH["offline"]}
+REPETITIONS = 5
+OF_A_PRESET = ("unwrap", "static", "skew", "denoise")
+"""A preset knows of a curve only."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene under a load.
+
+    Attributes:
+        name: of the table.
+        scene: built-in.
+        load: file of a recorded load; None: the scene's own ground.
+        load_scale: newtons on the tiles per newton of the recording.
+        cop_scale: metres likewise.
+        seconds: how much of it; None: all.
+    """
+
+    name: str
+    scene: str
+    load: str | None = None
+    load_scale: float = 1.0
+    cop_scale: float = 1.0
+    seconds: float | None = 20.0
+
+    def foot(self, data: Path) -> EmulatedFoot:
+        """What presses the tiles."""
+        if self.load is None:
+            return EmulatedFoot()
+        cop = CopTransform(scale=self.cop_scale)
+        return EmulatedFoot(read_load_trace(data / self.load), load_scale=self.load_scale, cop=cop)
+
+
+CASES = (
+    Case("insole, walking, left", "insole", "insole_walk_left.csv", 0.05),
+    Case("insole, walking, right", "insole", "insole_walk_right.csv", 0.05),
+    Case("standing, quiet", "standing"),
+    Case("standing, squat jumps", "standing", "squat_jump_plate1.csv", 0.06, 0.2, None),
+    Case("grid, quiet", "grid", seconds=6.0),
+    Case("grid, squat jumps", "grid", "squat_jump_plate2.csv", 0.5, 0.2, None),
+    Case("rolling", "rolling", seconds=None),
+)
+
+
+def ladders_of(scene: Scene) -> tuple[Rung, ...]:
+    """All that are compared: what it names, up to every model that is offered, and less each."""
+    offered: tuple[str, ...] = OF_A_PRESET
+    if scene.calibration not in PRESETS:
+        has_bare_tile = any(tile.reference for tile in scene.tile)
+        offered = tuple(name for name in MODELS if name != "ambient" or has_bare_tile)
+    ladders = rungs(offered)
+    named = tuple(name for name in MODELS if name in scene.models)
+    if any(rung.models == named for rung in ladders):
+        return ladders
+    return (Rung("the scene's", named, False, None, None, False), *ladders)
+
+
+def drawn(case: Case, data: Path, draws: int) -> Iterator[tuple[Drawn, Recording]]:
+    """Every draw of tiles, calibration and noise, estimated by every ladder."""
+    scene, foot = load_scene(case.scene), case.foot(data)
+    serials = [tile.serial for tile in scene.tile if not tile.reference]
+    for draw in range(draws):
+        calibration = find_calibration(scene.calibration, serials, parts_seed=draw)
+        recording, _ = recorded(scene, case.seconds, draw, calibration, foot)
+        accuracy = {
+            (mode, rung.label): estimated(recording, rung.models, lag_ms)
+            for rung in ladders_of(scene)
+            for mode, lag_ms in LAGS_MS.items()
+        }
+        yield Drawn(draw, len(recording.frames), accuracy, ()), recording
+
+
+def measured(case: Case, data: Path, draws: int) -> tuple[dict[tuple[str, str], Measured], str]:
+    """Every ladder in every mode, and what was pressed."""
+    ladders = ladders_of(load_scene(case.scene))
+    judged: list[Drawn] = []
+    recordings: list[Recording] = []
+    for draw, recording in drawn(case, data, draws):
+        judged.append(draw)
+        recordings[:] = [recording]
+        print(f"{case.name}: {len(judged)} of {draws} draws", file=sys.stderr, flush=True)
+    (recording,) = recordings
+    times_ns, failures = time_rungs(recording, ladders, FRAMES, REPETITIONS)
+    for failure in failures:
+        print(f"{case.name}: {failure.what}: {failure.why}", file=sys.stderr)
+    peak_n, info = recording.truth["true_grf_n"].max(), recording.info
+    what = (
+        f"{len(info.tiles)} tiles at {info.nominal_rate_hz:.0f} frames/s, "
+        f"{draws} draws of {len(recording.frames)} frames, up to {peak_n:.0f} N."
+    )
+    return measured_of(ladders, judged, times_ns), what
+
+
+def tables(case: Case, data: Path, draws: int) -> Iterator[str]:
+    """What a ladder costs and what it is off by."""
+    scene = load_scene(case.scene)
+    figures, what = measured(case, data, draws)
+    ladders = ladders_of(scene)
+    named = tuple(name for name in MODELS if name in scene.models)
+    fronts = {mode: on_front(figures, ladders, mode) for mode in LAGS_MS}
+    head = [
+        f"{quantity}, {mode}"
+        for mode in LAGS_MS
+        for quantity in ("us a frame", "GRF N", "peak N", "COP p95 mm", "covered %")
+    ]
+    yield from ("", f"### {case.name}", "", what, "")
+    yield f"| ladder | {' | '.join(head)} |"
+    yield f"|---{'|--:' * len(head)}|"
+    for rung in ladders:
+        cells = []
+        for mode in LAGS_MS:
+            m = figures[mode, rung.label]
+            us = f"{m.ns_per_frame.median / 1e3:.1f}"
+            cells += [
+                f"**{us}**" if rung.label in fronts[mode] else us,
+                *(
+                    cell(m.figures[name].median, scale, digits)
+                    for name, scale, digits in (
+                        ("grf_mae_n", 1.0, 3),
+                        ("peak_error_n", 1.0, 2),
+                        ("cop_p95_m", 1e3, 2),
+                    )
+                ),
+                cell(m.coverage["all"].share, 100.0, 0),
+            ]
+        label = f"{rung.label} (named)" if rung.models == named else rung.label
+        yield f"| {label} | {' | '.join(cells)} |"
+
+
+def on_front(
+    figures: dict[tuple[str, str], Measured], ladders: Sequence[Rung], mode: str
+) -> set[str]:
+    """Labels of the ladders that no other beats in both time and GRF error."""
+    points = [
+        (m.ns_per_frame.median, m.figures["grf_mae_n"].median)
+        for m in (figures[mode, rung.label] for rung in ladders)
+    ]
+    return {ladders[i].label for i in pareto(points)}
+
+
+def cell(value: float, scale: float, digits: int) -> str:
+    """A figure of the table."""
+    return "-" if math.isnan(value) else f"{scale * value:.{digits}f}"
+
+
+def main() -> None:
+    """See the module's first lines."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--draws", type=int, default=3)
+    parser.add_argument("--case", action="append", choices=[case.name for case in CASES])
+    parser.add_argument("--out", type=Path)
+    asked = parser.parse_args()
+    lines = []
+    for case in CASES:
+        if asked.case is None or case.name in asked.case:
+            for line in tables(case, asked.data, asked.draws):
+                lines.append(line)
+                print(line, flush=True)
+    if asked.out is not None:
+        before = asked.out.read_text("utf-8").partition(MARK)[0]
+        asked.out.write_text(f"{before}{MARK}\n" + "\n".join(lines) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""What a recording asks for: models that are offered and not named, and their newtons.
+
+A model that is not named is run all the same, beside the others, over what was seen: how far the
+GRF lies from itself without that model is what the estimate is off by for want of it. All of it
+comes from the calibration's own parameters. `denoise` is left out: it changes no load, and takes
+most of the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from devices.arrays import Bools
+from devices.errors import FootTileError
+from devices.frames import ArrayInfo, FrameBatch
+from service.estimation.calibration import Calibration
+from service.estimation.estimate import EstimationState, step
+from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.tare.tare import Tare
+
+ASKED_FROM_N = 0.1
+"""So much of the GRF, mean absolute under load, is worth a word."""
+SEEN: Mapping[str, str] = {
+    "temperature": "chips have warmed or cooled since the tare",
+    "ambient": "the pressure around the domes has changed",
+    "gas": "loads come or go fast",
+    "rubber": "loads last",
+    "hysteresis": "loads rise and fall",
+}
+"""Models that can be asked for, and what it is that asks."""
+_WHOLE = "whole"
+_NEWTON = 1e9  # whole nanonewtons add up to the same in any order
+
+
+class Asking:
+    """What consecutive frames of one stream ask for.
+
+    Args:
+        info: the array.
+        calibration: of its tiles.
+        models: those that are named.
+    """
+
+    def __init__(self, info: ArrayInfo, calibration: Calibration, models: Sequence[str]) -> None:
+        self._info, self._calibration = info, calibration
+        self._named = tuple(name for name in models if name != "denoise")
+        self._tare: Tare | None = None
+        self._offered: tuple[str, ...] | None = None
+        self._plans: dict[str, EstimationPlan] = {}
+        self._states: dict[str, EstimationState] = {}
+        self._sums: dict[str, int] = {}
+        self._frames = 0
+        self._last_t_mono_ns = 0
+
+    def feed(self, tare: Tare, frames: FrameBatch, loaded: Bools) -> None:
+        """Take the next frames.
+
+        Args:
+            tare: in force.
+            frames: n frames, in order, one at least.
+            loaded: (n,), does the foot bear load?
+        """
+        if tare is not self._tare:
+            self._begin(tare)
+        if int(frames.t_mono_ns[0]) < self._last_t_mono_ns:  # the node was switched on again
+            self._states = dict.fromkeys(self._plans, EstimationState())
+        self._last_t_mono_ns = int(frames.t_mono_ns[-1])
+        grf_n = {}
+        for name, plan in self._plans.items():
+            estimates, self._states[name] = step(plan, frames, self._states[name])
+            grf_n[name] = estimates.grf_n
+        if not grf_n:
+            return
+        whole_n = grf_n.pop(_WHOLE)
+        judged = loaded & np.isfinite(whole_n)
+        for without_n in grf_n.values():
+            judged &= np.isfinite(without_n)
+        self._frames += int(judged.sum())
+        for name, without_n in grf_n.items():
+            off_n = np.abs(without_n - whole_n)[judged]
+            self._sums[name] += int(np.rint(_NEWTON * off_n).astype(np.int64).sum())
+
+    def finish(self) -> dict[str, float]:
+        """Models that were asked for with the newtons that each is good for, the greatest first."""
+        if not self._frames:
+            return {}
+        newtons = {name: total / _NEWTON / self._frames for name, total in self._sums.items()}
+        asked = [(n, name) for name, n in newtons.items() if n >= ASKED_FROM_N]
+        return {name: n for n, name in sorted(asked, reverse=True)}
+
+    def _begin(self, tare: Tare) -> None:
+        self._tare = tare
+        if self._offered is None:
+            self._offered = tuple(
+                name for name in SEEN if name not in self._named and self._is_offered(name, tare)
+            )
+            self._sums = dict.fromkeys(self._offered, 0)
+        if not self._offered:
+            return
+        every = (*self._named, *self._offered)
+        self._plans = {_WHOLE: self._plan(every, tare)}
+        for name in self._offered:
+            self._plans[name] = self._plan([other for other in every if other != name], tare)
+        self._states = dict.fromkeys(self._plans, EstimationState())
+
+    def _is_offered(self, name: str, tare: Tare) -> bool:
+        try:
+            self._plan((*self._named, name), tare)
+        except FootTileError:
+            return False
+        return True
+
+    def _plan(self, models: Sequence[str], tare: Tare) -> EstimationPlan:
+        return make_plan(self._info, self._calibration, tare, models=models)
