@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
+from scipy.special import chdtrc
 
 from devices.arrays import Floats
 from service.estimation.effects import (
@@ -26,10 +27,13 @@ from service.estimation.fitting.soak import bounds_of
 from service.estimation.fitting.unknowns import LATE_S, TERMS_MAX, Parts
 from service.estimation.models.hysteresis import WIDTHS_N
 
-_CLEAR = 3.0
-"""An effect is determined if it differs from zero by this many standard uncertainties."""
-_TOLD = 2.0
-"""A term of creep beside others is one by this many: less depends on it."""
+_SURE = 5.0
+"""An effect that differs from zero by so many standard uncertainties is there. Of others it is
+asked ..."""
+_CHANCE = 0.0027
+"""... how often chance explains as much as it does: three standard uncertainties of one unknown."""
+_LITTLE_N = 0.1
+"""An effect that never exceeds this on the bench is not worth a model."""
 _FAST_MIN = 50
 """Least number of readings of holds, releases and taps that determine fast effects."""
 
@@ -66,18 +70,17 @@ def identify(
     if int(points.fast.sum()) < _FAST_MIN:
         parts = replace(parts, late_s=None, gas=False)
         refused["gas"] = "no holds, releases or taps in the recording"
-    while True:
-        fit = best_creep(problem, parts) if parts.terms else problem.fit(parts)
-        reasons = _undetermined(fit)
-        if not reasons and parts.flow and not _flows(fit):
-            parts = replace(parts, flow=False)
-            continue
-        if not reasons:
-            break
-        # One at a time: without the worst effect, the others may be determined.
-        worst = next(name for name in ("gas", "hysteresis", "rubber") if name in reasons)
-        refused[worst] = reasons[worst]
-        parts = replace(parts, **_WITHOUT[worst])
+    # Judged beside as many terms of creep as there may be, or what creeps would seem to flow.
+    parts = replace(parts, terms=TERMS_MAX)
+    fit = problem.fit(parts)
+    # One at a time: without the least needed, the others may be.
+    while (spared := _spared(problem, parts, fit)) is not None:
+        name, why, fit = spared
+        parts = replace(parts, **_WITHOUT[name])
+        if name != "flow":
+            refused[name] = why
+    if parts.terms:
+        fit = best_creep(problem, parts, fit)
     misfits, model, sigma = problem.misfits(fit), fit.model, fit.sigma
     gas = rubber = hysteresis = None
     if "gamma" in sigma:
@@ -116,56 +119,97 @@ def identify(
     )
 
 
-def best_creep(problem: OutputErrorProblem, parts: Parts) -> Fit:
+def best_creep(problem: OutputErrorProblem, parts: Parts, many: Fit) -> Fit:
     """With as many terms of creep as foretell best a loading that was not fitted.
 
-    A further term has to lower the squares of the loadings held out, in sum, by more than chance
-    would from the one loading to the other, and none may be nothing: else there are too few
-    loadings to tell it.
+    A further term has to lower the squares of all loadings by more than chance would, and of the
+    loadings held out, in sum, by more than they differ from one to the other.
+
+    Args:
+        problem: of the tile.
+        parts: what is fitted beside.
+        many: with `TERMS_MAX` terms.
     """
-    many = problem.fit(replace(parts, terms=TERMS_MAX))
     fits = [problem.fit(replace(parts, terms=n), many.scatter) for n in range(1, TERMS_MAX)]
     best, *others = [*fits, many]
     for more in others:
         better = best.unseen - more.unseen
-        told = (more.model.part > _TOLD * more.sigma["part"]).all()
-        if told and better.sum() > np.sqrt(len(better)) * better.std():
+        is_told = _chance(problem, more, best) < _CHANCE
+        if is_told and better.sum() > np.sqrt(len(better)) * better.std():
             best = more
     return best
 
 
-def _undetermined(fit: Fit) -> dict[EffectName, str]:
-    """Why a fitted effect cannot be told from zero."""
-    model, sigmas = fit.model, fit.sigma
-    reasons: dict[EffectName, str] = {}
-    if "gamma" in sigmas:
-        sigma = float(sigmas["gamma"][0])
-        if model.gamma - 1.0 < _CLEAR * sigma:
-            reasons["gas"] = f"gamma {model.gamma:.3f} +- {sigma:.3f}: not determined"
-    if "part" in sigmas:
-        total, sigma = float(model.part.sum()), float(sigmas["part_sum"][0])
-        if total < _CLEAR * sigma:
-            reasons["rubber"] = f"creeping part {total:.3f} +- {sigma:.3f}: not determined"
-    if "loop" in sigmas and not _flows(fit):
-        width_n, sigma = float(model.loop @ WIDTHS_N), float(sigmas["loop_n"][0])
-        if width_n < _CLEAR * sigma:
-            reasons["hysteresis"] = f"half width {width_n:.2f} +- {sigma:.2f} N: not determined"
-    return reasons
+def _chance(problem: OutputErrorProblem, more: Fit, less: Fit) -> float:
+    """How often chance explains as much as `more` does beyond `less`, which has fewer unknowns.
+
+    Twice the logarithm of the likelihood is as chi squared of their number (Wilks 1938). How
+    uncertain parameters are does not tell: of a quick gas time and gamma make up for one another.
+    """
+    better = problem.squares(less.model, more.scatter) - problem.squares(more.model, more.scatter)
+    return float(chdtrc(more.unknowns - less.unknowns, max(better, 0.0)))
 
 
-def _flows(fit: Fit) -> bool:
-    """Does the recording tell that a branch flows, and how much it bears?"""
-    if "flow_part" not in fit.sigma:
-        return False
-    clear = fit.model.flow_part > _CLEAR * float(fit.sigma["flow_part"][0])
-    return clear and float(fit.sigma["ln_flow_n"][0]) < 1.0 / _CLEAR
+_Effect = EffectName | Literal["flow"]
 
 
-_WITHOUT: Mapping[EffectName, Mapping[str, Any]] = {
-    "gas": {"gas": False},
+@dataclass(frozen=True)
+class _Size:
+    """How great a fitted effect is: in words, in its uncertainties, and in newtons at most."""
+
+    words: str
+    sigmas: float
+    most_n: float
+
+
+def _spared(problem: OutputErrorProblem, parts: Parts, fit: Fit) -> tuple[_Effect, str, Fit] | None:
+    """The effect that is needed least, why it may be left out, and the fit without it.
+
+    None: all are needed.
+    """
+    found, greatest = None, 0.0
+    for name, without in _WITHOUT.items():
+        size = _size(problem, fit, name)
+        if size is None or (size.sigmas > _SURE and size.most_n > _LITTLE_N):
+            continue
+        less = problem.fit(replace(parts, **without), fit.scatter)
+        chance = _chance(problem, fit, less)
+        is_told = chance < _CHANCE
+        if chance > greatest and not (is_told and size.most_n > _LITTLE_N):
+            why = f"at most {size.most_n:.2f} N" if is_told else "not determined"
+            found, greatest = (name, f"{size.words}: {why}", less), chance
+    return found
+
+
+def _size(problem: OutputErrorProblem, fit: Fit, name: _Effect) -> _Size | None:
+    """Of an effect; None: it was not fitted."""
+    model, full_n = fit.model, problem.most_n
+    sigma = {each: float(sigmas[0]) for each, sigmas in fit.sigma.items()}
+    flows = model.flow_part / sigma["flow_part"] if "flow_part" in sigma else 0.0
+    if name == "flow" and "flow_part" in sigma:
+        return _Size("", flows, model.flow_part * full_n)
+    if name == "hysteresis" and "loop" in sigma:
+        width_n = float(model.loop @ WIDTHS_N)
+        words = f"half width {width_n:.2f} +- {sigma['loop_n']:.2f} N"
+        most_n = width_n + model.flow_part * full_n
+        return _Size(words, max(flows, width_n / sigma["loop_n"]), most_n)
+    if name == "rubber" and "part" in sigma:
+        total = float(model.part.sum())
+        words = f"creeping part {total:.3f} +- {sigma['part_sum']:.3f}"
+        return _Size(words, total / sigma["part_sum"], total * full_n)
+    if name == "gas" and "gamma" in sigma:
+        words = f"gamma {model.gamma:.3f} +- {sigma['gamma']:.3f}"
+        return _Size(words, (model.gamma - 1.0) / sigma["gamma"], problem.heat_n(fit))
+    return None
+
+
+_WITHOUT: Mapping[_Effect, Mapping[str, Any]] = {
+    "flow": {"flow": False},
     "hysteresis": {"hysteresis": False, "flow": False},
     "rubber": {"terms": 0},
+    "gas": {"gas": False},
 }
+"""Parts without an effect."""
 
 
 def _parameters(values: Iterable[float], sigmas: Floats) -> tuple[Parameter, ...]:

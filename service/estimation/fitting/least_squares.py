@@ -16,7 +16,7 @@ import numpy as np
 from devices.arrays import Bools, Floats
 
 _STEPS = 60  # a bound; a good start needs ten
-_ENOUGH = 1e-4
+ENOUGH = 1e-4
 """A sum of squares that falls by less is at its end: a hundredth of a standard uncertainty."""
 _DIFFERENCE = 1e-6  # of an unknown's scale: errors of rounding and of curvature are alike small
 _DAMPING = (1e-9, 1e-3, 1e9)  # least, first, and that at which no step is left
@@ -40,7 +40,12 @@ class Found:
 
 
 def least_squares(
-    residual: Callable[[Floats], Floats], x: Floats, low: Floats, high: Floats, scale: Floats
+    residual: Callable[[Floats], Floats],
+    x: Floats,
+    low: Floats,
+    high: Floats,
+    scale: Floats,
+    enough: float = ENOUGH,
 ) -> Found:
     """Levenberg and Marquardt's steps, none of them across a bound.
 
@@ -50,6 +55,7 @@ def least_squares(
         low: least values.
         high: greatest values.
         scale: what is much for an unknown.
+        enough: the search ends where the sum of squares falls by less.
     """
     _, damping, most = _DAMPING
     off = residual(x)
@@ -68,7 +74,7 @@ def least_squares(
         if better is None:
             break
         gained, x, off, cost = cost - trial_cost, better, trial_off, trial_cost
-        if gained < _ENOUGH:
+        if gained < enough:
             break
     jacobian = _jacobian(residual, x, off, high, scale)
     slope = jacobian.T @ off

@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 
 from devices.arrays import Bools, Floats
 from service.estimation.fitting.confidence import beyond_bounds, fit_covariance
-from service.estimation.fitting.least_squares import Found, least_squares
+from service.estimation.fitting.least_squares import ENOUGH, Found, least_squares
 from service.estimation.fitting.model import DomeModel, load
 from service.estimation.fitting.press import Presses
 from service.estimation.fitting.unknowns import Parts, told_s, unknowns_of
@@ -22,7 +22,8 @@ from service.estimation.models.hysteresis import WIDTHS_N
 
 _SCATTER = (0.003, 0.03)
 """Least scatter of loadings that is believed; and the paper's scatter, to begin with."""
-_ROUNDS = 2  # the second one knows how much loadings scatter
+_ROUGHLY = 1.0
+"""A sum of squares that tells how much loadings scatter; a second search knows that."""
 _MODEL = 0.01
 """Part of a pressure that no model explains: a tenth of what is corrected, which is a tenth.
 Without it readings under great loads would have the curve err under small ones."""
@@ -46,6 +47,7 @@ class Fit:
             what neighbouring terms trade with one another only the sum: "part_sum", "loop_n".
         curve_covariance: (3, 3), of the curve's coefficients.
         at_bound: unknowns that are at the end of what is possible.
+        unknowns: how many were fitted.
         unseen: (loadings,), squares of what each would be off if the others alone were fitted.
         unsure: how uncertain the corrections of gas and of creep are by their parameters alone,
             relative, root mean square on the bench: "gas", "rubber".
@@ -58,6 +60,7 @@ class Fit:
     sigma: dict[str, Floats]
     curve_covariance: Floats
     at_bound: tuple[str, ...]
+    unknowns: int
     unseen: Floats
     unsure: dict[str, float]
 
@@ -113,13 +116,13 @@ class OutputErrorProblem:
         x = np.clip(likely, low, high)
         known = scatter is not None
         scatter = _SCATTER[1] if scatter is None else scatter
-        for _ in range(1 if known else _ROUNDS):
+        for enough in (ENOUGH,) if known else (_ROUGHLY, ENOUGH):
 
             def residual(x: Floats, scatter: float = scatter) -> Floats:
                 off = self.residual(self._model(x, at), scatter)
                 return np.concatenate([off, (x - likely) / within])
 
-            found = least_squares(residual, x, low, high, within)
+            found = least_squares(residual, x, low, high, within, enough)
             x = found.x
             model = self._model(x, at)
             gains, modelled = self._gains(model, scatter)
@@ -150,6 +153,7 @@ class OutputErrorProblem:
             sigma=sigma,
             curve_covariance=covariance[at["curve"], at["curve"]],
             at_bound=tuple(name for name, where in at.items() if found.at_bound[where].any()),
+            unknowns=len(x),
             unseen=self._unseen(found, within),
             unsure=self._unsure(jacobian, covariance, modelled, model, at),
         )
@@ -249,6 +253,23 @@ class OutputErrorProblem:
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
         off = (gains[self._points.loading] * gauge_kpa - self._gauge_kpa) * self._weight
         return np.concatenate([off, (gains - 1.0) / scatter])
+
+    @property
+    def most_n(self) -> float:
+        """The greatest force on the bench."""
+        return float(self._points.force_n.max())
+
+    def heat_n(self, fit: Fit) -> float:
+        """What the gas' heat makes of a force at most."""
+        model, rows = fit.model, self._usable
+        heated_kpa, settled_kpa = fit.modelled[rows, 0], fit.modelled[rows, 1]
+        slope = _n_per_kpa(model, (settled_kpa - model.baseline_kpa) / model.scale_kpa)
+        return float(np.abs((heated_kpa - settled_kpa) * slope).max())
+
+    def squares(self, model: DomeModel, scatter: float) -> float:
+        """Sum of squares of what is fitted."""
+        off = self.residual(model, scatter)
+        return float(off @ off)
 
 
 def _n_per_kpa(model: DomeModel, x: Floats) -> Floats:
