@@ -104,7 +104,7 @@ def told(tmp_path: Path) -> Iterator[Told]:
 messages = st.tuples(st.sampled_from([OLD, NEW]), st.integers(0, 7))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     order=st.permutations([(boot, n) for boot in (OLD, NEW) for n in range(8)]),
     again=st.lists(messages, max_size=8),
