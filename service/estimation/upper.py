@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from devices.arrays import Arrays, Bools, Floats, Times
+from service.estimation.averaged import averaged, summed
 from service.estimation.compiled import compiled
 from service.estimation.ladder import Ladder
 from service.estimation.lower import ApparentForces
-from service.estimation.models import denoise
 from service.estimation.models.flow import FlowState
 from service.estimation.models.rubber import RubberState
 from service.estimation.plan import EstimationPlan
@@ -111,30 +111,7 @@ def tile_forces(
     force_n, noise_n, at_ns = now.apparent_n, now.noise_n, now.sampled_ns
     bend_n = np.zeros(force_n.shape)
     if ladder.denoise:
-        # A lower bound would be averaged with what is no bound.
-        usable_n = np.where(apparent.beyond, np.nan, apparent.apparent_n)
-        asked_ns = apparent.sampled_ns
-        if ladder.skew:
-            asked_ns = np.broadcast_to(apparent.t_mono_ns[:, None], asked_ns.shape)
-            at_ns = asked_ns[first:stop]
-        averaged_n, left, bend_n, of_bend = denoise.denoised(
-            np.ascontiguousarray(usable_n),
-            np.ascontiguousarray(apparent.noise_n),
-            np.ascontiguousarray(apparent.sampled_ns),
-            np.ascontiguousarray(apparent.t_mono_ns),
-            np.ascontiguousarray(asked_ns),
-            np.ascontiguousarray(apparent.run),
-            first,
-            stop,
-            plan.look_ns,
-            denoise.PAST_NS,
-            denoise.REACHES,
-            denoise.AGREE,
-            plan.noise_left,
-        )
-        force_n = np.where(np.isnan(averaged_n), force_n, averaged_n)
-        bend_n = denoise.shared_bend(bend_n, noise_n * np.sqrt(of_bend))
-        noise_n = noise_n * np.sqrt(np.where(np.isnan(left), 1.0, left))
+        force_n, noise_n, bend_n, at_ns = averaged(plan, apparent, first, stop)
     own_n = np.sqrt(noise_n**2 + now.sigma_n**2)
     averaged_n = force_n
     force_n, unseen_n, state = _undone(plan, now, averaged_n, at_ns, state)
@@ -311,14 +288,3 @@ def grid_index(plan: EstimationPlan, gauge_kpa: Floats) -> tuple[Floats, Floats]
     divisor_kpa = np.where(total_kpa == 0.0, np.nan, total_kpa)
     x, y = (summed(weight_kpa * index) / divisor_kpa for index in plan.grid)
     return x, y
-
-
-@compiled
-def summed(values: Floats) -> Floats:
-    """Sum over tiles, (n,)."""
-    n, tiles = values.shape
-    total = np.zeros(n)
-    for i in range(n):
-        for tile in range(tiles):
-            total[i] += values[i, tile]
-    return total

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from devices.arrays import Floats, Times
+from devices.arrays import Floats, Ints, Times
 from service.estimation.compiled import compiled
 
 PAST_NS = 250_000_000  # how far the longest window reaches back
@@ -49,7 +49,8 @@ def denoised(
     reaches: Times,
     agree: float,
     noise_left: Floats,
-) -> tuple[Floats, Floats, Floats, Floats]:
+    within: Ints,
+) -> tuple[Floats, Floats, Floats, Floats, Ints]:
     """Averaged values of rows `first` to `stop`.
 
     Args:
@@ -67,18 +68,22 @@ def denoised(
         agree: as `AGREE`.
         noise_left: (tiles, `AVERAGED_MAX` + 1), how much more of the noise's variance is left of an
             average of so many readings than of white noise.
+        within: (stop - first, 4), rows that a window may reach: of a line the first and the last,
+            and of a parabola; `anywhere`, or what windows of the sum of tiles reached.
 
     Returns:
         Values (stop - first, tiles), and their squared standard uncertainty in units of that of a
         single one: what is left of the noise, and what curvature within the window adds. And how
         far they are from those of a window of half the length, with the variance that noise gives
-        that, in the same units: for `shared_bend`.
+        that, in the same units: for `shared_bend`. And the rows that the windows of the last tile
+        reached, as `within`.
     """
     n, tiles = values.shape
     out = np.full((stop - first, tiles), math.nan)
     left = np.full((stop - first, tiles), math.nan)
     bend = np.full((stop - first, tiles), math.nan)
     of_bend = np.full((stop - first, tiles), math.nan)
+    reached = np.empty((stop - first, 4), dtype=np.int64)
     moments, trial = np.empty(8), np.empty(8)
     kept = np.empty((4 * len(reaches) + 1, 3))
     newest = oldest = first
@@ -90,8 +95,10 @@ def denoised(
             newest += 1
         while frame_t_ns[oldest] < frame_t_ns[i] - past_ns:
             oldest += 1
+        line_low, line_high, bent_low, bent_high = within[i - first]
         for j in range(tiles):
             if math.isnan(values[i, j]):
+                reached[i - first] = within[i - first]
                 continue
             sigma = sigmas[i, j]
             # Times relative to the instant asked for, in milliseconds.
@@ -101,7 +108,7 @@ def denoised(
             variance = shorter_variance = shortest_variance = 1.0
             kept[0, 0], kept[0, 1], kept[0, 2] = best, variance, 1.0
             stored = 1
-            low = high = i
+            low = high = straight_low = straight_high = i
             open_low = open_high = straight = True
             for reach in reaches:
                 before, before_variance = best, variance
@@ -109,7 +116,10 @@ def denoised(
                     if not (open_high if ahead else open_low):
                         continue
                     way, edge = (1, high) if ahead else (-1, low)
-                    end = min(newest, i + reach) if ahead else max(oldest, i - reach)
+                    if ahead:
+                        end = min(newest, i + reach, bent_high)
+                    else:
+                        end = max(oldest, i - reach, bent_low)
                     trial[:] = moments
                     at = edge
                     while at != end and run[at + way] == run[i]:
@@ -120,8 +130,12 @@ def denoised(
                         continue
                     accepted, remains = math.nan, 0.0
                     agrees = True
+                    if ahead:
+                        is_beyond = low < line_low or at > line_high
+                    else:
+                        is_beyond = at < line_low or high > line_high
                     for bent in (True, False):
-                        if not bent and not straight:
+                        if not bent and (not straight or is_beyond):
                             break
                         value, of_noise = _parabola(trial) if bent else _line(trial)
                         if math.isnan(value):
@@ -145,6 +159,8 @@ def denoised(
                         high = at
                     else:
                         low = at
+                    if straight:
+                        straight_low, straight_high = low, high
                     if not math.isnan(accepted) and remains < (1.0 - SAME) * variance:
                         best, variance = accepted, remains
                 if variance < before_variance:
@@ -160,7 +176,14 @@ def denoised(
                 off = ((best - shortest) / sigma) ** 2
                 variance += max(0.0, off - (shortest_variance - variance))
             out[i - first, j], left[i - first, j] = best, variance
-    return out, left, bend, of_bend
+            reached[i - first, 0], reached[i - first, 1] = straight_low, straight_high
+            reached[i - first, 2], reached[i - first, 3] = low, high
+    return out, left, bend, of_bend, reached
+
+
+def anywhere(rows: int, n: int) -> Ints:
+    """`within` of so many rows if windows may reach all of n."""
+    return np.tile(np.array([0, n - 1, 0, n - 1]), (rows, 1))
 
 
 @compiled

@@ -339,9 +339,15 @@ def denoised(
     run: list[int],
     look_ns: int,
     noise_left: Floats,
-) -> list[tuple[Exact, Exact, Exact, Exact] | None]:
-    """Windows that grow on either side, a parabola and a line in each, as long as they agree."""
-    out: list[tuple[Exact, Exact, Exact, Exact] | None] = []
+    within: list[Any] | None = None,
+) -> list[Any]:
+    """Windows that grow on either side, a parabola and a line in each, as long as they agree.
+
+    Of each value: it, its variance, what half the window differs by, the variance of that, and the
+    rows of the longest window that a line described, and of the longest: they are the `within` of
+    others, beyond which these take no line, and do not grow.
+    """
+    out: list[Any] = []
     for i, own in enumerate(values):
         if own is None:
             out.append(None)
@@ -355,9 +361,14 @@ def denoised(
             <= frame_ns[j]
             <= max(frame_ns[i] + look_ns, frame_ns[i])
         ]
+        lines: set[int] = set(reachable)
+        if within is not None and within[i] is not None:
+            lines, most = within[i]
+            reachable = [j for j in reachable if j in most]
         history = [(own, mpf(1))] * 3
         shorter = [(own, mpf(1), 2)]
         straight, window, growing = True, {i}, [-1, 1]
+        straight_window = {i}
         for reach in denoise.REACHES:
             best = history[-1]
             for side in (-1, 1):
@@ -368,7 +379,7 @@ def denoised(
                 x = [mpf(t_ns[j] - at_ns[i]) / 10**6 for j in good]
                 y = [values[j] for j in good]
                 accepted = None
-                for degree in (2, 1) if straight else (2,):
+                for degree in (2, 1) if straight and wider <= lines else (2,):
                     found = curve_at_zero(x, y, degree)
                     if found is None:
                         continue
@@ -384,6 +395,8 @@ def denoised(
                 if side not in growing:
                     continue
                 window = wider
+                if straight:
+                    straight_window = window
                 if accepted is not None and accepted[1] < (1 - mpf(denoise.SAME)) * best[1]:
                     best = accepted
             if best[1] < history[-1][1]:
@@ -392,7 +405,7 @@ def denoised(
         bend, of_bend = value - old, old_variance - variance
         if sigma > 0:
             variance += max(mpf(0), (bend / sigma) ** 2 - of_bend)
-        out.append((value, variance, bend, of_bend))
+        out.append((value, variance, bend, of_bend, (straight_window, window)))
     return out
 
 

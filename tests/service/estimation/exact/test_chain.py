@@ -71,7 +71,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
     effects: list[Any] = [plan.calibration.of(plan.info.tiles[i].serial).effects for i in domes]
     walls = [e.temperature.wall_per_kpa for e in effects]
     doubt = max(mpf(w.sigma) / mpf(w.value) for w in walls)
-    forces, stated, bounds, errors = [], [], [], []
+    forces, stated, bounds, errors, felt = [], [], [], [], []
     bends: list[list[Exact]] = []
     of_bends: list[list[Exact]] = []
     for i in domes:
@@ -149,15 +149,47 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
             heat_n[k] = slope * mpf(hot.misfit) * (guess[k] - dry[k])
             unseen_heat_n[k] = 0 if hidden[k] else slope * (elsewise[k] - guess[k]) / mp.sqrt(3)
             own.append(slope**2 * variance[k] + fit)
+        felt.append(
+            SimpleNamespace(
+                apparent=apparent, single=single, beyond=beyond, own=own, heat_n=heat_n,
+                unseen_heat_n=unseen_heat_n, guess_n=guess_n, most_n=most_n, end_n=end_n,
+            )
+        )  # fmt: skip
+    usable = [
+        [None if b else f for f, b in zip(of.apparent, of.beyond, strict=True)] for of in felt
+    ]
+
+    def of_all(columns: list[list[Exact]]) -> list[Any]:
+        """By frame; None where a tile has none."""
+        return [None if None in row else list(row) for row in zip(*columns, strict=True)]
+
+    sampled = [sum(row) // len(felt) for row in zip(*t_ns[:3], strict=True)]
+    together: list[Any] = equations.denoised(
+        [None if row is None else mp.fsum(row) for row in of_all(usable)],
+        [None if row is None else mp.norm(row) for row in of_all([of.single for of in felt])],
+        sampled,
+        frame_ns,
+        frame_ns,
+        run,
+        plan.lag_ns - 1,
+        plan.noise_left.mean(axis=0),
+    )
+    within = [None if each is None else each[4] for each in together]
+    for i in domes:
+        of, curve = felt[i], effects[i].rubber
+        apparent, single, beyond, own = of.apparent, of.single, of.beyond, of.own
+        heat_n, unseen_heat_n, guess_n = of.heat_n, of.unseen_heat_n, of.guess_n
+        most_n, end_n = of.most_n, of.end_n
         averaged: list[Any] = equations.denoised(
-            [None if b else f for f, b in zip(apparent, beyond, strict=True)],
+            usable[i],
             single,
             t_ns[i],
             frame_ns,
             frame_ns,
             run,
             plan.lag_ns - 1,
-            plan.noise_left[domes.index(i)],
+            plan.noise_left[i],
+            within,
         )
         smooth = [f if a is None else a[0] for f, a in zip(apparent, averaged, strict=True)]
         loop = [mpf(w.value) for w in effects[i].hysteresis.part]

@@ -184,7 +184,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -
     missing = rng.random(n) < (0.6 if kind == "few" else 0.05)
     run = np.arange(n) // 10 if kind == "crowded" else np.cumsum(rng.random(n) < 0.03)
     column = np.where(missing, NAN, values)
-    averaged, left, bend, of_bend = denoise.denoised(
+    averaged, left, bend, of_bend, _ = denoise.denoised(
         column[:, None],
         np.full((n, 1), 0.3),
         t_ns[:, None],
@@ -198,6 +198,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -
         denoise.REACHES,
         denoise.AGREE,
         noise_left[None, :],
+        denoise.anywhere(n, n),
     )
     found = equations.denoised(
         equations.exact(column),

@@ -15,6 +15,7 @@ from service.estimation.models.denoise import (
     AVERAGED_MAX,
     PAST_NS,
     REACHES,
+    anywhere,
     denoised,
     shared_bend,
 )
@@ -37,7 +38,7 @@ def averaged(
     values = np.asarray(values, dtype=float)
     n = len(values)
     frame_ns = PERIOD_NS * np.arange(n) if t_ns is None else np.asarray(t_ns)
-    out, left, _, _ = denoised(
+    out, left, *_ = denoised(
         values[:, None],
         np.full((n, 1), sigma_n),
         frame_ns[:, None].copy(),
@@ -51,6 +52,7 @@ def averaged(
         REACHES,
         AGREE,
         np.ones((1, AVERAGED_MAX + 1)) if noise_left is None else noise_left[None, :],
+        anywhere(n, n),
     )
     return out[:, 0], left[:, 0]
 
@@ -253,7 +255,7 @@ def test_a_load_that_shakes_all_tiles_makes_their_sum_less_certain_and_a_still_o
     load_n = 6.0 + shakes_n * np.sin(2 * math.pi * 35.0 * 1e-9 * t_ns)
     rng = np.random.default_rng(3)
     sampled_ns = np.repeat(t_ns[:, None], tiles, axis=1)
-    out, left, bend, of_bend = denoised(
+    out, left, bend, of_bend, _ = denoised(
         load_n[:, None] + rng.normal(0.0, SIGMA_N, (n, tiles)),
         np.full((n, tiles), SIGMA_N),
         sampled_ns,
@@ -267,6 +269,7 @@ def test_a_load_that_shakes_all_tiles_makes_their_sum_less_certain_and_a_still_o
         REACHES,
         AGREE,
         np.ones((tiles, AVERAGED_MAX + 1)),
+        anywhere(n, n),
     )
     off_n = (out - load_n[:, None]).sum(axis=1)
     own_n2 = (SIGMA_N**2 * left).sum(axis=1)
