@@ -6,7 +6,7 @@ isothermal wall, eight modes; the rubber Prony terms, as many as the part has, a
 operators, and where the part has it a branch that flows (Bergstrom and Boyce 1998: filled rubbers
 lose energy in chains that creep past one another, at a rate that is a high power of their stress,
 so that the loop grows slowly with speed; there about the fourth). None of these equations is the
-estimator's but that one, whose power is each part's own here and fixed there; and no number is.
+estimator's but that one, whose part, power and width are each dome's own; and no number is.
 
 Everything is computed ahead of the bus in blocks of time on a fine grid, for all domes at once, and
 interpolated where a chip samples: the physics does not know who asks, or when.

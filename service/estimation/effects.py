@@ -97,6 +97,8 @@ class RubberEffect(CalibrationPart):
 
 PART_MOST = 0.4
 """Of a change of force: up to here the force is found from what appears of it, come what may."""
+POWERS = (1.5, 10.0)
+"""Of the flow: from nearly an exponential to nearly a play."""
 STRESS_LEAST_N = 0.01
 """What bears less is not seen, and its fourth power is still a number."""
 
@@ -108,6 +110,8 @@ class FlowEffect(CalibrationPart):
     """Of a change of force, that the branch bears at first."""
     stress_n: Parameter
     """What it bears of a force that changes as in a slow stroke."""
+    power: Parameter
+    """Of its flow over what it bears."""
 
     @model_validator(mode="after")
     def _can_be_undone(self) -> Self:
@@ -116,6 +120,9 @@ class FlowEffect(CalibrationPart):
                 f"a branch that flows has a part of 0 to {PART_MOST:g} and bears "
                 f"{STRESS_LEAST_N:g} N or more"
             )
+        least, most = POWERS
+        if not least <= self.power.value <= most:
+            raise ValueError(f"a branch flows with a power of {least:g} to {most:g}")
         return self
 
 

@@ -210,6 +210,7 @@ def _flow(tiles: Sequence[TileCalibration]) -> Flow | None:
     return Flow(
         part=np.array([0.0 if effect is None else effect.part.value for effect in found]),
         stress_n=np.array([1.0 if effect is None else effect.stress_n.value for effect in found]),
+        power=np.array([4.0 if effect is None else effect.power.value for effect in found]),
     )
 
 

@@ -89,7 +89,8 @@ def _calibration() -> Calibration:
             curve_misfit_n=0.1,
         ),
         hysteresis=HysteresisEffect(
-            part=(tenth,) * len(WIDTHS_N), flow=FlowEffect(part=tenth, stress_n=tenth)
+            part=(tenth,) * len(WIDTHS_N),
+            flow=FlowEffect(part=tenth, stress_n=tenth, power=Parameter(value=4.0, sigma=1.0)),
         ),
         temperature=TemperatureEffect(kpa_per_k=tenth, lag_s=tenth, wall_per_kpa=tenth),
     )

@@ -123,7 +123,8 @@ def dome_model(effects: Effects, tile: TileCalibration, baseline_kpa: float) -> 
     if loop is not None:
         model = replace(model, loop=values(loop.part))
         if (flow := loop.flow) is not None:
-            model = replace(model, flow_part=flow.part.value, flow_n=flow.stress_n.value)
+            part, flow_n, power = values((flow.part, flow.stress_n, flow.power)).tolist()
+            model = replace(model, flow_part=part, flow_n=flow_n, flow_power=power)
     return model
 
 

@@ -103,7 +103,8 @@ def identify(
         if "flow_part" in sigma:
             (part,) = _parameters([model.flow_part], sigma["flow_part"])
             (flow_n,) = _parameters([model.flow_n], model.flow_n * sigma["ln_flow_n"])
-            flow = FlowEffect(part=part, stress_n=flow_n)
+            (power,) = _parameters([model.flow_power], sigma["flow_power"])
+            flow = FlowEffect(part=part, stress_n=flow_n, power=power)
         hysteresis = HysteresisEffect(part=_parameters(model.loop, sigma["loop"]), flow=flow)
     late_s = None
     if "late_s" in sigma:

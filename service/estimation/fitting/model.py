@@ -16,7 +16,7 @@ from scipy.interpolate import PchipInterpolator
 
 from devices.arrays import Floats
 from service.estimation.compiled import compiled
-from service.estimation.models.flow import flow_per_s, flowed
+from service.estimation.models.flow import flowed
 from service.estimation.models.hysteresis import WIDTHS_N, played
 from service.estimation.models.rubber import crept_parts
 
@@ -46,6 +46,7 @@ class DomeModel:
         loop: (plays,) parts of the plays of half widths `WIDTHS_N`.
         flow_part: of the branch that flows; 0 for none.
         flow_n: what it bears in a slow stroke.
+        flow_power: of its flow over what it bears.
         late_s: how much later than its instant says the tile is sampled; the forces given to
             `pressed` are those of that time, from `load`.
     """
@@ -61,6 +62,7 @@ class DomeModel:
     loop: Floats = field(default_factory=lambda: np.zeros(0))
     flow_part: float = 0.0
     flow_n: float = 1.0
+    flow_power: float = 4.0
     late_s: float = 0.0
 
     def pressed(self, t_s: Floats, force_n: Floats) -> Floats:
@@ -79,7 +81,8 @@ class DomeModel:
             self.loop,
             WIDTHS_N[: len(self.loop)],
             self.flow_part,
-            flow_per_s(self.flow_part, self.flow_n),
+            self.flow_n,
+            self.flow_power,
         )
 
 
@@ -145,7 +148,8 @@ def pressed(
     loop: Floats,
     widths: Floats,
     flow_part: float,
-    flow_per_s: float,
+    flow_n: float,
+    flow_power: float,
 ) -> Floats:
     """Pressures of one tile under forces that are linear between instants.
 
@@ -163,7 +167,8 @@ def pressed(
         loop: parts of the plays.
         widths: their half widths.
         flow_part: of the branch that flows.
-        flow_per_s: how fast it flows under a newton.
+        flow_n: what it bears in a slow stroke.
+        flow_power: of its flow over what it bears.
 
     Returns:
         (n, 3): pressure, pressure without the gas' heat, and the part of the force that creep and
@@ -192,7 +197,7 @@ def pressed(
             lag += loop[m] * (plays[m] - apparent)
         apparent += lag
         if flow_part > 0.0:
-            stress = flowed(stress, flow_part, flow_per_s, apparent - through, dt)
+            stress = flowed(stress, flow_part, flow_n, flow_power, apparent - through, dt)
             through = apparent
             apparent -= stress
         for _ in range(_NEWTON_STEPS):

@@ -28,7 +28,7 @@ _MODEL = 0.01
 """Part of a pressure that no model explains: a tenth of what is corrected, which is a tenth.
 Without it readings under great loads would have the curve err under small ones."""
 _BINS = 15  # parts of the range that systematic errors are averaged over
-_OF_RUBBER = ("part", "ln_creep", "loop", "flow_part", "ln_flow_n")
+_OF_RUBBER = ("part", "ln_creep", "loop", "flow_part", "ln_flow_n", "flow_power")
 _OPENS_N = 0.1
 """A tile with less force is at rest."""
 
@@ -43,7 +43,8 @@ class Fit:
         scatter: standard deviation of the gains.
         modelled: (m, 3), as `pressed` gives it.
         sigma: standard uncertainties by the name of the unknown: "late_s", "gamma", "ln_tau",
-            "part", "ln_creep", "loop", "flow_part", "ln_flow_n", as far as they were fitted; and of
+            "part", "ln_creep", "loop", "flow_part", "ln_flow_n", "flow_power", as far as they were
+            fitted; and of
             what neighbouring terms trade with one another only the sum: "part_sum", "loop_n".
         curve_covariance: (3, 3), of the curve's coefficients.
         at_bound: unknowns that are at the end of what is possible.
@@ -233,7 +234,8 @@ class OutputErrorProblem:
             model = replace(model, part=x[at["part"]], creep_s=np.exp(x[at["ln_creep"]]))
         if "flow_part" in at:
             part, flow_n = float(x[at["flow_part"]][0]), float(np.exp(x[at["ln_flow_n"]][0]))
-            model = replace(model, flow_part=part, flow_n=flow_n)
+            power = float(x[at["flow_power"]][0])
+            model = replace(model, flow_part=part, flow_n=flow_n, flow_power=power)
         return replace(model, loop=x[at["loop"]]) if "loop" in at else model
 
     def _gains(self, model: DomeModel, scatter: float) -> tuple[Floats, Floats]:

@@ -74,6 +74,8 @@ _LOOP = (0.05, 0.1, 0.3)  # of a play
 _FLOW = (
     Unknowns("flow_part", (0.05,), 0.05, (0.0,), (PART_MOST,)),
     Unknowns("ln_flow_n", (np.log(0.2),), 1.0, (np.log(2.0 * STRESS_LEAST_N),), (np.log(2.0),)),
+    # Bergstrom and Boyce (1998) found about 4, in one rubber.
+    Unknowns("flow_power", (4.0,), 1.0, (2.0,), (8.0,)),
 )
 
 

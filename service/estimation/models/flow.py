@@ -2,9 +2,9 @@
 
 Beside the spring a branch bears part g of every change of the force F and flows, the faster the
 more it bears; the bubble gets the rest (Bergstrom and Boyce 1998, J. Mech. Phys. Solids 46: the
-rate of flow goes with about the fourth power of the stress)::
+rate of flow goes with a power n of the stress, about the fourth)::
 
-    apparent = F - s,  ds/dt = g dF/dt - g R (s/S)^4 sign(s)
+    apparent = F - s,  ds/dt = g dF/dt - g R |s/S|^n sign(s)
 
 so that under a force that changes by R for long s is S. The flow alone has a closed form; it stands
 between two halves of the step in force, which is stable for any step and as exact as the force is
@@ -45,10 +45,12 @@ class Flow:
     Attributes:
         part: g, of a change of force that the branch bears at first; `FlowEffect` bounds it.
         stress_n: S, what it bears of a force that changes by `STROKE_N_PER_S`.
+        power: n, above 1.
     """
 
     part: Floats
     stress_n: Floats
+    power: Floats
 
     def at_rest(self) -> FlowState:
         """Before the first reading."""
@@ -82,7 +84,8 @@ class Flow:
             np.ascontiguousarray(apparent_n),
             np.ascontiguousarray(t_ns),
             self.part,
-            np.array([flow_per_s(*each) for each in zip(self.part, self.stress_n, strict=True)]),
+            self.stress_n,
+            self.power,
             _NONE if borne_n is None else np.ascontiguousarray(borne_n),
             np.full(len(self.part), math.nan) if away_n is None else away_n,
             after.stress_n,
@@ -93,23 +96,34 @@ class Flow:
         return out, after
 
 
-def flow_per_s(part: float, stress_n: float) -> float:
-    """How fast the branch flows under a newton, in N/s."""
-    return part * STROKE_N_PER_S / (stress_n * stress_n * stress_n * stress_n)
-
-
 @compiled
-def flowed(stress: float, part: float, per_s: float, rise: float, dt: float) -> float:
+def flowed(
+    stress: float, part: float, stress_n: float, power: float, rise: float, dt: float
+) -> float:
     """What the branch bears after a step of the force by `rise` within `dt`."""
     half = 0.5 * part * rise
     between = stress + half
-    spread: float = 1.0 + 3.0 * per_s * dt * abs(between) ** 3
-    return float(between * spread ** (-1.0 / 3.0) + half)
+    spread = _spread(between, part, stress_n, power, dt)
+    return float(between * spread ** (1.0 / (1.0 - power)) + half)
+
+
+@compiled
+def _spread(stress: float, part: float, stress_n: float, power: float, dt: float) -> float:
+    """(s(0)/s(t))^(n - 1) of the flow alone, within `dt`."""
+    fast_per_s = (power - 1.0) * part * STROKE_N_PER_S / stress_n
+    spread: float = 1.0 + fast_per_s * dt * (abs(stress) / stress_n) ** (power - 1.0)
+    return spread
 
 
 @compiled
 def _inverted(
-    apparent: float, before: float, stress: float, part: float, per_s: float, dt: float
+    apparent: float,
+    before: float,
+    stress: float,
+    part: float,
+    stress_n: float,
+    power: float,
+    dt: float,
 ) -> float:
     """The force that appears as `apparent` at the end of a step.
 
@@ -120,9 +134,9 @@ def _inverted(
     for _ in range(_ITERATIONS):
         half = 0.5 * part * (force - before)
         between = stress + half
-        spread = 1.0 + 3.0 * per_s * dt * abs(between) ** 3
-        value = force - half - between * spread ** (-1.0 / 3.0)
-        slope = 1.0 - 0.5 * part * (1.0 + spread ** (-4.0 / 3.0))
+        spread = _spread(between, part, stress_n, power, dt)
+        value = force - half - between * spread ** (1.0 / (1.0 - power))
+        slope = 1.0 - 0.5 * part * (1.0 + spread ** (power / (1.0 - power)))
         step = (value - apparent) / slope
         force -= step
         if abs(step) <= _CLOSE * max(abs(force), 1.0):
@@ -135,7 +149,8 @@ def _compensate(
     apparent_n: Floats,
     t_ns: Times,
     part: Floats,
-    per_s: Floats,
+    stress_n: Floats,
+    power: Floats,
     borne: Floats,
     away: Floats,
     stress: Floats,
@@ -146,6 +161,7 @@ def _compensate(
     n, tiles = apparent_n.shape
     for j in range(tiles):
         before, before_ns, s = force[j], last_ns[j], stress[j]
+        law = (part[j], stress_n[j], power[j])
         for i in range(n):
             apparent = apparent_n[i, j]
             if not math.isfinite(apparent):
@@ -157,9 +173,9 @@ def _compensate(
             if away[j] > 0.0 and t_ns[i, j] - before_ns > UNSEEN_NS:  # until just now
                 before = away[j] if before + apparent < away[j] else 0.0
                 s, dt = 0.0, 0.0
-            out[i, j] = now = _inverted(apparent, before, s, part[j], per_s[j], dt)
+            out[i, j] = now = _inverted(apparent, before, s, *law, dt)
             if len(borne) > 0 and not math.isnan(borne[i, j]):
                 now = borne[i, j]
-            s = flowed(s, part[j], per_s[j], now - before, dt)
+            s = flowed(s, *law, now - before, dt)
             before, before_ns = now, t_ns[i, j]
         stress[j], force[j], last_ns[j] = s, before, before_ns

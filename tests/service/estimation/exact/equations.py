@@ -146,10 +146,11 @@ def flow(
     t_ns: list[int],
     part: Exact,
     stress: Exact,
+    power: Exact,
     borne: list[Exact] | None = None,
     away: Exact = None,
 ) -> list[Exact]:
-    """`apparent = F - s`, `s' = g F' - 10 g (s/S)^4 sign(s)`: the flow between two half changes.
+    """`apparent = F - s`, `s' = g F' - 10 g |s/S|^n sign(s)`: the flow between two half changes.
 
     The branch flows under what was `borne` where that is not None. While nothing was read it bore
     `away`, or nothing, the farther one, until just now: long enough for the branch to be at rest.
@@ -170,9 +171,10 @@ def flow(
         ) -> Exact:
             half = part * (force - before) / 2
             between = s + half
-            if between != 0:  # s^-3 grows evenly
-                cubed = 1 / (abs(between) ** -3 + 3 * 10 * part * passed / stress**4)
-                between = mp.sign(between) * mp.cbrt(cubed)
+            if between != 0:  # s^-(n - 1) grows evenly
+                more = power - 1
+                grown = abs(between) ** -more + more * 10 * part * passed / stress**power
+                between = mp.sign(between) * grown ** (-1 / more)
             return between + half
 
         # What is added to the apparent force hardly changes with it: that comes to rest.

@@ -195,7 +195,7 @@ def chain(plan: EstimationPlan, frames: FrameBatch, run: list[int]) -> Any:
         loop = [mpf(w.value) for w in effects[i].hysteresis.part]
         parts, taus_s = ([mpf(p.value) for p in x] for x in (curve.part, curve.tau_s))
         flows = effects[i].hysteresis.flow
-        branch = mpf(flows.part.value), mpf(flows.stress_n.value)
+        branch = mpf(flows.part.value), mpf(flows.stress_n.value), mpf(flows.power.value)
         sprung = equations.flow(smooth, frame_ns, *branch, guess_n)
         unlooped = equations.hysteresis(sprung, loop, guess_n)
         force_n = equations.rubber(unlooped, frame_ns, parts, taus_s, guess_n)
@@ -306,6 +306,7 @@ def plan() -> EstimationPlan:
         flow = FlowEffect(
             part=Parameter(value=0.07 + 0.01 * i, sigma=0.01),
             stress_n=Parameter(value=0.11 * (1 + i), sigma=0.01),
+            power=Parameter(value=3.3 + i, sigma=0.1),
         )
         loop = known.hysteresis.model_copy(update={"flow": flow})
         tiles.append(

@@ -90,21 +90,24 @@ def test_rubber_is_within_a_nanonewton(
 @given(
     part=st.sampled_from([0.0, 1e-9, 0.08, 0.4]),
     stress_n=st.sampled_from([0.01, 0.3, 2.0]),
+    power=st.sampled_from([1.5, 4.0, 5.3, 10.0]),
     swing_n=st.sampled_from([0.01, 0.5, 5.0]),
     seed=seeds,
 )
 def test_flow_is_within_a_nanonewton(
-    part: float, stress_n: float, swing_n: float, seed: int
+    part: float, stress_n: float, power: float, swing_n: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     apparent_n = with_holes(rng, 3.0 + np.cumsum(rng.normal(0, swing_n, 40)))
     t_ns = wild_instants(rng, 40)
-    model = Flow(np.array([part]), np.array([stress_n]))
+    model = Flow(np.array([part]), np.array([stress_n]), np.array([power]))
     state, out = model.at_rest(), []
     for rows in in_two_parts(40):
         force_n, state = model.compensated(apparent_n[rows, None], t_ns[rows, None], state)
         out.append(force_n)
-    expected = equations.flow(equations.exact(apparent_n), t_ns.tolist(), mpf(part), mpf(stress_n))
+    expected = equations.flow(
+        equations.exact(apparent_n), t_ns.tolist(), mpf(part), mpf(stress_n), mpf(power)
+    )
     assert equations.apart(np.concatenate(out), expected) < GOAL
 
 

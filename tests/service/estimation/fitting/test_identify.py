@@ -34,7 +34,7 @@ FULL_N, SCALE_KPA, BASE_KPA = 30.0, 16.0, 100.3
 CURVE = np.array([22.0, 5.0, 5.0])
 GAMMA, TAU_S = 1.28, 0.011
 PART, CREEP_S, LOOP = (0.05, 0.04), (0.08, 1.2), (0.03, 0.04, 0.05)
-FLOW_PART, FLOW_N = 0.07, 0.35
+FLOW_PART, FLOW_N, FLOW_POWER = 0.07, 0.35, 5.0
 NOISE_KPA = 0.165
 
 
@@ -64,7 +64,7 @@ def pressed_by_model(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
     kpa = pressed(
         t_s, force_n, CURVE, SCALE_KPA, BASE_KPA, GAMMA, TAU_S, WALL_PER_KPA, part, creep_s, loop,
-        WIDTHS_N, 0.0, 0.0,
+        WIDTHS_N, 0.0, 1.0, 4.0,
     )  # fmt: skip
     return np.asarray(kpa[:, 0])
 
@@ -74,7 +74,7 @@ def flowing(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     part, creep_s, loop = (np.array(values) for values in (PART, CREEP_S, LOOP))
     model = DomeModel(
         CURVE, SCALE_KPA, BASE_KPA, WALL_PER_KPA, GAMMA, TAU_S, part, creep_s, loop, FLOW_PART,
-        FLOW_N,
+        FLOW_N, FLOW_POWER,
     )  # fmt: skip
     return np.asarray(model.pressed(t_s, force_n)[:, 0])
 
@@ -179,6 +179,8 @@ def test_a_branch_that_flows_is_found_beside_plays_and_creep_and_only_where_ther
     for parameter, true in ((loop.flow.part, FLOW_PART), (loop.flow.stress_n, FLOW_N)):
         assert abs(parameter.value - true) < 3.0 * parameter.sigma
         assert parameter.sigma < 0.2 * true
+    assert abs(loop.flow.power.value - FLOW_POWER) < 3.0 * loop.flow.power.sigma
+    assert loop.flow.power.sigma < 0.9  # what is known beforehand is 1
 
 
 def test_taps_and_releases_tell_the_gas_to_a_few_percent(known: list[Effects]) -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from service.estimation.fitting.model import pressed
 from service.estimation.models import gas
-from service.estimation.models.flow import Flow, flow_per_s
+from service.estimation.models.flow import Flow
 from service.estimation.models.hysteresis import WIDTHS_N, Hysteresis
 from service.estimation.models.rubber import Rubber
 
@@ -25,7 +25,7 @@ def modelled(
     gamma: float = 1.0,
     part: tuple[float, ...] = (),
     loop: tuple[float, ...] = (),
-    flow: tuple[float, float] = (0.0, 0.0),
+    flow: tuple[float, float, float] = (0.0, 1.0, 4.0),
 ) -> np.ndarray:
     return np.asarray(
         pressed(
@@ -66,9 +66,9 @@ def strides(seed: int, n: int = 120) -> tuple[np.ndarray, np.ndarray]:
 @given(seed=st.integers(0, 1000))
 def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
     t_ns, force_n = strides(seed)
-    part, flow_n = 0.08, 0.3
-    out = modelled(t_ns, force_n, part=PART, loop=LOOP, flow=(part, flow_per_s(part, flow_n)))
-    flow, loop = Flow(np.array([part]), np.array([flow_n])), Hysteresis(np.array([LOOP]))
+    law = (0.08, 0.3, 4.7)
+    out = modelled(t_ns, force_n, part=PART, loop=LOOP, flow=law)
+    flow, loop = Flow(*(np.array([x]) for x in law)), Hysteresis(np.array([LOOP]))
     sprung, _ = flow.compensated(apparent_n(out[:, :1]), t_ns[:, None], flow.at_rest())
     unlooped, _ = loop.compensated(sprung, loop.at_rest())
     rubber = Rubber(np.array([PART]), np.array([CREEP_S]))
@@ -108,6 +108,6 @@ def test_a_trial_curve_that_turns_over_still_has_pressures() -> None:
     out = pressed(
         np.linspace(0, 0.098, 50), np.linspace(0, 60, 50), np.array([20.0, -40.0, 5.0]), SCALE_KPA,
         BASE_KPA, 1.3, 0.011, WALL, np.array(PART), np.array(CREEP_S), np.array(LOOP), WIDTHS_N,
-        0.08, 99.0,
+        0.08, 0.3, 4.0,
     )  # fmt: skip
     assert np.isfinite(out).all()

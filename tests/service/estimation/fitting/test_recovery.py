@@ -34,7 +34,7 @@ def slowly_crept(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     part, creep_s, loop = np.array([0.1]), np.array([3.0]), np.array(LOOP)
     kpa = pressed(
         t_s, force_n, CURVE, SCALE_KPA, BASE_KPA, GAMMA, TAU_S, WALL_PER_KPA, part, creep_s, loop,
-        WIDTHS_N, 0.0, 0.0,
+        WIDTHS_N, 0.0, 1.0, 4.0,
     )  # fmt: skip
     return np.asarray(kpa[:, 0])
 

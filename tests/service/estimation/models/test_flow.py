@@ -19,21 +19,27 @@ STEP_S = 0.002
 
 
 def compensated(
-    apparent_n: Any, t_s: Any, *, part: float = PART, stress_n: float = STRESS_N, **more: Any
+    apparent_n: Any,
+    t_s: Any,
+    *,
+    part: float = PART,
+    stress_n: float = STRESS_N,
+    power: float = 4.0,
+    **more: Any,
 ) -> np.ndarray:
-    model = Flow(np.array([part]), np.array([stress_n]))
+    model = Flow(np.array([part]), np.array([stress_n]), np.array([power]))
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
     column = np.asarray(apparent_n, dtype=float)[:, None]
     out, _ = model.compensated(column, t_ns[:, None], model.at_rest(), **more)
     return out[:, 0]
 
 
-def borne_by_branch(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
+def borne_by_branch(t_s: np.ndarray, force_n: np.ndarray, power: float) -> np.ndarray:
     """The branch's stress under a force linear between instants, by a solver of stiff equations."""
 
     def change(slope: float) -> Any:
         flow = PART * STROKE_N_PER_S
-        return lambda _, s: PART * slope - flow * np.sign(s) * (np.abs(s) / STRESS_N) ** 4
+        return lambda _, s: PART * slope - flow * np.sign(s) * (np.abs(s) / STRESS_N) ** power
 
     s, out = 0.0, [0.0]
     for i in range(1, len(t_s)):
@@ -45,14 +51,15 @@ def borne_by_branch(t_s: np.ndarray, force_n: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def test_a_walk_comes_back_from_what_the_bubble_gets_of_it() -> None:
+@pytest.mark.parametrize("power", [2.5, 4.0, 6.0])
+def test_a_walk_comes_back_from_what_the_bubble_gets_of_it(power: float) -> None:
     t_s = np.arange(0.0, 1.2, STEP_S)
     turns_s, turns_n = [0.0, 0.05, 0.09, 0.4, 0.45, 0.7, 1.2], [0.0, 0.0, 24.0, 18.0, 0.0, 0.0, 9.0]
     force_n = np.interp(t_s, turns_s, turns_n)
-    apparent_n = force_n - borne_by_branch(t_s, force_n)
-    assert np.abs(apparent_n - force_n).max() > 0.8
+    apparent_n = force_n - borne_by_branch(t_s, force_n, power)
+    assert np.abs(apparent_n - force_n).max() > 0.5
     # Two halves of a step stand for what happens within it: of fast ones a hundredth is left.
-    assert np.abs(compensated(apparent_n, t_s) - force_n).max() < 0.02
+    assert np.abs(compensated(apparent_n, t_s, power=power) - force_n).max() < 0.02
 
 
 def test_in_a_long_slow_stroke_the_branch_bears_its_stress() -> None:
@@ -80,20 +87,23 @@ def test_of_a_force_that_comes_at_once_the_branch_bears_its_part_and_then_lets_g
     steps_s=st.lists(st.sampled_from([0.0, 1e-9, 0.002, 0.1, 60.0]), min_size=40, max_size=40),
     part=st.sampled_from([0.0, 1e-9, 0.08, PART_MOST]),
     stress_n=st.sampled_from([0.02, 0.3, 2.0]),
+    power=st.sampled_from([2.0, 4.0, 6.5]),
 )
 def test_forces_come_back_from_what_is_felt_of_them_after_any_steps(
-    force_n: list[float], steps_s: list[float], part: float, stress_n: float
+    force_n: list[float], steps_s: list[float], part: float, stress_n: float, power: float
 ) -> None:
     t_s = np.cumsum(steps_s)[: len(force_n)]
-    k, s, before, apparent = part * STROKE_N_PER_S / stress_n**4, 0.0, 0.0, []
+    k, s, before, apparent = part * STROKE_N_PER_S / stress_n**power, 0.0, 0.0, []
+    more = power - 1
     for i, force in enumerate(force_n):
         step_s = np.rint(1e9 * (t_s[i] - t_s[i - 1])) * 1e-9 if i else 0.0
         s += part * (force - before) / 2
-        s = math.copysign((abs(s) ** -3 + 3 * k * step_s) ** (-1 / 3), s) if abs(s) > 1e-90 else s
+        if abs(s) > 1e-40:
+            s = math.copysign((abs(s) ** -more + more * k * step_s) ** (-1 / more), s)
         s += part * (force - before) / 2
         before = force
         apparent.append(force - s)
-    out = compensated(apparent, t_s, part=part, stress_n=stress_n)
+    out = compensated(apparent, t_s, part=part, stress_n=stress_n, power=power)
     assert out == pytest.approx(force_n, abs=1e-6)
 
 
