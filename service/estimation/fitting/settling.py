@@ -77,6 +77,7 @@ def _crept(t_s: Floats, recording: Indentation, at_s: Floats) -> Floats:
     zero_n = float(recording.reference_n[before].mean()) if before.any() else 0.0
     # A reading stands for the time to the one before it; none for a time in which nothing is read.
     step_s = np.diff(t_s, prepend=t_s[0])
+    step_s[step_s > _BLOCK_S] = 0.0
     impulse = (step_s * (np.where(pressed, recording.reference_n, zero_n) - zero_n))[pressed]
     pressed_s = t_s[pressed]
     left = np.zeros((len(at_s), len(_CREEP_S)))
