@@ -30,6 +30,8 @@ def averaged(
     noise_n, sampled_ns, t_ns = apparent.noise_n, apparent.sampled_ns, apparent.t_mono_ns
     asked_ns = np.broadcast_to(t_ns[:, None], sampled_ns.shape) if plan.ladder.skew else sampled_ns
     tiles = usable_n.shape[1]
+    # Without look-ahead the next frame is not there, and may be of the same instant.
+    look_ns = plan.look_ns if plan.waits else -1
 
     def averages(
         forces_n: Floats,
@@ -47,7 +49,7 @@ def averaged(
             np.ascontiguousarray(apparent.run),
             first,
             stop,
-            plan.look_ns,
+            look_ns,
             denoise.PAST_NS,
             denoise.REACHES,
             denoise.AGREE,
@@ -57,7 +59,11 @@ def averaged(
 
     within = denoise.anywhere(stop - first, len(t_ns))
     if tiles > 1:
-        mean_ns = [each.sum(axis=1, keepdims=True) // tiles for each in (sampled_ns, asked_ns)]
+        # Of offsets: so many instants may add up to more than there are bits.
+        mean_ns = [
+            t_ns[:, None] + (each - t_ns[:, None]).sum(axis=1, keepdims=True) // tiles
+            for each in (sampled_ns, asked_ns)
+        ]
         *_, within = averages(
             summed(usable_n)[:, None],
             np.sqrt(summed(noise_n**2))[:, None],

@@ -7,10 +7,10 @@ model that needs it is not offered for that tile, and `refused` says why.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from devices.arrays import Floats
 from devices.facts import Facts, Text
@@ -136,6 +136,14 @@ class HysteresisEffect(CalibrationPart):
     def _can_be_undone(self) -> Self:
         _leave_something("parts of the plays", self.part)
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_a_branch_as_before(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A branch that is not there is not written: the ids of older calibrations stay theirs."""
+        content: dict[str, Any] = written(self)
+        if self.flow is None:
+            content.pop("flow", None)
+        return content
 
 
 class TemperatureEffect(CalibrationPart):

@@ -285,7 +285,7 @@ def _systematic_n(residual_n: Floats, force_n: Floats, fast: Bools) -> float:
 
     Means over `_BINS` parts of the range of force, on the way in and on the way out.
     """
-    slow = ~fast
+    slow = fast if fast.all() else ~fast  # strokes that went on into taps are all there is
     rising = np.gradient(force_n) > 0.0
     full_n = force_n[slow].max()
     squares = []

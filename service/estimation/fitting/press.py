@@ -60,7 +60,9 @@ def presses(recording: Indentation, zero: Unloaded) -> Presses:
     unexplained_kpa = kpa - _kpa_per_n(kpa, force_n) * force_n
     kpa = np.where(spikes(unexplained_kpa[:, None], np.array([zero.noise_kpa]))[:, 0], np.nan, kpa)
     active = phase != "rest"
-    begins = active & ~np.concatenate([[False], active[:-1]])
+    before = np.concatenate([["rest"], phase[:-1]])
+    # After a stroke back the next loading may come without a rest.
+    begins = active & ((before == "rest") | ((phase == "load") & (before == "unload")))
     loading = np.maximum(np.cumsum(begins) - 1, 0)
     fast = np.isin(phase, ("hold", "release", "tap"))
     # What follows a fast loading, and the load that precedes a hold, belong to it.
@@ -71,9 +73,9 @@ def presses(recording: Indentation, zero: Unloaded) -> Presses:
     run = np.cumsum(np.concatenate([[0], np.diff(fast.astype(np.int8)) != 0]))
     index = np.arange(len(t_s))
     first = np.searchsorted(run, run)
-    _, block = np.unique(
-        np.where(fast, index, first + (index - first) // BLOCK * BLOCK), return_inverse=True
-    )
+    number = np.where(fast, index, first + (index - first) // BLOCK * BLOCK)
+    # Of one instant there is one point.
+    _, block = np.unique(number[np.searchsorted(t_s, t_s)], return_inverse=True)
     size = np.bincount(block)
     good = np.isfinite(kpa)
     counted = np.bincount(block, good)

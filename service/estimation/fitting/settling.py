@@ -77,12 +77,12 @@ def _crept(t_s: Floats, recording: Indentation, at_s: Floats) -> Floats:
     zero_n = float(recording.reference_n[before].mean()) if before.any() else 0.0
     # A reading stands for the time to the one before it; none for a time in which nothing is read.
     step_s = np.diff(t_s, prepend=t_s[0])
+    step_s[step_s > _BLOCK_S] = 0.0
     impulse = (step_s * (np.where(pressed, recording.reference_n, zero_n) - zero_n))[pressed]
-    ago_s = at_s[:, None] - t_s[pressed]
-    return np.stack(
-        [
-            np.where(ago_s > 0.0, np.exp(-np.maximum(ago_s, 0.0) / tau_s), 0.0) @ impulse / tau_s
-            for tau_s in _CREEP_S
-        ],
-        axis=1,
-    )
+    pressed_s = t_s[pressed]
+    left = np.zeros((len(at_s), len(_CREEP_S)))
+    for row, now_s in zip(left, at_s.tolist(), strict=True):  # of all at once, too much for memory
+        stop = int(np.searchsorted(pressed_s, now_s))
+        ago_s = now_s - pressed_s[:stop]
+        row[:] = np.exp(-ago_s / _CREEP_S[:, None]) @ impulse[:stop] / _CREEP_S
+    return left

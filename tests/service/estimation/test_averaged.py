@@ -21,6 +21,7 @@ def plan(tiles: int) -> Any:
     return SimpleNamespace(
         ladder=SimpleNamespace(skew=True),
         look_ns=100_000_000,
+        waits=True,
         noise_left=np.ones((tiles, AVERAGED_MAX + 1)),
     )
 

@@ -43,6 +43,16 @@ def test_long_batches_give_the_bits_of_short_ones() -> None:
     assert_same_bits(estimate(plan, frames), estimate(plan, *pieces))
 
 
+@pytest.mark.parametrize("lag_ms", [0.0, 20.0])
+def test_frames_of_the_same_instant_give_the_same_bits_in_any_batch(lag_ms: float) -> None:
+    plan = newton_plan(array_at(SQUARE), models=("static", "denoise"), lag_ms=lag_ms)
+    forces_n = np.random.default_rng(1).normal(9.0, 1.0, (60, 4))
+    t_ns = 2_000_000 * (np.arange(60, dtype=np.int64) // 2)
+    frames = loaded_frames(forces_n, t_mono_ns=t_ns, t_ns=t_ns)
+    one_by_one = estimate(plan, *(frames.rows(i, i + 1) for i in range(60)))
+    assert_same_bits(estimate(plan, frames), one_by_one)
+
+
 @pytest.mark.parametrize("first", [2**53 - 3, 2**63 - 3, 2**63, 2**64 - 10])
 def test_numbers_of_frames_may_be_as_great_as_their_type_holds(first: int) -> None:
     plan = newton_plan(array_at(SQUARE))

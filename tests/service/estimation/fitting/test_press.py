@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from service.estimation.fitting.indentation import Indentation, Unloaded
@@ -47,3 +49,29 @@ def test_joined_recordings_keep_their_loadings_apart_and_far_apart() -> None:
     assert np.diff(both.t_s).max() >= 600.0
     assert both.loading[len(one.t_s)] == one.loadings
     np.testing.assert_array_equal(both.kpa, np.concatenate([one.kpa, other.kpa]))
+
+
+def test_strokes_that_follow_one_another_without_a_rest_are_loadings_of_their_own() -> None:
+    phase = np.repeat(["rest", "load", "unload", "load", "unload", "load", "hold"], 20)
+    bench = taps(1)
+    no_rests = replace(
+        bench,
+        t_ns=np.arange(len(phase), dtype=np.int64) * 3_000_000,
+        kpa=np.full(len(phase), 100.0),
+        reference_n=np.zeros(len(phase)),
+        phase=phase,
+        under_spindle=np.ones(len(phase), dtype=bool),
+        tadc=np.full(len(phase), 500.0),
+    )
+    points = presses(no_rests, ZERO)
+    assert points.loadings == 3
+    assert points.fast[points.loading == 2].all()
+    assert not points.fast[points.loading < 2].any()
+
+
+def test_readings_of_the_same_instant_are_one_point() -> None:
+    bench = taps()
+    coarse = presses(replace(bench, t_ns=bench.t_ns // 12_000_000 * 12_000_000), ZERO)
+    assert (np.diff(coarse.t_s) > 0.0).all()
+    assert coarse.force_n.max() > 5.0
+    assert coarse.loadings == 3

@@ -128,3 +128,17 @@ def test_what_comes_with_a_change_of_temperature_does_not_count_as_what_the_load
     assert baseline_drift_kpa([warmed]) < 0.8
     with pytest.raises(CalibrationError, match=r"creep would leave"):
         baseline_drift_kpa([recording])
+
+
+def test_a_pause_of_the_recording_under_load_is_no_load_that_explains_a_drift() -> None:
+    end = len(_forces())
+    at = end - round(STROKE_S / 4 / STEP_S)  # in the last way back
+    t_s = STEP_S * np.arange(len(everything_n()))
+    drift_kpa = np.where(np.arange(len(t_s)) >= at, 3.0 * np.exp(-(t_s - t_s[at]) / 10.0), 0.0)
+    whole = bench(drift_kpa)
+    later_ns = np.where(np.arange(len(t_s)) >= at, 60_000_000_000, 0)
+    broken = settling(replace(whole, t_ns=whole.t_ns + later_ns))
+    unbroken = settling(whole)
+    assert broken is not None
+    assert unbroken is not None
+    assert np.ptp(broken.left_kpa) > 0.8 * np.ptp(unbroken.left_kpa)
