@@ -36,7 +36,8 @@ log = logging.getLogger("foottile.doors")
 
 OUTLET = "foottile.outlet"
 """Of a websocket's scope, among the extensions: the connection, as an `Outlet` to write to."""
-_SAID_ON_LIVE_BYTES_MAX = 4096
+SAID_ON_LIVE_BYTES_MAX = 4096
+"""Of a message to a server by others than nodes."""
 _UNREAD_BYTES_MAX = 1 << 20
 """What may wait for one who goes on asking and does not read."""
 _STARVED = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
@@ -225,7 +226,7 @@ class WebSocket(WebSocketsSansIOProtocol):
         doors = self.config.doors
         self._is_node = event.path.partition("?")[0] == INGEST_PATH
         if not self._is_node:
-            self.conn.max_message_size = _SAID_ON_LIVE_BYTES_MAX
+            self.conn.max_message_size = SAID_ON_LIVE_BYTES_MAX
         if doors.nodes_are_full if self._is_node else not doors.admit(self.transport):
             self.app = refuse
         super().handle_connect(event)

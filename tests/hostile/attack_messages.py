@@ -17,6 +17,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from devices.frames import ArrayInfo
+from service.api.protocols import SAID_ON_LIVE_BYTES_MAX
 from service.link import (
     INGEST_PATH,
     LIVE_PATH,
@@ -124,6 +125,7 @@ class _Foreign(ABC):
     """A connection that is used until it is hung up on."""
 
     path = ""
+    most_bytes = MESSAGE_BYTES_MAX
 
     def __init__(self, served: Served, random: Random) -> None:
         self._url = served.url.replace("http", "ws")
@@ -143,7 +145,7 @@ class _Foreign(ABC):
                     await self.answered()
                 except ConnectionClosed as closed:
                     code = closed.rcvd.code if closed.rcvd is not None else 1006
-                    if code == 1006 and said is not None and len(said) > MESSAGE_BYTES_MAX:
+                    if code == 1006 and said is not None and len(said) > self.most_bytes:
                         code = 1009  # it did not wait until all of it was sent
                     if code in _CODES:
                         return f"let go with {code}"
@@ -274,6 +276,7 @@ class _Viewer(_Foreign):
     """A screen that says more than `ping`."""
 
     path = LIVE_PATH
+    most_bytes = SAID_ON_LIVE_BYTES_MAX
 
     async def opened(self) -> ClientConnection:
         odd = ("", "", "", "?rate_hz=nan", "?rate_hz=1e999", "?node=%00", "?format=x", "?a=%ff%fe")
