@@ -100,7 +100,7 @@ PART_MOST = 0.4
 POWERS = (1.5, 10.0)
 """Of the flow: from nearly an exponential to nearly a play."""
 STRESS_LEAST_N = 0.01
-"""What bears less is not seen, and its fourth power is still a number."""
+"""What bears less is not seen."""
 
 
 class FlowEffect(CalibrationPart):
