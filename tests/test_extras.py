@@ -19,6 +19,7 @@ import pytest
 from storage.sessions.folder import FRAMES_NAME, SessionFolder
 from tests.service.cli.outcome import static_only
 from tests.service.process import Process
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCKER = """
@@ -47,7 +48,7 @@ def foottile(*words: object, **environment: str) -> subprocess.CompletedProcess[
         env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
 
 

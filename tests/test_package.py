@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.waiting import PATIENCE_S
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_a_wheel_holds_the_scenes_and_the_packages_and_no_tests(tmp_path: Path) -> None:
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
-    subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=PATIENCE_S)
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
     scenes = sorted((ROOT / "devices" / "scene" / "builtin").glob("*.toml"))
@@ -30,7 +32,7 @@ def test_a_wheel_holds_the_scenes_and_the_packages_and_no_tests(tmp_path: Path) 
 
 def test_an_installed_wheel_and_a_checkout_both_find_the_page(tmp_path: Path) -> None:
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
-    subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=60)
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True, timeout=PATIENCE_S)
     (wheel,) = tmp_path.glob("*.whl")
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
     code = "import service.api.app; print(service.api.app.page_folder())"
@@ -58,5 +60,7 @@ HEAVY = ("fastapi", "starlette", "uvicorn", "httpx", "numba", "scipy", "matplotl
 )
 def test_what_needs_no_heavy_library_loads_none(imports: str, absent: tuple[str, ...]) -> None:
     code = f"import sys, {imports}; print([m for m in {absent!r} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, timeout=PATIENCE_S
+    )
     assert done.stdout.decode().strip() == "[]"

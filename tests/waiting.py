@@ -13,6 +13,10 @@ import pytest
 P = ParamSpec("P")
 T = TypeVar("T")
 
+PATIENCE_S = 60.0
+"""How long to wait for what has to happen in the end, on however slow a machine: no test's claim.
+Who claims a time measures it."""
+
 
 def in_a_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
     """A test that is a coroutine, run in an event loop of its own."""
@@ -24,7 +28,7 @@ def in_a_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]
     return run
 
 
-def until(condition: Callable[[], T], timeout_s: float = 8.0) -> T:
+def until(condition: Callable[[], T], timeout_s: float = PATIENCE_S) -> T:
     """What `condition` gives, as soon as that is true."""
     end_s = time.monotonic() + timeout_s
     while not (found := condition()):

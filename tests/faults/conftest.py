@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.faults.power import Disk
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 
@@ -43,7 +44,7 @@ def run_on() -> Run:
             env={**os.environ, **disk.environment(), **environment},
             capture_output=True,
             text=True,
-            timeout=60.0,
+            timeout=PATIENCE_S,
         )
         assert not ended.stderr, ended.stderr
         return Ended(ended.returncode, ended.stdout)

@@ -19,6 +19,7 @@ from tests.faults.clock_step import WallClock
 from tests.faults.disk import SlowSync
 from tests.faults.power import Disk
 from tests.faults.product import NODE, REPOSITORY, clean_environment, command, product
+from tests.waiting import PATIENCE_S
 
 T = TypeVar("T")
 
@@ -133,7 +134,7 @@ class Machine:
         group = self._process.pid
         wait_for(f"the children of the {self.name} end with it", lambda: not _group(group), 10.0)
 
-    def terminate(self, timeout_s: float = 15.0) -> int:
+    def terminate(self, timeout_s: float = PATIENCE_S) -> int:
         """End it gently; its exit code.
 
         Raises:
@@ -159,14 +160,14 @@ class ServerMachine(Machine):
         super().__init__("server", folder, small)
         self.port = free_port()
         self._http = httpx.Client(
-            base_url=f"http://127.0.0.1:{self.port}/api/v1", timeout=15.0, trust_env=False
+            base_url=f"http://127.0.0.1:{self.port}/api/v1", timeout=PATIENCE_S, trust_env=False
         )
 
     def start(self, kill_at: str = "") -> None:
         """Start it, to be killed at a call if one is given."""
         self.run("serve", "--port", self.port, "--data", self.root, kill_at=kill_at)
 
-    def wait_ready(self, timeout_s: float = 40.0) -> None:
+    def wait_ready(self, timeout_s: float = PATIENCE_S) -> None:
         """Until it answers.
 
         Raises:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from tests.waiting import PATIENCE_S
+
 REPOSITORY = Path(__file__).parents[2]
 NODE = "foot"
 """What the node is called."""
@@ -73,7 +75,7 @@ def run_command(*arguments: object, **environment: str) -> subprocess.CompletedP
         env={**clean_environment(), **environment},
         capture_output=True,
         text=True,
-        timeout=60.0,
+        timeout=PATIENCE_S,
     )
 
 

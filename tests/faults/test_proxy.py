@@ -11,6 +11,7 @@ from contextlib import suppress
 import pytest
 
 from tests.faults.proxy import Proxy, Quality
+from tests.waiting import PATIENCE_S
 
 
 class Echo:
@@ -78,7 +79,7 @@ def proxy(echo: Echo) -> Iterator[Proxy]:
 
 
 def connect(proxy: Proxy) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", proxy.port), timeout=10.0)
+    return socket.create_connection(("127.0.0.1", proxy.port), timeout=PATIENCE_S)
 
 
 def answer(connection: socket.socket, data: bytes) -> bytes:

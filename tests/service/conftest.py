@@ -29,7 +29,7 @@ def no_threads_left() -> Iterator[None]:
     def left() -> list[threading.Thread]:
         return [thread for thread in threading.enumerate() if thread not in before]
 
-    until(lambda: not left(), 5.0)
+    until(lambda: not left())
 
 
 @pytest.fixture

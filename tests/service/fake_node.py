@@ -42,7 +42,7 @@ from tests.builders.calibrations import make_calibration
 from tests.builders.frames import make_frames
 from tests.service.recording import Recording
 from tests.service.running import Running
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 LONG_AGO_NS = 20_000_000_000
 """A node's frames begin so long before now, so that `now=True` is a leap past what was asked."""
@@ -213,7 +213,7 @@ class FakeNode:
         """Connect and say hello, which may be refused."""
         self.open().send(self.hello(**changes).model_dump_json())
 
-    def receive(self, kind: str, timeout_s: float = 8.0) -> Any:
+    def receive(self, kind: str, timeout_s: float = PATIENCE_S) -> Any:
         """The next message of a kind; acknowledgements on the way are noted."""
         end_s = time.monotonic() + timeout_s
         while True:

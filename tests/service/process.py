@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 Start = Callable[..., "Process"]
 
@@ -55,7 +55,7 @@ class Process:
     def pid(self) -> int:
         return self.process.pid
 
-    def said(self, text: str, timeout_s: float = 20.0) -> str:
+    def said(self, text: str, timeout_s: float = PATIENCE_S) -> str:
         """The first line of either stream with this text."""
 
         def found() -> str | None:

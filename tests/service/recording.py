@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from devices.frames import FrameBatch
 from storage.sessions.file import SessionReader
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from tests.service.running import Running
@@ -51,7 +51,7 @@ class Recording:
     def stop(self) -> dict[str, Any]:
         return self._answered(self.running.http.post(f"{self.url}/stop"))
 
-    def sealed(self, timeout_s: float = 8.0) -> dict[str, Any]:
+    def sealed(self, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
         """The session once it is sealed."""
         until(lambda: self.now()["state"] == "sealed", timeout_s)
         return self.now()

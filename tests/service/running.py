@@ -24,6 +24,7 @@ from service.link import SUBPROTOCOL
 from service.server.server import Server
 from storage.journal.journal import Journal
 from tests.service.recording import Recording
+from tests.waiting import PATIENCE_S
 
 T = TypeVar("T")
 
@@ -75,7 +76,7 @@ class Running:
             self._thread.join()
             self._thread = None
             raise self._problem
-        self.http = httpx.Client(base_url=self.url + "/api/v1", timeout=10.0, trust_env=False)
+        self.http = httpx.Client(base_url=self.url + "/api/v1", timeout=PATIENCE_S, trust_env=False)
 
     def stop(self) -> None:
         if self._thread is None:
@@ -195,7 +196,7 @@ async def _left_over() -> list[str]:
         await asyncio.sleep(0.01)
 
 
-def closed(socket: Any, timeout_s: float = 5.0) -> tuple[int, str]:
+def closed(socket: Any, timeout_s: float = PATIENCE_S) -> tuple[int, str]:
     """Code and reason with which the server closes a websocket."""
     try:
         while True:

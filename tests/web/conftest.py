@@ -14,11 +14,12 @@ from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 import service.api.routes.sessions
 import service.server
 import service.server.recorder
+from tests.waiting import PATIENCE_S
 from tests.web.scripted import Scripted
 
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
@@ -37,8 +38,10 @@ CHROMIUM_OPTIONS = [
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 ]
 
+expect.set_options(timeout=1e3 * PATIENCE_S)
 
-def wait_until(true: Callable[[], bool], what: str, timeout_s: float = 30.0) -> None:
+
+def wait_until(true: Callable[[], bool], what: str, timeout_s: float = PATIENCE_S) -> None:
     end = time.monotonic() + timeout_s
     while time.monotonic() < end:
         if true():
@@ -75,7 +78,7 @@ class Field:
         self.others.append(subprocess.Popen(COMMAND + node, env=self.environment))
 
     def get(self, path: str) -> Any:
-        return httpx.get(f"{self.url}/api/v1{path}", timeout=5, trust_env=False).json()
+        return httpx.get(f"{self.url}/api/v1{path}", timeout=PATIENCE_S, trust_env=False).json()
 
     def is_tared(self) -> bool:
         return any(node["tare"] for node in self.get("/nodes")["items"])

@@ -59,7 +59,7 @@ def test_live_recording_and_marked(
         for name in ("first", "second"):
             scripted.node.record(name=name)
         page = open_page(scripted.url, *size)
-        expect(page.locator(_LIVE)).to_have_count(1, timeout=20_000)
+        expect(page.locator(_LIVE)).to_have_count(1)
         expect(page.locator("#recordings li")).to_have_count(2)
         page.fill("#mark-label", "a stone")
         page.press("#mark-label", "Enter")

@@ -42,7 +42,7 @@ def test_frames_are_counted_once_by_the_ledger_whatever_becomes_of_the_node(
     session = node.record(name="walk")
     with Play(node):
         page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1, timeout=20_000)
+        expect(page.locator(LIVE)).to_have_count(1)
         until(lambda: session.now()["frames"] > 300)
     node.frames(40)  # taken, and not sent before it is killed
     for _ in range(3):
@@ -51,10 +51,10 @@ def test_frames_are_counted_once_by_the_ledger_whatever_becomes_of_the_node(
         node.send(20)
     node.leave()
     total = session.now()["frames"]
-    until(lambda: counted(page, session) == (total,) * 4, 8.0)
+    until(lambda: counted(page, session) == (total,) * 4)
     page.reload()
     expect(page.locator("#recordings li")).to_have_count(1)
-    until(lambda: counted(page, session) == (total,) * 4, 8.0)
+    until(lambda: counted(page, session) == (total,) * 4)
 
 
 def test_a_page_opened_after_the_node_died_tells_one_story(
@@ -73,7 +73,7 @@ def test_a_page_opened_after_the_node_died_tells_one_story(
     assert scripted.running.sessions() == []
     scripted.node.connect()
     with Play(scripted.node):
-        expect(page.locator(LIVE)).to_have_count(1, timeout=20_000)
+        expect(page.locator(LIVE)).to_have_count(1)
         expect(page.locator("#record")).to_be_enabled()
         expect(page.locator("#cannot-record")).to_be_hidden()
 
@@ -83,10 +83,10 @@ def test_a_node_out_of_reach_is_away_on_the_page_within_five_seconds(
 ) -> None:
     with Play(scripted.node):
         page = open_page(scripted.url)
-        expect(page.locator(LIVE)).to_have_count(1, timeout=20_000)
+        expect(page.locator(LIVE)).to_have_count(1)
     # Nothing comes any more, and nobody says goodbye: as when a cable is pulled.
-    expect(page.locator("#frozen")).to_contain_text("silent, though connected", timeout=3000)
-    expect(page.locator("#frozen")).to_contain_text("Node bench is away.", timeout=7000)
+    expect(page.locator("#frozen")).to_contain_text("silent, though connected")
+    expect(page.locator("#frozen")).to_contain_text("Node bench is away.")
 
 
 def test_what_follows_a_labelled_mark_is_a_shortcut_again(
@@ -142,7 +142,7 @@ def test_a_session_whose_end_alone_is_open_says_so_and_completes_when_the_node_i
     expect(row.get_by_role("button", name="Seal without")).to_have_count(0)
     scripted.node.connect()
     scripted.node.send(10, now=True)
-    expect(row.locator(".state")).to_have_text("complete", timeout=15_000)
+    expect(row.locator(".state")).to_have_text("complete")
     assert session.now()["waits_for"] is None
 
 
@@ -155,6 +155,6 @@ def test_a_session_whose_node_never_comes_back_is_sealed_with_what_is_here(
     row.get_by_role("button", name="Seal as it is").click()
     expect(page.locator("#ask-dialog")).to_contain_text("is given up")
     page.get_by_role("button", name="Seal as lossy").click()
-    expect(row.locator(".state")).to_have_text("lossy", timeout=15_000)
+    expect(row.locator(".state")).to_have_text("lossy")
     expect(row).to_contain_text("more may be missing where the node could not tell its end")
     assert session.now()["frames"] == 50

@@ -20,7 +20,7 @@ from tests.builders.frames import with_columns
 from tests.builders.odd_values import with_value
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, closed
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 LIVE = "/api/v1/live"
 
@@ -45,7 +45,7 @@ def assert_goes_on(screen: Any, other: FakeNode) -> None:
     """The screen is shown what the other node sends, and that is acknowledged."""
     other.deliver(40, now=True)
     while True:
-        message = json.loads(screen.recv(timeout=5.0))
+        message = json.loads(screen.recv(timeout=PATIENCE_S))
         if message["type"] == "frame" and message["node"] == "other":
             return
 
@@ -152,7 +152,7 @@ def test_a_node_that_cannot_be_shown_is_left_out_of_the_screens_and_said_once(
     node.connect()
     monkeypatch.setattr(NodeView, "of", failing)
     with caplog.at_level(logging.ERROR), running.socket(LIVE) as live:
-        hello = json.loads(live.recv(timeout=5.0))
+        hello = json.loads(live.recv(timeout=PATIENCE_S))
         assert [shown["node"] for shown in hello["nodes"]] == ["other"]
         node.deliver(30)
         assert_goes_on(live, other)

@@ -20,7 +20,7 @@ from service.api.protocols import accept
 from service.link import INGEST_PATH, LIVE_PATH, Close
 from tests.service.fake_node import NodeOf, Play, Spoken
 from tests.service.running import Running, ServeWith, closed
-from tests.waiting import in_a_loop, until
+from tests.waiting import PATIENCE_S, in_a_loop, until
 
 PLENTY = 10_000
 """Of descriptors."""
@@ -195,7 +195,7 @@ class Greeting(asyncio.Protocol):
 def test_beyond_the_bound_a_screen_is_told_1013_and_a_request_503(strict: Running) -> None:
     with ExitStack() as screens:
         for _ in range(3):
-            screens.enter_context(strict.socket(LIVE_PATH)).recv(timeout=5.0)
+            screens.enter_context(strict.socket(LIVE_PATH)).recv(timeout=PATIENCE_S)
         with strict.socket(LIVE_PATH) as further:
             code, reason = closed(further)
         assert code == Close.TRY_LATER
@@ -214,7 +214,7 @@ def test_a_node_gets_in_when_screens_have_taken_every_place(
 ) -> None:
     with ExitStack() as others:
         for _ in range(3):
-            others.enter_context(strict.socket(LIVE_PATH)).recv(timeout=5.0)
+            others.enter_context(strict.socket(LIVE_PATH)).recv(timeout=PATIENCE_S)
         for _ in range(2 * RESERVE):
             others.enter_context(socket.create_connection(("127.0.0.1", strict.port)))
         node = node_of(strict)
@@ -253,7 +253,7 @@ def test_one_that_was_let_go_and_goes_on_sending_takes_no_nodes_place(
 ) -> None:
     running = serve_with(bounds=Bounds(max_nodes=1))
     word = b"\x81\x81" + bytes(4) + b"x"
-    with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as connection:
+    with socket.create_connection(("127.0.0.1", running.port), timeout=PATIENCE_S) as connection:
         connection.sendall(upgrade(INGEST_PATH) + word)
         said = b""
         while b"\x88" not in said.partition(b"\r\n\r\n")[2]:  # a close frame, never answered
@@ -276,7 +276,7 @@ def upgrade(path: str) -> bytes:
 def first_word(spoken: Spoken) -> int | str:
     """What the first message of the server is, or with which code it closes."""
     try:
-        return str(json.loads(spoken.recv(timeout=5.0))["type"])
+        return str(json.loads(spoken.recv(timeout=PATIENCE_S))["type"])
     except ConnectionClosed as end:
         return int(end.rcvd.code) if end.rcvd is not None else "cut off"
 
@@ -286,13 +286,13 @@ def test_a_websocket_has_no_time_for_headers_to_come(strict: Running, node_of: N
     node.connect()
     with strict.socket(LIVE_PATH) as live, Play(node) as play:
         for _ in range(20):
-            live.recv(timeout=5.0)
+            live.recv(timeout=PATIENCE_S)
     assert play.problem is None
 
 
 def test_one_that_pings_and_does_not_read_is_let_go(serve_with: ServeWith) -> None:
     running = serve_with()
-    with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as connection:
+    with socket.create_connection(("127.0.0.1", running.port), timeout=PATIENCE_S) as connection:
         connection.sendall(upgrade(LIVE_PATH))
         ping = b"\x89\xfd" + bytes(4) + bytes(125)
         with pytest.raises(OSError, match=r"reset|pipe"):

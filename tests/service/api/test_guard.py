@@ -14,6 +14,7 @@ from service.api.serve import token_for
 from service.link import INGEST_PATH
 from tests.service.fake_node import NodeOf
 from tests.service.running import Running, ServeWith
+from tests.waiting import PATIENCE_S
 
 LIVE = "/api/v1/live"
 TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
@@ -197,7 +198,7 @@ def test_reading_and_watching_need_no_token(serve_with: ServeWith) -> None:
     for path in ("/health", "/ready", "/version", "/nodes", "/sessions", "/openapi.json"):
         assert running.http.get(path).status_code == 200, path
     with running.socket(LIVE) as live:
-        assert "hello" in live.recv(timeout=5.0)
+        assert "hello" in live.recv(timeout=PATIENCE_S)
 
 
 @pytest.mark.parametrize(

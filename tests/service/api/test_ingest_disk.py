@@ -26,7 +26,7 @@ from tests.storage.faulty_disk import (
     failing_once,
     refusing,
 )
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 STORAGE_FULL = (StorageError, "No space left on device")
 
@@ -97,7 +97,7 @@ def test_frames_that_a_full_disk_does_not_take_are_asked_for_when_it_does(
         assert "No space left" in running.node()["storage_problem"]
         shown = -1
         while shown < 90:  # all but those that wait for their look-ahead
-            message = json.loads(live.recv(timeout=5.0))
+            message = json.loads(live.recv(timeout=PATIENCE_S))
             shown = message["seq"] if message["type"] == "frame" else shown
         assert message["force_n"] == pytest.approx([20.0, 20.0], abs=0.5)
         node.socket.send('{"type":"probe","id":1}')

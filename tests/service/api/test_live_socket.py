@@ -12,12 +12,12 @@ import pytest
 import service.server.screens.fan_out
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.running import Running, closed
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 LIVE = "/api/v1/live"
 
 
-def next_of(socket: Any, kind: str, timeout_s: float = 5.0) -> dict[str, Any]:
+def next_of(socket: Any, kind: str, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
     end_s = time.monotonic() + timeout_s
     while True:
         message: dict[str, Any] = json.loads(
@@ -37,7 +37,7 @@ def test_hello_comes_first_and_says_who_is_there(running: Running, tared: FakeNo
     session = tared.record()
     with running.socket(LIVE) as live:
         assert live.subprotocol == "foottile.v1"
-        hello = json.loads(live.recv(timeout=5.0))
+        hello = json.loads(live.recv(timeout=PATIENCE_S))
     assert hello["type"] == "hello"
     assert hello["protocol"] == 1
     assert [node["node"] for node in hello["nodes"]] == ["bench"]
@@ -47,7 +47,7 @@ def test_hello_comes_first_and_says_who_is_there(running: Running, tared: FakeNo
 
 def test_a_screen_may_offer_no_subprotocol(running: Running) -> None:
     with running.socket(LIVE, subprotocols=None) as live:
-        assert json.loads(live.recv(timeout=5.0))["type"] == "hello"
+        assert json.loads(live.recv(timeout=PATIENCE_S))["type"] == "hello"
 
 
 def test_a_frame_has_what_the_contract_says(running: Running, tared: FakeNode) -> None:
@@ -199,7 +199,7 @@ def test_only_the_node_that_was_asked_for_is_shown(
     other.connect()
     other.send(20)
     with running.socket(f"{LIVE}?node=bench&rate_hz=60") as live:
-        hello = json.loads(live.recv(timeout=5.0))
+        hello = json.loads(live.recv(timeout=PATIENCE_S))
         assert [node["node"] for node in hello["nodes"]] == ["bench"]
         other.send(20)
         until(lambda: running.node("other")["last_seq"] == 39)
@@ -248,7 +248,7 @@ def test_who_joins_late_sees_the_picture_at_once(running: Running, tared: FakeNo
             next_frame_from(early, 100)
         with running.socket(LIVE) as late:
             begin_s = time.monotonic()
-            hello = json.loads(late.recv(timeout=5.0))
+            hello = json.loads(late.recv(timeout=PATIENCE_S))
             assert hello["nodes"][0]["tare"] is not None
             frame = next_of(late, "frame")
             assert time.monotonic() - begin_s < 0.5
@@ -258,7 +258,7 @@ def test_who_joins_late_sees_the_picture_at_once(running: Running, tared: FakeNo
 
 def test_a_node_that_leaves_and_returns_is_told(running: Running, tared: FakeNode) -> None:
     with running.socket(LIVE) as live:
-        json.loads(live.recv(timeout=5.0))
+        json.loads(live.recv(timeout=PATIENCE_S))
         tared.leave()
         while next_of(live, "node")["node"]["connected"]:
             pass

@@ -18,7 +18,7 @@ from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, assert_refused
 from tests.storage.faulty_disk import failing_once
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 
 def test_a_sealed_session_has_estimates_with_the_tare_in_force(tared: FakeNode) -> None:
@@ -63,7 +63,7 @@ def test_a_tare_without_load_is_in_force_until_it_is_undone(
         with running.socket("/api/v1/live?rate_hz=60") as live:
             tared.send(60, 3.0)
             while True:
-                message = json.loads(live.recv(timeout=5.0))
+                message = json.loads(live.recv(timeout=PATIENCE_S))
                 if message["type"] == "frame" and message["seq"] >= tared.seq - 20:
                     values: list[float] = message["force_n"]
                     return values

@@ -13,13 +13,14 @@ import pytest
 
 from service.api.doors import Bounds
 from tests.service.running import Running, ServeWith
+from tests.waiting import PATIENCE_S
 
 TOKEN = "secret"  # noqa: S105  # of these tests
 
 
 @pytest.fixture
 def raw(strict: Running) -> Iterator[socket.socket]:
-    with socket.create_connection(("127.0.0.1", strict.port), timeout=5.0) as connection:
+    with socket.create_connection(("127.0.0.1", strict.port), timeout=PATIENCE_S) as connection:
         yield connection
 
 
@@ -118,7 +119,7 @@ def test_what_is_neither_request_nor_body_has_an_end(
     serve_with: ServeWith, begun: bytes, piece: bytes, token: str | None
 ) -> None:
     running = serve_with(bounds=Bounds(max_header_bytes=4096), token=token)
-    with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as raw:
+    with socket.create_connection(("127.0.0.1", running.port), timeout=PATIENCE_S) as raw:
         raw.sendall(begun)
         if token is not None:
             assert raw.recv(65536).startswith((b"HTTP/1.1 401 ", b"HTTP/1.1 200 "))
@@ -128,7 +129,7 @@ def test_what_is_neither_request_nor_body_has_an_end(
 
 def test_a_token_behind_the_body_opens_nothing(serve_with: ServeWith) -> None:
     running = serve_with(token=TOKEN)
-    with socket.create_connection(("127.0.0.1", running.port), timeout=5.0) as raw:
+    with socket.create_connection(("127.0.0.1", running.port), timeout=PATIENCE_S) as raw:
         asked = head("POST /api/v1/sessions", "Connection: close", "Transfer-Encoding: chunked")
         raw.sendall(asked + f"0\r\nAuthorization: Bearer {TOKEN}\r\n\r\n".encode())
         assert problem_of(all_of(raw))[0] == 401

@@ -23,6 +23,7 @@ from storage.journal.stream_notes import StreamNotes
 from storage.wire import EncodedBatch
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
+from tests.waiting import PATIENCE_S
 
 
 class Publishing:
@@ -72,7 +73,7 @@ class Publishing:
             self.stream.put(batch, 0)
         self.publisher.notify()
 
-    async def until(self, condition: Callable[[], object], timeout_s: float = 5.0) -> None:
+    async def until(self, condition: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
         end_s = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < end_s, (self.reports, self.stream.acked)

@@ -31,7 +31,7 @@ def process(running: Running, foottile: Start, tmp_path: Path) -> Process:
     path.write_text(ONE_TILE_FILE)
     started = foottile("node", "--scene", path, "--server", running.url, "--name", "leg")
     started.said("connected to")
-    until(lambda: (running.node("leg")["last_seq"] or 0) > 100, 30.0)
+    until(lambda: (running.node("leg")["last_seq"] or 0) > 100)
     return started
 
 
@@ -50,7 +50,7 @@ def test_acquisition_that_is_held_up_is_said_everywhere_and_goes_on_in_the_same_
     assert held_up["connected"], "the node itself is heard of"
     assert "no frames for" in held_up["troubles"][0]
     assert held_up["rate_hz"] == 0.0
-    until(lambda: running.node("leg")["last_seq"] > held_up["last_seq"] + 100, 30.0)
+    until(lambda: running.node("leg")["last_seq"] > held_up["last_seq"] + 100)
     process.said("no longer: acquisition is held up")
     until(lambda: not running.node("leg")["troubles"])
     after = running.node("leg")
@@ -65,7 +65,7 @@ def test_acquisition_that_is_killed_ends_the_node_with_the_reason(
     assert process.ended(20.0) == 1
     assert any("acquisition process was killed by SIGKILL" in line for line in process.err)
     assert any("Start the node again" in line for line in process.err)
-    until(lambda: not running.node("leg")["connected"], 5.0)
+    until(lambda: not running.node("leg")["connected"])
 
 
 class _Tells:

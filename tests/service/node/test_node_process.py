@@ -56,8 +56,8 @@ def test_an_emulated_node_streams_tares_and_ends_without_loss(
 ) -> None:
     process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
     process.said("connected to")
-    until(lambda: (running.node("demo")["last_seq"] or 0) > 600, 30.0)
-    until(lambda: running.node("demo")["tare"], 30.0)
+    until(lambda: (running.node("demo")["last_seq"] or 0) > 600)
+    until(lambda: running.node("demo")["tare"])
     node = running.node("demo")
     assert node["emulated"] is True
     assert node["tare"]["source"] == "lead"
@@ -86,7 +86,7 @@ def test_a_servo_that_is_silent_from_the_start_is_said_and_the_tiles_stream(
         process = foottile("node", "--scene", scene, "--server", running.url, "--name", "mute")
         process.said("servo 1 at 1000000 baud, protocol 1: no answer within 100 ms")
         process.said("connected to")
-        until(lambda: (running.node("mute")["last_seq"] or 0) > 100, 15.0)
+        until(lambda: (running.node("mute")["last_seq"] or 0) > 100)
         process.process.send_signal(signal.SIGTERM)
         assert process.ended(8.0) == 0, process.err
     finally:
@@ -134,9 +134,9 @@ def test_acquisition_ends_when_its_node_is_killed(
     assert begun
     os.kill(process.pid, signal.SIGKILL)
     # Its pipes stay open as long as a child has them: that they end is what is waited for.
-    until(lambda: not any(is_alive(pid) for pid in begun), 8.0)
+    until(lambda: not any(is_alive(pid) for pid in begun))
     assert process.ended(5.0) == -signal.SIGKILL
-    until(lambda: not running.node("demo")["connected"], 8.0)
+    until(lambda: not running.node("demo")["connected"])
 
 
 def test_a_node_without_a_server_keeps_its_frames(
@@ -148,7 +148,7 @@ def test_a_node_without_a_server_keeps_its_frames(
         *("--journal", tmp_path / "node"),
     )
     assert "trying again" in process.said("not connected to")
-    until(lambda: list((tmp_path / "node").glob("journal/leg/*/*.arrows")), 30.0)
+    until(lambda: list((tmp_path / "node").glob("journal/leg/*/*.arrows")))
     process.process.send_signal(signal.SIGINT)
     assert process.ended(20.0) == 0  # no session needs them
     (folder,) = (tmp_path / "node" / "journal" / "leg").glob("?" * 32)
@@ -173,9 +173,9 @@ def leg(running: Running, foottile: Start, scene: Path, tmp_path: Path) -> Calla
 
 def streaming(running: Running, more: int = 100) -> dict[str, Any]:
     """Wait until the server has seen this many frames of the node's present stream."""
-    until(lambda: running.http.get("/nodes/leg").status_code == 200, 30.0)
-    until(lambda: running.node("leg")["connected"], 30.0)
-    until(lambda: (running.node("leg")["last_seq"] or 0) > more, 30.0)
+    until(lambda: running.http.get("/nodes/leg").status_code == 200)
+    until(lambda: running.node("leg")["connected"])
+    until(lambda: (running.node("leg")["last_seq"] or 0) > more)
     node: dict[str, Any] = running.node("leg")
     return node
 
@@ -186,12 +186,12 @@ def test_a_killed_node_has_lost_nothing_and_its_session_goes_on(
     process = leg()
     before = streaming(running)
     session = running.record("leg", name="killed")
-    until(lambda: running.node("leg")["last_seq"] > before["last_seq"] + 200, 30.0)
+    until(lambda: running.node("leg")["last_seq"] > before["last_seq"] + 200)
     seen = running.node("leg")["last_seq"]
     process.process.kill()
-    until(lambda: not running.node("leg")["connected"], 15.0)
+    until(lambda: not running.node("leg")["connected"])
     again = leg()
-    until(lambda: running.node("leg")["boot_id"] != before["boot_id"], 30.0)
+    until(lambda: running.node("leg")["boot_id"] != before["boot_id"])
     streaming(running)
     session.stop()
     found = session.sealed(40.0)
@@ -208,11 +208,11 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
     before = streaming(running)
     session = running.record("leg", name="damaged")
     own = tmp_path / "node" / "journal" / "leg"
-    until((own / "wanted.json").exists, 10.0)
-    until(lambda: running.node("leg")["last_seq"] > before["last_seq"] + 200, 30.0)
+    until((own / "wanted.json").exists)
+    until(lambda: running.node("leg")["last_seq"] > before["last_seq"] + 200)
     process.process.kill()
     process.ended(5.0)
-    until(lambda: not running.node("leg")["connected"], 15.0)
+    until(lambda: not running.node("leg")["connected"])
     arrived = running.node("leg")["last_seq"]
     stream = own / before["boot_id"]
     left = read_in_flight(stream)
@@ -226,7 +226,7 @@ def test_a_node_whose_own_files_are_damaged_starts_says_so_and_loses_no_more_tha
     again = leg()
     for name in ("wanted.json", "stream.json", "in_flight"):
         again.said(f"{name}.damaged-1", 30.0)
-    until(lambda: running.node("leg")["boot_id"] != before["boot_id"], 30.0)
+    until(lambda: running.node("leg")["boot_id"] != before["boot_id"])
     streaming(running)
     until(lambda: "wanted.json" in " ".join(running.node("leg")["troubles"]))
     session.stop()
@@ -250,7 +250,7 @@ def test_what_a_session_needs_waits_on_the_nodes_disk_until_both_are_back(
     session = running.record("leg", name="apart")
     # A server that is stopped before it has told the node leaves it with frames that nobody wants.
     told = tmp_path / "node" / "journal" / "leg" / "wanted.json"
-    until(lambda: told.exists() and running.node("leg")["boot_id"] in told.read_text(), 20.0)
+    until(lambda: told.exists() and running.node("leg")["boot_id"] in told.read_text())
     running.stop()
     process.said("not connected to")
     process.process.send_signal(signal.SIGINT)
@@ -268,12 +268,12 @@ def test_a_node_alone_leaves_a_complete_session_that_proves_itself(
     leg: Callable[..., Any], foottile: Start, tmp_path: Path
 ) -> None:
     process = leg("--record", "third trial")
-    until(lambda: list((tmp_path / "node").glob("journal/leg/*/*.arrows")), 30.0)
+    until(lambda: list((tmp_path / "node").glob("journal/leg/*/*.arrows")))
     process.process.kill()  # the battery held, the process did not
     process.ended(5.0)
     again = leg("--record", "third trial")
     again.said("goes on")
-    until(lambda: len(list((tmp_path / "node").glob("journal/leg/*/*.arrows"))) > 1, 30.0)
+    until(lambda: len(list((tmp_path / "node").glob("journal/leg/*/*.arrows"))) > 1)
     again.process.send_signal(signal.SIGINT)
     assert again.ended(30.0) == 0, again.err
     assert "is complete" in again.said("session")
@@ -290,7 +290,7 @@ def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old
     scene.write_text(scene.read_text() + swap)
     process = foottile("node", "--scene", scene, "--server", running.url, "--name", "demo")
     process.said("connected to")
-    until(lambda: running.node("demo")["tare"], 40.0)
+    until(lambda: running.node("demo")["tare"])
     session = running.record("demo", name="swap")
     process.said("a new stream begins", 40.0)
     sealed = session.sealed()
@@ -300,7 +300,7 @@ def test_a_part_that_is_swapped_begins_a_new_stream_and_loses_nothing_of_the_old
     tile = first.status[-20:, 1]
     assert (tile & TileStatus.UNUSABLE != 0).all(), "of the other part nothing was believed"
     assert (first.status[:, 0] & TileStatus.UNUSABLE == 0).all()
-    until(lambda: (running.node("demo")["last_seq"] or 0) > 200, 30.0)
+    until(lambda: (running.node("demo")["last_seq"] or 0) > 200)
     second = running.only_session(but=session)
     assert (second["name"], second["state"]) == ("swap (2)", "recording")
     second.stop()

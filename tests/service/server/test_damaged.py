@@ -17,7 +17,7 @@ from service.sessions.tares import TareHistory
 from storage.checked_json import read_checked
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 LOST = int(EstimateStatus.TARE_LOST)
 
@@ -36,10 +36,10 @@ def problems(running: Running) -> str:
 def shown(running: Running, node: FakeNode) -> dict[str, Any]:
     """What a screen gets of the next frames."""
     with running.socket("/api/v1/live?rate_hz=60") as live:
-        assert json.loads(live.recv(timeout=5.0))["type"] == "hello"
+        assert json.loads(live.recv(timeout=PATIENCE_S))["type"] == "hello"
         node.deliver(60, 3.0)
         while True:
-            message: dict[str, Any] = json.loads(live.recv(timeout=5.0))
+            message: dict[str, Any] = json.loads(live.recv(timeout=PATIENCE_S))
             if message["type"] == "frame" and message["seq"] >= node.seq - 20:
                 return message
 
@@ -173,7 +173,7 @@ def test_a_node_whose_hello_is_damaged_is_known_again_when_it_connects(
     assert path.with_name("hello.json.damaged-1").exists() == (damage != "another version")
     assert pending.now()["state"] == "pending"
     with running.socket("/api/v1/live") as live:
-        assert "hello.json" in " ".join(json.loads(live.recv(timeout=5.0))["problems"])
+        assert "hello.json" in " ".join(json.loads(live.recv(timeout=PATIENCE_S))["problems"])
     tared.connect()
     tared.send_again(ends)
     sealed = pending.sealed()
@@ -232,4 +232,4 @@ def test_whatever_a_file_is_called_everybody_can_be_told_of_it(
     assert "not what this node said last" in said
     assert said.isprintable()
     with running.socket("/api/v1/live") as live:
-        assert json.loads(live.recv(timeout=5.0))["problems"]
+        assert json.loads(live.recv(timeout=PATIENCE_S))["problems"]

@@ -21,7 +21,7 @@ from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused, closed
 from tests.storage.faulty_disk import refusing
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 
 def sealed(node: FakeNode) -> Recording:
@@ -201,9 +201,9 @@ def test_screens_are_told_of_a_deletion(running: Running, tared: FakeNode) -> No
 
     session = sealed(tared)
     with running.socket("/api/v1/live") as live:
-        assert json.loads(live.recv(timeout=5.0))["type"] == "hello"
+        assert json.loads(live.recv(timeout=PATIENCE_S))["type"] == "hello"
         running.http.delete(session.url)
-        while (message := json.loads(live.recv(timeout=5.0)))["type"] != "deleted":
+        while (message := json.loads(live.recv(timeout=PATIENCE_S)))["type"] != "deleted":
             pass
     assert message["session_id"] == session.id
 

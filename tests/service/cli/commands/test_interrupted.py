@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.service.cli.outcome import Run
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 SAID = "foottile: interrupted"
 
@@ -60,9 +60,10 @@ def test_ctrl_c_is_said_and_leaves_no_file_and_no_process(
             stderr=said,
         )
     try:
-        until(lambda: process.poll() is not None or has_begun(process, folder), 60.0)
+        until(lambda: process.poll() is not None or has_begun(process, folder))
         process.send_signal(signal.SIGINT)
-        out, _ = process.communicate(timeout=60)  # and those that it started have ended, too
+        # And those that it started have ended, too.
+        out, _ = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     lines = (tmp_path / "said").read_text().splitlines()
