@@ -254,6 +254,11 @@ def array_info(schema: pa.Schema, *, where: str) -> ArrayInfo:
 # --- flat -----------------------------------------------------------------------------------------
 
 
+def flat_of(tiles: int) -> dict[str, Column]:
+    """Of which quantity every flat column is that an array of so many tiles may have."""
+    return {flat: column for column in KNOWN.values() for flat in column.flat_names(tiles)}
+
+
 def flat_columns(
     columns: Sequence[Column], values: Mapping[str, Array]
 ) -> list[tuple[pa.Field[Any], pa.Array[Any]]]:
@@ -262,11 +267,16 @@ def flat_columns(
     for column in columns:
         data = values[column.name]
         parts = data.T if column.per_tile else data[None]
-        may_miss = column.missing is not None or not np.issubdtype(data.dtype, np.integer)
         for name, part in zip(column.flat_names(len(parts)), parts, strict=True):
-            array = _to_arrow(np.ascontiguousarray(part), column)
-            out.append((column.field(name, column.type, nullable=may_miss), array))
+            out.append(flat_column(column, name, part))
     return out
+
+
+def flat_column(column: Column, name: str, values: Array) -> tuple[pa.Field[Any], pa.Array[Any]]:
+    """Field and array of one flat column, n rows; missing values become null."""
+    may_miss = column.missing is not None or not np.issubdtype(values.dtype, np.integer)
+    field = column.field(name, column.type, nullable=may_miss)
+    return field, _to_arrow(np.ascontiguousarray(values), column)
 
 
 def _to_arrow(values: Array, column: Column) -> pa.Array[Any]:
@@ -284,14 +294,22 @@ def from_flat(column: Column, table: pa.Table, tiles: int) -> Array:
         KeyError: the table lacks it.
         ValueError: its type is not the column's.
     """
-    parts = []
-    for name in column.flat_names(tiles):
-        array = table.column(name).combine_chunks()
-        if array.type != column.type:
-            raise ValueError(f"column {name} is {array.type}, not {column.type}")
-        if column.missing is not None:
-            array = array.fill_null(column.missing)
-        elif array.null_count and pa.types.is_integer(array.type):
-            raise ValueError(f"column {name} has {array.null_count} empty values")
-        parts.append(array.to_numpy(zero_copy_only=False))
+    parts = [flat_values(column, name, table) for name in column.flat_names(tiles)]
     return np.stack(parts, axis=1) if column.per_tile else parts[0]
+
+
+def flat_values(column: Column, name: str, table: pa.Table) -> Array:
+    """One flat column as numpy, (n,); nulls are what they are in memory.
+
+    Raises:
+        KeyError: the table lacks it.
+        ValueError: its type is not the column's.
+    """
+    array = table.column(name).combine_chunks()
+    if array.type != column.type:
+        raise ValueError(f"column {name} is {array.type}, not {column.type}")
+    if column.missing is not None:
+        array = array.fill_null(column.missing)
+    elif array.null_count and pa.types.is_integer(array.type):
+        raise ValueError(f"column {name} has {array.null_count} empty values")
+    return array.to_numpy(zero_copy_only=False)

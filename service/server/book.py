@@ -16,7 +16,8 @@ from service.server_clock import utc_ns
 from service.sessions.restore import restore
 from storage.durable import storage_errors
 from storage.sessions.beside import write_events
-from storage.sessions.file import CheckedFiles, SessionReader
+from storage.sessions.checked_files import CheckedFiles
+from storage.sessions.file import SessionReader
 from storage.sessions.folder import DOOMED_PREFIX, FRAMES_NAME, Event, Session, SessionFolder
 
 log = logging.getLogger("foottile.book")
@@ -140,13 +141,18 @@ class SessionBook:
         self._sessions = {session.id: session for session in found}
         self._files = CheckedFiles()
 
-    def frames(self, session_id: str) -> SessionReader:
+    def frames(self, session_id: str, *, only_slices: bool = False) -> SessionReader:
         """The sealed file of a session, opened; from any thread.
+
+        Args:
+            session_id: which.
+            only_slices: as for `SessionReader`.
 
         Raises:
             FileFormatError: there is none, or it is damaged.
         """
-        return self._files.open(self.folder.path(session_id) / FRAMES_NAME)
+        path = self.folder.path(session_id) / FRAMES_NAME
+        return self._files.open(path, only_slices=only_slices)
 
     def __iter__(self) -> Iterator[Session]:
         return iter(list(self._sessions.values()))

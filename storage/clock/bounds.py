@@ -35,6 +35,8 @@ FAST = 500e-6
 
 _READING_NS = 1.0
 """Both clocks are read in whole ns."""
+_ROUNDING_NS = 4
+"""Bounds and their middle are whole ns."""
 _FIRST_LOOK_ROWS = 64
 """Rows looked at first, then twice as many: a clock that often steps costs no quadratic time."""
 _STEADY_ROWS_MIN = 4
@@ -212,6 +214,27 @@ class ClockMap:
                 high[torn] = np.maximum(high[torn], later_high)
         offset = (low >> 1) + (high >> 1) + (low & high & 1)  # the sum might not fit
         return offset, np.maximum(high - offset, offset - low)
+
+    def reach(self, begins_ns: Int64, ends_ns: Int64) -> tuple[Int64, Int64, npt.NDArray[np.bool_]]:
+        """Bounds of the offset at all instants from one to another, n times.
+
+        Args:
+            begins_ns: int64[n], `t_mono_ns`, absolute values below `T_MONO_NS_END`.
+            ends_ns: int64[n], the same, not before them.
+
+        Returns:
+            Least and greatest offset, int64[n], and whether they are sure, bool[n]: a step that may
+            lie between the two instants has no bound.
+        """
+        sure = np.ones(len(begins_ns), dtype=np.bool_)
+        if len(self.stretches) > 1:
+            for begun_ns, ended_ns in zip(self._begins_ns, self._ends_ns, strict=True):
+                sure &= (ends_ns < begun_ns) | (begins_ns >= begun_ns)
+                sure &= (ends_ns <= ended_ns) | (begins_ns > ended_ns)
+        one, other = self.at(begins_ns)[0], self.at(ends_ns)[0]
+        # Within a stretch an offset has no jumps, and no clock gains faster than that.
+        slack_ns = np.ceil(FAST * (ends_ns - begins_ns)).astype(np.int64) + _ROUNDING_NS
+        return np.minimum(one, other) - slack_ns, np.maximum(one, other) + slack_ns, sure
 
 
 def _intervals(rows: Rows) -> tuple[Float64, Float64]:

@@ -97,6 +97,28 @@ class ClockTable:
             uncertainty_ns[here[fits]] = bound[fits]
         return {"t_server_ns": t_server_ns, "t_server_uncertainty_ns": uncertainty_ns}
 
+    def reach(
+        self, begins_ns: Int64, ends_ns: Int64, part: int
+    ) -> tuple[Int64, Int64, npt.NDArray[np.bool_]] | None:
+        """Bounds of `t_server_ns - t_ns` of all frames of a part between two instants, n times.
+
+        Args:
+            begins_ns: int64[n], `t_mono_ns`.
+            ends_ns: int64[n], not before them.
+            part: its number.
+
+        Returns:
+            As of `ClockMap.reach`; None: this part's clock was never compared.
+        """
+        clock = self._maps.get(self._parts[part]) if part < len(self._parts) else None
+        if clock is None:
+            return None
+        sane = _is_within(begins_ns, T_MONO_NS_END) & _is_within(ends_ns, T_MONO_NS_END)
+        least, greatest, sure = clock.reach(
+            np.where(sane, begins_ns, 0), np.where(sane, ends_ns, 0)
+        )
+        return least, greatest, sure & sane
+
     def summary(self) -> ClockSummary:
         """Stretches, drifts, steps and flags of every stream, in the order of the session."""
         return ClockSummary(streams=tuple(self._summary(stream) for stream in self._streams))

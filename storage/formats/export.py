@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Literal, get_args
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pacsv
@@ -28,9 +31,10 @@ from storage.schema import (
     MARKS,
     SERVER_TIME,
     Array,
-    flat_columns,
+    flat_column,
 )
-from storage.sessions.file import EXPORT_KEY, NOTES_KEY, parquet_options
+from storage.sessions.file import EXPORT_KEY, parquet_options
+from storage.sessions.footer import NOTES_KEY
 
 Format = Literal["parquet", "arrow", "csv"]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -49,6 +53,24 @@ _MADE = {column.name: "Ask for the clock `server` as well" for column in SERVER_
 _MADE |= {column.name: "Ask for marks as well" for column in MARKS}
 
 Pieces = Iterable[tuple[FrameBatch, Mapping[str, Array]]]
+Flat = Mapping[str, Array]
+"""Flat columns by name, n rows each."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a session has, to be exported.
+
+    Attributes:
+        names: its quantities, of `storage.schema.KNOWN`, in the order of their columns.
+        read: gives these flat columns, and others if it likes, of frames in order.
+        span_ns: `t_ns` of the session's first frame, and the latest; None: `read` gives the session
+            from its first frame to its last, and not only where the slice is.
+    """
+
+    names: Sequence[str]
+    read: Callable[[Sequence[str]], Iterable[Flat]]
+    span_ns: tuple[int, int] | None = None
 
 
 def export(
@@ -61,10 +83,49 @@ def export(
     marks: Marks | None = None,
     source: Mapping[str, object] | None = None,
 ) -> Iterator[bytes]:
-    """A session's frames as bytes of a file.
+    """A session's frames as bytes of a file, from all of its frames.
 
     Args:
         pieces: frames with their further columns, in order.
+        info: the array.
+        notes: as for `export_content`, and so are the others.
+        to: format.
+        part: rows and columns.
+        clock: adds the server's time.
+        marks: adds `event`.
+        source: which session it is of.
+
+    Yields:
+        Chunks of the file.
+
+    Raises:
+        UsageError: as for `export_content`, or there are no frames.
+    """
+    there = ((frames, extra) for frames, extra in pieces if len(frames))
+    first = next(there, None)
+    if first is None:
+        raise UsageError("the session has no frames")
+    names = [column.name for column in FRAMES] + list(first[1])
+    flat = (_flat(frames, extra) for frames, extra in chain((first,), there))
+    yield from export_content(
+        Content(names, lambda _: flat), info, notes, to, part, clock, marks, source
+    )
+
+
+def export_content(
+    content: Content,
+    info: ArrayInfo,
+    notes: Mapping[str, object],
+    to: Format,
+    part: Slice,
+    clock: ClockTable | None = None,
+    marks: Marks | None = None,
+    source: Mapping[str, object] | None = None,
+) -> Iterator[bytes]:
+    """A session's frames as bytes of a file.
+
+    Args:
+        content: the frames.
         info: the array.
         notes: for the file's metadata; CSV has no place for them.
         to: format.
@@ -81,10 +142,8 @@ def export(
             before the first chunk.
     """
     if clock is not None:
-        pieces = _with_server_time(pieces, clock)
         notes = {**notes, "clock": clock.summary().model_dump(mode="json")}
     if marks is not None:
-        pieces = marks.added(pieces)
         notes = {**notes, "marks": [mark.as_dict() for mark in marks.all]}
     chosen = {"start_s": part.start_s, "end_s": part.end_s, "columns": list(part.columns)}
     made_of = {**(source or {}), **chosen, "clock": "node" if clock is None else "server"}
@@ -93,10 +152,8 @@ def export(
         NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
         EXPORT_KEY: json.dumps(made_of).encode(),
     }
-    tables = _tables(pieces, info, metadata, part)
-    first = next(tables, None)
-    if first is None:
-        raise UsageError("the session has no frames")
+    tables = _tables(content, len(info.tiles), metadata, part, clock, marks)
+    first = next(tables)
     sink = _Sink()
     writer = _open(sink, first.schema, to)
     writer.write_table(first)
@@ -109,31 +166,34 @@ def export(
 
 
 def _tables(
-    pieces: Pieces, info: ArrayInfo, metadata: dict[bytes | str, bytes | str], part: Slice
+    content: Content,
+    tiles: int,
+    metadata: dict[bytes | str, bytes | str],
+    part: Slice,
+    clock: ClockTable | None,
+    marks: Marks | None,
 ) -> Iterator[pa.Table]:
-    begin_t_ns: int | None = None
-    end_t_ns = 0
+    made = [column.name for column in SERVER_TIME] if clock is not None else []
+    made += [column.name for column in MARKS] if marks is not None else []
+    chosen = _chosen([*content.names, *made], tiles, part.columns)
+    begin_t_ns, end_t_ns = content.span_ns or (None, 0)
     header: pa.Table | None = None
-    for frames, extra in pieces:
-        if not len(frames):
-            continue
+    for flat in content.read(_needed(chosen, made, content.names)):
+        t_ns = flat["t_ns"]
         if begin_t_ns is None:
-            begin_t_ns = end_t_ns = int(frames.t_ns[0])
-        end_t_ns = max(end_t_ns, int(frames.t_ns.max()))
-        values = {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)
-        rows = part.rows(frames.t_ns, begin_t_ns)
-        wanted = _chosen(tuple(values), len(info.tiles), part.columns)
-        logical = dict.fromkeys(name for name, _ in wanted)
-        flat = {
-            field.name: (field, array)
-            for field, array in flat_columns(
-                [KNOWN[name] for name in logical], {name: values[name][rows] for name in logical}
-            )
-        }
-        chosen = [flat[name] for _, name in wanted]
+            begin_t_ns = end_t_ns = int(t_ns[0])
+        if content.span_ns is None:
+            end_t_ns = max(end_t_ns, int(t_ns.max()))
+        values = _of_rows(flat, part.rows(t_ns, begin_t_ns))
+        if clock is not None:
+            times = (values["t_mono_ns"], values["t_ns"], values.get("part"))
+            values |= clock.columns(*times)
+        if marks is not None:
+            values["event"] = marks.column(values["seq"], values.get("part"))
+        columns = [flat_column(KNOWN[of], name, values[name]) for name, of in chosen.items()]
         table = pa.Table.from_arrays(
-            [array for _, array in chosen],
-            schema=pa.schema([field for field, _ in chosen], metadata=metadata),
+            [array for _, array in columns],
+            schema=pa.schema([field for field, _ in columns], metadata=metadata),
         )
         if len(table):
             yield table
@@ -151,18 +211,36 @@ def _tables(
     yield header
 
 
-def _with_server_time(
-    pieces: Pieces, clock: ClockTable
-) -> Iterator[tuple[FrameBatch, Mapping[str, Array]]]:
-    for frames, extra in pieces:
-        yield frames, {**extra, **clock.columns(frames.t_mono_ns, frames.t_ns, extra.get("part"))}
+def _flat(frames: FrameBatch, extra: Mapping[str, Array]) -> dict[str, Array]:
+    values = {column.name: getattr(frames, column.name) for column in FRAMES} | dict(extra)
+    flat: dict[str, Array] = {}
+    for name, value in values.items():
+        parts = value.T if KNOWN[name].per_tile else value[None]
+        flat |= zip(KNOWN[name].flat_names(len(parts)), parts, strict=True)
+    return flat
 
 
-def _chosen(present: Sequence[str], tiles: int, asked: Sequence[str]) -> list[tuple[str, str]]:
-    """Logical and flat name of every column asked for, in that order, each once."""
+def _of_rows(flat: Flat, rows: Array) -> dict[str, Array]:
+    """These rows; where they are one piece, as in a slice of time they are, without a copy."""
+    at = np.flatnonzero(rows)
+    begin, end = (int(at[0]), int(at[-1]) + 1) if len(at) else (0, 0)
+    if end - begin == len(at):
+        return {name: value[begin:end] for name, value in flat.items()}
+    return {name: value[at] for name, value in flat.items()}
+
+
+def _needed(chosen: Mapping[str, str], made: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Columns to read: those chosen, and those by which rows are found and others made."""
+    by = ["t_ns", *(("t_mono_ns", "seq", "part") if made else ())]
+    read = [name for name, of in chosen.items() if of not in made]
+    return list(dict.fromkeys([*read, *(name for name in by if name in names)]))
+
+
+def _chosen(present: Sequence[str], tiles: int, asked: Sequence[str]) -> dict[str, str]:
+    """Flat and logical name of every column asked for, in that order, each once."""
     flat = {f: name for name in present for f in KNOWN[name].flat_names(tiles)}
     if not asked:
-        return [(name, f) for f, name in flat.items()]
+        return flat
     chosen: dict[str, str] = {}
     for name in asked:
         if name in present:
@@ -175,7 +253,7 @@ def _chosen(present: Sequence[str], tiles: int, asked: Sequence[str]) -> list[tu
                 expected=f"some of {', '.join(present)}",
                 remedy=_MADE.get(name, ""),
             )
-    return [(name, f) for f, name in chosen.items()]
+    return chosen
 
 
 class _Sink(io.BytesIO):

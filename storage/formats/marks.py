@@ -7,13 +7,12 @@ said; so does one whose frames have no server's time, because their clock was ne
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from devices.frames import FrameBatch
 from storage.clock.table import ClockTable
 from storage.formats.slice import Slice
 from storage.schema import NO_INSTANT, Array
@@ -95,31 +94,29 @@ class Marks:
             labels[row] = self._labels.get((0 if part is None else int(part[row]), int(seq[row])))
         return labels
 
-    def added(
-        self, pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]]
-    ) -> Iterator[tuple[FrameBatch, Mapping[str, Array]]]:
-        """Frames with their further columns, and `event` as the last of them."""
-        for frames, extra in pieces:
-            yield frames, {**extra, "event": self.column(frames.seq, extra.get("part"))}
-
 
 def place(
-    events: Iterable[Event], pieces: Iterable[Mapping[str, Array]], clock: ClockTable, part: Slice
+    events: Iterable[Event],
+    pieces: Iterable[Mapping[str, Array]],
+    clock: ClockTable,
+    part: Slice,
+    begin_t_ns: int | None = None,
 ) -> Marks:
     """Find the frame of every event.
 
     Args:
         events: in any order.
-        pieces: columns `TIMES` of all frames of the session, and `part` if it has parts.
+        pieces: columns `TIMES` of all frames of the session, and `part` if it has parts; those
+            that are further than `NEAREST_NS` from every event may be left out.
         clock: of the session.
         part: the slice that is wanted; a mark whose frame is not in it is left out.
+        begin_t_ns: instant of the session's first frame; None: the first that comes.
 
     Returns:
         The marks. Of two frames that are as near the earlier one has it.
     """
     ordered = sorted(events, key=lambda event: event.t_ns)
     nearest = _Nearest(np.array([event.t_ns for event in ordered], dtype=np.int64))
-    begin_t_ns: int | None = None
     for piece in pieces:
         if not len(piece["t_ns"]):
             continue

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from devices.errors import FileFormatError, UsageError
 from devices.frames import FRAME_COLUMNS
-from storage.formats.export import ClockName, Format, export
-from storage.formats.marks import TIMES, Mark, Marks, place
+from storage.clock.table import ClockTable
+from storage.formats.export import ClockName, Content, Format, export_content
+from storage.formats.marks import NEAREST_NS, TIMES, Mark, Marks, place
 from storage.formats.slice import Slice
-from storage.schema import KNOWN
+from storage.schema import FRAMES, KNOWN
 from storage.sessions.beside import clock_beside
 from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event
+
+_NEAR_NS = NEAREST_NS + 1_000_000
+"""Rather a group too many; sums of instants as float64, which do not wrap, are off by 2 us."""
 
 
 def marks_of(reader: SessionReader, events: Sequence[Event], part: Slice) -> Marks:
@@ -28,22 +34,58 @@ def marks_of(reader: SessionReader, events: Sequence[Event], part: Slice) -> Mar
     except (UsageError, FileFormatError) as error:  # the frames are worth more than the marks
         return Marks([Mark(event, left_out=error.what) for event in events])
     names = (*TIMES, "part") if reader.has("part") else TIMES
-    return place(events, reader.columns(*names), clock, part)
+    pieces = reader.columns(*names, groups=_near(reader, clock, events))
+    return place(events, pieces, clock, part, reader.span_ns()[0])
+
+
+def _near(reader: SessionReader, clock: ClockTable, events: Sequence[Event]) -> list[int]:
+    """Row groups in which a mark may stand, by what the footer says of their times.
+
+    If there is none, one whose clock was compared: who finds no frame near a mark has to know
+    whether any frame's time is known.
+    """
+    names = (*TIMES[1:], "part") if reader.has("part") else TIMES[1:]
+    said = zip(*(reader.extremes(name) for name in names), strict=True)
+    near: set[int] = set()
+    known: list[int] = []
+    by_part: dict[int, list[tuple[int, ...]]] = {}
+    for group, (t_mono_ns, t_ns, *part) in enumerate(said):
+        of_part = part[0] if part else (0, 0)
+        if t_mono_ns is None or t_ns is None or of_part is None or of_part[0] != of_part[1]:
+            near.add(group)
+        else:
+            by_part.setdefault(of_part[0], []).append((group, *t_mono_ns, *t_ns))
+    marks_ns = np.sort(np.array([event.t_ns for event in events], dtype=np.float64))
+    for number, rows in by_part.items():
+        groups, begins, ends, earliest, latest = np.array(rows, dtype=np.int64).T
+        reach = clock.reach(begins, ends, number)
+        if reach is None:
+            continue
+        known += groups.tolist()
+        least, greatest, sure = reach
+        first = np.searchsorted(marks_ns, earliest.astype(np.float64) + least - _NEAR_NS)
+        behind = np.searchsorted(marks_ns, latest.astype(np.float64) + greatest + _NEAR_NS)
+        near.update(groups[~sure | (first < behind)].tolist())
+    return sorted(near) or sorted(known)[:1]
 
 
 def export_file(
     reader: SessionReader, to: Format, part: Slice, *, clock: ClockName, marks: Marks | None
 ) -> Iterator[bytes]:
-    """A sealed file as bytes of another one, as `export` does it.
+    """A sealed file as bytes of another one: what the slice needs of it is read, and no more.
 
     Raises:
-        UsageError: as for `export`; the server's time is asked for, and no clock table is there.
+        UsageError: as for `export_content`; the server's time is asked for, and no clock table is
+            there.
         FileFormatError: the file or its clock table is damaged.
     """
     extra = [name for name in KNOWN if name not in FRAME_COLUMNS and reader.has(name)]
     table = clock_beside(reader) if clock == "server" else None
-    yield from export(
-        reader.batches(*extra),
+    span_ns = reader.span_ns()
+    begin_ns, end_ns = part.bounds_ns(span_ns[0])
+    names = [*(column.name for column in FRAMES), *extra]
+    yield from export_content(
+        Content(names, lambda flat: reader.flat(flat, begin_ns, end_ns), span_ns),
         reader.info,
         reader.notes,
         to,

@@ -49,6 +49,18 @@ class Slice:
         """Is it the whole session?"""
         return self == Slice()
 
+    def bounds_ns(self, begin_t_ns: int) -> tuple[int | None, int | None]:
+        """The first instant that is in it, and the first that is not any more; None: no bound.
+
+        Args:
+            begin_t_ns: instant of the session's first frame.
+        """
+        start, end = (
+            None if seconds is None else begin_t_ns + round(seconds * 1e9)
+            for seconds in (self.start_s, self.end_s)
+        )
+        return start, end
+
     def rows(self, t_ns: Array, begin_t_ns: int) -> Array:
         """Which frames are in it, bool[n].
 
@@ -56,11 +68,12 @@ class Slice:
             t_ns: int64[n], instants of frames.
             begin_t_ns: instant of the session's first frame.
         """
+        start_ns, end_ns = self.bounds_ns(begin_t_ns)
         rows = np.ones(len(t_ns), dtype=np.bool_)
-        if self.start_s is not None:
-            rows &= t_ns >= begin_t_ns + round(self.start_s * 1e9)
-        if self.end_s is not None:
-            rows &= t_ns < begin_t_ns + round(self.end_s * 1e9)
+        if start_ns is not None:
+            rows &= t_ns >= start_ns
+        if end_ns is not None:
+            rows &= t_ns < end_ns
         return rows
 
     def begins_after(self, end_s: float) -> bool:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from storage.file_hash import FILE_HASH_KEY, NO_HASH
+from storage.file_hash import FILE_HASH_KEY, FOOTER_HASH_KEY, NO_HASH
 from storage.schema import KNOWN
 from storage.sessions.frame_order import FrameOrder
 
@@ -58,11 +58,12 @@ class ContentDigest:
         }
 
     def metadata(self, array_info: bytes, notes: bytes) -> dict[str, str]:
-        """The entries of the footer; the file hash follows when the file is whole."""
+        """The entries of the footer; its own hash and the file's follow when the file is whole."""
         content = json.dumps(self.content())
         return {
             CONTENT_KEY.decode(): content,
             CONTENT_HASH_KEY.decode(): content_hash(array_info, notes, content.encode()),
+            FOOTER_HASH_KEY.decode(): NO_HASH.decode(),
             FILE_HASH_KEY.decode(): NO_HASH.decode(),
         }
 

@@ -1,16 +1,18 @@
 """A sealed session: one Parquet file of flat columns, written and read here and nowhere else.
 
 Integers are delta-encoded, floats byte-stream-split, all of it zstd (6 bytes a frame of four tiles
-where CSV takes 54, performance.md). A row group is about a minute. The file appears whole or not at
-all: it is written beside its place under a name of its own, synced, and renamed. Its footer states
-hashes of its content and of its bytes (`storage.sessions.content_hash`), so that it proves itself.
+where CSV takes 54, performance.md). A row group is about a minute, in sessions of more than an hour
+up to five: each costs who reads the footer some time. The file appears whole or not at all: it is
+written beside its place under a name of its own, synced, and renamed. Its footer states hashes of
+its content, of its bytes and of itself (`storage.sessions.content_hash`, `storage.file_hash`), so
+that it proves itself.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -21,15 +23,11 @@ import pyarrow.parquet as pq
 
 from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
-from devices.inputs import check_file
 from storage.durable import storage_errors, sync_folder, temporary_of
 from storage.file_hash import (
     FILE_HASH_KEY,
     FORMAT,
     FORMAT_KEY,
-    FORMAT_WITHOUT_HASH,
-    check_hash,
-    file_hashes,
     write_file_hash,
 )
 from storage.schema import (
@@ -37,17 +35,27 @@ from storage.schema import (
     FRAMES,
     KNOWN,
     Array,
-    array_info,
     flat_columns,
+    flat_of,
+    flat_values,
     from_flat,
 )
-from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, ContentDigest, content_hash
+from storage.sessions.content_hash import ContentDigest
+from storage.sessions.footer import NOTES_KEY, Footer
 
-NOTES_KEY = b"foottile.notes"
 EXPORT_KEY = b"foottile.export"
 """Only in what was made from a session: of which one, and what of it."""
 
 ROW_GROUP_NS = 60_000_000_000
+"""The shortest row group, and the pieces of which longer ones are made."""
+GROWS_AFTER = 30
+"""A row group is a thirtieth of what lies before it: in ten hours there are 180 instead of 600."""
+ROW_GROUP_PIECES_MAX = 5
+"""And no longer than that: of eight tiles with estimates it takes 45 MB to write."""
+
+_PIECE_VALUES = 1 << 20
+_PIECE_ROWS_MIN = 1024
+"""A piece of a row group that is read at once has so many numbers: 8 MiB, however many tiles."""
 
 
 class SessionWriter:
@@ -67,13 +75,15 @@ class SessionWriter:
         self._info = info
         self._notes = dict(notes)
         self._waiting: list[dict[str, Array]] = []
-        self._group_end_ns: int | None = None
+        self._piece_end_ns: int | None = None
+        self._group: list[pa.Table] = []
+        self._pieces = 0
         self._writer: pq.ParquetWriter | None = None
         self._digest = ContentDigest()
         self._head = b"", b""
 
     def add_notes(self, notes: Mapping[str, object]) -> None:
-        """Add what became known later; must precede the first row group's end."""
+        """Add what became known later; must precede the first minute's end."""
         self._notes |= notes
 
     def append(self, frames: FrameBatch, extra: Mapping[str, Array]) -> None:
@@ -87,17 +97,18 @@ class SessionWriter:
         begin = 0
         while begin < len(frames):
             t_mono_ns = int(frames.t_mono_ns[begin])
-            if self._group_end_ns is not None and t_mono_ns < self._group_end_ns - ROW_GROUP_NS:
-                self._write_group()  # the node was switched on again: another part begins
-            fresh = self._group_end_ns is None
-            if self._group_end_ns is None:
-                self._group_end_ns = int(frames.t_mono_ns[begin]) + ROW_GROUP_NS
-            inside = int(np.searchsorted(frames.t_mono_ns[begin:], self._group_end_ns))
+            if self._piece_end_ns is not None and t_mono_ns < self._piece_end_ns - ROW_GROUP_NS:
+                self._end_piece()  # the node was switched on again: another part begins
+                self._write_group()
+            fresh = self._piece_end_ns is None
+            if self._piece_end_ns is None:
+                self._piece_end_ns = int(frames.t_mono_ns[begin]) + ROW_GROUP_NS
+            inside = int(np.searchsorted(frames.t_mono_ns[begin:], self._piece_end_ns))
             end = begin + max(inside, int(fresh))
             if end > begin:
                 self._waiting.append({name: v[begin:end] for name, v in columns.items()})
             if end < len(frames):
-                self._write_group()
+                self._end_piece()
             begin = end
 
     def seal(self) -> None:
@@ -107,6 +118,7 @@ class SessionWriter:
             FileFormatError: not one frame was appended.
             StorageError: the disk is full or not writable; nothing is left behind then.
         """
+        self._end_piece()
         self._write_group()
         if self._writer is None:
             raise FileFormatError("no frames to write", where=str(self.path))
@@ -133,15 +145,16 @@ class SessionWriter:
         finally:
             self._discard()
 
-    def _write_group(self) -> None:
+    def _end_piece(self) -> None:
+        """Make columns of what waits; as many numbers are half as long as in memory."""
         if not self._waiting:
             return
         names = list(self._waiting[0])
         values = {name: np.concatenate([piece[name] for piece in self._waiting]) for name in names}
         self._waiting = []
-        self._group_end_ns = None
+        self._piece_end_ns = None
         fields, arrays = zip(*flat_columns([KNOWN[name] for name in names], values), strict=True)
-        if self._writer is None:
+        if not self._pieces:
             info, notes = self._info.model_dump_json(), json.dumps(self._notes, sort_keys=True)
             self._head = info.encode(), notes.encode()
         info_text, notes_text = self._head
@@ -150,13 +163,23 @@ class SessionWriter:
             metadata={FORMAT_KEY: FORMAT, ARRAY_INFO_KEY: info_text, NOTES_KEY: notes_text},
         )
         table = pa.Table.from_arrays(list(arrays), schema=schema)
+        self._digest.feed(table)
+        self._group.append(table)
+        self._pieces += 1
+        if len(self._group) >= min(self._pieces // GROWS_AFTER, ROW_GROUP_PIECES_MAX):
+            self._write_group()
+
+    def _write_group(self) -> None:
+        if not self._group:
+            return
+        table = pa.concat_tables(self._group)
+        self._group = []
         with self._errors():
             if self._writer is None:
                 self._writer = pq.ParquetWriter(
                     self._temporary, table.schema, **parquet_options(table.schema)
                 )
             self._writer.write_table(table, row_group_size=len(table))
-        self._digest.feed(table)
 
     def _errors(self) -> AbstractContextManager[None]:
         return storage_errors(
@@ -193,92 +216,69 @@ def _encoding(type_: pa.DataType) -> str | None:
 
 
 class SessionReader:
-    """Reads what `SessionWriter` wrote, one row group at a time."""
+    """Reads what `SessionWriter` wrote, some thousand rows at a time.
 
-    def __init__(self, path: Path, *, is_checked: bool = False) -> None:
-        """Open a sealed session, whose every byte is held against the file's hash.
+    Attributes:
+        path: the file.
+        footer: what its footer says; `info`, `notes`, `format`, `content`, `content_sha256`,
+            `column_names` and `frame_count` are those of `storage.sessions.footer.Footer`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        is_checked: bool = False,
+        only_slices: bool = False,
+        footer: Footer | None = None,
+    ) -> None:
+        """Open a sealed session.
+
+        Its every byte is held against the file's hash, unless only slices are read: then the footer
+        is, against its own, and what is read of pages, always, against their checksums. A file of
+        an older version, whose footer has no hash, is held against the file's all the same.
 
         Args:
             path: the file.
-            is_checked: its bytes were held against the hash already.
+            is_checked: nothing is held against any hash: it was already, or shall not be.
+            only_slices: what is read are some columns, or some time.
+            footer: of this very file, if it was read before.
 
         Raises:
             FileFormatError: no such file, not Parquet, not one of ours, or damaged.
         """
         self.path = path
+        if footer is None:
+            footer = Footer(path, is_checked=is_checked, only_slices=only_slices)
+        elif not is_checked:
+            footer.prove(path, only_slices=only_slices)
+        self.footer = footer
+        self._has_true_statistics = self.footer.is_proven or self.footer.format == FORMAT
+        self.info, self.notes = self.footer.info, self.footer.notes
+        self.format = self.footer.format
+        self.content, self.content_sha256 = self.footer.content, self.footer.content_sha256
+        self.column_names = self.footer.column_names
+        self.frame_count = self.footer.frame_count
         try:
-            check_file(path)
-            self._file = pq.ParquetFile(path, page_checksum_verification=True)
-            schema = self._file.schema_arrow
-        except Exception as error:  # damaged bytes may cause any error
-            raise FileFormatError(
-                f"cannot be read as Parquet: {error}", where=str(path), expected="a sealed session"
-            ) from error
-        metadata = schema.metadata or {}
-        version = metadata.get(FORMAT_KEY)
-        if version not in (FORMAT, FORMAT_WITHOUT_HASH):
-            raise FileFormatError(
-                f"its format is {version!r}" if version else "it states no format",
-                where=str(path),
-                expected=f"a session of format {FORMAT.decode()}, written by foottile",
-                remedy="Update foottile" if version else "",
+            self._file = pq.ParquetFile(
+                path, metadata=self.footer.metadata, page_checksum_verification=True
             )
-        if not is_checked:
-            self._check_bytes(metadata)
-        self.info = array_info(schema, where=str(path))
-        self.notes = _notes(metadata.get(NOTES_KEY), where=str(path))
-        self.format = version
-        self.content_sha256, self.content = self._content(metadata)
-        self.column_names = frozenset(schema.names)
-        tiles = len(self.info.tiles)
-        if f"padc_{tiles}" in schema.names:
-            raise FileFormatError(
-                f"it describes {tiles} tiles and has columns of more", where=str(path)
-            )
-        self.frame_count = self._file.metadata.num_rows
-        if not self.frame_count:
-            raise FileFormatError("the session has no frames", where=str(path))
-
-    def _check_bytes(self, said: Mapping[bytes, bytes]) -> None:
-        try:
-            hashes = file_hashes(self.path)
-        except OSError as error:
-            raise FileFormatError(f"cannot be read: {error}", where=str(self.path)) from error
-        check_hash(hashes, said, where=str(self.path))
-
-    def _content(self, metadata: Mapping[bytes, bytes]) -> tuple[str | None, dict[str, Any] | None]:
-        """What the file says of its content; None if another program wrote it last."""
-        said = self._file.metadata.metadata or {}
-        content, stated = said.get(CONTENT_KEY), said.get(CONTENT_HASH_KEY)
-        if content is None or stated is None:
-            return None, None
-        found = content_hash(metadata[ARRAY_INFO_KEY], metadata[NOTES_KEY], content)
-        if found.encode() != stated:
-            raise FileFormatError(
-                "its description of array and session is not the one that was sealed",
-                where=str(self.path),
-                expected=f"content with the hash {stated[:64]!r}, found {found}",
-            )
-        return found, json.loads(content)
+        except Exception as error:  # gone meanwhile, or damaged
+            raise FileFormatError(f"cannot be read as Parquet: {error}", where=str(path)) from error
 
     def tables(self) -> Iterator[pa.Table]:
-        """All columns as they are in the file, a row group at a time.
+        """All columns as they are in the file, a piece of a row group at a time.
 
         Raises:
             FileFormatError: a row group is damaged.
         """
-        for group in range(self._file.num_row_groups):
-            try:
-                yield self._file.read_row_group(group)
-            except (OSError, ValueError, pa.ArrowException) as error:
-                raise FileFormatError(
-                    f"row group {group} cannot be read: {error}", where=str(self.path)
-                ) from error
+        for group in range(len(self.footer.group_rows)):
+            yield from self._tables(group, None)
 
     @property
     def identity(self) -> dict[str, object]:
         """Which session it is, for what is made from it: id, content hash, stated file hash."""
-        said = self._file.metadata.metadata or {}
+        said = self.footer.metadata.metadata or {}
         session = self.notes.get("session")
         return {
             "session": session.get("id") if isinstance(session, dict) else None,
@@ -310,23 +310,76 @@ class SessionReader:
         for values in self.columns(*(column.name for column in FRAMES), *extra):
             yield FrameBatch(**{column.name: values.pop(column.name) for column in FRAMES}), values
 
-    def columns(self, *wanted: str) -> Iterator[dict[str, Array]]:
-        """Some columns only, of `storage.schema.KNOWN`, a row group at a time.
+    def columns(
+        self, *wanted: str, groups: Sequence[int] | None = None
+    ) -> Iterator[dict[str, Array]]:
+        """Some columns only, of `storage.schema.KNOWN`, some thousand rows at a time.
+
+        Args:
+            wanted: their names.
+            groups: the row groups to read; None: all.
 
         Raises:
             FileFormatError: as for `batches`.
         """
         tiles = len(self.info.tiles)
         names = [flat for name in wanted for flat in KNOWN[name].flat_names(tiles)]
-        for group in range(self._file.num_row_groups):
-            try:
-                table = self._file.read_row_group(group, columns=names)
-                values = {name: from_flat(KNOWN[name], table, tiles) for name in wanted}
-            except (KeyError, ValueError, OSError, pa.ArrowException) as error:
-                raise FileFormatError(
-                    f"row group {group} cannot be read: {error}", where=str(self.path)
-                ) from error
-            yield values
+        for group in range(len(self.footer.group_rows)) if groups is None else groups:
+            for table in self._tables(group, names):
+                with self._damage(group):
+                    values = {name: from_flat(KNOWN[name], table, tiles) for name in wanted}
+                yield values
+
+    def span_ns(self) -> tuple[int, int]:
+        """`t_ns` of the first frame, and the latest `t_ns` of all.
+
+        Raises:
+            FileFormatError: as for `batches`.
+        """
+        if self.footer.span_ns is not None:
+            return self.footer.span_ns
+        first = next(self._tables(0, ["t_ns"], rows=1))
+        with self._damage(0):
+            begin = int(flat_values(KNOWN["t_ns"], "t_ns", first)[0])
+        latest = self.extremes("t_ns")
+        unsaid = [group for group, said in enumerate(latest) if said is None]
+        ends = [int(piece["t_ns"].max()) for piece in self.columns("t_ns", groups=unsaid)]
+        end = max([*ends, *(said[1] for said in latest if said is not None)])
+        self.footer.span_ns = begin, end
+        return begin, end
+
+    def flat(
+        self, names: Sequence[str], begin_t_ns: int | None, end_t_ns: int | None
+    ) -> Iterator[dict[str, Array]]:
+        """Flat columns of the row groups that may hold frames of some time.
+
+        Which these are the footer says; where it does not, or nothing proves it, all are read.
+
+        Args:
+            names: of the columns, each n rows.
+            begin_t_ns: of the first instant; None: from the beginning.
+            end_t_ns: of the instant behind the last; None: to the end.
+
+        Yields:
+            One piece at least, of no rows if there is nothing.
+
+        Raises:
+            FileFormatError: as for `batches`.
+        """
+        logical = flat_of(len(self.info.tiles))
+        is_empty = True
+        for group, said in enumerate(self.extremes("t_ns")):
+            if said is not None and not _overlap(said, begin_t_ns, end_t_ns):
+                continue
+            for table in self._tables(group, names):
+                with self._damage(group):
+                    values = {name: flat_values(logical[name], name, table) for name in names}
+                yield values
+                is_empty = False
+        if is_empty:
+            table = self.footer.schema.empty_table()
+            with self._damage(0):
+                yield {name: flat_values(logical[name], name, table) for name in names}
 
     def frames(self) -> FrameBatch:
         """All frames at once.
@@ -336,49 +389,42 @@ class SessionReader:
         """
         return FrameBatch.concatenate([frames for frames, _ in self.batches()])
 
+    def extremes(self, name: str) -> list[tuple[int, int] | None]:
+        """Least and greatest value of a column in every row group; None: not known for sure."""
+        if self._has_true_statistics:
+            return self.footer.extremes(name)
+        return [None] * len(self.footer.group_rows)  # nothing proves what an older version wrote
 
-class CheckedFiles:
-    """Sealed sessions that are opened often: each is held against its hash once, not every time.
+    def _tables(
+        self, group: int, names: Sequence[str] | None, rows: int | None = None
+    ) -> Iterator[pa.Table]:
+        """Columns of a row group, or all, in pieces; with `rows`, so many of the first."""
+        width = len(self.column_names if names is None else names)
+        size = rows or max(_PIECE_ROWS_MIN, _PIECE_VALUES // max(1, width))
+        left = self.footer.group_rows[group]
+        with self._damage(group):
+            if absent := set(names or ()) - self.column_names:
+                raise KeyError(f"no column {', '.join(sorted(absent))}")
+            columns = None if names is None else list(names)
+            pieces = self._file.iter_batches(size, row_groups=[group], columns=columns)
+        while left:
+            with self._damage(group):
+                piece = next(pieces, None)
+                if piece is None or len(piece) > left:
+                    raise ValueError(f"it has not the {self.footer.group_rows[group]} rows it says")
+            left = 0 if rows else left - len(piece)
+            yield pa.Table.from_batches([piece])
 
-    One whose stamps say that it is another file by now is held against its hash again; checksums
-    of pages are looked at whenever they are read. May be used from several threads.
-    """
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[int, ...], None] = {}
-
-    def open(self, path: Path) -> SessionReader:
-        """Open a sealed session.
-
-        Raises:
-            FileFormatError: as for `SessionReader`.
-        """
-        stamps = _stamps(path)
-        reader = SessionReader(path, is_checked=stamps in self._known)
-        if stamps and stamps == _stamps(path):  # not replaced meanwhile
-            while len(self._known) >= _KNOWN_MAX:
-                self._known.pop(next(iter(self._known)), None)
-            self._known[stamps] = None
-        return reader
-
-
-_KNOWN_MAX = 1000
-
-
-def _stamps(path: Path) -> tuple[int, ...]:
-    """What changes if a file does; empty if there is none."""
-    try:
-        found = path.stat()
-    except OSError:
-        return ()
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+    @contextmanager
+    def _damage(self, group: int) -> Iterator[None]:
+        try:
+            yield
+        except (KeyError, ValueError, OSError, pa.ArrowException) as error:
+            raise FileFormatError(
+                f"row group {group} cannot be read: {error}", where=str(self.path)
+            ) from error
 
 
-def _notes(text: bytes | None, *, where: str) -> dict[str, Any]:
-    try:
-        notes = json.loads(text or b"")
-    except ValueError as error:
-        raise FileFormatError(f"its notes are not readable: {error}", where=where) from error
-    if not isinstance(notes, dict):
-        raise FileFormatError("its notes are no JSON object", where=where)
-    return notes
+def _overlap(said: tuple[int, int], begin_ns: int | None, end_ns: int | None) -> bool:
+    least, greatest = said
+    return (begin_ns is None or greatest >= begin_ns) and (end_ns is None or least < end_ns)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
 from devices.errors import FileFormatError
-from storage.file_hash import FORMAT_WITHOUT_HASH, file_hashes
+from storage.file_hash import FORMAT_WITHOUT_HASH, file_hashes, footer_hashes, read_footer
 from storage.intervals import AsPairs, Intervals, Losses, union
 from storage.sessions.content_hash import ContentDigest
 from storage.sessions.file import SessionReader
@@ -71,6 +71,10 @@ def verify_file(path: Path) -> FileReport:
         report.problems.append(
             "its bytes are not those that were sealed, by the hash in its footer"
         )
+    elif hashes is not None:
+        own = footer_hashes(read_footer(path))
+        if own is not None and own[0] != own[1]:
+            report.problems.append("its footer's own hash is of another footer")
     try:
         with SessionReader(path, is_checked=True) as reader:
             _read_through(reader, report, has_file_hash=hashes is not None)

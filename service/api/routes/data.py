@@ -233,7 +233,7 @@ def _marks(session: Session, query: DataQuery, server: Server) -> Marks:
     if not session.events:
         return Marks(())
     if session.sha256 is not None:
-        with server.sessions.frames(session.id) as reader:
+        with server.sessions.frames(session.id, only_slices=True) as reader:
             return marks_of(reader, session.events, query.slice)
     sources = server.recorder.sources(session.id)
     times = (
@@ -253,7 +253,7 @@ def _chunks(
         pieces, source = SessionFrames(sources), {"session": session.id, "state": session.state}
         yield from export(pieces, sources.info, {}, to, part, clock, marks, source)
         return
-    with server.sessions.frames(session.id) as reader:
+    with server.sessions.frames(session.id, only_slices=not part.is_all) as reader:
         yield from export_file(reader, to, part, clock=query.clock, marks=marks)
 
 

@@ -150,7 +150,10 @@ def export_command(
     path = output_path(out, source)
     names = tuple(name.strip() for name in (columns or "").split(",") if name.strip())
     part = Slice(start_s, end_s, names)
-    with SessionReader(source) as reader, progress(f"writing {path.name}"):
+    with (
+        SessionReader(source, only_slices=not part.is_all) as reader,
+        progress(f"writing {path.name}"),
+    ):
         beside = source.with_name(EVENTS_NAME)
         stored = read_events(beside) if marks is not False and beside.is_file() else None
         if marks and stored is None:

@@ -83,6 +83,32 @@ def test_the_truth_is_within_the_bound_beside_steps_and_across_them(
     assert (np.abs(offset - clock.at(t_mono_ns)) <= bound).all()
 
 
+@given(
+    drawn=RATES,
+    seed=st.integers(0, 2**32),
+    jumps_ns=st.lists(st.integers(-3 * SECOND, 3 * SECOND), max_size=2),
+    begin_s=st.floats(-100, 400),
+    lasts_s=st.sampled_from([0.0, 1e-6, 1.0, 60.0, 300.0]),
+)
+def test_no_offset_between_two_instants_is_out_of_reach(
+    drawn: tuple[float, float, int, int],
+    seed: int,
+    jumps_ns: list[int],
+    begin_s: float,
+    lasts_s: float,
+) -> None:
+    steps = tuple((i * 100 * SECOND + 7, jump_ns) for i, jump_ns in enumerate(jumps_ns, 1))
+    plain = wandering(drawn)
+    stepping = Clock(plain.rates_ppm, plain.offset_ns, steps)
+    clock = ClockMap(stepping.measured(every(10, 31), seed))
+    between = BEGIN_NS + np.linspace(begin_s, begin_s + lasts_s, 301) * SECOND
+    t_mono_ns = np.rint(between).astype(np.int64)
+    least, greatest, sure = clock.reach(t_mono_ns[:1], t_mono_ns[-1:])
+    offset, _ = clock.at(t_mono_ns)
+    assert not sure[0] or (least[0] <= offset.min() and offset.max() <= greatest[0])
+    assert sure[0] or len(clock.stretches) > 1
+
+
 def test_a_lopsided_network_does_not_become_a_small_bound_around_a_wrong_offset() -> None:
     # Every way there takes 0.3 ms, every way back 9.3 ms: a mean would be 4.5 ms off, and sure.
     t_mono_ns = every(10, 3600)

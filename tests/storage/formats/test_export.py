@@ -19,7 +19,7 @@ from storage.clock.table import ClockTable, StreamFacts
 from storage.formats.export import FORMATS, MEDIA_TYPES, Format, export
 from storage.formats.slice import Slice
 from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, FRAMES
-from storage.sessions.file import NOTES_KEY
+from storage.sessions.footer import NOTES_KEY
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.storage.formats.exports import (
     NOTES,

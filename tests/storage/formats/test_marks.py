@@ -21,8 +21,8 @@ from storage.formats.export import FORMATS, Format, export
 from storage.formats.marks import NEAREST_NS, TIMES, Marks, place
 from storage.formats.slice import Slice
 from storage.schema import Array
-from storage.sessions.file import NOTES_KEY
 from storage.sessions.folder import Event
+from storage.sessions.footer import NOTES_KEY
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 

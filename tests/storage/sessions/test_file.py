@@ -17,8 +17,10 @@ from devices.frames import (
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,
     NOT_READ,
+    FrameBatch,
 )
 from storage.schema import CONTACT_UNKNOWN
+from storage.sessions import file
 from storage.sessions.file import SessionReader, SessionWriter
 from tests.builders.arrays import make_array
 from tests.builders.frames import any_frames, assert_same_bits
@@ -248,6 +250,32 @@ def test_one_long_batch_is_cut_into_row_groups_of_a_minute_too(tmp_path: Path) -
     path = write(tmp_path / "s.parquet", batch)
     assert all(s <= 62.0 for s in group_seconds(path))
     assert_same_bits(read(path), batch)
+
+
+def test_row_groups_grow_with_the_session_to_five_minutes_and_no_frame_is_lost(
+    tmp_path: Path,
+) -> None:
+    # a footer costs every reader time for each of them
+    batch = frames(10 * 3600, period_ns=1_000_000_000)
+    path = write(tmp_path / "s.parquet", batch)
+    groups = pq.ParquetFile(path).metadata
+    rows = [groups.row_group(i).num_rows for i in range(groups.num_row_groups)]
+    assert rows[:59] == [60] * 59
+    assert max(rows) == 300
+    assert len(rows) < 200
+    assert_same_bits(read(path), batch)
+
+
+def test_a_long_row_group_is_read_in_pieces(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = frames(5000)
+    path = write(tmp_path / "s.parquet", batch)
+    monkeypatch.setattr(file, "_PIECE_VALUES", 1)
+    with SessionReader(path) as session:
+        pieces = [piece for piece, _ in session.batches()]
+    assert [len(piece) for piece in pieces] == [1024] * 4 + [904]
+    assert_same_bits(FrameBatch.concatenate(pieces), batch)
 
 
 def test_a_gap_of_an_hour_is_no_reason_for_a_group_of_its_own_for_every_frame(

@@ -1,4 +1,4 @@
-"""When the file of a sealed session appears, what stays if it fails, and when it is read anew."""
+"""When the file of a sealed session appears, and what stays if it fails."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from devices.frames import (
     FrameBatch,
 )
 from storage.durable import remove_stale_temporaries
-from storage.file_hash import file_hashes
-from storage.sessions import file
 from storage.sessions.file import SessionWriter
 from tests.builders.arrays import make_array
 from tests.storage.faulty_disk import disk_with_room_for
@@ -118,42 +116,3 @@ def test_a_full_disk_is_an_os_error_and_leaves_nothing_behind(tmp_path: Path, ro
 def test_a_folder_that_is_not_there_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="missing"):
         write(tmp_path / "missing" / "s.parquet", frames(5))
-
-
-def test_a_file_that_is_opened_again_is_held_against_its_hash_once_and_anew_if_it_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, looked = write(tmp_path / "s.parquet", frames(20)), list[Path]()
-
-    def counted(path: Path) -> tuple[str, str] | None:
-        looked.append(path)
-        return file_hashes(path)
-
-    monkeypatch.setattr(file, "file_hashes", counted)
-    files = file.CheckedFiles()
-    for _ in range(3):
-        files.open(path).close()
-    assert looked == [path]
-    whole = path.read_bytes()
-    footer = whole.replace(b"tadc_0", b"tadc_x").replace(b"tadc_1", b"tadc_0")
-    path.write_bytes(footer.replace(b"tadc_x", b"tadc_1"))  # every page is as it was
-    os.utime(path, ns=(1, 1))  # a kernel's ticks are milliseconds
-    for _ in range(2):
-        with pytest.raises(FileFormatError, match="are not those that were sealed"):
-            files.open(path)
-    path.write_bytes(whole)
-    os.utime(path, ns=(2, 2))
-    files.open(path).close()
-    assert len(looked) == 4
-
-
-def test_how_many_opened_files_are_remembered_is_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(file, "_KNOWN_MAX", 2)
-    files = file.CheckedFiles()
-    for number in range(4):
-        files.open(write(tmp_path / f"{number}.parquet", frames(5))).close()
-    assert len(files._known) == 2
-    with pytest.raises(FileFormatError, match="cannot be read"):
-        files.open(tmp_path / "none.parquet")

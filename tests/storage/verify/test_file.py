@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
-from storage.file_hash import FORMAT_KEY
+from storage.file_hash import FOOTER_HASH_KEY, FORMAT_KEY, file_hashes
 from storage.sessions.file import SessionReader, SessionWriter
 from storage.sessions.folder import Ledger, Part, PartLedger
 from storage.verify.file import ledger_problems, verify_file
@@ -172,6 +173,21 @@ def test_bytes_behind_its_end_are_damage(tmp_path: Path) -> None:
     path = walk(tmp_path / "frames.parquet")
     path.write_bytes(path.read_bytes() + b"\0")
     assert problems(path)
+
+
+def test_a_footer_hash_of_another_footer_is_found_though_the_file_hash_agrees(
+    tmp_path: Path,
+) -> None:
+    # slices of such a file would be refused
+    path = walk(tmp_path / "s.parquet")
+    before = FOOTER_HASH_KEY + b"\x18\x40"
+    head, rest = path.read_bytes().split(before)
+    flipped = head + before + (b"0" if rest[:1] != b"0" else b"1") + rest[1:]
+    stated, _ = file_hashes(path) or ("", "")
+    unhashed = flipped.replace(stated.encode(), b"0" * 64)
+    digits = hashlib.sha256(unhashed).hexdigest().encode()
+    path.write_bytes(flipped.replace(stated.encode(), digits))
+    assert problems(path) == "its footer's own hash is of another footer"
 
 
 def test_a_file_that_another_program_wrote_anew_says_so(tmp_path: Path) -> None:

@@ -1,0 +1,184 @@
+"""What the footer of a sealed session says: array, notes, content, and where its columns are.
+
+Reading it costs more the more row groups and columns there are, and it never changes. So it is an
+object of its own, that a server keeps (`storage.sessions.checked_files`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from devices.errors import FileFormatError
+from devices.inputs import check_file
+from storage.file_hash import (
+    FORMAT,
+    FORMAT_KEY,
+    FORMAT_WITHOUT_HASH,
+    check_footer,
+    check_hash,
+    file_hashes,
+    footer_hashes,
+    read_footer,
+)
+from storage.schema import ARRAY_INFO_KEY, array_info
+from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, content_hash
+
+NOTES_KEY = b"foottile.notes"
+_MAGIC = b"PAR1"
+
+
+class Footer:
+    """A sealed file's footer, read and understood, with what is found out of the file only once.
+
+    Attributes:
+        metadata: what pyarrow made of it, with which the file is opened again.
+        format: version of the file's format.
+        info: the array.
+        notes: whatever else a reader should know.
+        content: what the file says of its content, and
+        content_sha256: the hash of that; None of both if another program wrote it last.
+        column_names: flat names.
+        frame_count: rows.
+        size_bytes: length of the footer.
+        is_proven: is it what was sealed, by a hash of its own?
+        is_whole: was every byte of the file held against its hash?
+        span_ns: `t_ns` of the first frame, and the latest of all; None: not looked for yet.
+    """
+
+    def __init__(self, path: Path, *, is_checked: bool = False, only_slices: bool = False) -> None:
+        """Read the footer of a file, and prove what is asked for.
+
+        Args:
+            path: the file.
+            is_checked: nothing is held against any hash: it was already, or shall not be.
+            only_slices: as for `prove`.
+
+        Raises:
+            FileFormatError: no such file, not Parquet, not one of ours, or damaged.
+        """
+        self._where = where = str(path)
+        try:
+            check_file(path)
+            footer = read_footer(path)
+            length = len(footer).to_bytes(4, "little")
+            # Parsed are the very bytes that are held against the hash.
+            self.metadata = pq.read_metadata(
+                pa.BufferReader(b"".join((_MAGIC, footer, length, _MAGIC)))
+            )
+            schema = self.metadata.schema.to_arrow_schema()
+        except Exception as error:  # damaged bytes may cause any error
+            raise FileFormatError(
+                f"cannot be read as Parquet: {error}", where=where, expected="a sealed session"
+            ) from error
+        self.size_bytes = len(footer)
+        hashes = None if is_checked else footer_hashes(footer)
+        if hashes is not None:
+            check_footer(hashes, where=where)
+        self.is_proven = hashes is not None
+        self.is_whole = False
+        self.said: Mapping[bytes, bytes] = schema.metadata or {}
+        self.format = self._format()
+        if not is_checked:
+            self.prove(path, only_slices=only_slices)
+        self.info = array_info(schema, where=where)
+        self.notes = _notes(self.said.get(NOTES_KEY), where=where)
+        self.content_sha256, self.content = self._content()
+        self.schema = schema
+        self.column_names = frozenset(schema.names)
+        tiles = len(self.info.tiles)
+        if f"padc_{tiles}" in schema.names:
+            raise FileFormatError(
+                f"it describes {tiles} tiles and has columns of more", where=where
+            )
+        self.frame_count = self.metadata.num_rows
+        if not self.frame_count:
+            raise FileFormatError("the session has no frames", where=where)
+        self.span_ns: tuple[int, int] | None = None
+        self._extremes: dict[str, list[tuple[int, int] | None]] = {}
+
+    def prove(self, path: Path, *, only_slices: bool) -> None:
+        """Hold the file against its hash, unless that was done.
+
+        Args:
+            path: the file.
+            only_slices: the footer's own hash will do: all that is read besides are pages, each
+                against its checksum. Where the footer has none, as of an older version, it is the
+                whole file all the same.
+
+        Raises:
+            FileFormatError: it is damaged.
+        """
+        if self.is_whole or (only_slices and self.is_proven):
+            return
+        try:
+            hashes = file_hashes(path)
+        except OSError as error:
+            raise FileFormatError(f"cannot be read: {error}", where=self._where) from error
+        check_hash(hashes, self.said, where=self._where)
+        self.is_whole = True
+
+    @cached_property
+    def group_rows(self) -> list[int]:
+        """Rows of every row group."""
+        return [self.metadata.row_group(i).num_rows for i in range(self.metadata.num_row_groups)]
+
+    def extremes(self, name: str) -> list[tuple[int, int] | None]:
+        """Least and greatest value of a column of integers in every row group.
+
+        None where the file does not say, and of a column that it does not have.
+        """
+        if name not in self._extremes:
+            self._extremes[name] = [self._extreme(name, i) for i in range(len(self.group_rows))]
+        return self._extremes[name]
+
+    def _extreme(self, name: str, group: int) -> tuple[int, int] | None:
+        if name not in self.column_names:
+            return None
+        column = self.metadata.row_group(group).column(self.schema.get_field_index(name))
+        said: Any = column.statistics if column.is_stats_set else None
+        if said is None or not said.has_min_max or not isinstance(said.min, int):
+            return None
+        return said.min, said.max
+
+    def _format(self) -> bytes:
+        version = self.said.get(FORMAT_KEY)
+        if version not in (FORMAT, FORMAT_WITHOUT_HASH):
+            raise FileFormatError(
+                f"its format is {version!r}" if version else "it states no format",
+                where=self._where,
+                expected=f"a session of format {FORMAT.decode()}, written by foottile",
+                remedy="Update foottile" if version else "",
+            )
+        return version
+
+    def _content(self) -> tuple[str | None, dict[str, Any] | None]:
+        """What the file says of its content; None if another program wrote it last."""
+        said = self.metadata.metadata or {}
+        content, stated = said.get(CONTENT_KEY), said.get(CONTENT_HASH_KEY)
+        if content is None or stated is None:
+            return None, None
+        found = content_hash(self.said[ARRAY_INFO_KEY], self.said[NOTES_KEY], content)
+        if found.encode() != stated:
+            raise FileFormatError(
+                "its description of array and session is not the one that was sealed",
+                where=self._where,
+                expected=f"content with the hash {stated[:64]!r}, found {found}",
+            )
+        return found, json.loads(content)
+
+
+def _notes(text: bytes | None, *, where: str) -> dict[str, Any]:
+    try:
+        notes = json.loads(text or b"")
+    except ValueError as error:
+        raise FileFormatError(f"its notes are not readable: {error}", where=where) from error
+    if not isinstance(notes, dict):
+        raise FileFormatError("its notes are no JSON object", where=where)
+    return notes

@@ -1,0 +1,297 @@
+"""A slice of a sealed file is that of the whole table, and reads no more than it needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.errors import FileFormatError, FootTileError, UsageError
+from devices.frames import FrameBatch
+from storage.clock.file import write_clock
+from storage.clock.log import ClockOffset
+from storage.clock.table import StreamFacts
+from storage.formats.export import ClockName, export
+from storage.formats.marks import TIMES, place
+from storage.formats.sealed import export_file, marks_of
+from storage.formats.slice import Slice
+from storage.schema import Array
+from storage.sessions import file
+from storage.sessions.beside import clock_beside
+from storage.sessions.file import SessionReader, SessionWriter, parquet_options
+from storage.sessions.folder import Event
+from tests.builders.arrays import make_array
+from tests.builders.frames import make_frames
+from tests.storage.sessions.session_files import rewritten
+
+SECOND_NS = 1_000_000_000
+PERIOD_NS = SECOND_NS // 10
+UTC_NS = 10**18
+COLUMNS = ("seq", "t_ns", "t_mono_ns", "part", "padc", "padc_1", "grf_n", "force_n_0", "phase")
+
+
+@dataclass(frozen=True)
+class Boot:
+    """A part: how many frames, when its clocks began, and where it lacks some."""
+
+    rows: int
+    t_mono_ns: int
+    utc_ns: int
+    gap_at: int
+    gap: int
+
+
+boots = st.builds(
+    Boot,
+    rows=st.integers(1, 60),
+    t_mono_ns=st.integers(0, 20 * SECOND_NS),
+    utc_ns=st.integers(-10 * SECOND_NS, 30 * SECOND_NS).map(lambda ns: UTC_NS + ns),
+    gap_at=st.integers(0, 60),
+    gap=st.sampled_from([0, 1, 80]),
+)
+seconds = st.none() | st.floats(0.0, 30.0) | st.integers(0, 120).map(lambda tenths: tenths / 10)
+columns = st.lists(st.sampled_from(COLUMNS), max_size=3).map(tuple)
+
+
+def recorded(parts: Sequence[Boot]) -> tuple[FrameBatch, dict[str, Array]]:
+    """Frames of these parts; a clock may have been set back in between."""
+    rng = np.random.default_rng(1)
+    pieces = []
+    for part in parts:
+        seq = np.arange(part.rows) + part.gap * (np.arange(part.rows) >= part.gap_at)
+        t_mono_ns = part.t_mono_ns + PERIOD_NS * seq + rng.integers(0, PERIOD_NS // 2, part.rows)
+        padc = rng.integers(250, 420, (part.rows, 2))
+        pieces.append(
+            make_frames(seq, 2, t_mono_ns=t_mono_ns, utc_offset_ns=part.utc_ns, padc=padc)
+        )
+    frames = FrameBatch.concatenate(pieces)
+    force_n = rng.normal(0.0, 20.0, (len(frames), 2))
+    force_n[rng.random(force_n.shape) < 0.2] = np.nan
+    return frames, {
+        "part": np.repeat(np.arange(len(parts), dtype=np.uint16), [part.rows for part in parts]),
+        "force_n": force_n,
+        "grf_n": force_n.sum(axis=1),
+        "phase": np.where(rng.random(len(frames)) < 0.5, "rest", "load").astype(object),
+    }
+
+
+def sealed(
+    path: Path, frames: FrameBatch, extra: dict[str, Array], group_ns: int, **options: Any
+) -> Path:
+    """The file, with row groups of so long."""
+    info = make_array(2, boot_id="boot 0", utc_offset_ns=UTC_NS, clock_set=True)
+    parts = [{"boot_id": f"boot {i}"} for i in range(int(extra["part"].max()) + 1)]
+
+    def changed(schema: pa.Schema) -> dict[str, Any]:
+        return parquet_options(schema) | options
+
+    with (
+        patch.object(file, "ROW_GROUP_NS", group_ns),
+        patch.object(file, "parquet_options", changed),
+        SessionWriter(path, info, {"session": {"id": "s", "parts": parts}}) as writer,
+    ):
+        writer.append(frames, extra)
+    return path
+
+
+def outcome(chunks: Callable[[], Any]) -> pa.Table | str:
+    try:
+        return pa.ipc.open_stream(b"".join(chunks())).read_all().combine_chunks()
+    except UsageError as error:
+        return str(error)
+
+
+def sliced(path: Path, part: Slice, clock: ClockName, events: Sequence[Event]) -> pa.Table | str:
+    with SessionReader(path, only_slices=True) as reader:
+        marks = marks_of(reader, events, part) if events else None
+        return outcome(lambda: export_file(reader, "arrow", part, clock=clock, marks=marks))
+
+
+def of_the_whole(
+    path: Path,
+    frames: FrameBatch,
+    extra: dict[str, Array],
+    part: Slice,
+    clock: ClockName,
+    events: Sequence[Event],
+) -> pa.Table | str:
+    with SessionReader(path) as reader:
+        table = clock_beside(reader)
+        times = {name: getattr(frames, name) for name in TIMES} | {"part": extra["part"]}
+        marks = place(events, [times], table, part) if events else None
+        return outcome(
+            lambda: export(
+                [(frames, extra)],
+                reader.info,
+                reader.notes,
+                "arrow",
+                part,
+                table if clock == "server" else None,
+                marks,
+                reader.identity,
+            )
+        )
+
+
+def same(a: pa.Table | str, b: pa.Table | str) -> bool:
+    if isinstance(a, str) or isinstance(b, str):
+        return a == b
+    return bool(a.equals(b, check_metadata=True))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("sliced")
+
+
+@settings(max_examples=80)
+@given(
+    parts=st.lists(boots, min_size=1, max_size=3),
+    group_ns=st.sampled_from([PERIOD_NS, 7 * PERIOD_NS, SECOND_NS, 60 * SECOND_NS]),
+    start_s=seconds,
+    length_s=seconds,
+    asked=columns,
+    clock=st.sampled_from(["node", "server"]),
+    marks_s=st.lists(st.floats(-15.0, 45.0), max_size=3),
+    steps=st.lists(st.sampled_from([0, 0, 1, 3 * SECOND_NS]), max_size=5),
+    options=st.sampled_from([{}, {}, {"write_statistics": False}]),
+)
+def test_a_slice_by_statistics_is_the_slice_of_the_whole_table(
+    folder: Path,
+    parts: list[Boot],
+    group_ns: int,
+    start_s: float | None,
+    length_s: float | None,
+    asked: tuple[str, ...],
+    clock: ClockName,
+    marks_s: list[float],
+    steps: list[int],
+    options: dict[str, Any],
+) -> None:
+    end_s = None if length_s is None else (start_s or 0.0) + max(length_s, 1e-6)
+    part = Slice(start_s, end_s, asked)
+    frames, extra = recorded(parts)
+    path = sealed(folder / "s.parquet", frames, extra, group_ns, **options)
+    events = [
+        Event(id=f"{i:012x}", label=f"mark {i}", t_ns=UTC_NS + round(at_s * 1e9))
+        for i, at_s in enumerate(marks_s)
+    ]
+    rows = [  # of the first part's clock, which may step; of the others nothing is known
+        ClockOffset(
+            boot_id="boot 0",
+            t_mono_ns=i * 5 * SECOND_NS,
+            server_minus_node_ns=step,
+            uncertainty_ns=1000,
+        )
+        for i, step in enumerate(steps)
+    ]
+    write_clock(folder / "clock.parquet", rows, [StreamFacts("boot 0", UTC_NS, True)])
+    found = sliced(path, part, clock, events)
+    assert same(found, of_the_whole(path, frames, extra, part, clock, events)), found
+
+
+# --- what is read ---------------------------------------------------------------------------------
+
+
+LONG = Boot(rows=100, t_mono_ns=5, utc_ns=UTC_NS, gap_at=0, gap=0)
+
+
+def ten_groups(path: Path) -> Path:
+    return sealed(path, *recorded([LONG]), SECOND_NS)
+
+
+def place_of(path: Path, group: int, name: str) -> tuple[int, int]:
+    """Where a column's pages are in the file, first byte and the one behind."""
+    with pq.ParquetFile(path) as whole:
+        at = whole.schema_arrow.get_field_index(name)
+        column = whole.metadata.row_group(group).column(at)
+        begin = column.dictionary_page_offset or column.data_page_offset
+        return begin, begin + column.total_compressed_size
+
+
+def table_of(path: Path, part: Slice) -> pa.Table:
+    with SessionReader(path, only_slices=True) as reader:
+        content = b"".join(export_file(reader, "arrow", part, clock="node", marks=None))
+    return pa.ipc.open_stream(content).read_all()
+
+
+def test_a_slice_reads_its_own_row_groups_and_columns_and_no_page_besides(tmp_path: Path) -> None:
+    path = ten_groups(tmp_path / "s.parquet")
+    part = Slice(4.2, 5.1, ("force_n_1",))
+    right = table_of(path, part)
+    content = bytearray(path.read_bytes())
+    kept = [(0, "t_ns"), *((group, name) for group in (4, 5) for name in ("t_ns", "force_n_1"))]
+    places = [place_of(path, group, name) for group, name in kept]
+    with pq.ParquetFile(path) as whole:
+        names, groups = whole.schema_arrow.names, whole.num_row_groups
+    for group in range(groups):
+        for name in names:
+            begin, end = place_of(path, group, name)
+            if (begin, end) not in places:
+                content[begin:end] = bytes(end - begin)  # whoever reads it fails
+    path.write_bytes(content)
+    assert table_of(path, part).equals(right)
+    with pytest.raises(FileFormatError, match="row group 6 cannot be read"):
+        table_of(path, Slice(4.2, 6.5, ("force_n_1",)))
+    with pytest.raises(FileFormatError, match="are not those that were sealed"):
+        SessionReader(path)
+
+
+def test_statistics_that_nothing_proves_are_not_believed(tmp_path: Path) -> None:
+    # An older version wrote no hash: a flip in a footer would leave out frames without a word.
+    table = pq.read_table(ten_groups(tmp_path / "s.parquet"))
+    path = rewritten(tmp_path / "older.parquet", table)
+    with SessionReader(path, only_slices=True) as reader:
+        assert reader.extremes("t_ns") == [None]
+        assert reader.span_ns() == (
+            UTC_NS + table["t_mono_ns"][0].as_py(),
+            table["t_ns"][-1].as_py(),
+        )
+    part = Slice(4.2, 5.1, ("force_n_1",))
+    assert table_of(path, part).equals(table_of(tmp_path / "s.parquet", part))
+
+
+# --- damage ---------------------------------------------------------------------------------------
+
+
+def refused_or(path: Path, part: Slice, right: pa.Table) -> str:
+    try:
+        return "right" if table_of(path, part).equals(right) else "wrong"
+    except FootTileError:
+        return "refused"
+
+
+def flips(size: int, headers: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Byte and bit: every bit of what stands before the pages' content, and some everywhere."""
+    everywhere = [(at, 1 << at % 8) for at in range(0, size, 61)]
+    return everywhere + [
+        (at, 1 << bit) for a, b in headers for at in range(a, b) for bit in range(8)
+    ]
+
+
+@pytest.mark.parametrize("name", ["force_n_1", "padc_0", "phase"])
+def test_a_slice_of_a_file_with_a_flipped_bit_is_refused_or_right(
+    tmp_path: Path, name: str
+) -> None:
+    path = ten_groups(tmp_path / "s.parquet")
+    part = Slice(4.2, 5.1, (name,))
+    right, whole = table_of(path, part), path.read_bytes()
+    begins = [place_of(path, 4, column)[0] for column in ("t_ns", name)]
+    found = {}
+    for at, bit in flips(len(whole), [(begin, begin + 48) for begin in begins]):
+        content = bytearray(whole)
+        content[at] ^= bit
+        path.write_bytes(content)
+        found[at, bit] = refused_or(path, part, right)
+    assert set(found.values()) == {"refused", "right"}, [
+        k for k, v in found.items() if v == "wrong"
+    ]

@@ -1,0 +1,110 @@
+"""What a server proves of sealed files that it opens often, and what it keeps of them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from devices.errors import FileFormatError
+from storage.file_hash import file_hashes
+from storage.sessions import checked_files, footer
+from storage.sessions.checked_files import CheckedFiles
+from tests.storage.sessions.session_files import frames, rewritten, write
+
+
+@pytest.fixture
+def hashed(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The files of which all bytes were held against a hash, each time."""
+    looked: list[Path] = []
+
+    def counted(path: Path) -> tuple[str, str] | None:
+        looked.append(path)
+        return file_hashes(path)
+
+    monkeypatch.setattr(footer, "file_hashes", counted)
+    return looked
+
+
+def test_a_file_that_is_opened_again_is_held_against_its_hash_once_and_anew_if_it_changed(
+    tmp_path: Path, hashed: list[Path]
+) -> None:
+    path, files = write(tmp_path / "s.parquet", frames(20)), CheckedFiles()
+    for _ in range(3):
+        files.open(path).close()
+    assert hashed == [path]
+    whole = path.read_bytes()
+    changed = whole.replace(b"tadc_0", b"tadc_x").replace(b"tadc_1", b"tadc_0")
+    path.write_bytes(changed.replace(b"tadc_x", b"tadc_1"))  # every page is as it was
+    os.utime(path, ns=(1, 1))  # a kernel's ticks are milliseconds
+    for _ in range(2):
+        for only_slices in (False, True):
+            with pytest.raises(FileFormatError, match="are not those that were sealed"):
+                files.open(path, only_slices=only_slices)
+    path.write_bytes(whole)
+    os.utime(path, ns=(2, 2))
+    files.open(path).close()
+    assert hashed == [path, path]  # of the changed one its footer's own hash was enough
+
+
+def test_for_slices_the_footer_is_proven_and_the_whole_file_when_all_of_it_is_read(
+    tmp_path: Path, hashed: list[Path]
+) -> None:
+    path, files = write(tmp_path / "s.parquet", frames(20)), CheckedFiles()
+    for _ in range(2):
+        files.open(path, only_slices=True).close()
+    assert hashed == []
+    for _ in range(2):
+        files.open(path).close()
+        files.open(path, only_slices=True).close()
+    assert hashed == [path]
+
+
+def test_a_file_of_an_older_version_is_held_against_its_hash_for_slices_too(
+    tmp_path: Path, hashed: list[Path]
+) -> None:
+    table = pq.read_table(write(tmp_path / "s.parquet", frames(20)))
+    path, files = rewritten(tmp_path / "older.parquet", table), CheckedFiles()
+    for _ in range(3):
+        files.open(path, only_slices=True).close()
+    assert hashed == [path]
+
+
+def test_a_footer_is_read_once_and_anew_if_the_file_changed(tmp_path: Path) -> None:
+    path, files = write(tmp_path / "s.parquet", frames(20)), CheckedFiles()
+    kept = [files.open(path, only_slices=True).footer for _ in range(2)]
+    assert kept[0] is kept[1]
+    write(path, frames(30))
+    with files.open(path, only_slices=True) as reader:
+        assert reader.footer is not kept[0]
+        assert len(reader.frames()) == 30
+
+
+def test_how_many_opened_files_are_remembered_is_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checked_files, "_KNOWN_MAX", 2)
+    files = CheckedFiles()
+    for number in range(4):
+        files.open(write(tmp_path / f"{number}.parquet", frames(5))).close()
+    assert len(files._whole) == len(files._footers) == 2
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        files.open(tmp_path / "none.parquet")
+
+
+def test_footers_are_kept_up_to_a_bound_of_their_bytes_the_ones_used_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hashed: list[Path]
+) -> None:
+    paths = [write(tmp_path / f"{number}.parquet", frames(5)) for number in range(3)]
+    files = CheckedFiles()
+    first = files.open(paths[0]).footer
+    monkeypatch.setattr(checked_files, "_FOOTERS_MAX_BYTES", 2 * first.size_bytes + 100)
+    files.open(paths[1]).close()
+    assert files.open(paths[0]).footer is first
+    files.open(paths[2]).close()
+    assert files.open(paths[0]).footer is first
+    assert len(files._footers) == 2
+    files.open(paths[1]).close()
+    assert hashed == paths  # what was forgotten is where its columns are, not that it is whole
