@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from recording_data import Recording, batches
 
 from devices.frames import FrameBatch
-from storage.formats.export import export
+from storage.formats.sealed import export_file
 from storage.formats.slice import Slice
 from storage.journal.journal import Journal
 from storage.schema import FRAMES, flat_columns, wire_schema
@@ -157,11 +157,10 @@ def read_parquet(path: Path, column: str, begin_ns: int, end_ns: int) -> Values:
 
 def read_as_service(path: Path, column: str, begin_ns: int, end_ns: int) -> Values:
     """What the server and `foottile export` do for a slice of a sealed session."""
-    with SessionReader(path) as reader:
+    with SessionReader(path, only_slices=True) as reader:
         first_ns = _first_t_ns(path)
         part = Slice((begin_ns - first_ns) * 1e-9, (end_ns - first_ns) * 1e-9, (column,))
-        chunks = export(reader.batches(), reader.info, reader.notes, "arrow", part)
-        content = b"".join(chunks)
+        content = b"".join(export_file(reader, "arrow", part, clock="node", marks=None))
     return pa.ipc.open_stream(content).read_all().column(column).to_numpy()
 
 
