@@ -17,10 +17,10 @@ from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.calibration import TileCalibration
 from service.estimation.effects import FlowEffect, Parameter
 from service.estimation.estimates import EstimateStatus
-from service.estimation.ladder import MODELS
+from service.estimation.ladder.chosen import MODELS
+from service.estimation.ladder.plan import EstimationPlan, make_plan
+from service.estimation.ladder.upper import BOUND_SIGMAS
 from service.estimation.models.outliers import FAR
-from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.upper import BOUND_SIGMAS
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
 from tests.builders.estimates import estimate

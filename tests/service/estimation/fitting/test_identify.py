@@ -17,9 +17,9 @@ from devices.emulation.parts import DomePart, draw_dome
 from devices.emulation.surroundings import Surroundings
 from devices.scene.emulated import EmulationScene
 from service.estimation.effects import WALL_PER_KPA, EffectName, Effects
+from service.estimation.fitting.bench.indentation import Indentation
 from service.estimation.fitting.effects_fit import curve_over_range, fit_effects, loadings
 from service.estimation.fitting.fit import fit_tile
-from service.estimation.fitting.indentation import Indentation
 from service.estimation.fitting.model import DomeModel, pressed
 from service.estimation.fitting.output_error import OutputErrorProblem
 from service.estimation.fitting.unknowns import Parts
