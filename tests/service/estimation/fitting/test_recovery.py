@@ -14,7 +14,7 @@ from service.estimation.fitting.effects_fit import fit_effects
 from service.estimation.fitting.fit import fit_tile
 from service.estimation.fitting.model import pressed
 from service.estimation.models.hysteresis import WIDTHS_N
-from tests.service.estimation.fitting.test_identify import (
+from tests.service.estimation.fitting.recordings import (
     BASE_KPA,
     CURVE,
     GAMMA,
