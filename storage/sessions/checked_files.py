@@ -48,6 +48,9 @@ class CheckedFiles:
         if stamps and stamps == _stamps(path):  # not replaced meanwhile
             with self._lock:
                 self._keep(stamps, reader.footer)
+        elif footer is not None:  # it may be another file's by now
+            reader.close()
+            return self.open(path, only_slices=only_slices)
         return reader
 
     def _keep(self, stamps: _Stamps, footer: Footer) -> None:

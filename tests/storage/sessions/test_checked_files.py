@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -12,6 +13,8 @@ from devices.errors import FileFormatError
 from storage.file_hash import file_hashes
 from storage.sessions import checked_files, footer
 from storage.sessions.checked_files import CheckedFiles
+from storage.sessions.file import SessionReader
+from storage.sessions.footer import Footer
 from tests.storage.sessions.session_files import frames, rewritten, write
 
 
@@ -80,6 +83,25 @@ def test_a_footer_is_read_once_and_anew_if_the_file_changed(tmp_path: Path) -> N
     with files.open(path, only_slices=True) as reader:
         assert reader.footer is not kept[0]
         assert len(reader.frames()) == 30
+
+
+def test_a_file_that_is_replaced_while_it_is_opened_is_not_read_with_the_footer_of_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, files = write(tmp_path / "s.parquet", frames(20)), CheckedFiles()
+    files.open(path, only_slices=True).close()
+    opened: list[bool] = []
+
+    def replaced(*args: Any, footer: Footer | None, **options: Any) -> SessionReader:
+        if not opened:
+            write(path, frames(30))
+        opened.append(footer is not None)
+        return SessionReader(*args, footer=footer, **options)
+
+    monkeypatch.setattr(checked_files, "SessionReader", replaced)
+    with files.open(path, only_slices=True) as reader:
+        assert len(reader.frames()) == 30
+    assert opened == [True, False]
 
 
 def test_how_many_opened_files_are_remembered_is_bounded(
