@@ -22,7 +22,7 @@ from static_kernel import StaticKernel
 from devices.frames import FrameBatch
 from service.estimation.calibration import paper_eq2_shape
 from service.estimation.estimate import EstimationState, finish, step
-from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.ladder.plan import EstimationPlan, make_plan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 

@@ -41,7 +41,7 @@ from devices.scene.file import Scene, load_scene
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates, EstimateStatus
-from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.ladder.plan import EstimationPlan, make_plan
 from service.estimation.tare.unloaded import take_tare
 from service.estimation.watch.watch import Watch, WatchState
 from service.offline.calibrations import find_calibration

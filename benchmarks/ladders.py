@@ -19,7 +19,7 @@ from pathlib import Path
 from devices.emulation.ground.load_trace import CopTransform
 from devices.scene.file import Scene, load_scene
 from service.estimation.calibration import PRESETS
-from service.estimation.ladder import MODELS
+from service.estimation.ladder.chosen import MODELS
 from service.offline.benchmark.draws import (
     BATCH,
     LAGS_MS,

@@ -16,7 +16,7 @@ from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MAX_KPA, PRESSURE_MIN_KP
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.calibration import BASIS, LOOP_OPENS_N
 from service.estimation.estimate import HULL_SIGMAS
-from service.estimation.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
+from service.estimation.ladder.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
 
 Floats = npt.NDArray[np.float64]
 

@@ -52,7 +52,7 @@ HEAVY = ("fastapi", "starlette", "uvicorn", "httpx", "numba", "scipy", "matplotl
 @pytest.mark.parametrize(
     ("imports", "absent"),
     [
-        ("service.cli.main", ("pyarrow", *HEAVY)),
+        ("service.cli.main", ("numpy", "pydantic", "pyarrow", *HEAVY)),
         ("service.cli.commands.node, service.node.run", HEAVY),
         ("service.node.recording, service.sessions.sealing, service.link", HEAVY),
     ],

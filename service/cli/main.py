@@ -10,19 +10,7 @@ import typer
 
 from devices.errors import FootTileError
 from devices.words import printable
-from service.cli.commands.bench import bench_command
-from service.cli.commands.calibrate import calibrate_command
-from service.cli.commands.demo import demo_command
-from service.cli.commands.doctor import doctor_command
-from service.cli.commands.domes import domes_command
-from service.cli.commands.estimate import estimate_command
-from service.cli.commands.node import node_command
-from service.cli.commands.recover import recover_command
-from service.cli.commands.serve import serve_command
-from service.cli.commands.sessions import export_command, pull_command, sessions_command
-from service.cli.commands.simulate import simulate_command
-from service.cli.commands.verify import verify_command
-from service.cli.options import with_finite_numbers
+from service.cli.table import Commands, name_all
 from service.version import SOFTWARE
 
 INTERRUPTED = 130
@@ -30,18 +18,14 @@ INTERRUPTED = 130
 
 app = typer.Typer(
     name="foottile",
+    cls=Commands,
     help="Data service for arrays of FootTile pressure sensors on robot feet.",
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (
-    *(demo_command, serve_command, node_command, sessions_command, pull_command, export_command),
-    *(simulate_command, estimate_command, calibrate_command, domes_command, verify_command),
-    *(recover_command, doctor_command, bench_command),
-):
-    app.command(command.__name__.removesuffix("_command"))(with_finite_numbers(command))
+name_all(app)
 
 
 def _print_version(wanted: bool) -> None:

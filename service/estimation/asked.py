@@ -17,7 +17,7 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, step
-from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.ladder.plan import EstimationPlan, make_plan
 from service.estimation.tare.tare import Tare
 
 ASKED_FROM_N = 0.1

@@ -15,7 +15,6 @@ import numpy as np
 from devices.arrays import Bools, Floats
 from devices.frames import FrameBatch
 from devices.temperature import HeldTemperature, hold_temperature
-from service.estimation.averaged import summed
 from service.estimation.estimates import COP_COLUMNS, Estimates, EstimateStatus
 from service.estimation.foot.contact import (
     UNKNOWN,
@@ -27,9 +26,16 @@ from service.estimation.foot.contact import (
 )
 from service.estimation.foot.geometry import angle_rad, to_ground_x_m
 from service.estimation.foot.kinematics import Readings, counts_at, readings_of
-from service.estimation.lower import LowerState, Pending, PendingFrames, apparent_forces, tile_kpa
-from service.estimation.plan import SIGMAS, EstimationPlan
-from service.estimation.upper import Foot, UpperState, foot_of, grid_index, tile_forces
+from service.estimation.ladder.averaged import summed
+from service.estimation.ladder.lower import (
+    LowerState,
+    Pending,
+    PendingFrames,
+    apparent_forces,
+    tile_kpa,
+)
+from service.estimation.ladder.plan import SIGMAS, EstimationPlan
+from service.estimation.ladder.upper import Foot, UpperState, foot_of, grid_index, tile_forces
 
 HULL_SIGMAS = 3.0  # noise about the edge of the tiles is no reason to mask
 

@@ -27,9 +27,9 @@ from service.estimation.effects import (
     TemperatureEffect,
 )
 from service.estimation.estimate import EstimationState, finish, step
-from service.estimation.ladder import MODELS
+from service.estimation.ladder.chosen import MODELS
+from service.estimation.ladder.plan import make_plan
 from service.estimation.models.hysteresis import WIDTHS_N
-from service.estimation.plan import make_plan
 from service.estimation.tare.tare import Tare
 
 _CHIP = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)

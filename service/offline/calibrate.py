@@ -16,9 +16,9 @@ from devices.frames import NOT_READ, FrameBatch
 from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.effects import Parameter
+from service.estimation.fitting.bench.indentation import Indentation, pressed_in
 from service.estimation.fitting.effects_fit import fit_effects
 from service.estimation.fitting.fit import fit_tile
-from service.estimation.fitting.indentation import Indentation, pressed_in
 from service.estimation.fitting.timing import UNKNOWN_DELAY, resolved
 from storage.sessions.file import SessionReader
 

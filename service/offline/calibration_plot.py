@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.fitting.bench.indentation import Indentation, pressed_in, strokes
 from service.estimation.fitting.confidence import curve_n, mean_band_n, new_loading_band_n
 from service.estimation.fitting.effects_fit import Replay, replays
-from service.estimation.fitting.indentation import Indentation, pressed_in, strokes
 from service.offline.plots import new_figure, png_of
 
 if TYPE_CHECKING:

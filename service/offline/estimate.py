@@ -13,7 +13,7 @@ from devices.scene.emulated import Family
 from devices.scene.file import Scene, load_scene
 from service.estimation.asked import Asking
 from service.estimation.calibration import Calibration
-from service.estimation.plan import EstimationPlan
+from service.estimation.ladder.plan import EstimationPlan
 from service.estimation.tare.tare import Tare
 from service.offline.calibrations import BENCH, find_calibration
 from service.offline.findings import Findings, FindingsOf

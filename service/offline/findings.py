@@ -15,7 +15,7 @@ from service.estimation.foot.contact import Stance, Stances
 from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 
 if TYPE_CHECKING:
-    from service.estimation.plan import EstimationPlan
+    from service.estimation.ladder.plan import EstimationPlan
 
 Columns = Mapping[str, npt.NDArray[Any]]
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from devices.errors import StateError, StorageError, UnknownError
+from service.server.index import Age, SessionIndex
 from service.server_clock import utc_ns
 from service.sessions.restore import restore
 from storage.durable import storage_errors
@@ -57,14 +58,18 @@ class Trash:
         found, unreadable = load_or_restore(self.folder)
         self.problems = [f"in the trash, {text}" for text in _in_words(unreadable)]
         """Sessions that cannot be read, and why."""
-        self._sessions = {session.id: session for session in found}
+        self._sessions = SessionIndex(found)
 
     def __contains__(self, session_id: str) -> bool:
         return session_id in self._sessions
 
     def all(self) -> list[Session]:
         """What is in it, newest first."""
-        return sorted(self._sessions.values(), key=lambda s: (s.started_t_ns, s.id), reverse=True)
+        return list(self._sessions.newest_first())
+
+    def unsealed(self) -> list[Session]:
+        """Those in it that are not sealed."""
+        return self._sessions.unsealed()
 
     def take(self, session: Session, out_of: SessionFolder) -> None:
         """Move a session into the trash.
@@ -73,7 +78,7 @@ class Trash:
             StorageError: it cannot be moved.
         """
         out_of.move(session.id, self.folder)
-        self._sessions[session.id] = session
+        self._sessions.put(session)
 
     def give_back(self, session_id: str, to: SessionFolder) -> Session:
         """Move a session back to where it was.
@@ -86,7 +91,7 @@ class Trash:
         if session_id not in self._sessions:
             raise UnknownError(f"no session {session_id!r} in the trash")
         self.folder.move(session_id, to)
-        return self._sessions.pop(session_id)
+        return self._sessions.take(session_id)
 
     def doom(self) -> list[Path]:
         """Give up all its sessions for good; return the folders to delete.
@@ -95,9 +100,9 @@ class Trash:
             StorageError: one of them cannot be moved; it and those after it are still here.
         """
         doomed = []
-        for session_id in list(self._sessions):
-            doomed.append(self.folder.doom(session_id))
-            del self._sessions[session_id]
+        for session in self.all():
+            doomed.append(self.folder.doom(session.id))
+            self._sessions.take(session.id)
         return doomed
 
 
@@ -137,7 +142,7 @@ class SessionBook:
         """The same in words, with those in the trash."""
         self.has_unreadable = bool(self.problems)
         """Is a session unreadable? Then it is not known which frames it needs."""
-        self._sessions = {session.id: session for session in found}
+        self._sessions = SessionIndex(found)
         self._files = CheckedFiles()
 
     def frames(self, session_id: str) -> SessionReader:
@@ -148,16 +153,13 @@ class SessionBook:
         """
         return self._files.open(self.folder.path(session_id) / FRAMES_NAME)
 
-    def __iter__(self) -> Iterator[Session]:
-        return iter(list(self._sessions.values()))
+    def unsealed(self, node: str | None = None) -> list[Session]:
+        """Sessions, of all nodes or of one, that are not sealed yet and not in the trash."""
+        return self._sessions.unsealed(node)
 
-    def of_node(self, node: str) -> list[Session]:
-        """Sessions of a node that are not sealed yet and not in the trash."""
-        return [s for s in self._sessions.values() if s.node == node and s.state != "sealed"]
-
-    def all(self) -> list[Session]:
-        """All sessions, newest first."""
-        return sorted(self._sessions.values(), key=lambda s: (s.started_t_ns, s.id), reverse=True)
+    def newest_first(self, before: Age | None = None) -> Iterator[Session]:
+        """All sessions, or those before one, newest first; change none meanwhile."""
+        return self._sessions.newest_first(before)
 
     def get(self, session_id: str) -> Session:
         """One session, with the counts of the moment.
@@ -190,7 +192,7 @@ class SessionBook:
 
     def note(self, session: Session) -> None:
         """Replace what is known of a session in memory; its next change is written to disk."""
-        self._sessions[session.id] = session
+        self._sessions.put(session)
 
     def change(self, session_id: str, **changes: object) -> Session:
         """Change what people say of a session: name, subject, notes, tags.
@@ -230,7 +232,7 @@ class SessionBook:
             StorageError: it cannot be moved.
         """
         self.trash.take(session, self.folder)
-        del self._sessions[session.id]
+        self._sessions.take(session.id)
 
 
 def _in_words(unreadable: Mapping[str, str]) -> list[str]:

@@ -13,8 +13,8 @@ from devices.errors import FootTileError, TareError
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
 from service.estimation.calibration import Calibration
 from service.estimation.foot.contact import UNSEEN_NS
+from service.estimation.ladder.plan import make_plan
 from service.estimation.models.static import StaticCurves
-from service.estimation.plan import make_plan
 from service.estimation.tare.automatic import (
     LOOK_BACK_NS,
     Look,

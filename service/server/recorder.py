@@ -47,7 +47,7 @@ class Recorder:
         self._book = book
         self._nodes = nodes
         self._settling = settling
-        for session in book:
+        for session in book.unsealed():
             book.note(self._with_clock(session))
 
     def know(self, node: ServerNode) -> None:
@@ -55,13 +55,13 @@ class Recorder:
 
         They lack those of a node that was not known before, and of streams in which they went on.
         """
-        for session in self._book.of_node(node.name):
+        for session in self._book.unsealed(node.name):
             if session.state != "sealing":
                 self._book.note(self._with_clock(session))
 
     def recording_on(self, node: str) -> list[Session]:
         """Sessions that are being recorded on a node."""
-        return [s for s in self._book.of_node(node) if s.state == "recording"]
+        return [s for s in self._book.unsealed(node) if s.state == "recording"]
 
     def start(
         self,
@@ -197,7 +197,7 @@ class Recorder:
         except StorageError as error:  # it counts all the same
             log.warning("node %s: %s", node.name, error)
         offset = node.present.clock_rows[-1]
-        for session in self._book.of_node(node.name):
+        for session in self._book.unsealed(node.name):
             is_its_own = any(part.boot_id == node.boot_id for part in session.parts)
             if is_its_own and session.state != "sealing":
                 clock = (*session.clock, offset)
@@ -259,8 +259,8 @@ class Recorder:
             return {boot_id: Intervals([(0, NO_END)]) for boot_id in node.streams}
         return numbers_of(
             part
-            for session in (*self._book, *self._book.trash.all())
-            if session.node == node_name and session.state != "sealed"
+            for session in (*self._book.unsealed(), *self._book.trash.unsealed())
+            if session.node == node_name
             for part in following.parts_needed(session, node)
         )
 

@@ -207,7 +207,7 @@ class Server:
     def _tell_counts(self) -> None:
         """Tell screens how far unsealed sessions are, where that has changed: by the ledger."""
         counts: dict[str, Counted] = {}
-        for session in self.sessions if self.hub.subscribers else ():
+        for session in self.sessions.unsealed() if self.hub.subscribers else ():
             if session.state in ("recording", "pending"):
                 counted = counts[session.id] = Counted.of(session, self.recorder)
                 if counted != self._counts.get(session.id):
@@ -262,9 +262,8 @@ class Server:
                 },
             }
         )
-        for session in self.sessions:
-            if session.state in ("recording", "pending", "sealing"):
-                self._tell_session(session)
+        for session in self.sessions.unsealed():
+            self._tell_session(session)
 
     async def _sync(self, node: ServerNode) -> None:
         """Sync a node's journals to disk, then acknowledge the frames that were in them before."""

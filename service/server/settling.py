@@ -56,7 +56,7 @@ class Settling:
         Raises:
             StorageError: that cannot be written down.
         """
-        for session in self._book.of_node(node.name):
+        for session in self._book.unsealed(node.name):
             if session.state != "sealing":
                 try:
                     self._follow(session)
@@ -65,7 +65,7 @@ class Settling:
 
     def settle(self) -> None:
         """Find the end of stopped sessions, and seal those whose frames are all there."""
-        for session in self._book:
+        for session in self._book.unsealed():
             if time.monotonic() < self._again_after.get(session.id, 0.0):
                 continue
             try:
@@ -117,9 +117,12 @@ class Settling:
             return session
         followed = following.followed(session, node)
         # Save the sessions that continue it first: if the server is killed between, none is lost.
-        if not any(known.continues == session.id for known in self._book):
-            for further in reversed(followed[1:]):
-                self._book.keep(further)
+        further = followed[1:]
+        if further and not any(
+            known.continues == session.id for known in self._book.newest_first()
+        ):
+            for each in reversed(further):
+                self._book.keep(each)
         return session if followed[0] is session else self._book.keep(followed[0])
 
     def _disown(self, session: Session, error: DamagedFramesError) -> None:

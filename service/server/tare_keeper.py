@@ -12,7 +12,7 @@ import numpy as np
 
 from devices.errors import FileFormatError, TareError
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus
-from service.estimation.plan import TARE_OLD_NS
+from service.estimation.ladder.plan import TARE_OLD_NS
 from service.estimation.tare.automatic import APART_NS, SETTLE_NS, WINDOW_NS, Look
 from service.estimation.tare.tare import Tare, expected_shift_kpa, has_warmed, warmer_k
 from service.server.live_estimates import LiveEstimates

@@ -22,7 +22,7 @@ from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
-from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.ladder.plan import EstimationPlan, make_plan
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import RECOGNISE_WITHIN_NS, take_tare
 

@@ -11,7 +11,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import TileCalibration
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
-from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.ladder.plan import EstimationPlan, make_plan
 from tests.builders.arrays import COUNT_KPA
 from tests.builders.calibrations import make_calibration, make_tare
 

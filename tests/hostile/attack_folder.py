@@ -37,7 +37,7 @@ def served(server: Server) -> Served:
             except FootTileError as error:
                 frames = [f"damaged: {error}"]
             found[f"stream {boot_id}"] = (node.name, numbers, frames)
-    for session in server.sessions:
+    for session in server.sessions.newest_first():
         view = SessionView.of(session, server.recorder).model_dump_json()
         folder = server.sessions.folder.path(session.id)
         files = {p.name: sha(p) for p in sorted(folder.iterdir()) if p.suffix == ".parquet"}

@@ -30,19 +30,23 @@ def test_what_is_written_is_read_and_proven_by_any_program(path: Path) -> None:
     assert pq.read_table(path).to_pylist() == TABLE.to_pylist()
 
 
-def test_no_flipped_bit_is_read(path: Path) -> None:
+@pytest.mark.parametrize("every_bit", [False, pytest.param(True, marks=pytest.mark.soak)])
+def test_no_flipped_bit_is_read(path: Path, every_bit: bool) -> None:
     whole = path.read_bytes()
     for at in range(len(whole)):
-        damaged = bytearray(whole)
-        damaged[at] ^= 1 << at % 8
-        path.write_bytes(damaged)
-        with pytest.raises(DamagedFileError, match=r"small\.parquet"):
-            read_table(path)
+        for bit in range(8) if every_bit else (at % 8,):
+            damaged = bytearray(whole)
+            damaged[at] ^= 1 << bit
+            path.write_bytes(damaged)
+            with pytest.raises(DamagedFileError, match=r"small\.parquet"):
+                read_table(path)
 
 
-def test_no_cut_or_longer_file_is_read(path: Path) -> None:
+@pytest.mark.parametrize("every_bytes", [7, pytest.param(1, marks=pytest.mark.soak)])
+def test_no_cut_or_longer_file_is_read(path: Path, every_bytes: int) -> None:
     whole = path.read_bytes()
-    for content in (*(whole[:end] for end in range(0, len(whole), 7)), whole + b"\0", whole * 2):
+    cut = [whole[:end] for end in range(0, len(whole), every_bytes)]
+    for content in (*cut, whole + b"\0", whole * 2):
         path.write_bytes(content)
         with pytest.raises(DamagedFileError):
             read_table(path)

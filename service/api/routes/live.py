@@ -11,6 +11,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from service.api.protocols import OUTLET, send_text
 from service.link import SUBPROTOCOL, Close, HangUp, close_reason
+from service.server.index import age_of
 from service.server.screens.fan_out import RATES_HZ, Outlet, framed
 from service.server.screens.picture import dumps
 from service.server.screens.views import SessionView
@@ -92,8 +93,8 @@ def _hello(server: Server, node: str | None) -> dict[str, object]:
         ],
         "recording": [
             SessionView.of(session, recorder).model_dump(mode="json")
-            for session in server.sessions.all()
-            if session.state == "recording" and node in (None, session.node)
+            for session in sorted(server.sessions.unsealed(node), key=age_of, reverse=True)
+            if session.state == "recording"
         ],
     }
 

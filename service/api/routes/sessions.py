@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from http import HTTPStatus
+from itertools import islice
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Response
@@ -151,12 +152,11 @@ async def list_sessions(
     ] = None,
 ) -> SessionPage:
     """A page of sessions."""
-    found = [s for s in server.sessions.all() if q is None or _mentions(s, q.casefold())]
-    if cursor is not None:
-        key = _key_of(cursor)
-        found = [session for session in found if (session.started_t_ns, session.id) < key]
-    page = found[:limit]
-    more = len(found) > limit
+    before = None if cursor is None else _key_of(cursor)
+    listed = server.sessions.newest_first(before)
+    found = (s for s in listed if q is None or _mentions(s, q.casefold()))
+    page = list(islice(found, limit))
+    more = next(found, None) is not None
     return SessionPage(
         items=[SessionView.of(session, server.recorder) for session in page],
         unreadable=server.sessions.unreadable,

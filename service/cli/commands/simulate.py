@@ -62,7 +62,7 @@ def simulate_command(
     the scene's frame rate.
     """
     # Imported here: the physics pulls in scipy, which `--help` need not wait for.
-    from service.estimation.ladder import check_models
+    from service.estimation.ladder.chosen import check_models
     from service.offline.calibrations import find_calibration, with_tiles
     from service.offline.simulate import SimulateOptions, simulate
     from service.sessions.pipeline import EstimateOptions

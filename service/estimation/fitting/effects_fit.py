@@ -18,11 +18,17 @@ from service.estimation.effects import (
     TemperatureEffect,
     values,
 )
+from service.estimation.fitting.bench.indentation import (
+    Indentation,
+    Soak,
+    pressed_in,
+    soak,
+    unloaded,
+)
+from service.estimation.fitting.bench.press import Presses, joined, presses
 from service.estimation.fitting.identify import identify
-from service.estimation.fitting.indentation import Indentation, pressed_in, soak, unloaded
 from service.estimation.fitting.model import DomeModel, load
-from service.estimation.fitting.press import Presses, joined, presses
-from service.estimation.fitting.soak import Soak, fit_soak
+from service.estimation.fitting.soak import fit_soak
 from service.estimation.fitting.timing import UNKNOWN_DELAY
 
 _U_OF_X = np.array([[0.5, 0.5, 0.375], [0.0, 0.25, 0.375], [0.0, 0.0, 0.125]])

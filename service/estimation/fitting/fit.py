@@ -22,7 +22,7 @@ from service.estimation.calibration import (
     is_monotonic,
     loop_share,
 )
-from service.estimation.fitting.checks import (
+from service.estimation.fitting.bench.checks import (
     baseline_drift_kpa,
     before_saturation,
     refuse_contradictions,
@@ -30,19 +30,19 @@ from service.estimation.fitting.checks import (
     refuse_saturated_reference,
     refuse_unloaded,
 )
-from service.estimation.fitting.confidence import (
-    cubic_basis,
-    curve_n,
-    mean_band_n,
-    new_loading_band_n,
-)
-from service.estimation.fitting.indentation import (
+from service.estimation.fitting.bench.indentation import (
     Indentation,
     Strokes,
     place,
     stroke_rows,
     strokes,
     unloaded,
+)
+from service.estimation.fitting.confidence import (
+    cubic_basis,
+    curve_n,
+    mean_band_n,
+    new_loading_band_n,
 )
 
 BAND_STEPS = 10  # of the band in the file

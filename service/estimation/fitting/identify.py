@@ -20,9 +20,9 @@ from service.estimation.effects import (
     RubberEffect,
     TemperatureEffect,
 )
+from service.estimation.fitting.bench.press import Presses
 from service.estimation.fitting.model import DomeModel
 from service.estimation.fitting.output_error import Fit, OutputErrorProblem
-from service.estimation.fitting.press import Presses
 from service.estimation.fitting.soak import bounds_of
 from service.estimation.fitting.unknowns import LATE_S, TERMS_MAX, Parts
 from service.estimation.models.hysteresis import WIDTHS_N

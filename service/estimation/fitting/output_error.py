@@ -13,10 +13,10 @@ import numpy as np
 from scipy.optimize import nnls
 
 from devices.arrays import Bools, Floats
+from service.estimation.fitting.bench.press import Presses
 from service.estimation.fitting.confidence import beyond_bounds, fit_covariance
 from service.estimation.fitting.least_squares import ENOUGH, Found, least_squares
 from service.estimation.fitting.model import DomeModel, load
-from service.estimation.fitting.press import Presses
 from service.estimation.fitting.unknowns import Parts, told_s, unknowns_of
 from service.estimation.models.hysteresis import WIDTHS_N
 

@@ -15,6 +15,7 @@ import numpy as np
 from devices.arrays import Bools, Floats, Ints
 from devices.chips.mpl115a2 import TADC_PER_KELVIN, indicative_degc
 from service.estimation.effects import Parameter, TemperatureEffect
+from service.estimation.fitting.bench.indentation import Soak
 from service.estimation.fitting.confidence import beyond_bounds, fit_covariance
 from service.estimation.fitting.least_squares import least_squares
 from service.estimation.models.temperature import at_rest, followed
@@ -31,23 +32,6 @@ _T_SIGMA = 5.0 / 298.0
 """The chip's thermometer is not calibrated: it may be off by 5 K (hardware.md 1.3)."""
 _RECOVERS_S = 5.0
 """How long a dome that was pressed before creeps back, and is left alone."""
-
-
-@dataclass(frozen=True)
-class Soak:
-    """An unloaded tile while its surroundings warm up; arrays of n readings.
-
-    Attributes:
-        t_s: instants.
-        kpa: absolute pressures, NaN where there is none.
-        tadc: temperature in counts, NaN where there is none.
-        noise_kpa: standard deviation of a reading.
-    """
-
-    t_s: Floats
-    kpa: Floats
-    tadc: Floats
-    noise_kpa: float
 
 
 def fit_soak(soak: Soak) -> TemperatureEffect | str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from service.estimation.effects import PART_MOST, STRESS_LEAST_N
-from service.estimation.fitting.press import Presses
+from service.estimation.fitting.bench.press import Presses
 from service.estimation.models.hysteresis import WIDTHS_N
 
 _NO_LIMIT = 1e3  # newtons: no coefficient of a curve of 30 N comes near

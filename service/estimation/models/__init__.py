@@ -1,1 +1,1 @@
-"""The model ladder: one module per effect, used where a scene names it."""
+"""A module per model: what an effect does to readings, and how that is undone."""

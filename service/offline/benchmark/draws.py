@@ -24,7 +24,7 @@ from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.file import Scene
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, finish, step
-from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.ladder.plan import EstimationPlan, make_plan
 from service.estimation.tare.unloaded import take_tare
 from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 from service.offline.benchmark.rungs import Rung

@@ -16,7 +16,7 @@ import numpy as np
 from devices.errors import FootTileError
 from devices.scene.file import Scene
 from service.estimation.calibration import PRESETS
-from service.estimation.ladder import MODELS
+from service.estimation.ladder.chosen import MODELS
 from service.offline.benchmark.draws import (
     BATCH,
     Drawn,

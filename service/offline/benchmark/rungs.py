@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.estimation.ladder import MODELS
+from service.estimation.ladder.chosen import MODELS
 
 FOUNDATION = ("unwrap", "static")
 """The first rung: what every force needs."""

@@ -11,7 +11,7 @@ from devices.frames import FrameBatch
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.running import Running, assert_refused
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 
 def test_a_session_has_exactly_the_frames_between_start_and_stop(
@@ -45,7 +45,7 @@ def test_a_stop_answers_sealed_while_the_node_streams(
     tared: FakeNode,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 5.0)
+    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", PATIENCE_S)
     with Play(tared, 10.0):
         until(lambda: running.node()["last_seq"] > 100)
         session = tared.record()

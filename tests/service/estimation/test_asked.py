@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
 from service.estimation.asked import ASKED_FROM_N, Asking
-from service.estimation.plan import make_plan
+from service.estimation.ladder.plan import make_plan
 from tests.builders.arrays import array_at
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
 from tests.builders.estimates import estimate

@@ -19,8 +19,8 @@ from devices.chips.mpl115a2 import Coefficients, compensate_kpa, padc_of_kpa
 from devices.frames import FrameBatch
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import EstimateStatus
-from service.estimation.lower import ApparentForces
-from service.estimation.plan import make_plan
+from service.estimation.ladder.lower import ApparentForces
+from service.estimation.ladder.plan import make_plan
 from service.estimation.tare.unloaded import take_tare
 from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
 from tests.builders.calibrations import make_calibration, make_tare, newton_tile

@@ -9,9 +9,9 @@ import pytest
 
 from devices.frames import TileStatus
 from service.estimation.estimates import EstimateStatus
-from service.estimation.ladder import MODELS
+from service.estimation.ladder.chosen import MODELS
+from service.estimation.ladder.plan import make_plan
 from service.estimation.models.temperature import Temperature
-from service.estimation.plan import make_plan
 from service.estimation.tare.tare import Tare
 from tests.builders.arrays import COUNT_KPA, array_at, make_servo
 from tests.builders.calibrations import make_effects, newton_tile

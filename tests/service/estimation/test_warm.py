@@ -12,8 +12,8 @@ import pytest
 import service.estimation
 from service.estimation import warm
 from service.estimation.estimate import EstimationState, finish, step
-from service.estimation.ladder import MODELS
-from service.estimation.plan import EstimationPlan, make_plan
+from service.estimation.ladder.chosen import MODELS
+from service.estimation.ladder.plan import EstimationPlan, make_plan
 from storage.schema import wire_schema
 from storage.wire import decode, encode
 from tests.builders.calibrations import make_tare

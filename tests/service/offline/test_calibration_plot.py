@@ -11,8 +11,8 @@ import pytest
 
 from devices.scene.file import build_scene, load_scene
 from service.estimation.calibration import Calibration
+from service.estimation.fitting.bench.indentation import Indentation
 from service.estimation.fitting.effects_fit import fit_effects, replays
-from service.estimation.fitting.indentation import Indentation
 from service.offline.calibrate import calibrate_recordings, read_recordings
 from service.offline.calibrations import with_tiles
 from service.offline.simulate import SimulateOptions, simulate

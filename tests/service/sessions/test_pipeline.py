@@ -17,7 +17,7 @@ from devices.frames import FrameBatch, TileStatus
 from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
-from service.estimation.plan import make_plan
+from service.estimation.ladder.plan import make_plan
 from service.estimation.tare.tare import Tare
 from service.sessions import pipeline
 from service.sessions.pipeline import EstimateStream, estimate_columns, notes_of

@@ -56,7 +56,7 @@ def test_of_a_sealed_session_it_is_made_again_from_the_files_beside_it(data: Pat
     before, path = loaded(data), damage(data)
     damaged = path.read_bytes()
     if by == "server":
-        assert [one.id for one in book(data)] == [ID]
+        assert [one.id for one in book(data).newest_first()] == [ID]
     else:
         recovery = recover(data)
         assert (recovery.restored, recovery.problems) == ([ID], [])
@@ -84,7 +84,7 @@ def test_one_that_is_gone_is_made_again_and_lost_marks_are_said(data: Path) -> N
     folder = data / "sessions" / ID
     (folder / "session.json").unlink()
     (folder / "events.parquet").write_bytes(b"PAR1")
-    (one,) = book(data)
+    (one,) = book(data).newest_first()
     assert one.events == ()
     assert str(one.problem).endswith("lost are subject, notes and tags, marks")
     recover(data)
@@ -95,7 +95,7 @@ def test_a_lost_clock_is_said_as_well(data: Path) -> None:
     folder = data / "sessions" / ID
     (folder / "session.json").unlink()
     (folder / "clock.parquet").unlink()
-    (one,) = book(data)
+    (one,) = book(data).newest_first()
     assert one.clock == ()
     assert str(one.problem).endswith("lost are subject, notes and tags, clock measurements")
 
@@ -108,7 +108,7 @@ def test_one_that_nothing_proves_is_named_and_its_files_stay(data: Path) -> None
     path = damage(data)
     before = path.read_bytes()
     found = book(data)
-    assert (list(found), found.has_unreadable) == ([], True)
+    assert (list(found.newest_first()), found.has_unreadable) == ([], True)
     assert "it was changed" in found.unreadable[ID]
     with pytest.raises(StateError, match="cannot be read"):
         found.get(ID)

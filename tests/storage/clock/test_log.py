@@ -82,13 +82,14 @@ def test_a_torn_last_line_costs_that_row_only(log: ClockLog) -> None:
         assert set(log.rows()) <= {*rows, row(9)}
 
 
-def test_a_flipped_bit_anywhere_never_makes_another_row(log: ClockLog) -> None:
+@pytest.mark.parametrize("every_bit", [False, pytest.param(True, marks=pytest.mark.soak)])
+def test_a_flipped_bit_anywhere_never_makes_another_row(log: ClockLog, every_bit: bool) -> None:
     rows = filled(log, 3)
     whole = log.path.read_bytes()
     first, second = (at for at, byte in enumerate(whole[:-1]) if byte == 10)
     for at in range(len(whole)):
         # Every bit of a row in the middle and of the line ends around it; of its like one of each.
-        for bit in range(8) if first <= at <= second else (at % 8,):
+        for bit in range(8) if every_bit or first <= at <= second else (at % 8,):
             damaged = bytearray(whole)
             damaged[at] ^= 1 << bit
             log.path.write_bytes(damaged)

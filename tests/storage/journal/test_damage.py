@@ -37,7 +37,10 @@ from tests.storage.journal.journals import (
 
 
 @pytest.mark.slow
-def test_a_cut_anywhere_keeps_every_whole_message_before_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("every_bytes", [7, pytest.param(1, marks=pytest.mark.soak)])
+def test_a_cut_anywhere_keeps_every_whole_message_before_it(
+    tmp_path: Path, every_bytes: int
+) -> None:
     whole = tmp_path / "whole"
     filled(whole, (0, 9), (10, 10), (11, 12)).close()
     (path,) = segments(whole)
@@ -47,11 +50,11 @@ def test_a_cut_anywhere_keeps_every_whole_message_before_it(tmp_path: Path) -> N
     for first, last in ((0, 9), (10, 10), (11, 12)):
         edges.append(edges[-1] + len(encode(part(first, last), SCHEMA)))
     assert edges[-1] == len(content)
-    # At every byte near an edge, and at every seventh within the messages.
+    # At every byte near an edge, at fewer within later messages, and fewer still of the header.
     near = {cut for edge in edges[1:] for cut in range(edge - 40, edge + 41)}
-    cuts = sorted({*range(0, header, 97), *range(edges[1], len(content), 7)} | near)
-    cuts = [cut for cut in cuts if cut <= len(content)]
-    for cut in cuts:
+    at_first = range(edges[1]) if every_bytes == 1 else range(0, header, 97)
+    cuts = near.union(at_first, range(edges[1], len(content), every_bytes))
+    for cut in sorted(cut for cut in cuts if cut <= len(content)):
         folder = tmp_path / f"cut-{cut}"
         folder.mkdir()
         (folder / path.name).write_bytes(content[:cut])

@@ -15,8 +15,8 @@ from typing import Any, Union, get_args, get_origin
 
 import pytest
 
-from service.cli.main import app
 from service.cli.options import FootOptions
+from service.cli.table import SUMMARIES, command_of
 from tests.service.cli.outcome import Outcome, Run
 
 NUMBERS = ("nan", "inf", "-inf", "-1", "1e308", str(10**30))
@@ -69,22 +69,19 @@ def options(*wanted: type) -> list[tuple[str, str]]:
     """Command and option, of these types."""
     of_foot = set(inspect.signature(FootOptions).parameters)
     found = []
-    for command in app.registered_commands:
-        assert command.name is not None
-        assert command.callback is not None
-        for name, parameter in inspect.signature(
-            command.callback, eval_str=True
-        ).parameters.items():
+    for command in SUMMARIES:
+        parameters = inspect.signature(command_of(command), eval_str=True).parameters
+        for name, parameter in parameters.items():
             # An emulated foot is refused by one function, whoever asks for it.
-            if command.name != "simulate" and name in of_foot:
+            if command != "simulate" and name in of_foot:
                 continue
             if set(kinds(parameter.annotation)) & set(wanted):
-                found.append((command.name, name))
+                found.append((command, name))
     return found
 
 
 def test_every_command_has_its_place_here() -> None:
-    assert {command.name for command in app.registered_commands} == set(COMMANDS)
+    assert set(SUMMARIES) == set(COMMANDS)
 
 
 @pytest.fixture(scope="module")

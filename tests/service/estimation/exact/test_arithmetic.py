@@ -19,13 +19,14 @@ from mpmath import mp, mpf
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.calibration import TileCalibration, paper_eq2_shape
 from service.estimation.estimates import Estimates
-from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.upper import BOUND_SIGMAS
+from service.estimation.ladder.plan import EstimationPlan, make_plan
+from service.estimation.ladder.upper import BOUND_SIGMAS
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at
 from tests.builders.calibrations import make_calibration, make_tare, newton_tile
 from tests.builders.estimates import estimate
 from tests.builders.frames import loaded_frames
-from tests.service.estimation.exact.equations import apart, pressure_kpa
+from tests.service.estimation.exact.digits import apart
+from tests.service.estimation.exact.lower import pressure_kpa
 
 GOAL_N = 1e-9
 GOAL_M = 1e-11

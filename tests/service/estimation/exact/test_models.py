@@ -15,7 +15,7 @@ from service.estimation.models import ambient, denoise, gas, rubber, temperature
 from service.estimation.models.flow import Flow
 from service.estimation.models.hysteresis import Hysteresis
 from service.estimation.tare.noise import left_by_mean
-from tests.service.estimation.exact import equations
+from tests.service.estimation.exact import digits, lower, upper
 
 GOAL = 1e-9
 NAN = float("nan")
@@ -56,8 +56,8 @@ def test_gas_is_within_a_micropascal(gamma: float, tau_s: float, seed: int) -> N
         settled, state = model.settled(kpa[rows, None], t_ns[rows, None], state)
         out.append(settled)
     parameters = (mpf(gamma), mpf(tau_s), mpf(0.00124), mpf(100.1))
-    expected = equations.gas(equations.exact(kpa), t_ns.tolist(), *parameters)
-    assert equations.apart(np.concatenate(out), expected) < GOAL
+    expected = lower.gas(digits.exact(kpa), t_ns.tolist(), *parameters)
+    assert digits.apart(np.concatenate(out), expected) < GOAL
 
 
 @settings(max_examples=15)
@@ -77,13 +77,13 @@ def test_rubber_is_within_a_nanonewton(
     for rows in in_two_parts(40):
         force_n, state = model.compensated(apparent_n[rows, None], t_ns[rows, None], state)
         out.append(force_n)
-    expected = equations.rubber(
-        equations.exact(apparent_n),
+    expected = upper.rubber(
+        digits.exact(apparent_n),
         t_ns.tolist(),
         [mpf(g) for g in parts],
         [mpf(tau) for tau in taus_s],
     )
-    assert equations.apart(np.concatenate(out), expected) < GOAL
+    assert digits.apart(np.concatenate(out), expected) < GOAL
 
 
 @settings(max_examples=15)
@@ -105,10 +105,10 @@ def test_flow_is_within_a_nanonewton(
     for rows in in_two_parts(40):
         force_n, state = model.compensated(apparent_n[rows, None], t_ns[rows, None], state)
         out.append(force_n)
-    expected = equations.flow(
-        equations.exact(apparent_n), t_ns.tolist(), mpf(part), mpf(stress_n), mpf(power)
+    expected = upper.flow(
+        digits.exact(apparent_n), t_ns.tolist(), mpf(part), mpf(stress_n), mpf(power)
     )
-    assert equations.apart(np.concatenate(out), expected) < GOAL
+    assert digits.apart(np.concatenate(out), expected) < GOAL
 
 
 @settings(max_examples=15)
@@ -129,8 +129,8 @@ def test_hysteresis_is_within_a_nanonewton(
     for rows in in_two_parts(40):
         force_n, plays_n = model.compensated(apparent_n[rows, None], plays_n)
         out.append(force_n)
-    expected = equations.hysteresis(equations.exact(apparent_n), [mpf(w) for w in parts])
-    assert equations.apart(np.concatenate(out), expected) < GOAL * max(1.0, swing_n)
+    expected = upper.hysteresis(digits.exact(apparent_n), [mpf(w) for w in parts])
+    assert digits.apart(np.concatenate(out), expected) < GOAL * max(1.0, swing_n)
 
 
 @settings(max_examples=15)
@@ -146,9 +146,9 @@ def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -
         state = both[2]
     found = np.concatenate(out)
     for column, expected in enumerate(
-        equations.temperature(equations.exact(tadc), t_ns.tolist(), mpf(lag_s))
+        lower.temperature(digits.exact(tadc), t_ns.tolist(), mpf(lag_s))
     ):
-        assert equations.apart(found[:, column], expected) < 1e-9
+        assert digits.apart(found[:, column], expected) < 1e-9
 
 
 @settings(max_examples=15)
@@ -162,9 +162,9 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
     for rows in in_two_parts(60):
         passed_kpa, _, state = model.passed_on(kpa[rows], t_ns[rows], state)
         out.append(passed_kpa)
-    averaged = equations.smoothed(equations.exact(kpa), t_ns.tolist())
+    averaged = lower.smoothed(digits.exact(kpa), t_ns.tolist())
     expected = [None if x is None else mpf(0.11) * x for x in averaged]
-    assert equations.apart(np.concatenate(out), expected) < GOAL
+    assert digits.apart(np.concatenate(out), expected) < GOAL
 
 
 @pytest.mark.parametrize("look_ms", [0, 3, 10, 100])
@@ -203,8 +203,8 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -
         noise_left[None, :],
         denoise.anywhere(n, n),
     )
-    found = equations.denoised(
-        equations.exact(column),
+    found = upper.denoised(
+        digits.exact(column),
         [mpf(0.3)] * n,
         t_ns.tolist(),
         frame_ns.tolist(),
@@ -213,9 +213,9 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -
         look_ms * 1_000_000,
         noise_left,
     )
-    assert equations.apart(averaged, [None if x is None else x[0] for x in found]) < GOAL
-    assert equations.apart(left, [None if x is None else x[1] for x in found]) < GOAL
+    assert digits.apart(averaged, [None if x is None else x[0] for x in found]) < GOAL
+    assert digits.apart(left, [None if x is None else x[1] for x in found]) < GOAL
     there = [x for x in found if x is not None]
     known = np.isfinite(averaged[:, 0])
-    assert equations.apart(bend[known], [x[2] for x in there]) < GOAL
-    assert equations.apart(of_bend[known], [x[3] for x in there]) < GOAL
+    assert digits.apart(bend[known], [x[2] for x in there]) < GOAL
+    assert digits.apart(of_bend[known], [x[3] for x in there]) < GOAL

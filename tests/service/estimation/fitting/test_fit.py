@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from devices.errors import CalibrationError
 from service.estimation.calibration import TileCalibration
+from service.estimation.fitting.bench.indentation import Indentation
 from service.estimation.fitting.fit import fit_tile
-from service.estimation.fitting.indentation import Indentation
 from service.estimation.models.static import StaticCurves
 
 Curve = Callable[[np.ndarray], np.ndarray]

@@ -15,7 +15,7 @@ from service.estimation.fitting.least_squares import least_squares
 from service.estimation.fitting.model import DomeModel
 from service.estimation.fitting.output_error import OutputErrorProblem
 from service.estimation.fitting.unknowns import Parts, told_s, unknowns_of
-from tests.service.estimation.fitting.test_identify import recorded
+from tests.service.estimation.fitting.recordings import recorded
 
 _WIDE = np.full(3, 100.0)
 

@@ -9,12 +9,12 @@ import pytest
 
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from service.estimation.effects import WALL_PER_KPA
+from service.estimation.fitting.bench.indentation import Indentation
 from service.estimation.fitting.effects_fit import fit_effects
 from service.estimation.fitting.fit import fit_tile
-from service.estimation.fitting.indentation import Indentation
 from service.estimation.fitting.model import pressed
 from service.estimation.models.hysteresis import WIDTHS_N
-from tests.service.estimation.fitting.test_identify import (
+from tests.service.estimation.fitting.recordings import (
     BASE_KPA,
     CURVE,
     GAMMA,

@@ -7,7 +7,8 @@ import pytest
 from scipy.signal import lfilter
 
 from service.estimation.effects import TemperatureEffect
-from service.estimation.fitting.soak import LAG_S, Soak, fit_soak
+from service.estimation.fitting.bench.indentation import Soak
+from service.estimation.fitting.soak import LAG_S, fit_soak
 
 CHIP_LAG_S, GAS_LAG_S, KPA_PER_K, BASE_KPA = 1.2, 3.3, 0.297, 100.3
 STEP_S = 0.00184

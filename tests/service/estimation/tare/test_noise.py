@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
 from devices.errors import TareError
-from service.estimation.plan import make_plan
+from service.estimation.ladder.plan import make_plan
 from service.estimation.tare.noise import lasting, left_by_mean
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import take_tare

@@ -13,8 +13,8 @@ from devices.arrays import Floats
 from devices.chips.mpl115a2 import TADC_PER_KELVIN
 from devices.frames import FrameBatch
 from service.estimation.estimates import EstimateStatus
-from service.estimation.ladder import MODELS
-from service.estimation.plan import EstimationPlan
+from service.estimation.ladder.chosen import MODELS
+from service.estimation.ladder.plan import EstimationPlan
 from tests.builders.arrays import COUNT_KPA, PERIOD_NS, array_at
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import estimate, newton_plan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.estimation.ladder import MODELS
+from service.estimation.ladder.chosen import MODELS
 from service.offline.benchmark.rungs import absent, rungs
 
 LADDER = (

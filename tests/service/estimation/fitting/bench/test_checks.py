@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from devices.errors import CalibrationError
+from service.estimation.fitting.bench.indentation import Indentation
 from service.estimation.fitting.fit import fit_tile
-from service.estimation.fitting.indentation import Indentation
 
 BASELINE_KPA = 100.0
 READINGS = 120

@@ -11,7 +11,7 @@ from devices.arrays import Floats
 from devices.frames import FrameBatch
 from service.estimation.effects import Effects, Parameter
 from service.estimation.estimates import Estimates
-from service.estimation.plan import EstimationPlan
+from service.estimation.ladder.plan import EstimationPlan
 from tests.builders.arrays import array_at
 from tests.builders.calibrations import newton_tile
 from tests.builders.estimates import estimate, newton_plan

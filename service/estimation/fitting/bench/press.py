@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from devices.arrays import Arrays, Bools, Floats, Ints
-from service.estimation.fitting.indentation import Indentation, Unloaded
+from service.estimation.fitting.bench.indentation import Indentation, Unloaded
 from service.estimation.models.outliers import spikes
 
 BLOCK = 10  # readings: 20 ms of a stroke that lasts seconds

@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from devices.arrays import Arrays, Bools, Floats, Ints, Times
 from devices.errors import CalibrationError
-from service.estimation.fitting.soak import Soak
 
 BLOCKS_PER_STROKE = 60  # many for a cubic, and each averages many readings
 BASELINE_NS = 1_000_000_000  # before the first press
@@ -79,6 +78,23 @@ class Unloaded:
     reference_zero_n: float
     tadc_counts: float | None = None
     """Mean temperature; None where it is not known."""
+
+
+@dataclass(frozen=True)
+class Soak:
+    """An unloaded tile while its surroundings warm up; arrays of n readings.
+
+    Attributes:
+        t_s: instants.
+        kpa: absolute pressures, NaN where there is none.
+        tadc: temperature in counts, NaN where there is none.
+        noise_kpa: standard deviation of a reading.
+    """
+
+    t_s: Floats
+    kpa: Floats
+    tadc: Floats
+    noise_kpa: float
 
 
 def unloaded(recording: Indentation) -> Unloaded:

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates, EstimateStatus
-from service.estimation.ladder import MODELS
-from service.estimation.plan import EstimationPlan
+from service.estimation.ladder.chosen import MODELS
+from service.estimation.ladder.plan import EstimationPlan
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import estimate, newton_plan

@@ -10,7 +10,7 @@ import pytest
 
 from devices.errors import CalibrationError, FootTileError, UsageError
 from service.estimation.calibration import paper_eq2_shape
-from service.estimation.plan import make_plan
+from service.estimation.ladder.plan import make_plan
 from tests.builders.arrays import DATA_SHEET_CHIP, array_at
 from tests.builders.calibrations import newton_tile
 from tests.builders.estimates import newton_plan

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.estimation.fitting.indentation import Indentation, Unloaded
-from service.estimation.fitting.press import joined, presses
+from service.estimation.fitting.bench.indentation import Indentation, Unloaded
+from service.estimation.fitting.bench.press import joined, presses
 
 ZERO = Unloaded(baseline_kpa=100.0, noise_kpa=0.1, reference_zero_n=0.0)
 

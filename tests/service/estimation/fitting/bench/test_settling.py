@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from devices.errors import CalibrationError
-from service.estimation.fitting.checks import baseline_drift_kpa
-from service.estimation.fitting.indentation import Indentation
-from service.estimation.fitting.settling import settling
+from service.estimation.fitting.bench.checks import baseline_drift_kpa
+from service.estimation.fitting.bench.indentation import Indentation
+from service.estimation.fitting.bench.settling import settling
 
 STEP_S = 0.01
 STROKES, REST_S, STROKE_S, ALONE_S = 4, 0.3, 8.0, 15.0

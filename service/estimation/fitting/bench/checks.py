@@ -12,7 +12,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import CalibrationError
-from service.estimation.fitting.indentation import (
+from service.estimation.fitting.bench.indentation import (
     Indentation,
     Strokes,
     place,
@@ -21,7 +21,7 @@ from service.estimation.fitting.indentation import (
     strokes,
     unloaded,
 )
-from service.estimation.fitting.settling import settling
+from service.estimation.fitting.bench.settling import settling
 
 LOADED_N = 1.0  # less is as good as no load on a tile of 30 N
 LOADED_KPA = 3.0

@@ -17,13 +17,13 @@ from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.estimates import EstimateStatus
 from service.estimation.foot.kinematics import Readings
+from service.estimation.ladder.plan import SIGMAS, SUCTION_MAX_KPA, TARE_OLD_NS, EstimationPlan
+from service.estimation.ladder.unseen import EVENLY, Unseen, farthest, was_away
 from service.estimation.models import ambient, denoise, gas, skew, temperature
 from service.estimation.models.gas import Gas, GasState
 from service.estimation.models.outliers import despiked
 from service.estimation.models.unwrap import unwrap
-from service.estimation.plan import SIGMAS, SUCTION_MAX_KPA, TARE_OLD_NS, EstimationPlan
 from service.estimation.tare.tare import has_warmed
-from service.estimation.unseen import EVENLY, Unseen, farthest, was_away
 from service.estimation.watch.watch import WatchState
 
 

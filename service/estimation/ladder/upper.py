@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from devices.arrays import Arrays, Bools, Floats, Times
-from service.estimation.averaged import averaged, summed
 from service.estimation.compiled import compiled
-from service.estimation.ladder import Ladder
-from service.estimation.lower import ApparentForces
+from service.estimation.ladder.averaged import averaged, summed
+from service.estimation.ladder.chosen import Ladder
+from service.estimation.ladder.lower import ApparentForces
+from service.estimation.ladder.plan import EstimationPlan
+from service.estimation.ladder.unseen import EVENLY, farthest, was_away
 from service.estimation.models.flow import FlowState
 from service.estimation.models.rubber import RubberState
-from service.estimation.plan import EstimationPlan
-from service.estimation.unseen import EVENLY, farthest, was_away
 
 BOUND_SIGMAS = 2.33
 """A stated bound lies so many standard uncertainties below: one in a hundred is above the truth."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from devices.errors import CalibrationError
-from service.estimation.fitting.indentation import Indentation, place, strokes, unloaded
+from service.estimation.fitting.bench.indentation import Indentation, place, strokes, unloaded
 
 Segment = tuple[str, list[float], list[float]]
 """Phase, absolute pressures and reference forces; a phase with * is of another tile."""

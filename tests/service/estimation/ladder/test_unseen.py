@@ -20,9 +20,9 @@ from devices.frames import FrameBatch, TileStatus
 from service.estimation.effects import GasEffect, HysteresisEffect, Parameter, RubberEffect
 from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.fitting.model import DomeModel
-from service.estimation.ladder import MODELS
-from service.estimation.plan import EstimationPlan, make_plan
-from service.estimation.unseen import farthest, was_away
+from service.estimation.ladder.chosen import MODELS
+from service.estimation.ladder.plan import EstimationPlan, make_plan
+from service.estimation.ladder.unseen import farthest, was_away
 from tests.builders.arrays import UNLOADED_KPA, make_array
 from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
 from tests.builders.estimates import estimate

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.estimation.averaged import averaged
-from service.estimation.lower import ApparentForces
+from service.estimation.ladder.averaged import averaged
+from service.estimation.ladder.lower import ApparentForces
 from service.estimation.models.denoise import AVERAGED_MAX
 
 SIGMA_N, PERIOD_NS, TILES = 0.3, 1_838_235, 4

@@ -19,11 +19,11 @@ from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.foot.contact import ContactRule
 from service.estimation.foot.geometry import grid_indices, hull, lost_by_tilt
-from service.estimation.ladder import MODELS, Ladder, make_ladder
+from service.estimation.ladder.chosen import MODELS, Ladder, make_ladder
+from service.estimation.ladder.unseen import Unseen, make_unseen
 from service.estimation.models import denoise
 from service.estimation.tare.noise import left_by_mean
 from service.estimation.tare.tare import Tare
-from service.estimation.unseen import Unseen, make_unseen
 from service.estimation.watch.watch import Watch, make_watch
 
 CONTACT_ON_SIGMA = 5.0  # of the GRF unloaded: noise alone does not get there

@@ -11,9 +11,9 @@ import numpy as np
 
 from devices.arrays import Floats, Ints, Times
 from service.estimation.compiled import compiled
-from service.estimation.lower import ApparentForces
+from service.estimation.ladder.lower import ApparentForces
+from service.estimation.ladder.plan import EstimationPlan
 from service.estimation.models import denoise
-from service.estimation.plan import EstimationPlan
 
 
 def averaged(

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from devices.arrays import Floats
-from service.estimation.fitting.indentation import Indentation, rests, stroke_rows
+from service.estimation.fitting.bench.indentation import Indentation, rests, stroke_rows
 
 _CREEP_S = np.array([0.3, 1.0, 3.0, 10.0])
 """Times of the creep that a rest or a stroke leaves something of."""

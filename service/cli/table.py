@@ -1,0 +1,81 @@
+"""The commands of `foottile`, each loaded when it is called: for `--help` none has to be.
+
+Together they import all there is, numpy and pydantic's models of scenes among it: two thirds of a
+second before a word is printed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+_IN = "service.cli.commands"
+
+SUMMARIES = {
+    "demo": "Run a server and an emulated node, and show where the live page is.",
+    "serve": "Take in nodes, estimate, show live, record, and give sessions away over HTTP.",
+    "node": "Take frames from an array, keep them on disk and publish them to a server.",
+    "sessions": "List recorded sessions, newest first.",
+    "pull": "Download a sealed session: data, description, events.",
+    "export": "Write a sealed session, or a slice of it, in another format.",
+    "simulate": "Run a scene on emulated hardware in virtual time and write the session.",
+    "estimate": "Estimate a recorded session again and write it with the new estimates.",
+    "calibrate": (
+        "Fit every tile that was pressed in the recordings, and say how good the fit is."
+    ),
+    "domes": "List the domes of the paper's Table I, and say which one bears a load.",
+    "verify": (
+        "Prove sessions and journals from their files alone: checksums, hashes, order and ledger."
+    ),
+    "recover": (
+        "Complete what a crash has left, without a server: mend journals, seal sessions, prove "
+        "them."
+    ),
+    "doctor": (
+        "Find the tiles of a bus, measure it, and say what rate it will hold and what to change."
+    ),
+    "bench": "Measure time per frame and error of every rung of the model ladder.",
+}
+"""What each command does, as the first sentence of its function says; in the order of `--help`."""
+
+_MODULES = {"pull": "sessions", "export": "sessions"}
+"""Modules with more than one command."""
+
+
+def command_of(name: str) -> Callable[..., None]:
+    """The function of a command."""
+    module = import_module(f"{_IN}.{_MODULES.get(name, name)}")
+    command: Callable[..., None] = getattr(module, f"{name}_command")
+    return command
+
+
+def loaded(name: str) -> Any:
+    """A command with its options, as typer runs it."""
+    from service.cli.options import with_finite_numbers
+
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    app.command(name)(with_finite_numbers(command_of(name)))
+    return typer.main.get_command(app)
+
+
+class Commands(TyperGroup):
+    """A group that knows names and summaries, and loads the one command that is called."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """The command that is called, loaded."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command if name is None else loaded(name), rest
+
+
+def name_all(app: typer.Typer) -> None:
+    """Add the commands' names and summaries to a group of class `Commands`."""
+    for name, summary in SUMMARIES.items():
+        app.command(name, help=summary)(_not_loaded)
+
+
+def _not_loaded() -> None:
+    raise AssertionError("a command is loaded before it runs")

@@ -1,0 +1,1 @@
+"""The models that a scene names, one after the other. Asks models, tare, watch; none knows it."""
