@@ -26,7 +26,7 @@ def bench_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--soak", action="store_true", help="run what takes minutes, too")
+    parser.addoption("--soak", action="store_true", help="run what takes long, too")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -34,4 +34,4 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return
     for item in items:
         if item.get_closest_marker("soak"):
-            item.add_marker(pytest.mark.skip(reason="takes minutes; run with --soak"))
+            item.add_marker(pytest.mark.skip(reason="takes long; run with --soak"))
