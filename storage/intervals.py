@@ -9,6 +9,10 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from operator import itemgetter
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 NO_END = 2**62
 """In place of the last number of an interval that goes on with every number to come."""
@@ -83,6 +87,20 @@ class Intervals:
             end += 1
         self._intervals[begin:end] = [(first, last)]
 
+    def add_stretches(self, first: npt.NDArray[Any], count: npt.NDArray[Any]) -> None:
+        """Add stretches of numbers, none of them empty, in any order.
+
+        Args:
+            first: number with which each begins, [n].
+            count: how many numbers it has, [n].
+        """
+        first = first.astype(np.int64)
+        last = first + count.astype(np.int64) - 1
+        begins = np.concatenate([[True], first[1:] != last[:-1] + 1])[: len(first)]
+        ends = np.concatenate([begins[1:], [True]])[: len(first)]
+        for a, b in zip(first[begins].tolist(), last[ends].tolist(), strict=True):
+            self.add(a, b)
+
     def within(self, first: int, last: int) -> Intervals:
         """The numbers of this set from `first` to `last`."""
         found = Intervals()
@@ -114,6 +132,19 @@ class Intervals:
         if at <= last:
             gaps._intervals.append((at, last))
         return gaps
+
+    def covers(self, first: npt.NDArray[Any], count: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+        """Which stretches are in this set whole?
+
+        Args:
+            first: number with which each begins, [n].
+            count: how many numbers it has, [n].
+        """
+        begins, ends = np.array([(0, 0), *self._intervals], np.int64).T  # one before the first
+        first = first.astype(np.int64)
+        at = np.searchsorted(begins[1:], first, side="right")
+        found: npt.NDArray[np.bool_] = (at > 0) & (ends[at] >= first + count.astype(np.int64) - 1)
+        return found
 
     def __or__(self, other: Intervals) -> Intervals:
         """The numbers that are in either."""

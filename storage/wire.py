@@ -16,12 +16,11 @@ import pyarrow as pa
 from devices.errors import FileFormatError
 from devices.facts import SEQ_END
 from devices.frames import ArrayInfo, FrameBatch
-from storage.arrow_header import BatchHeader, HeaderError, read_header
+from storage.arrow_header import HeaderError
 from storage.intervals import Intervals
+from storage.layout import layout_of
 from storage.schema import from_record_batch, to_record_batch, wire_schema
 
-FRAMES_MAX = 4096
-"""Frames in one message; a node sends some ten. More is not what a node sends."""
 _MESSAGE_FRAMES = 64
 """As many as acquisition puts into a batch at most."""
 
@@ -72,9 +71,7 @@ def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
     """
     try:
         message = pa.ipc.read_message(pa.py_buffer(payload))
-        header = read_header(message)
-        _check_header(header, schema)
-        if 8 + message.metadata.size + header.body_bytes != len(payload):
+        if layout_of(message, schema).message_bytes != len(payload):
             raise HeaderError(f"it is {len(payload)} bytes long, and says another length")
         record = pa.ipc.read_record_batch(message, schema)
         record.validate(full=True)  # whatever the header did not say
@@ -99,37 +96,3 @@ def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
             expected="t_mono_ns rising",
         )
     return batch
-
-
-def _check_header(header: BatchHeader, schema: pa.Schema) -> None:
-    """Whether a message is as large as its number of frames makes it, before memory is taken.
-
-    Raises:
-        FileFormatError: too many frames, or none.
-        HeaderError: columns or buffers are not those of so many frames.
-    """
-    rows = header.rows
-    if not 0 < rows <= FRAMES_MAX:
-        raise FileFormatError(f"a message of {rows} frames", expected=f"1 to {FRAMES_MAX} frames")
-    nodes: list[tuple[int, int]] = []
-    needed_bytes: list[int] = []
-    for type_ in schema.types:
-        nodes.append((rows, 0))
-        needed_bytes.append(0)  # which rows are empty: none
-        values, value_type = rows, type_
-        if isinstance(type_, pa.FixedSizeListType):
-            values, value_type = rows * type_.list_size, type_.value_type
-            nodes.append((values, 0))
-            needed_bytes.append(0)
-        needed_bytes.append(values * value_type.bit_width // 8)
-    if list(header.nodes) != nodes:
-        raise HeaderError(f"its columns are not those of {rows} frames without empty values")
-    if len(header.buffers) != len(needed_bytes):
-        raise HeaderError(f"{len(header.buffers)} buffers instead of {len(needed_bytes)}")
-    end = 0
-    for (offset, length), needed in zip(header.buffers, needed_bytes, strict=True):
-        if length < needed:
-            raise HeaderError(f"a column of {length} bytes where {needed} are needed")
-        if length and (offset < end or offset + length > header.body_bytes):
-            raise HeaderError("its buffers overlap, or reach outside of it")
-        end = max(end, offset + length if length else 0)

@@ -20,7 +20,6 @@ from service.sessions.sources import Sources
 
 Columns = Mapping[str, npt.NDArray[Any]]
 
-_GATHER_FRAMES = 4096
 TARE_LOST = (
     "a tare is damaged and lost: where it may have been in force, forces are not known (bit 512 of "
     "estimate_status)"
@@ -90,22 +89,8 @@ class SessionFrames:
             last = part.seq_last if part.seq_last is not None else journal.held.last
             if last is None:
                 continue
-            for batch in _gathered(journal.read(part.seq_first, last)):
+            for batch in journal.read(part.seq_first, last):
                 yield batch, {"part": np.full(len(batch), number, dtype=np.uint16)}
 
 
 _LATER = "`foottile estimate` adds them where foottile[server] is installed"
-
-
-def _gathered(batches: Iterator[FrameBatch]) -> Iterator[FrameBatch]:
-    """Join batches: estimating ten rows costs nearly as much as estimating thousands."""
-    waiting: list[FrameBatch] = []
-    count = 0
-    for batch in batches:
-        waiting.append(batch)
-        count += len(batch)
-        if count >= _GATHER_FRAMES:
-            yield FrameBatch.concatenate(waiting)
-            waiting, count = [], 0
-    if waiting:
-        yield FrameBatch.concatenate(waiting)

@@ -9,7 +9,6 @@ whole. Nothing is held twice: a number that is there already is left as it is.
 from __future__ import annotations
 
 import errno
-import os
 import shutil
 import stat
 from collections.abc import Iterator
@@ -18,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from devices.errors import DamagedFramesError, FileFormatError, StorageError
+from devices.errors import FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.words import printable
 from storage.durable import make_folder, storage_errors
@@ -26,6 +25,7 @@ from storage.intervals import CORRUPT, NO_END, Intervals, Losses, union
 from storage.journal import instants
 from storage.journal.instants import Instants
 from storage.journal.open_segments import OpenSegments
+from storage.journal.reading import Batches, BatchReader
 from storage.journal.segment import (
     SUFFIX,
     Segment,
@@ -34,10 +34,12 @@ from storage.journal.segment import (
     set_aside_no_files,
     unread_of,
 )
-from storage.journal.segment_format import INDEX_SUFFIX, numbers, payload_of, read_header
+from storage.journal.segment_format import INDEX_SUFFIX, read_header
 from storage.journal.stream_notes import StreamNotes
+from storage.layout import FRAMES_MAX
+from storage.run import RunReader
 from storage.schema import array_info, wire_schema
-from storage.wire import FRAMES_MAX, EncodedBatch, decode, encode
+from storage.wire import EncodedBatch, decode, encode
 
 RING_NS = 600_000_000_000
 """How long frames of no session are kept, for pre-roll and for late starts."""
@@ -65,6 +67,7 @@ class Journal:
         self._schema = wire_schema(info)
         self._segments: list[Segment] = []
         self._open = OpenSegments(folder, self._schema.serialize().to_pybytes())
+        self._runs = RunReader(self._schema)
         self._instants = Instants(lambda seq, is_upper: self.t_ns_near(seq, newest=is_upper))
         with storage_errors(folder):
             make_folder(folder)
@@ -190,15 +193,17 @@ class Journal:
         self._open.retire_all()
 
     def read(self, seq_first: int, seq_last: int) -> Iterator[FrameBatch]:
-        """Frames from `seq_first` to `seq_last` that are held, in order, a batch at a time.
+        """Frames from `seq_first` to `seq_last` that are held, in order, some thousand at a time.
 
         Raises:
             DamagedFramesError: a batch on disk is damaged; which one, it says.
             StorageError: a segment cannot be read.
         """
-        for message in self.messages(seq_first, seq_last):
-            batch, first = decode(message.payload, self._schema), message.seq_first
-            yield batch.rows(max(0, seq_first - first), min(len(batch), seq_last - first + 1))
+        with BatchReader(self._runs) as reader:
+            for batches in self._found(seq_first, seq_last):
+                for frames in reader.frames(batches):
+                    begin, end = np.searchsorted(frames.seq, (seq_first, seq_last + 1)).tolist()
+                    yield frames.rows(begin, end)
 
     def messages(self, seq_first: int, seq_last: int) -> Iterator[EncodedBatch]:
         """Batches with any of these frames, whole, in order, as the bytes in which they came.
@@ -207,24 +212,9 @@ class Journal:
             DamagedFramesError: a batch on disk is damaged; which one, it says.
             StorageError: a segment cannot be read.
         """
-        at = max(0, seq_first - FRAMES_MAX)
-        while (held := list(self.held.within(at, seq_last))) and held[0][0] <= seq_last:
-            at = held[0][0]
-            end = min(at + _WINDOW_FRAMES, seq_last + 1)
-            found = []
-            for segment in list(self._segments):
-                if segment.held and segment.span[0] < end and segment.span[1] >= at:
-                    try:
-                        records = segment.records()
-                    except StorageError as error:
-                        if error.errno == errno.ENOENT and segment not in self._segments:
-                            continue  # pruned meanwhile
-                        raise
-                    inside = (records["seq_first"] >= at) & (records["seq_first"] < end)
-                    found += [(numbers(r), segment.path, r) for r in records[inside]]
-            found.sort(key=lambda item: item[0])
-            yield from self._messages_of([item for item in found if item[0][1] >= seq_first])
-            at = end
+        with BatchReader(self._runs) as reader:
+            for batches in self._found(seq_first, seq_last):
+                yield from reader.messages(batches)
 
     def first_seq_since(self, t_ns: int) -> int | None:
         """The first number held that was taken at `t_ns` (node's UTC) or later, roughly.
@@ -318,30 +308,25 @@ class Journal:
         self._instants.note(message, self.held)
         self.lost.found(numbers_)
 
-    def _messages_of(
-        self, found: list[tuple[tuple[int, int], Path, np.void]]
-    ) -> Iterator[EncodedBatch]:
-        opened: dict[Path, int] = {}
-        try:
-            for (first, last), path, record in found:
-                with storage_errors(path):
-                    if path not in opened:
-                        opened[path] = os.open(path, os.O_RDONLY)
-                    payload = payload_of(opened[path], record)
-                if payload is None:
-                    raise DamagedFramesError(
-                        f"the batch at byte {int(record['offset'])} (frames {first} to {last}) is "
-                        "damaged",
-                        where=str(path),
-                        expected="the bytes that were written, by their CRC-32",
-                        seq_first=first,
-                        seq_last=last,
-                    )
-                t_ns = int(record["t_ns_first"]), int(record["t_ns_last"])
-                yield EncodedBatch(first, last, *t_ns, payload)
-        finally:
-            for descriptor in opened.values():
-                os.close(descriptor)
+    def _found(self, seq_first: int, seq_last: int) -> Iterator[Batches]:
+        """Batches with any of these frames, some ten thousand frames at a time."""
+        at = max(0, seq_first - FRAMES_MAX)
+        while (held := list(self.held.within(at, seq_last))) and held[0][0] <= seq_last:
+            at = held[0][0]
+            end = min(at + _WINDOW_FRAMES, seq_last + 1)
+            found = []
+            for segment in list(self._segments):
+                if segment.held and segment.span[0] < end and segment.span[1] >= at:
+                    try:
+                        records = segment.records()
+                    except StorageError as error:
+                        if error.errno == errno.ENOENT and segment not in self._segments:
+                            continue  # pruned meanwhile
+                        raise
+                    inside = (records["seq_first"] >= at) & (records["seq_first"] < end)
+                    found.append((segment.path, records[inside]))
+            yield Batches.of(found).since(seq_first)
+            at = end
 
 
 def _described(folder: Path) -> ArrayInfo | None:

@@ -73,9 +73,7 @@ class Segment:
 
     def take_in(self, records: Records) -> None:
         """Note batches that are in the file."""
-        for record in records:
-            first = int(record["seq_first"])
-            self.held.add(first, first + int(record["count"]) - 1)
+        self.held.add_stretches(records["seq_first"], records["count"])
         if len(records):
             begin, end = int(records["t_ns_first"].min()), int(records["t_ns_last"].max())
             fresh = not self.size_bytes
@@ -95,8 +93,7 @@ class Segment:
             raise StorageError(
                 f"cannot be read: {error}", where=str(self.path), errno=error.errno
             ) from error
-        held = [not self.held.missing(*numbers(record)) for record in found]
-        found = found[np.array(held, dtype=np.bool_)]
+        found = found[self.held.covers(found["seq_first"], found["count"])]
         return found[np.argsort(found["seq_first"], kind="stable")]
 
     def disown(self, doubtful: Intervals) -> None:
@@ -279,17 +276,21 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
     try:
         index = read_index(path)
     except FileNotFoundError:
-        index, was_closed = _rebuilt_index(path, end, schema), False
+        index = _rebuilt_index(path, end, schema)
     else:
         batches = batches_in(index)
-        was_closed = is_closed(index) and len(batches) == len(index) - 1 and end_of(batches) == size
+        was_closed = is_closed(index) and len(batches) == len(index) - 1
+        if was_closed and len(batches) and end_of(batches) == size:
+            segment = Segment(path)
+            segment.take_in(batches)
+            return segment, damaged
     good = []
     read: dict[int, EncodedBatch | None] = {}
     with path.open("rb") as file:
         for record in index:
-            if not was_closed and not is_whole(record) and end not in read:
+            if not is_whole(record) and end not in read:
                 read[end] = next(messages_from(path, end, schema), None)
-            found = record if was_closed else _checked(file.fileno(), record, end, read.get(end))
+            found = _checked(file.fileno(), record, end, read.get(end))
             if found is None and is_whole(record):
                 doubtful.add(*numbers(record))
             elif found is not None:
@@ -308,12 +309,11 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
         return None, damaged
     records = np.array(good, RECORD)
     segment.take_in(records)
-    if not was_closed:
-        os.truncate(path, end)
-        # A killed process leaves frames that only the kernel holds; from now on they are promised.
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-        _write_index(path, records)
+    os.truncate(path, end)
+    # A killed process leaves frames that only the kernel holds; from now on they are promised.
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+    _write_index(path, records)
     return segment, damaged
 
 

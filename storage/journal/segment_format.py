@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from devices.errors import FileFormatError
+from storage.run import Run
 from storage.wire import EncodedBatch, decode
 
 INDEX_SUFFIX = ".idx"
@@ -67,6 +68,15 @@ def is_whole(record: Any) -> bool:
     return zlib.crc32(record.tobytes()[:_CHECKED]) == int(record["check"])
 
 
+def are_whole(index: Records) -> npt.NDArray[np.bool_]:
+    """Which records are what was written?"""
+    content = memoryview(np.ascontiguousarray(index).tobytes())
+    begins = range(0, len(content), RECORD.itemsize)
+    checks = [zlib.crc32(content[at : at + _CHECKED]) for at in begins]
+    found: npt.NDArray[np.bool_] = np.array(checks, np.uint32) == index["check"]
+    return found
+
+
 def is_closed(index: Records) -> bool:
     """Does it say that its segment was closed in order?"""
     return bool(len(index)) and is_whole(index[-1]) and not index[-1]["count"]
@@ -74,7 +84,7 @@ def is_closed(index: Records) -> bool:
 
 def batches_in(index: Records) -> Records:
     """Its whole records with frames."""
-    return index[[bool(record["count"]) and is_whole(record) for record in index]]
+    return index[(index["count"] > 0) & are_whole(index)]
 
 
 def end_of(index: Records) -> int:
@@ -137,6 +147,17 @@ def payload_of(descriptor: int, record: Any) -> bytes | None:
     payload = os.pread(descriptor, int(record["length"]), int(record["offset"]))
     whole = len(payload) == record["length"] and zlib.crc32(payload) == record["crc32"]
     return payload if whole else None
+
+
+def run_of(records: Records, content: bytes) -> Run:
+    """Batches that are to be read at once.
+
+    Args:
+        records: in order of their frames.
+        content: their bytes, in the same order.
+    """
+    columns = (records[name] for name in ("length", "seq_first", "count", "crc32"))
+    return Run(content, *columns)
 
 
 def _sealed(record: Records) -> Records:

@@ -23,6 +23,7 @@ from storage.journal.segment_format import (
     INDEX_SUFFIX,
     RECORD,
     Records,
+    are_whole,
     batches_in,
     end_of,
     is_closed,
@@ -32,9 +33,14 @@ from storage.journal.segment_format import (
     payload_of,
     read_header,
     read_index,
+    run_of,
 )
+from storage.run import RunReader
 from storage.schema import array_info, older_wire_schema, wire_schema
 from storage.wire import decode
+
+_RUN_BATCHES = 256
+"""Batches that are looked at together: some thousand frames."""
 
 
 @dataclass
@@ -122,7 +128,7 @@ def _verify(path: Path, report: SegmentReport) -> None:
                 "frames; it is rebuilt when the journal is next opened"
             )
         return
-    _check_batches(report, index, schema, header_bytes)
+    _Batches(report, schema, header_bytes).check(index)
     end = max(header_bytes, end_of(batches_in(index)))
     behind, at = 0, end
     for message in messages_from(path, end, schema):
@@ -138,52 +144,103 @@ def _verify(path: Path, report: SegmentReport) -> None:
         report.remarks.append("a batch behind its last one is in no index")
 
 
-def _check_batches(
-    report: SegmentReport, index: Records, schema: pa.Schema, header_bytes: int
-) -> None:
-    doubtful, said = Intervals(), list[str]()
-    good = []
-    end, info = header_bytes, array_info(schema, where="")
-    descriptor = os.open(report.path, os.O_RDONLY)
-    try:
-        for at, record in enumerate(index):
-            if not is_whole(record):
-                said.append(f"record {at} of its index is damaged")
-                continue
-            if not record["count"]:
-                continue
-            first, last = numbers(record)
-            payload = payload_of(descriptor, record)
-            if payload is None:
-                said.append(f"frames {first} to {last} do not agree with their checksum")
-                doubtful.add(first, last)
-                continue
-            # Damage followed by a good batch happened after writing.
-            report.damaged, doubtful = report.damaged | doubtful, Intervals()
-            report.problems += said
-            said = []
-            wrong = _wrong_in(payload, record, schema, info)
-            if int(record["offset"]) < end:
-                wrong = "they stand where other frames stand as well"
-            end = int(record["offset"]) + int(record["length"])
-            if not wrong and report.held.within(first, last):
-                wrong = "they are in it twice"
-            if wrong:
-                report.problems.append(f"frames {first} to {last}: {wrong}")
-                continue
-            report.held.add(first, last)
-            good.append(at)
-    finally:
-        os.close(descriptor)
-    report.index = index[good]
-    if report.is_closed:
-        report.damaged = report.damaged | doubtful
-        report.problems += said
-    elif said:
-        report.unsynced = doubtful
-        report.remarks.append(
-            f"{len(said)} batches at its end were not yet on the disk: they were never promised"
-        )
+class _Batches:
+    """Looks at the batches of one segment, in the order of its index.
+
+    Args:
+        report: told what is found.
+        schema: of the segment.
+        header_bytes: where its first batch begins.
+    """
+
+    def __init__(self, report: SegmentReport, schema: pa.Schema, header_bytes: int) -> None:
+        self._report = report
+        self._runs = RunReader(schema)
+        self._info = array_info(schema, where="")
+        self._end = header_bytes
+        self._doubtful = Intervals()
+        self._said: list[str] = []
+        """Since the last batch that is whole."""
+
+    def check(self, index: Records) -> None:
+        """Check all batches that the index has."""
+        report, good = self._report, [np.zeros(0, RECORD)]
+        if report.is_closed:
+            index = index[:-1]
+        with report.path.open("rb") as file:
+            for begin in range(0, len(index), _RUN_BATCHES):
+                records = index[begin : begin + _RUN_BATCHES]
+                if self._is_right(file.fileno(), records):
+                    good.append(records)
+                    continue
+                for at, record in enumerate(records):
+                    if self._is_good(file.fileno(), record, begin + at):
+                        good.append(records[at : at + 1])
+        report.index = np.concatenate(good)
+        if report.is_closed:
+            report.damaged = report.damaged | self._doubtful
+            report.problems += self._said
+        elif self._said:
+            report.unsynced = self._doubtful
+            report.remarks.append(
+                f"{len(self._said)} batches at its end were not yet on the disk: they were never "
+                "promised"
+            )
+
+    def _is_right(self, descriptor: int, records: Records) -> bool:
+        """Is all right with these batches, looked at together? If not, nothing is noted of them."""
+        offset, length = records["offset"], records["length"].astype(np.uint64)
+        is_joined = bool((offset[1:] == (offset + length)[:-1]).all())
+        first, last = numbers(records[0])[0], numbers(records[-1])[1]
+        if not is_joined or offset[0] < self._end or not are_whole(records).all():
+            return False
+        content = os.pread(descriptor, int(length.sum()), int(offset[0]))
+        frames = self._runs.read(run_of(records, content))
+        if frames is None or self._report.held.within(first, last):
+            return False
+        ends = np.cumsum(records["count"], dtype=np.int64)
+        t_ns_first, t_ns_last = frames.t_ns[ends - records["count"]], frames.t_ns[ends - 1]
+        if (t_ns_first != records["t_ns_first"]).any() or (t_ns_last != records["t_ns_last"]).any():
+            return False
+        if broken_rule(frames, self._info):
+            return False
+        self._report.held.add_stretches(records["seq_first"], records["count"])
+        self._found_whole()
+        self._end = int(offset[-1] + length[-1])
+        return True
+
+    def _is_good(self, descriptor: int, record: np.void, at: int) -> bool:
+        """Is one batch whole, with frames that belong there?"""
+        report = self._report
+        if not is_whole(record):
+            self._said.append(f"record {at} of its index is damaged")
+            return False
+        if not record["count"]:
+            return False
+        first, last = numbers(record)
+        payload = payload_of(descriptor, record)
+        if payload is None:
+            self._said.append(f"frames {first} to {last} do not agree with their checksum")
+            self._doubtful.add(first, last)
+            return False
+        self._found_whole()
+        wrong = _wrong_in(payload, record, self._runs.schema, self._info)
+        if int(record["offset"]) < self._end:
+            wrong = "they stand where other frames stand as well"
+        self._end = int(record["offset"]) + int(record["length"])
+        if not wrong and report.held.within(first, last):
+            wrong = "they are in it twice"
+        if wrong:
+            report.problems.append(f"frames {first} to {last}: {wrong}")
+            return False
+        report.held.add(first, last)
+        return True
+
+    def _found_whole(self) -> None:
+        """Damage followed by a good batch happened after writing."""
+        self._report.damaged = self._report.damaged | self._doubtful
+        self._report.problems += self._said
+        self._doubtful, self._said = Intervals(), []
 
 
 def _wrong_in(payload: bytes, record: np.void, schema: pa.Schema, info: ArrayInfo) -> str:

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
+from storage.layout import FRAMES_MAX
 from storage.schema import to_record_batch, wire_schema
-from storage.wire import FRAMES_MAX, decode, encode
+from storage.wire import decode, encode
 from tests.builders.arrays import make_array
 from tests.builders.frames import any_frames, assert_same_bits
 

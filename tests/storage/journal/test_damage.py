@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from hypothesis import given, settings
@@ -212,6 +214,33 @@ def test_a_segment_that_was_closed_is_not_read_through_but_its_frames_are_checke
     journal.append(part(10, 19))
     journal.close()
     assert_holds(reopened(tmp_path), set(range(30)))
+
+
+def test_one_damaged_batch_among_thousands_of_frames_costs_its_own_frames_only(
+    tmp_path: Path,
+) -> None:
+    whole = stream(9000)
+    cuts = [*range(0, 9000, 25), 9000]
+    journal = begun(tmp_path)
+    for a, b in pairwise(cuts):
+        journal.append(whole.rows(a, b))
+    journal.close()
+    (path,) = segments(tmp_path)
+    content = bytearray(path.read_bytes())
+    records = np.frombuffer(index_of(path).read_bytes(), RECORD)
+    record = records[records["seq_first"] == 5000][0]
+    content[int(record["offset"]) + int(record["length"]) // 2] ^= 1
+    path.write_bytes(content)
+    journal = reopened(tmp_path)
+    before: list[int] = []
+    with pytest.raises(DamagedFramesError, match="frames 5000 to 5024") as caught:
+        before += (int(seq) for batch in journal.read(3, 9000) for seq in batch.seq)
+    assert (caught.value.seq_first, caught.value.seq_last) == (5000, 5024)
+    assert before == list(range(3, 5000))
+    journal.disown(Intervals([(5000, 5024)]))
+    held = {*range(5000), *range(5025, 9000)}
+    assert_holds(journal, held, 3, 8990, of=whole)
+    assert max(len(batch) for batch in journal.read(0, 9000)) > 1000
 
 
 def test_a_truncation_exactly_at_a_batch_is_seen_by_the_index(tmp_path: Path) -> None:

@@ -1,0 +1,147 @@
+"""Batches of a journal, found in the indexes of its segments, as messages or as frames.
+
+Frames come in pieces of thousands, whatever the batches in which they were taken: a piece is read
+at once, and batch by batch only where something about it is not as it was written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from devices.arrays import Ints
+from devices.errors import DamagedFramesError
+from devices.frames import FrameBatch
+from storage.durable import storage_errors
+from storage.journal.segment_format import RECORD, Records, numbers, payload_of, run_of
+from storage.run import RunReader
+from storage.wire import EncodedBatch, decode
+
+PIECE_FRAMES = 4096
+"""Frames in a piece, unless one message has more: as many as estimates are made of at a time."""
+
+
+@dataclass(frozen=True)
+class Batches:
+    """Batches in order of their frames.
+
+    Attributes:
+        records: of them, in the indexes.
+        paths: segments.
+        segment: int64, in which of `paths` each is.
+    """
+
+    records: Records
+    paths: Sequence[Path]
+    segment: Ints
+
+    @classmethod
+    def of(cls, found: Sequence[tuple[Path, Records]]) -> Batches:
+        """Those of several segments."""
+        records = np.concatenate([np.zeros(0, RECORD), *(records for _, records in found)])
+        segment = np.repeat(np.arange(len(found)), [len(records) for _, records in found])
+        order = np.lexsort((records["count"], records["seq_first"]))
+        return cls(records[order], [path for path, _ in found], segment[order])
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def since(self, seq: int) -> Batches:
+        """Those that do not end before this number."""
+        keep = self.records["seq_first"] + self.records["count"] > seq
+        return Batches(self.records[keep], self.paths, self.segment[keep])
+
+    def pieces(self) -> Iterator[Batches]:
+        """The same, in as many as `PIECE_FRAMES` frames are in."""
+        frames = np.cumsum(self.records["count"], dtype=np.int64)
+        begin = before = 0
+        while begin < len(self):
+            end = int(np.searchsorted(frames, before + PIECE_FRAMES, side="right"))
+            end = max(end, begin + 1)
+            yield Batches(self.records[begin:end], self.paths, self.segment[begin:end])
+            begin, before = end, int(frames[end - 1])
+
+
+class BatchReader:
+    """Reads batches; a segment that was opened stays open until this is closed.
+
+    Args:
+        runs: of the stream.
+    """
+
+    def __init__(self, runs: RunReader) -> None:
+        self._runs = runs
+        self._opened: dict[Path, int] = {}
+
+    def __enter__(self) -> BatchReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with ExitStack() as stack:
+            for descriptor in self._opened.values():
+                stack.callback(os.close, descriptor)
+
+    def messages(self, batches: Batches) -> Iterator[EncodedBatch]:
+        """Each as the bytes in which it came.
+
+        Raises:
+            DamagedFramesError: a batch on disk is damaged; which one, it says.
+            StorageError: a segment cannot be read.
+        """
+        for record, at in zip(batches.records, batches.segment.tolist(), strict=True):
+            path = batches.paths[at]
+            first, last = numbers(record)
+            with storage_errors(path):
+                payload = payload_of(self._descriptor(path), record)
+            if payload is None:
+                raise DamagedFramesError(
+                    f"the batch at byte {int(record['offset'])} (frames {first} to {last}) is "
+                    "damaged",
+                    where=str(path),
+                    expected="the bytes that were written, by their CRC-32",
+                    seq_first=first,
+                    seq_last=last,
+                )
+            t_ns = int(record["t_ns_first"]), int(record["t_ns_last"])
+            yield EncodedBatch(first, last, *t_ns, payload)
+
+    def frames(self, batches: Batches) -> Iterator[FrameBatch]:
+        """Their frames, in pieces; what is before a damaged batch comes before it is refused.
+
+        Raises:
+            DamagedFramesError: as for `messages`.
+            FileFormatError: a batch is whole, and holds no frames of this stream.
+            StorageError: as for `messages`.
+        """
+        for piece in batches.pieces():
+            frames = self._runs.read(run_of(piece.records, self._content(piece)))
+            if frames is not None:
+                yield frames
+                continue
+            for message in self.messages(piece):
+                yield decode(message.payload, self._runs.schema)
+
+    def _content(self, batches: Batches) -> bytes:
+        """Their bytes, one behind the other; fewer if a segment was cut."""
+        records, segment = batches.records, batches.segment
+        ends = records["offset"] + records["length"]
+        breaks = (segment[1:] != segment[:-1]) | (records["offset"][1:] != ends[:-1])
+        stretches = []
+        for begin, end in pairwise([0, *(np.flatnonzero(breaks) + 1).tolist(), len(records)]):
+            path = batches.paths[segment[begin]]
+            offset = int(records["offset"][begin])
+            with storage_errors(path):
+                length = int(ends[end - 1]) - offset
+                stretches.append(os.pread(self._descriptor(path), length, offset))
+        return b"".join(stretches)
+
+    def _descriptor(self, path: Path) -> int:
+        if path not in self._opened:
+            self._opened[path] = os.open(path, os.O_RDONLY)
+        return self._opened[path]
