@@ -9,13 +9,14 @@ from typing import Any
 
 import pytest
 
+import service.api.routes.ingest
 import service.api.routes.sessions
 import service.server.recorder
 import service.server.server
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.process import Process, Start
 from tests.service.running import Running, ServeWith
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 TICK_S = 0.02
 
@@ -33,12 +34,19 @@ def no_threads_left() -> Iterator[None]:
 
 
 @pytest.fixture
+def silence_s() -> float:
+    """How long a server listens in vain: a node in a test's thread may wait for its turn."""
+    return PATIENCE_S
+
+
+@pytest.fixture
 def serve_with(
-    no_threads_left: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    no_threads_left: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, silence_s: float
 ) -> Iterator[ServeWith]:
     """A server with this token and these names; its ticks are quick, and so the tests are."""
     monkeypatch.setattr(service.server.server, "TICK_S", TICK_S)
     monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # its frames are long ago
+    monkeypatch.setattr(service.api.routes.ingest, "SILENCE_S", silence_s)
     # The scripted node sends what passes a stop only when that was answered.
     monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.02)
     started: list[Running] = []

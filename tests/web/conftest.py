@@ -16,6 +16,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
+import service.api.routes.ingest
 import service.api.routes.sessions
 import service.server
 import service.server.recorder
@@ -135,6 +136,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
         )
         contexts.append(context)
         page = context.new_page()
+        page.set_default_timeout(1e3 * PATIENCE_S)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on(
             "console",
@@ -155,6 +157,7 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
 def scripted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scripted]:
     monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
     monkeypatch.setattr(service.server.server, "TICK_S", 0.05)
+    monkeypatch.setattr(service.api.routes.ingest, "SILENCE_S", PATIENCE_S)
     monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # its lead is long ago
     one = Scripted(tmp_path)
     yield one

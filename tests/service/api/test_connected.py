@@ -17,7 +17,7 @@ from tests.waiting import until
 
 pytestmark = pytest.mark.real_time
 
-LOOKING_S = 1.5
+LOOKING_S = 5.0
 """What looking takes, beside other tests."""
 
 
@@ -34,6 +34,12 @@ class Through:
 
     def socket(self, path: str, **options: Any) -> ClientConnection:
         return self._over.socket(path, **options)
+
+
+@pytest.fixture
+def silence_s() -> float:
+    """As in a server that people use."""
+    return SILENCE_S
 
 
 @pytest.fixture
