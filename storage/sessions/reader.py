@@ -19,7 +19,7 @@ from devices.errors import FileFormatError
 from devices.frames import FrameBatch
 from storage.file_hash import FILE_HASH_KEY, FORMAT
 from storage.schema import FRAMES, KNOWN, Array, flat_of, flat_values, from_flat
-from storage.sessions.footer import Footer
+from storage.sessions.footer import Footer, stamps_of
 
 _PIECE_VALUES = 1 << 20
 _PIECE_ROWS_MIN = 1024
@@ -59,23 +59,13 @@ class SessionReader:
             FileFormatError: no such file, not Parquet, not one of ours, or damaged.
         """
         self.path = path
-        if footer is None:
-            footer = Footer(path, is_checked=is_checked, only_slices=only_slices)
-        elif not is_checked:
-            footer.prove(path, only_slices=only_slices)
-        self.footer = footer
+        self.footer, self._file = _opened(path, footer, is_checked, only_slices)
         self._has_true_statistics = self.footer.is_proven or self.footer.format == FORMAT
         self.info, self.notes = self.footer.info, self.footer.notes
         self.format = self.footer.format
         self.content, self.content_sha256 = self.footer.content, self.footer.content_sha256
         self.column_names = self.footer.column_names
         self.frame_count = self.footer.frame_count
-        try:
-            self._file = pq.ParquetFile(
-                path, metadata=self.footer.metadata, page_checksum_verification=True
-            )
-        except Exception as error:  # gone meanwhile, or damaged
-            raise FileFormatError(f"cannot be read as Parquet: {error}", where=str(path)) from error
 
     def tables(self) -> Iterator[pa.Table]:
         """All columns as they are in the file, a piece of a row group at a time.
@@ -149,7 +139,7 @@ class SessionReader:
         """
         if self.footer.span_ns is not None:
             return self.footer.span_ns
-        first = next(self._tables(0, ["t_ns"], rows=1))
+        first, *_ = self._tables(0, ["t_ns"])  # all: Arrow leaves out a page it does not know
         with self._damage(0):
             begin = int(flat_values(KNOWN["t_ns"], "t_ns", first)[0])
         latest = self.extremes("t_ns")
@@ -206,12 +196,10 @@ class SessionReader:
             return self.footer.extremes(name)
         return [None] * len(self.footer.group_rows)  # nothing proves what an older version wrote
 
-    def _tables(
-        self, group: int, names: Sequence[str] | None, rows: int | None = None
-    ) -> Iterator[pa.Table]:
-        """Columns of a row group, or all, in pieces; with `rows`, so many of the first."""
+    def _tables(self, group: int, names: Sequence[str] | None) -> Iterator[pa.Table]:
+        """Columns of a row group, or all, in pieces."""
         width = len(self.column_names if names is None else names)
-        size = rows or max(_PIECE_ROWS_MIN, _PIECE_VALUES // max(1, width))
+        size = max(_PIECE_ROWS_MIN, _PIECE_VALUES // max(1, width))
         left = self.footer.group_rows[group]
         with self._damage(group):
             if absent := set(names or ()) - self.column_names:
@@ -223,7 +211,7 @@ class SessionReader:
                 piece = next(pieces, None)
                 if piece is None or len(piece) > left:
                     raise ValueError(f"it has not the {self.footer.group_rows[group]} rows it says")
-            left = 0 if rows else left - len(piece)
+            left -= len(piece)
             yield pa.Table.from_batches([piece])
 
     @contextmanager
@@ -239,3 +227,21 @@ class SessionReader:
 def _overlap(said: tuple[int, int], begin_ns: int | None, end_ns: int | None) -> bool:
     least, greatest = said
     return (begin_ns is None or greatest >= begin_ns) and (end_ns is None or least < end_ns)
+
+
+def _opened(
+    path: Path, footer: Footer | None, is_checked: bool, only_slices: bool
+) -> tuple[Footer, pq.ParquetFile]:
+    """A file and its footer; that of another one, which was there a moment ago, is none of it."""
+    while True:
+        stamps = stamps_of(path)
+        own = footer or Footer(path, is_checked=is_checked, only_slices=only_slices)
+        if footer is not None and not is_checked:
+            footer.prove(path, only_slices=only_slices)
+        try:
+            file = pq.ParquetFile(path, metadata=own.metadata, page_checksum_verification=True)
+        except Exception as error:  # gone meanwhile, or damaged
+            raise FileFormatError(f"cannot be read as Parquet: {error}", where=str(path)) from error
+        if footer is not None or stamps == stamps_of(path):
+            return own, file
+        file.close()
