@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from devices.arrays import Ints
-from devices.errors import DamagedFramesError
+from devices.errors import DamagedFramesError, StorageError
 from devices.frames import FrameBatch
 from storage.durable import storage_errors
 from storage.journal.segment_format import RECORD, Records, numbers, payload_of, run_of
@@ -25,6 +25,8 @@ from storage.wire import EncodedBatch, decode
 
 PIECE_FRAMES = 4096
 """Frames in a piece, unless one message has more: as many as estimates are made of at a time."""
+_OPEN_MAX = 8
+"""Segments that are open at once; frames that came out of order lie in two or three in turn."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Batches:
 
 
 class BatchReader:
-    """Reads batches; a segment that was opened stays open until this is closed.
+    """Reads batches; the segments read last stay open until this is closed.
 
     Args:
         runs: of the stream.
@@ -112,7 +114,7 @@ class BatchReader:
             yield EncodedBatch(first, last, *t_ns, payload)
 
     def frames(self, batches: Batches) -> Iterator[FrameBatch]:
-        """Their frames, in pieces; what is before a damaged batch comes before it is refused.
+        """Their frames, in pieces; what is before a batch that cannot be read comes before it.
 
         Raises:
             DamagedFramesError: as for `messages`.
@@ -120,7 +122,11 @@ class BatchReader:
             StorageError: as for `messages`.
         """
         for piece in batches.pieces():
-            frames = self._runs.read(run_of(piece.records, self._content(piece)))
+            try:
+                content = self._content(piece)
+            except StorageError:  # a bad sector is in one batch: those before it are read
+                content = b""
+            frames = self._runs.read(run_of(piece.records, content))
             if frames is not None:
                 yield frames
                 continue
@@ -143,5 +149,7 @@ class BatchReader:
 
     def _descriptor(self, path: Path) -> int:
         if path not in self._opened:
+            if len(self._opened) >= _OPEN_MAX:  # a session of hours has hundreds
+                os.close(self._opened.pop(next(iter(self._opened))))
             self._opened[path] = os.open(path, os.O_RDONLY)
         return self._opened[path]

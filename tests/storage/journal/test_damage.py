@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from itertools import pairwise
@@ -241,6 +242,26 @@ def test_one_damaged_batch_among_thousands_of_frames_costs_its_own_frames_only(
     held = {*range(5000), *range(5025, 9000)}
     assert_holds(journal, held, 3, 8990, of=whole)
     assert max(len(batch) for batch in journal.read(0, 9000)) > 1000
+
+
+def test_a_sector_that_cannot_be_read_costs_no_frame_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = filled(tmp_path, *((a, a + 9) for a in range(0, 60, 10)))
+    journal.sync()
+    bad = HEADER + 3 * len(encode(part(0, 9), SCHEMA)) + 100
+    real = os.pread
+
+    def pread(descriptor: int, length: int, offset: int) -> bytes:
+        if offset <= bad < offset + length:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return real(descriptor, length, offset)
+
+    monkeypatch.setattr("os.pread", pread)
+    read: list[int] = []
+    with pytest.raises(StorageError, match="Input/output error"):
+        read += (int(seq) for batch in journal.read(0, 59) for seq in batch.seq)
+    assert read == list(range(30))
 
 
 def test_a_truncation_exactly_at_a_batch_is_seen_by_the_index(tmp_path: Path) -> None:
