@@ -102,14 +102,7 @@ class BatchReader:
             with storage_errors(path):
                 payload = payload_of(self._descriptor(path), record)
             if payload is None:
-                raise DamagedFramesError(
-                    f"the batch at byte {int(record['offset'])} (frames {first} to {last}) is "
-                    "damaged",
-                    where=str(path),
-                    expected="the bytes that were written, by their CRC-32",
-                    seq_first=first,
-                    seq_last=last,
-                )
+                raise _damaged(path, record, "the bytes that were written, by their CRC-32")
             t_ns = int(record["t_ns_first"]), int(record["t_ns_last"])
             yield EncodedBatch(first, last, *t_ns, payload)
 
@@ -130,8 +123,12 @@ class BatchReader:
             if frames is not None:
                 yield frames
                 continue
-            for message in self.messages(piece):
-                yield decode(message.payload, self._runs.schema)
+            for at, message in enumerate(self.messages(piece)):
+                frames = decode(message.payload, self._runs.schema)
+                if EncodedBatch.of(frames, message.payload).numbers != message.numbers:
+                    path = piece.paths[piece.segment[at]]
+                    raise _damaged(path, piece.records[at], "the frames that its index says")
+                yield frames
 
     def _content(self, batches: Batches) -> bytes:
         """Their bytes, one behind the other; fewer if a segment was cut."""
@@ -153,3 +150,14 @@ class BatchReader:
                 os.close(self._opened.pop(next(iter(self._opened))))
             self._opened[path] = os.open(path, os.O_RDONLY)
         return self._opened[path]
+
+
+def _damaged(path: Path, record: np.void, expected: str) -> DamagedFramesError:
+    first, last = numbers(record)
+    return DamagedFramesError(
+        f"the batch at byte {int(record['offset'])} (frames {first} to {last}) is damaged",
+        where=str(path),
+        expected=expected,
+        seq_first=first,
+        seq_last=last,
+    )

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from threading import Lock
 
-from storage.sessions.file import SessionReader
 from storage.sessions.footer import Footer
+from storage.sessions.reader import SessionReader
 
 _Stamps = tuple[int, ...]
 

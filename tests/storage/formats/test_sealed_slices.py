@@ -27,8 +27,9 @@ from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions import file
 from storage.sessions.beside import clock_beside
-from storage.sessions.file import SessionReader, SessionWriter, parquet_options
+from storage.sessions.file import SessionWriter, parquet_options
 from storage.sessions.folder import Event
+from storage.sessions.reader import SessionReader
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 from tests.storage.sessions.session_files import rewritten

@@ -13,8 +13,8 @@ from devices.errors import FileFormatError
 from storage.file_hash import file_hashes
 from storage.sessions import checked_files, footer
 from storage.sessions.checked_files import CheckedFiles
-from storage.sessions.file import SessionReader
 from storage.sessions.footer import Footer
+from storage.sessions.reader import SessionReader
 from tests.storage.sessions.session_files import frames, rewritten, write
 
 
