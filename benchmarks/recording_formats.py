@@ -22,7 +22,8 @@ from storage.formats.sealed import export_file
 from storage.formats.slice import Slice
 from storage.journal.journal import Journal
 from storage.schema import FRAMES, flat_columns, wire_schema
-from storage.sessions.file import ROW_GROUP_NS, SessionReader, SessionWriter
+from storage.sessions.file import ROW_GROUP_NS, SessionWriter
+from storage.sessions.reader import SessionReader
 from storage.wire import encode
 
 Values = npt.NDArray[Any]

@@ -22,7 +22,8 @@ from side_by_side import table
 
 from storage.journal.journal import Journal
 from storage.schema import wire_schema
-from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.file import SessionWriter
+from storage.sessions.reader import SessionReader
 from storage.wire import encode
 
 STEPS = {

@@ -147,7 +147,7 @@ def seal_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
 
 
 def read_it(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
-    from storage.sessions.file import SessionReader
+    from storage.sessions.reader import SessionReader
 
     with SessionReader(folder / "sessions" / SESSION_ID / "frames.parquet") as reader:
         frames = sum(len(batch) for batch, _ in reader.batches("grf_n", "force_n"))

@@ -21,10 +21,11 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from threading import Thread
+from typing import Any, TypeVar
 
 import httpx
 import numpy as np
@@ -40,7 +41,7 @@ from storage.file_hash import sha256_of
 from storage.formats.sealed import export_file
 from storage.formats.slice import Slice
 from storage.schema import ESTIMATES, Array
-from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.file import SessionWriter
 from storage.sessions.folder import (
     FRAMES_NAME,
     Ledger,
@@ -49,6 +50,7 @@ from storage.sessions.folder import (
     Session,
     SessionFolder,
 )
+from storage.sessions.reader import SessionReader
 
 TILES, RATE_HZ = 4, 544.0
 COLUMN, SECONDS = "grf_n", 10.0
@@ -57,6 +59,7 @@ _BEGIN_NS = int(minute(1, TILES, RATE_HZ).t_ns[0])
 """Of the first frame of every session here."""
 
 Values = npt.NDArray[Any]
+T = TypeVar("T")
 
 
 def session_id(number: int) -> str:
@@ -145,32 +148,46 @@ def _column(content: bytes) -> Values:
 
 
 class Rest:
-    """Requests to the server's application, without a socket."""
+    """Requests to the server's application, without a socket.
+
+    Its loop runs all the time, as a server's: threads that read files live as long as its task.
+    """
 
     def __init__(self, data: Path) -> None:
         self._server = Server(data)
-        self._loop = asyncio.new_event_loop()
+        self._loop, self._end = asyncio.new_event_loop(), asyncio.Event()
+        self._thread = Thread(target=self._loop.run_until_complete, args=(self._end.wait(),))
+        self._thread.start()
         transport = httpx.ASGITransport(make_app(self._server))
         self._http = httpx.AsyncClient(transport=transport, base_url="http://localhost/api/v1")
 
+    def get(self, path: str, **query: str) -> bytes:
+        """What the application answers."""
+        answer = self._wait(self._http.get(path, params=query))
+        answer.raise_for_status()
+        return answer.content
+
     def slice(self, number: int, start_s: float) -> Values:
         """One GET of the slice."""
-        query = {
-            "format": "arrow",
-            "columns": COLUMN,
-            "start_s": str(start_s),
-            "end_s": str(start_s + SECONDS),
-        }
-        url = f"/sessions/{session_id(number)}/data"
-        answer = self._loop.run_until_complete(self._http.get(url, params=query))
-        answer.raise_for_status()
-        return _column(answer.content)
+        content = self.get(
+            f"/sessions/{session_id(number)}/data",
+            format="arrow",
+            columns=COLUMN,
+            start_s=str(start_s),
+            end_s=str(start_s + SECONDS),
+        )
+        return _column(content)
 
     def close(self) -> None:
         """Let go of the data folder."""
-        self._loop.run_until_complete(self._http.aclose())
-        self._loop.run_until_complete(self._server.close())
+        self._wait(self._http.aclose())
+        self._wait(self._server.close())
+        self._loop.call_soon_threadsafe(self._end.set)
+        self._thread.join()
         self._loop.close()
+
+    def _wait(self, what: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(what, self._loop).result()
 
 
 def places(minutes: int) -> Iterator[float]:
@@ -191,11 +208,12 @@ def measure(path: Path, number: int, minutes: int, rest: Rest, turns: int) -> li
             _JOBS[1]: lambda start_s: by_export(path, start_s),
             _JOBS[2]: lambda start_s: by_pyarrow(path, start_s, None),
             _JOBS[3]: lambda start_s: by_pyarrow(path, start_s, kept),
+            _JOBS[4]: lambda _: np.frombuffer(rest.get("/version"), np.uint8),
         }
         return lambda: ways[name](next(where[name]))
 
     for _ in range(2):
-        first, *others = (job(name)() for name in _JOBS)
+        first, *others = (job(name)() for name in _JOBS[:4])
         for other in others:
             np.testing.assert_array_equal(first, other)
     times = in_turns({name: job(name) for name in _JOBS}, turns)
@@ -214,7 +232,16 @@ def measure(path: Path, number: int, minutes: int, rest: Rest, turns: int) -> li
     ]
 
 
-_JOBS = ("REST, footer kept", "`export`", "pyarrow, footer read", "pyarrow, footer kept")
+_JOBS = (
+    "REST, footer kept",
+    "`export`",
+    "pyarrow, footer read",
+    "pyarrow, footer kept",
+    "REST, of nothing",
+)
+
+
+_RUN = "from service.cli.main import main; main()"
 
 
 def command_cpu_s(path: Path, minutes: int) -> float:
@@ -222,10 +249,13 @@ def command_cpu_s(path: Path, minutes: int) -> float:
     start_s = next(places(minutes))
     before = _children_s()
     with tempfile.TemporaryDirectory() as folder:
-        words = [sys.executable, "-m", "service.cli.main", "export", str(path), "--format", "arrow"]
-        words += ["--out", f"{folder}/out.arrow", "--columns", COLUMN, "--no-marks"]
+        out = Path(folder) / "out.arrow"
+        words = [sys.executable, "-c", _RUN, "export", str(path), "--format", "arrow"]
+        words += ["--out", str(out), "--columns", COLUMN, "--no-marks"]
         words += [f"--start-s={start_s}", f"--end-s={start_s + SECONDS}"]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+        if not len(_column(out.read_bytes())):
+            raise RuntimeError("nothing was exported")
     return _children_s() - before
 
 

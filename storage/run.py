@@ -26,6 +26,8 @@ from storage.wire import decode
 
 _LAYOUTS_MAX = 256
 """Headers that are remembered; a node's batches have two or three different ones."""
+_HEAD_BYTES_MAX = 4096
+"""Longer ones are not remembered: ours take some 700 bytes, and a stranger's up to a megabyte."""
 
 Numbers = npt.NDArray[np.integer[Any]]
 
@@ -99,9 +101,10 @@ class RunReader:
             except FileFormatError:
                 return None
             known = layout_of(pa.ipc.read_message(pa.py_buffer(message)), self.schema)
-            if len(self._layouts) >= _LAYOUTS_MAX:
-                self._layouts.clear()
-            self._layouts[head] = known
+            if len(head) <= _HEAD_BYTES_MAX:
+                if len(self._layouts) >= _LAYOUTS_MAX:
+                    self._layouts.clear()
+                self._layouts[head] = known
         return known
 
 

@@ -21,6 +21,9 @@ from storage.intervals import Intervals
 from storage.layout import layout_of
 from storage.schema import from_record_batch, to_record_batch, wire_schema
 
+_MARK = b"\xff\xff\xff\xff"
+"""With which a message begins. Arrow also reads older ones without it, in which all that is behind
+stands four bytes earlier: where columns are said to lie there would be other numbers."""
 _MESSAGE_FRAMES = 64
 """As many as acquisition puts into a batch at most."""
 
@@ -70,6 +73,8 @@ def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
         FileFormatError: it is no such message, is cut off, or its frames are not in order.
     """
     try:
+        if bytes(payload[: len(_MARK)]) != _MARK:
+            raise HeaderError("it does not begin as messages do since Arrow 0.15")
         message = pa.ipc.read_message(pa.py_buffer(payload))
         if layout_of(message, schema).message_bytes != len(payload):
             raise HeaderError(f"it is {len(payload)} bytes long, and says another length")

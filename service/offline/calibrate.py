@@ -20,7 +20,7 @@ from service.estimation.fitting.bench.indentation import Indentation, pressed_in
 from service.estimation.fitting.effects_fit import fit_effects
 from service.estimation.fitting.fit import fit_tile
 from service.estimation.fitting.timing import UNKNOWN_DELAY, resolved
-from storage.sessions.file import SessionReader
+from storage.sessions.reader import SessionReader
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from service.offline.calibrations import BENCH, find_calibration
 from service.offline.findings import Findings, FindingsOf
 from service.sessions.pipeline import EstimateOptions, EstimateStream, notes_of
 from storage.schema import MILL, PARTS, TRUTH
-from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.file import SessionWriter
 from storage.sessions.frame_order import in_order
+from storage.sessions.reader import SessionReader
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from service.sessions.restore import restore
 from storage.durable import storage_errors
 from storage.sessions.beside import write_events
 from storage.sessions.checked_files import CheckedFiles
-from storage.sessions.file import SessionReader
 from storage.sessions.folder import DOOMED_PREFIX, FRAMES_NAME, Event, Session, SessionFolder
+from storage.sessions.reader import SessionReader
 
 log = logging.getLogger("foottile.book")
 

@@ -14,8 +14,8 @@ from storage.formats.marks import NEAREST_NS, TIMES, Mark, Marks, place
 from storage.formats.slice import Slice
 from storage.schema import FRAMES, KNOWN
 from storage.sessions.beside import clock_beside
-from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event
+from storage.sessions.reader import SessionReader
 
 _NEAR_NS = NEAREST_NS + 1_000_000
 """Rather a group too many; sums of instants as float64, which do not wrap, are off by 2 us."""

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from devices.arrays import Ints
-from devices.errors import DamagedFramesError
+from devices.errors import DamagedFramesError, StorageError
 from devices.frames import FrameBatch
 from storage.durable import storage_errors
 from storage.journal.segment_format import RECORD, Records, numbers, payload_of, run_of
@@ -25,6 +25,8 @@ from storage.wire import EncodedBatch, decode
 
 PIECE_FRAMES = 4096
 """Frames in a piece, unless one message has more: as many as estimates are made of at a time."""
+_OPEN_MAX = 8
+"""Segments that are open at once; frames that came out of order lie in two or three in turn."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Batches:
 
 
 class BatchReader:
-    """Reads batches; a segment that was opened stays open until this is closed.
+    """Reads batches; the segments read last stay open until this is closed.
 
     Args:
         runs: of the stream.
@@ -100,19 +102,12 @@ class BatchReader:
             with storage_errors(path):
                 payload = payload_of(self._descriptor(path), record)
             if payload is None:
-                raise DamagedFramesError(
-                    f"the batch at byte {int(record['offset'])} (frames {first} to {last}) is "
-                    "damaged",
-                    where=str(path),
-                    expected="the bytes that were written, by their CRC-32",
-                    seq_first=first,
-                    seq_last=last,
-                )
+                raise _damaged(path, record, "the bytes that were written, by their CRC-32")
             t_ns = int(record["t_ns_first"]), int(record["t_ns_last"])
             yield EncodedBatch(first, last, *t_ns, payload)
 
     def frames(self, batches: Batches) -> Iterator[FrameBatch]:
-        """Their frames, in pieces; what is before a damaged batch comes before it is refused.
+        """Their frames, in pieces; what is before a batch that cannot be read comes before it.
 
         Raises:
             DamagedFramesError: as for `messages`.
@@ -120,12 +115,20 @@ class BatchReader:
             StorageError: as for `messages`.
         """
         for piece in batches.pieces():
-            frames = self._runs.read(run_of(piece.records, self._content(piece)))
+            try:
+                content = self._content(piece)
+            except StorageError:  # a bad sector is in one batch: those before it are read
+                content = b""
+            frames = self._runs.read(run_of(piece.records, content))
             if frames is not None:
                 yield frames
                 continue
-            for message in self.messages(piece):
-                yield decode(message.payload, self._runs.schema)
+            for at, message in enumerate(self.messages(piece)):
+                frames = decode(message.payload, self._runs.schema)
+                if EncodedBatch.of(frames, message.payload).numbers != message.numbers:
+                    path = piece.paths[piece.segment[at]]
+                    raise _damaged(path, piece.records[at], "the frames that its index says")
+                yield frames
 
     def _content(self, batches: Batches) -> bytes:
         """Their bytes, one behind the other; fewer if a segment was cut."""
@@ -143,5 +146,18 @@ class BatchReader:
 
     def _descriptor(self, path: Path) -> int:
         if path not in self._opened:
+            if len(self._opened) >= _OPEN_MAX:  # a session of hours has hundreds
+                os.close(self._opened.pop(next(iter(self._opened))))
             self._opened[path] = os.open(path, os.O_RDONLY)
         return self._opened[path]
+
+
+def _damaged(path: Path, record: np.void, expected: str) -> DamagedFramesError:
+    first, last = numbers(record)
+    return DamagedFramesError(
+        f"the batch at byte {int(record['offset'])} (frames {first} to {last}) is damaged",
+        where=str(path),
+        expected=expected,
+        seq_first=first,
+        seq_last=last,
+    )

@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from devices.errors import FileFormatError
+from devices.facts import SEQ_END
 from storage.run import Run
 from storage.wire import EncodedBatch, decode
 
@@ -37,6 +38,7 @@ RECORD = np.dtype(
 """One batch in the index: `crc32` is of its bytes, `check` of this record before it."""
 
 _CHECKED = RECORD.itemsize - 4
+_OFFSET_END = 1 << 62
 
 Records = npt.NDArray[np.void]
 
@@ -64,8 +66,9 @@ def numbers(record: Any) -> tuple[int, int]:
 
 
 def is_whole(record: Any) -> bool:
-    """Is the record what was written?"""
-    return zlib.crc32(record.tobytes()[:_CHECKED]) == int(record["check"])
+    """Is the record what was written? No writer of ours gives numbers that no stream reaches."""
+    is_checked = zlib.crc32(record.tobytes()[:_CHECKED]) == int(record["check"])
+    return is_checked and int(record["seq_first"]) < SEQ_END and int(record["offset"]) < _OFFSET_END
 
 
 def are_whole(index: Records) -> npt.NDArray[np.bool_]:
@@ -74,7 +77,7 @@ def are_whole(index: Records) -> npt.NDArray[np.bool_]:
     begins = range(0, len(content), RECORD.itemsize)
     checks = [zlib.crc32(content[at : at + _CHECKED]) for at in begins]
     found: npt.NDArray[np.bool_] = np.array(checks, np.uint32) == index["check"]
-    return found
+    return found & (index["seq_first"] < SEQ_END) & (index["offset"] < _OFFSET_END)
 
 
 def is_closed(index: Records) -> bool:

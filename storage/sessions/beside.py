@@ -12,8 +12,8 @@ from devices.errors import DamagedFileError, FileFormatError, UsageError
 from storage.checked_table import read_table, write_table
 from storage.clock.file import CLOCK_NAME, read_clock
 from storage.clock.table import ClockTable, StreamFacts
-from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event, Session
+from storage.sessions.reader import SessionReader
 
 EVENTS_NAME = "events.parquet"
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from threading import Lock
 
-from storage.sessions.file import SessionReader
-from storage.sessions.footer import Footer
-
-_Stamps = tuple[int, ...]
+from storage.sessions.footer import Footer, Stamps, stamps_of
+from storage.sessions.reader import SessionReader
 
 _KNOWN_MAX = 1000
 _FOOTERS_MAX_BYTES = 16 << 20
@@ -24,8 +22,8 @@ class CheckedFiles:
     """
 
     def __init__(self) -> None:
-        self._whole: dict[_Stamps, None] = {}
-        self._footers: dict[_Stamps, Footer] = {}
+        self._whole: dict[Stamps, None] = {}
+        self._footers: dict[Stamps, Footer] = {}
         self._lock = Lock()
 
     def open(self, path: Path, *, only_slices: bool = False) -> SessionReader:
@@ -38,14 +36,14 @@ class CheckedFiles:
         Raises:
             FileFormatError: as for `SessionReader`.
         """
-        stamps = _stamps(path)
+        stamps = stamps_of(path)
         with self._lock:
             footer = self._footers.pop(stamps, None)
             if footer is not None:
                 self._footers[stamps] = footer  # the newest again
             is_checked = stamps in self._whole
         reader = SessionReader(path, is_checked=is_checked, only_slices=only_slices, footer=footer)
-        if stamps and stamps == _stamps(path):  # not replaced meanwhile
+        if stamps and stamps == stamps_of(path):  # not replaced meanwhile
             with self._lock:
                 self._keep(stamps, reader.footer)
         elif footer is not None:  # it may be another file's by now
@@ -53,7 +51,7 @@ class CheckedFiles:
             return self.open(path, only_slices=only_slices)
         return reader
 
-    def _keep(self, stamps: _Stamps, footer: Footer) -> None:
+    def _keep(self, stamps: Stamps, footer: Footer) -> None:
         if footer.is_whole:
             while len(self._whole) >= _KNOWN_MAX and stamps not in self._whole:
                 del self._whole[next(iter(self._whole))]
@@ -62,12 +60,3 @@ class CheckedFiles:
         size_bytes = sum(kept.size_bytes for kept in self._footers.values())
         while size_bytes > _FOOTERS_MAX_BYTES or len(self._footers) > _KNOWN_MAX:
             size_bytes -= self._footers.pop(next(iter(self._footers))).size_bytes
-
-
-def _stamps(path: Path) -> _Stamps:
-    """What changes if a file does; empty if there is none."""
-    try:
-        found = path.stat()
-    except OSError:
-        return ()
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns

@@ -1,4 +1,4 @@
-"""A sealed session: one Parquet file of flat columns, written and read here and nowhere else.
+"""A sealed session: one Parquet file of flat columns, written here and nowhere else.
 
 Integers are delta-encoded, floats byte-stream-split, all of it zstd (6 bytes a frame of four tiles
 where CSV takes 54, performance.md). A row group is about a minute, in sessions of more than an hour
@@ -11,8 +11,8 @@ that it proves itself.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -25,7 +25,6 @@ from devices.errors import FileFormatError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.durable import storage_errors, sync_folder, temporary_of
 from storage.file_hash import (
-    FILE_HASH_KEY,
     FORMAT,
     FORMAT_KEY,
     write_file_hash,
@@ -36,12 +35,9 @@ from storage.schema import (
     KNOWN,
     Array,
     flat_columns,
-    flat_of,
-    flat_values,
-    from_flat,
 )
 from storage.sessions.content_hash import ContentDigest
-from storage.sessions.footer import NOTES_KEY, Footer
+from storage.sessions.footer import NOTES_KEY
 
 EXPORT_KEY = b"foottile.export"
 """Only in what was made from a session: of which one, and what of it."""
@@ -52,10 +48,6 @@ GROWS_AFTER = 30
 """A row group is a thirtieth of what lies before it: in ten hours there are 180 instead of 600."""
 ROW_GROUP_PIECES_MAX = 5
 """And no longer than that: of eight tiles with estimates it takes 45 MB to write."""
-
-_PIECE_VALUES = 1 << 20
-_PIECE_ROWS_MIN = 1024
-"""A piece of a row group that is read at once has so many numbers: 8 MiB, however many tiles."""
 
 
 class SessionWriter:
@@ -213,218 +205,3 @@ def _encoding(type_: pa.DataType) -> str | None:
     if pa.types.is_integer(type_):
         return "DELTA_BINARY_PACKED"
     return None
-
-
-class SessionReader:
-    """Reads what `SessionWriter` wrote, some thousand rows at a time.
-
-    Attributes:
-        path: the file.
-        footer: what its footer says; `info`, `notes`, `format`, `content`, `content_sha256`,
-            `column_names` and `frame_count` are those of `storage.sessions.footer.Footer`.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        is_checked: bool = False,
-        only_slices: bool = False,
-        footer: Footer | None = None,
-    ) -> None:
-        """Open a sealed session.
-
-        Its every byte is held against the file's hash, unless only slices are read: then the footer
-        is, against its own, and what is read of pages, always, against their checksums. A file of
-        an older version, whose footer has no hash, is held against the file's all the same.
-
-        Args:
-            path: the file.
-            is_checked: nothing is held against any hash: it was already, or shall not be.
-            only_slices: what is read are some columns, or some time.
-            footer: of this very file, if it was read before.
-
-        Raises:
-            FileFormatError: no such file, not Parquet, not one of ours, or damaged.
-        """
-        self.path = path
-        if footer is None:
-            footer = Footer(path, is_checked=is_checked, only_slices=only_slices)
-        elif not is_checked:
-            footer.prove(path, only_slices=only_slices)
-        self.footer = footer
-        self._has_true_statistics = self.footer.is_proven or self.footer.format == FORMAT
-        self.info, self.notes = self.footer.info, self.footer.notes
-        self.format = self.footer.format
-        self.content, self.content_sha256 = self.footer.content, self.footer.content_sha256
-        self.column_names = self.footer.column_names
-        self.frame_count = self.footer.frame_count
-        try:
-            self._file = pq.ParquetFile(
-                path, metadata=self.footer.metadata, page_checksum_verification=True
-            )
-        except Exception as error:  # gone meanwhile, or damaged
-            raise FileFormatError(f"cannot be read as Parquet: {error}", where=str(path)) from error
-
-    def tables(self) -> Iterator[pa.Table]:
-        """All columns as they are in the file, a piece of a row group at a time.
-
-        Raises:
-            FileFormatError: a row group is damaged.
-        """
-        for group in range(len(self.footer.group_rows)):
-            yield from self._tables(group, None)
-
-    @property
-    def identity(self) -> dict[str, object]:
-        """Which session it is, for what is made from it: id, content hash, stated file hash."""
-        said = self.footer.metadata.metadata or {}
-        session = self.notes.get("session")
-        return {
-            "session": session.get("id") if isinstance(session, dict) else None,
-            "content_sha256": self.content_sha256,
-            "file_sha256": said.get(FILE_HASH_KEY, b"").decode("ascii", "replace") or None,
-        }
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def has(self, *names: str) -> bool:
-        """Does the file have these columns (of `storage.schema.KNOWN`)?"""
-        tiles = len(self.info.tiles)
-        return all(self.column_names.issuperset(KNOWN[name].flat_names(tiles)) for name in names)
-
-    def batches(self, *extra: str) -> Iterator[tuple[FrameBatch, dict[str, Array]]]:
-        """Frames in the order they were written, with the extra columns asked for.
-
-        Raises:
-            FileFormatError: a column is missing, of another type, or damaged.
-        """
-        for values in self.columns(*(column.name for column in FRAMES), *extra):
-            yield FrameBatch(**{column.name: values.pop(column.name) for column in FRAMES}), values
-
-    def columns(
-        self, *wanted: str, groups: Sequence[int] | None = None
-    ) -> Iterator[dict[str, Array]]:
-        """Some columns only, of `storage.schema.KNOWN`, some thousand rows at a time.
-
-        Args:
-            wanted: their names.
-            groups: the row groups to read; None: all.
-
-        Raises:
-            FileFormatError: as for `batches`.
-        """
-        tiles = len(self.info.tiles)
-        names = [flat for name in wanted for flat in KNOWN[name].flat_names(tiles)]
-        for group in range(len(self.footer.group_rows)) if groups is None else groups:
-            for table in self._tables(group, names):
-                with self._damage(group):
-                    values = {name: from_flat(KNOWN[name], table, tiles) for name in wanted}
-                yield values
-
-    def span_ns(self) -> tuple[int, int]:
-        """`t_ns` of the first frame, and the latest `t_ns` of all.
-
-        Raises:
-            FileFormatError: as for `batches`.
-        """
-        if self.footer.span_ns is not None:
-            return self.footer.span_ns
-        first = next(self._tables(0, ["t_ns"], rows=1))
-        with self._damage(0):
-            begin = int(flat_values(KNOWN["t_ns"], "t_ns", first)[0])
-        latest = self.extremes("t_ns")
-        unsaid = [group for group, said in enumerate(latest) if said is None]
-        ends = [int(piece["t_ns"].max()) for piece in self.columns("t_ns", groups=unsaid)]
-        end = max([*ends, *(said[1] for said in latest if said is not None)])
-        self.footer.span_ns = begin, end
-        return begin, end
-
-    def flat(
-        self, names: Sequence[str], begin_t_ns: int | None, end_t_ns: int | None
-    ) -> Iterator[dict[str, Array]]:
-        """Flat columns of the row groups that may hold frames of some time.
-
-        Which these are the footer says; where it does not, or nothing proves it, all are read.
-
-        Args:
-            names: of the columns, each n rows.
-            begin_t_ns: of the first instant; None: from the beginning.
-            end_t_ns: of the instant behind the last; None: to the end.
-
-        Yields:
-            One piece at least, of no rows if there is nothing.
-
-        Raises:
-            FileFormatError: as for `batches`.
-        """
-        logical = flat_of(len(self.info.tiles))
-        is_empty = True
-        for group, said in enumerate(self.extremes("t_ns")):
-            if said is not None and not _overlap(said, begin_t_ns, end_t_ns):
-                continue
-            for table in self._tables(group, names):
-                with self._damage(group):
-                    values = {name: flat_values(logical[name], name, table) for name in names}
-                yield values
-                is_empty = False
-        if is_empty:
-            table = self.footer.schema.empty_table()
-            with self._damage(0):
-                yield {name: flat_values(logical[name], name, table) for name in names}
-
-    def frames(self) -> FrameBatch:
-        """All frames at once.
-
-        Raises:
-            FileFormatError: as for `batches`.
-        """
-        return FrameBatch.concatenate([frames for frames, _ in self.batches()])
-
-    def extremes(self, name: str) -> list[tuple[int, int] | None]:
-        """Least and greatest value of a column in every row group; None: not known for sure."""
-        if self._has_true_statistics:
-            return self.footer.extremes(name)
-        return [None] * len(self.footer.group_rows)  # nothing proves what an older version wrote
-
-    def _tables(
-        self, group: int, names: Sequence[str] | None, rows: int | None = None
-    ) -> Iterator[pa.Table]:
-        """Columns of a row group, or all, in pieces; with `rows`, so many of the first."""
-        width = len(self.column_names if names is None else names)
-        size = rows or max(_PIECE_ROWS_MIN, _PIECE_VALUES // max(1, width))
-        left = self.footer.group_rows[group]
-        with self._damage(group):
-            if absent := set(names or ()) - self.column_names:
-                raise KeyError(f"no column {', '.join(sorted(absent))}")
-            columns = None if names is None else list(names)
-            pieces = self._file.iter_batches(size, row_groups=[group], columns=columns)
-        while left:
-            with self._damage(group):
-                piece = next(pieces, None)
-                if piece is None or len(piece) > left:
-                    raise ValueError(f"it has not the {self.footer.group_rows[group]} rows it says")
-            left = 0 if rows else left - len(piece)
-            yield pa.Table.from_batches([piece])
-
-    @contextmanager
-    def _damage(self, group: int) -> Iterator[None]:
-        try:
-            yield
-        except (KeyError, ValueError, OSError, pa.ArrowException) as error:
-            raise FileFormatError(
-                f"row group {group} cannot be read: {error}", where=str(self.path)
-            ) from error
-
-
-def _overlap(said: tuple[int, int], begin_ns: int | None, end_ns: int | None) -> bool:
-    least, greatest = said
-    return (begin_ns is None or greatest >= begin_ns) and (end_ns is None or least < end_ns)

@@ -32,6 +32,7 @@ from storage.sessions.content_hash import CONTENT_HASH_KEY, CONTENT_KEY, content
 
 NOTES_KEY = b"foottile.notes"
 _MAGIC = b"PAR1"
+Stamps = tuple[int, ...]
 
 
 class Footer:
@@ -182,3 +183,12 @@ def _notes(text: bytes | None, *, where: str) -> dict[str, Any]:
     if not isinstance(notes, dict):
         raise FileFormatError("its notes are no JSON object", where=where)
     return notes
+
+
+def stamps_of(path: Path) -> Stamps:
+    """What changes if a file does; empty if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns

@@ -16,9 +16,9 @@ from devices.errors import FileFormatError
 from storage.file_hash import FORMAT_WITHOUT_HASH, file_hashes, footer_hashes, read_footer
 from storage.intervals import AsPairs, Intervals, Losses, union
 from storage.sessions.content_hash import ContentDigest
-from storage.sessions.file import SessionReader
 from storage.sessions.folder import Ledger, Part, PartLedger
 from storage.sessions.frame_order import PartFrames
+from storage.sessions.reader import SessionReader
 
 _LOST = TypeAdapter(dict[str, AsPairs])
 _PARTS = TypeAdapter(tuple[Part, ...])

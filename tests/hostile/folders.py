@@ -20,8 +20,8 @@ from storage.clock.log import ClockLog, ClockOffset
 from storage.journal.node.wanted import ServerWants, Wanted
 from storage.server_id import SERVER_ID_NAME, write_server_id
 from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
-from storage.sessions.file import SessionReader
 from storage.sessions.folder import FRAMES_NAME, Event, Part, SessionFolder
+from storage.sessions.reader import SessionReader
 from tests.builders.arrays import make_array
 from tests.builders.calibrations import make_calibration, make_tare
 from tests.service.sessions.crashed import BOOT, session, stream, t_ns

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from devices.frames import FrameBatch
-from storage.sessions.file import SessionReader
+from storage.sessions.reader import SessionReader
 from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:

@@ -154,3 +154,28 @@ def test_a_message_that_is_none_of_this_stream_is_not_read_whatever_its_checksum
     longer = payloads[1] + bytes(8)
     for message in (foreign, packed, longer, b"PAR1" * 50, b"\xff\xff\xff\xff\0\0\0\0", b"", b"\0"):
         assert not is_read(parts, [payloads[0], message, payloads[2]])
+
+
+def test_numbers_of_a_message_in_the_form_of_before_are_not_read_from_beside_their_places() -> None:
+    """A number and an instant that are zeros where the next column is taken for this one."""
+    one = replace(frames(1), seq=np.zeros(1, np.uint64), t_mono_ns=np.array([1 << 32]))
+    payload = encode(one, SCHEMA)[4:] + bytes(4)
+    assert not is_read([one], [payload])
+
+
+def test_headers_of_strangers_take_no_memory() -> None:
+    reader, part = RunReader(SCHEMA), frames(5)
+    for number in range(20):
+        payload = padded(encode(part, SCHEMA), 100_000 + 8 * number)
+        assert_same_bits(decode(payload, SCHEMA), part)
+        read = reader.read(run_of([part], [payload]))
+        assert read is not None
+        assert_same_bits(read, part)
+    assert sum(len(head) for head in reader._layouts) < 100_000
+
+
+def padded(payload: bytes, more: int) -> bytes:
+    """The message with so many bytes behind its header, which says so."""
+    begin = 8 + int.from_bytes(payload[4:8], "little")
+    length = (begin - 8 + more).to_bytes(4, "little")
+    return payload[:4] + length + payload[8:begin] + bytes(more) + payload[begin:]

@@ -228,6 +228,15 @@ def test_a_message_with_bytes_behind_it_is_refused() -> None:
         decode(encode(frames(5), schema) + bytes(8), schema)
 
 
+def test_a_message_in_the_form_of_arrow_before_015_is_refused() -> None:
+    """Its columns lie four bytes before the places by which runs of messages are read."""
+    schema = schema_of(2)
+    options = pa.ipc.IpcWriteOptions(use_legacy_format=True)
+    payload = _written(to_record_batch(frames(1), schema), options) + bytes(4)
+    with pytest.raises(FileFormatError, match="does not begin as messages do"):
+        decode(payload, schema)
+
+
 def test_a_dictionary_is_refused() -> None:
     words = pa.array(["a", "b"]).dictionary_encode()
     record = pa.RecordBatch.from_arrays([words], names=["seq"])

@@ -139,7 +139,7 @@ def export_command(
     from storage.formats.sealed import export_file, marks_of
     from storage.formats.slice import Slice
     from storage.sessions.beside import EVENTS_NAME, read_events
-    from storage.sessions.file import SessionReader
+    from storage.sessions.reader import SessionReader
 
     if to not in FORMATS:
         raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))

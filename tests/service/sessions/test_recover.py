@@ -20,8 +20,8 @@ from storage.clock.log import ClockOffset
 from storage.durable import locked
 from storage.journal.node.in_flight import InFlight
 from storage.journal.stream_notes import unsynced_tail_max
-from storage.sessions.file import SessionReader
 from storage.sessions.folder import Event, Part, Session, SessionFolder
+from storage.sessions.reader import SessionReader
 from storage.verify.data import verdict_of, verify
 from tests.builders.calibrations import make_calibration
 from tests.service.sessions.crashed import (

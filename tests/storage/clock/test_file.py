@@ -16,7 +16,8 @@ from storage.clock.file import read_clock, write_clock
 from storage.clock.log import ClockOffset
 from storage.clock.table import StreamFacts
 from storage.sessions.beside import clock_beside
-from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.file import SessionWriter
+from storage.sessions.reader import SessionReader
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 

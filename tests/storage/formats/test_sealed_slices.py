@@ -27,8 +27,9 @@ from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions import file
 from storage.sessions.beside import clock_beside
-from storage.sessions.file import SessionReader, SessionWriter, parquet_options
+from storage.sessions.file import SessionWriter, parquet_options
 from storage.sessions.folder import Event
+from storage.sessions.reader import SessionReader
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 from tests.storage.sessions.session_files import rewritten
@@ -295,3 +296,23 @@ def test_a_slice_of_a_file_with_a_flipped_bit_is_refused_or_right(
     assert set(found.values()) == {"refused", "right"}, [
         k for k, v in found.items() if v == "wrong"
     ]
+
+
+def test_a_page_that_says_it_is_of_another_kind_is_not_left_out(tmp_path: Path) -> None:
+    """Arrow skips what it does not know: a slice would begin at another instant."""
+    t_mono_ns = np.arange(30_000) * 1_000_000
+    frames = make_frames(30_000, 2, t_mono_ns=t_mono_ns)
+    extra = {"part": np.zeros(30_000, np.uint16)}
+    path = sealed(tmp_path / "s.parquet", frames, extra, 60 * SECOND_NS)
+    part = Slice(1.0, 2.0, ("seq",))
+    right, whole = table_of(path, part), path.read_bytes()
+    assert len(right) == 1000
+    kind_at = place_of(path, 0, "t_ns")[0] + 1
+    assert whole[kind_at] == 0  # a data page
+    for bit in range(8):
+        content = bytearray(whole)
+        content[kind_at] ^= 1 << bit
+        path.write_bytes(content)
+        assert refused_or(path, part, right) == "refused"
+        with SessionReader(path, only_slices=True) as reader, pytest.raises(FileFormatError):
+            reader.span_ns()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
+import zlib
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from storage.journal.segment_format import RECORD
 from storage.schema import wire_schema
+from storage.verify.segment import verify_segment
 from storage.wire import encode
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits
@@ -241,6 +244,63 @@ def test_one_damaged_batch_among_thousands_of_frames_costs_its_own_frames_only(
     held = {*range(5000), *range(5025, 9000)}
     assert_holds(journal, held, 3, 8990, of=whole)
     assert max(len(batch) for batch in journal.read(0, 9000)) > 1000
+
+
+def with_record(path: Path, at: int, **columns: int) -> None:
+    """A record of the index says something else, and its checksum is right."""
+    records = np.frombuffer(index_of(path).read_bytes(), RECORD).copy()
+    for name, value in columns.items():
+        records[name][at] = value
+    records["check"][at] = zlib.crc32(records[at].tobytes()[:-4])
+    index_of(path).write_bytes(records.tobytes())
+
+
+@pytest.mark.parametrize(
+    "columns", [{"seq_first": 2**63}, {"seq_first": 2**64 - 1}, {"offset": 2**63}]
+)
+def test_numbers_in_an_index_that_no_stream_reaches_cost_nothing(
+    tmp_path: Path, columns: dict[str, int]
+) -> None:
+    filled(tmp_path, (0, 9), (10, 19), (20, 29)).close()
+    (path,) = segments(tmp_path)
+    with_record(path, 1, **columns)
+    report = verify_segment(path)
+    assert "record 1 of its index is damaged" in report.problems
+    assert_holds(reopened(tmp_path), set(range(30)))
+
+
+def test_a_batch_of_other_frames_than_its_index_says_is_refused_whatever_its_checksum(
+    tmp_path: Path,
+) -> None:
+    filled(tmp_path, (0, 9), (10, 19), (20, 29)).close()
+    (path,) = segments(tmp_path)
+    with_record(path, 1, seq_first=40)
+    journal, read = reopened(tmp_path), list[int]()
+    with pytest.raises(
+        DamagedFramesError, match=r"frames 40 to 49.*the frames that its index says"
+    ):
+        read += (int(seq) for batch in journal.read(0, 59) for seq in batch.seq)
+    assert read == [*range(10), *range(20, 30)]
+
+
+def test_a_sector_that_cannot_be_read_costs_no_frame_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = filled(tmp_path, *((a, a + 9) for a in range(0, 60, 10)))
+    journal.sync()
+    bad = HEADER + 3 * len(encode(part(0, 9), SCHEMA)) + 100
+    real = os.pread
+
+    def pread(descriptor: int, length: int, offset: int) -> bytes:
+        if offset <= bad < offset + length:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return real(descriptor, length, offset)
+
+    monkeypatch.setattr("os.pread", pread)
+    read: list[int] = []
+    with pytest.raises(StorageError, match="Input/output error"):
+        read += (int(seq) for batch in journal.read(0, 59) for seq in batch.seq)
+    assert read == list(range(30))
 
 
 def test_a_truncation_exactly_at_a_batch_is_seen_by_the_index(tmp_path: Path) -> None:

@@ -288,6 +288,9 @@ def test_open_files_do_not_grow_with_segments(tmp_path: Path) -> None:
     journal = long_journal(tmp_path, 20)
     journal.sync()
     assert len(open_here()) == 2
+    while_read = [len(open_here()) for _ in journal.read(0, 199)]
+    while_read += [len(open_here()) for _ in journal.messages(0, 199)]
+    assert max(while_read) <= 2 + 8
     assert sum(len(batch) for batch in journal.read(0, 199)) == 200
     assert len(open_here()) == 2
     journal.close()

@@ -14,7 +14,8 @@ from devices.frames import (
     FrameBatch,
 )
 from storage.file_hash import FORMAT_WITHOUT_HASH
-from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.file import SessionWriter
+from storage.sessions.reader import SessionReader
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 

@@ -11,10 +11,10 @@ import pytest
 
 from devices.errors import FileFormatError
 from storage.file_hash import file_hashes
-from storage.sessions import checked_files, footer
+from storage.sessions import checked_files, footer, reader
 from storage.sessions.checked_files import CheckedFiles
-from storage.sessions.file import SessionReader
 from storage.sessions.footer import Footer
+from storage.sessions.reader import SessionReader
 from tests.storage.sessions.session_files import frames, rewritten, write
 
 
@@ -80,9 +80,9 @@ def test_a_footer_is_read_once_and_anew_if_the_file_changed(tmp_path: Path) -> N
     kept = [files.open(path, only_slices=True).footer for _ in range(2)]
     assert kept[0] is kept[1]
     write(path, frames(30))
-    with files.open(path, only_slices=True) as reader:
-        assert reader.footer is not kept[0]
-        assert len(reader.frames()) == 30
+    with files.open(path, only_slices=True) as session:
+        assert session.footer is not kept[0]
+        assert len(session.frames()) == 30
 
 
 def test_a_file_that_is_replaced_while_it_is_opened_is_not_read_with_the_footer_of_before(
@@ -99,8 +99,8 @@ def test_a_file_that_is_replaced_while_it_is_opened_is_not_read_with_the_footer_
         return SessionReader(*args, footer=footer, **options)
 
     monkeypatch.setattr(checked_files, "SessionReader", replaced)
-    with files.open(path, only_slices=True) as reader:
-        assert len(reader.frames()) == 30
+    with files.open(path, only_slices=True) as session:
+        assert len(session.frames()) == 30
     assert opened == [True, False]
 
 
@@ -130,3 +130,21 @@ def test_footers_are_kept_up_to_a_bound_of_their_bytes_the_ones_used_last(
     assert len(files._footers) == 2
     files.open(paths[1]).close()
     assert hashed == paths  # what was forgotten is where its columns are, not that it is whole
+
+
+def test_a_file_that_is_replaced_behind_its_footer_is_read_with_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "s.parquet", frames(20))
+    footers: list[Footer] = []
+
+    def replaced(*args: Any, **options: Any) -> Footer:
+        footers.append(Footer(*args, **options))
+        if len(footers) == 1:
+            write(path, frames(30))
+        return footers[-1]
+
+    monkeypatch.setattr(reader, "Footer", replaced)
+    with SessionReader(path, only_slices=True) as session:
+        assert len(session.frames()) == 30
+    assert len(footers) == 2

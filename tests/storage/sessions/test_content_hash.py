@@ -20,7 +20,8 @@ from hypothesis import strategies as st
 from devices.errors import FileFormatError
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
 from storage.file_hash import file_hashes, write_file_hash
-from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.file import SessionWriter
+from storage.sessions.reader import SessionReader
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
 

@@ -20,8 +20,9 @@ from devices.frames import (
     FrameBatch,
 )
 from storage.schema import CONTACT_UNKNOWN
-from storage.sessions import file
-from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions import reader
+from storage.sessions.file import SessionWriter
+from storage.sessions.reader import SessionReader
 from tests.builders.arrays import make_array
 from tests.builders.frames import any_frames, assert_same_bits
 from tests.storage.sessions.session_files import frames, read, write
@@ -271,7 +272,7 @@ def test_a_long_row_group_is_read_in_pieces(
 ) -> None:
     batch = frames(5000)
     path = write(tmp_path / "s.parquet", batch)
-    monkeypatch.setattr(file, "_PIECE_VALUES", 1)
+    monkeypatch.setattr(reader, "_PIECE_VALUES", 1)
     with SessionReader(path) as session:
         pieces = [piece for piece, _ in session.batches()]
     assert [len(piece) for piece in pieces] == [1024] * 4 + [904]

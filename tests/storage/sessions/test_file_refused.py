@@ -17,8 +17,8 @@ from devices.frames import (
 )
 from storage.file_hash import FORMAT_KEY
 from storage.schema import ARRAY_INFO_KEY
-from storage.sessions.file import SessionReader
 from storage.sessions.footer import NOTES_KEY
+from storage.sessions.reader import SessionReader
 from tests.builders.arrays import make_array
 from tests.builders.frames import assert_same_bits
 from tests.storage.sessions.session_files import frames, read, refused, rewritten, write

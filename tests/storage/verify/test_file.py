@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from devices.errors import FileFormatError
 from devices.frames import FrameBatch
 from storage.file_hash import FOOTER_HASH_KEY, FORMAT_KEY, file_hashes
-from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.file import SessionWriter
 from storage.sessions.folder import Ledger, Part, PartLedger
+from storage.sessions.reader import SessionReader
 from storage.verify.file import ledger_problems, verify_file
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames

@@ -20,8 +20,9 @@ from storage.checked_json import write_checked
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.server_id import SERVER_ID_NAME, write_server_id
-from storage.sessions.file import SessionReader, SessionWriter
+from storage.sessions.file import SessionWriter
 from storage.sessions.folder import Part, Session, SessionFolder
+from storage.sessions.reader import SessionReader
 from tests.builders.arrays import UTC_NS, make_array
 from tests.builders.frames import make_frames
 from tests.service.cli.outcome import Run
