@@ -41,8 +41,8 @@ def marks_of(reader: SessionReader, events: Sequence[Event], part: Slice) -> Mar
 def _near(reader: SessionReader, clock: ClockTable, events: Sequence[Event]) -> list[int]:
     """Row groups in which a mark may stand, by what the footer says of their times.
 
-    If there is none, one whose clock was compared: who finds no frame near a mark has to know
-    whether any frame's time is known.
+    If none of them is one whose clock was compared, such a one as well: who finds no frame near a
+    mark has to know whether any frame's time is known.
     """
     names = (*TIMES[1:], "part") if reader.has("part") else TIMES[1:]
     said = zip(*(reader.extremes(name) for name in names), strict=True)
@@ -66,7 +66,9 @@ def _near(reader: SessionReader, clock: ClockTable, events: Sequence[Event]) -> 
         first = np.searchsorted(marks_ns, earliest.astype(np.float64) + least - _NEAR_NS)
         behind = np.searchsorted(marks_ns, latest.astype(np.float64) + greatest + _NEAR_NS)
         near.update(groups[~sure | (first < behind)].tolist())
-    return sorted(near) or sorted(known)[:1]
+    if near.isdisjoint(known):
+        near.update(sorted(known)[:1])
+    return sorted(near)
 
 
 def export_file(

@@ -9,8 +9,8 @@ from storage.sessions.footer import Footer, Stamps, stamps_of
 from storage.sessions.reader import SessionReader
 
 _KNOWN_MAX = 1000
-_FOOTERS_MAX_BYTES = 16 << 20
-"""As they are in their files; parsed they take some three times as much."""
+_FOOTERS_MAX_BYTES = 4 << 20
+"""As they are in their files; parsed they take some eleven times as much."""
 
 
 class CheckedFiles:

@@ -200,6 +200,22 @@ def test_a_slice_by_statistics_is_the_slice_of_the_whole_table(
     assert same(found, of_the_whole(path, frames, extra, part, clock, events)), found
 
 
+def test_why_a_mark_stands_nowhere_is_known_from_the_whole_file(tmp_path: Path) -> None:
+    """Two streams that no clock was compared with share a row group: it may hold the mark."""
+    parts = [Boot(6, at_s * SECOND_NS, UTC_NS, 0, 0) for at_s in (0, 100, 110)]
+    frames, extra = recorded(parts)
+    path = sealed(tmp_path / "s.parquet", frames, extra, 60 * SECOND_NS)
+    offset = {"t_mono_ns": 0, "server_minus_node_ns": 0, "uncertainty_ns": 1000}
+    rows = [ClockOffset.model_validate({"boot_id": "boot 0", **offset})]
+    write_clock(tmp_path / "clock.parquet", rows, [StreamFacts("boot 0", UTC_NS, True)])
+    events = [Event(id=f"{0:012x}", label="far", t_ns=UTC_NS + 1000 * SECOND_NS)]
+    found = sliced(path, Slice(), "node", events)
+    assert same(found, of_the_whole(path, frames, extra, Slice(), "node", events)), found
+    with SessionReader(path) as reader:
+        (mark,) = marks_of(reader, events, Slice()).all
+    assert mark.left_out == "no frame within a second of it"
+
+
 # --- what is read ---------------------------------------------------------------------------------
 
 
