@@ -20,7 +20,8 @@ def test_between_two_messages_of_a_node_others_have_their_turn(
 ) -> None:
     node.connect()
     node.deliver(10)
-    turns, taken_at, take = 0, [], ServerNode.take
+    turns, take = 0, ServerNode.take
+    taken_at: list[int] = []
 
     async def count() -> None:
         nonlocal turns
