@@ -5,7 +5,8 @@
 Two tables, medians of interleaved runs. The first, with four tiles, is beside the least there could
 be: compensation and cubic on the same rows, one sum, no uncertainty, no COP, no contact, no flags.
 The second, with 4 and 64 tiles, is beside the same arithmetic written by hand with buffers that are
-kept (static_kernel.py); that both give the same is checked first. The goal is within twice.
+kept (static_kernel.py); that both give the same forces and centres is checked first. The goal is
+within twice.
 """
 
 from __future__ import annotations
@@ -55,15 +56,17 @@ def plan_of(models: tuple[str, ...], count: int = 4) -> EstimationPlan:
 
 
 def frames_of(n: int, count: int = 4) -> FrameBatch:
-    """Frames with all tiles between no load and full load."""
+    """Frames with all tiles between no load and full load, a step a second."""
     rng = np.random.default_rng(0)
     shape = (n, count)
+    turn = 2 * np.pi * 2.5325e-3 * np.arange(n)
+    load = 55 - 55 * np.cos(turn[:, None] + np.linspace(0.0, 1.0, count))
     return make_frames(
         n,
         count,
         period_ns=2_532_500,
         utc_offset_ns=0,
-        padc=rng.integers(270, 380, shape),
+        padc=np.round(380 - load + rng.normal(0.0, 0.7, shape)).astype(np.int64),
         tadc=rng.integers(500, 510, shape),
     )
 
@@ -99,9 +102,13 @@ def check_same(plan: EstimationPlan, frames: FrameBatch) -> None:
     last = finish(plan, state)
     assert last is not None
     for name, values in theirs.items():
+        # What warmth and late instants may have done to a force is in our sigma only, and masks
+        # centres that the kernel shows.
+        if "sigma" in name:
+            continue
         mine = np.concatenate([getattr(first, name), getattr(last, name)])
         both = np.isfinite(mine) & np.isfinite(values)
-        assert both.mean() > 0.9, name
+        assert both.mean() > (0.3 if name.startswith("cop") else 0.9), name
         np.testing.assert_allclose(values[both], mine[both], rtol=1e-9, atol=1e-9, err_msg=name)
 
 
