@@ -73,33 +73,14 @@ class Content:
     span_ns: tuple[int, int] | None = None
 
 
-def export(
-    pieces: Pieces,
-    info: ArrayInfo,
-    notes: Mapping[str, object],
-    to: Format,
-    part: Slice,
-    clock: ClockTable | None = None,
-    marks: Marks | None = None,
-    source: Mapping[str, object] | None = None,
-) -> Iterator[bytes]:
-    """A session's frames as bytes of a file, from all of its frames.
+def content_of(pieces: Pieces) -> Content:
+    """The content of a session of which all frames are given; the first of them are read.
 
     Args:
         pieces: frames with their further columns, in order.
-        info: the array.
-        notes: as for `export_content`, and so are the others.
-        to: format.
-        part: rows and columns.
-        clock: adds the server's time.
-        marks: adds `event`.
-        source: which session it is of.
-
-    Yields:
-        Chunks of the file.
 
     Raises:
-        UsageError: as for `export_content`, or there are no frames.
+        UsageError: there are no frames.
     """
     there = ((frames, extra) for frames, extra in pieces if len(frames))
     first = next(there, None)
@@ -107,12 +88,10 @@ def export(
         raise UsageError("the session has no frames")
     names = [column.name for column in FRAMES] + list(first[1])
     flat = (_flat(frames, extra) for frames, extra in chain((first,), there))
-    yield from export_content(
-        Content(names, lambda _: flat), info, notes, to, part, clock, marks, source
-    )
+    return Content(names, lambda _: flat)
 
 
-def export_content(
+def export(
     content: Content,
     info: ArrayInfo,
     notes: Mapping[str, object],

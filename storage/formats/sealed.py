@@ -9,7 +9,7 @@ import numpy as np
 from devices.errors import FileFormatError, UsageError
 from devices.frames import FRAME_COLUMNS
 from storage.clock.table import ClockTable
-from storage.formats.export import ClockName, Content, Format, export_content
+from storage.formats.export import ClockName, Content, Format, export
 from storage.formats.marks import NEAREST_NS, TIMES, Mark, Marks, place
 from storage.formats.slice import Slice
 from storage.schema import FRAMES, KNOWN
@@ -77,7 +77,7 @@ def export_file(
     """A sealed file as bytes of another one: what the slice needs of it is read, and no more.
 
     Raises:
-        UsageError: as for `export_content`; the server's time is asked for, and no clock table is
+        UsageError: as for `export`; the server's time is asked for, and no clock table is
             there.
         FileFormatError: the file or its clock table is damaged.
     """
@@ -86,7 +86,7 @@ def export_file(
     span_ns = reader.span_ns()
     begin_ns, end_ns = part.bounds_ns(span_ns[0])
     names = [*(column.name for column in FRAMES), *extra]
-    yield from export_content(
+    yield from export(
         Content(names, lambda flat: reader.flat(flat, begin_ns, end_ns), span_ns),
         reader.info,
         reader.notes,

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from devices.frames import FrameBatch
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import Format, export
+from storage.formats.export import Format, content_of, export
 from storage.formats.marks import BETWEEN, TIMES, Marks, place
 from storage.formats.slice import Slice
 from storage.schema import Array
@@ -109,7 +109,7 @@ def _written(to: Format, frames: FrameBatch, extra: dict[str, Array], marks: Mar
         (frames.rows(a, a + half), {name: values[a : a + half] for name, values in extra.items()})
         for a in (0, half)
     ]
-    return b"".join(export(pieces, make_array(), {}, to, Slice(), None, marks))
+    return b"".join(export(content_of(pieces), make_array(), {}, to, Slice(), None, marks))
 
 
 def _wrong(written: dict[Format, bytes], marks: Marks, frames: FrameBatch) -> str | None:

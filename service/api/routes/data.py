@@ -24,7 +24,7 @@ from service.sessions.frames import SessionFrames
 from service.version import SOFTWARE
 from storage.clock.file import CLOCK_NAME
 from storage.file_hash import sha256_of
-from storage.formats.export import MEDIA_TYPES, ClockName, Format, export
+from storage.formats.export import MEDIA_TYPES, ClockName, Format, content_of, export
 from storage.formats.marks import TIMES, Marks, place
 from storage.formats.sealed import export_file, marks_of
 from storage.formats.slice import SECONDS_MAX, Slice
@@ -251,7 +251,7 @@ def _chunks(
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
         pieces, source = SessionFrames(sources), {"session": session.id, "state": session.state}
-        yield from export(pieces, sources.info, {}, to, part, clock, marks, source)
+        yield from export(content_of(pieces), sources.info, {}, to, part, clock, marks, source)
         return
     with server.sessions.frames(session.id, only_slices=not part.is_all) as reader:
         yield from export_file(reader, to, part, clock=query.clock, marks=marks)

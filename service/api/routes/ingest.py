@@ -153,6 +153,9 @@ async def _serve(socket: WebSocket, server: Server, link: Link) -> None:
 async def _take(socket: WebSocket, server: Server, link: Link) -> None:
     node = link.node
     while True:
+        # What has come already is given without waiting: a node that brings home what it took on
+        # its way, or talks without end, would have all others wait until the last of it is done.
+        await asyncio.sleep(0)
         message = await _receive(socket)
         if isinstance(message, bytes):
             tare_before = node.live.tare
@@ -163,9 +166,6 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
             server.hub.publish(node, due)
             if node.live.tare is not tare_before:
                 server.tell_node(node)
-            # What has come already is given without waiting: a node that brings home what it took
-            # on its way would have all others wait until the last of it is estimated.
-            await asyncio.sleep(0)
             continue
         said = _parse(message)
         match said:

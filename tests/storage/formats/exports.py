@@ -11,7 +11,7 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
 from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
-from storage.formats.export import Format, export
+from storage.formats.export import Format, content_of, export
 from storage.formats.slice import Slice
 from storage.schema import CONTACT_UNKNOWN, Array
 from tests.builders.arrays import PERIOD_NS, make_array
@@ -70,7 +70,7 @@ def cut(batch: FrameBatch, columns: Mapping[str, Array], every: int) -> Iterator
 
 def exported(to: Format, part: Slice | None = None, *, every: int = 20) -> bytes:
     pieces = cut(frames(), extra(), every)
-    return b"".join(export(pieces, make_array(), NOTES, to, part or Slice()))
+    return b"".join(export(content_of(pieces), make_array(), NOTES, to, part or Slice()))
 
 
 def read(content: bytes, to: Format) -> pa.Table:

@@ -16,7 +16,7 @@ from devices.errors import UsageError
 from devices.frames import NO_SERVO_COUNTS, NOT_READ, ArrayInfo
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import FORMATS, MEDIA_TYPES, Format, export
+from storage.formats.export import FORMATS, MEDIA_TYPES, Format, content_of, export
 from storage.formats.slice import Slice
 from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, FRAMES
 from storage.sessions.footer import NOTES_KEY
@@ -74,14 +74,16 @@ def test_a_slice_of_a_gap_has_a_header_and_no_rows(to: Format) -> None:
         yield frames().rows(40, ROWS), {}
 
     part = Slice(20 * PERIOD_NS * 1e-9, 30 * PERIOD_NS * 1e-9, ("seq",))
-    found = read(b"".join(export(with_a_gap(), make_array(), NOTES, to, part)), to)
+    found = read(b"".join(export(content_of(with_a_gap()), make_array(), NOTES, to, part)), to)
     assert found.column_names == ["seq"]
     assert found.num_rows == 0
 
 
 @pytest.mark.parametrize("to", FORMATS)
 def test_a_slice_that_begins_after_the_end_is_refused_before_the_first_chunk(to: Format) -> None:
-    chunks = export(cut(frames(), extra(), 20), make_array(), NOTES, to, Slice(ROWS * 2e-3 + 1))
+    chunks = export(
+        content_of(cut(frames(), extra(), 20)), make_array(), NOTES, to, Slice(ROWS * 2e-3 + 1)
+    )
     with pytest.raises(UsageError, match=r"starts at 1\.1 s, and the session ends at 0\.098 s"):
         next(chunks)
 
@@ -164,7 +166,7 @@ def on_servers_axis(to: Format, part: Slice | None = None, *, every: int = 20) -
     columns = extra()
     columns["part"][30:] = 1
     pieces = cut(frames(), columns, every)
-    return b"".join(export(pieces, make_array(), NOTES, to, part or Slice(), clock()))
+    return b"".join(export(content_of(pieces), make_array(), NOTES, to, part or Slice(), clock()))
 
 
 @pytest.mark.parametrize("to", FORMATS)
@@ -227,7 +229,7 @@ def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: Fo
             later = (asked - 1) * rows * PERIOD_NS
             yield replace(piece, t_ns=piece.t_ns + later), {}
 
-    chunks = export(endless(), make_array(), {}, to, Slice())
+    chunks = export(content_of(endless()), make_array(), {}, to, Slice())
     sizes = []
     for number in range(1, 31):
         sizes.append(len(next(chunks)))
@@ -239,7 +241,7 @@ def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: Fo
 @pytest.mark.parametrize("to", FORMATS)
 def test_frames_outside_of_a_slice_make_no_chunks(to: Format) -> None:
     part = Slice(0.09, None, ("seq",))
-    chunks = list(export(cut(frames(), extra(), 1), make_array(), {}, to, part))
+    chunks = list(export(content_of(cut(frames(), extra(), 1)), make_array(), {}, to, part))
     assert len(chunks) <= 1 + 5 + 1
     assert read(b"".join(chunks), to).num_rows == 5
 
@@ -247,7 +249,7 @@ def test_frames_outside_of_a_slice_make_no_chunks(to: Format) -> None:
 @pytest.mark.parametrize("to", FORMATS)
 def test_a_session_without_frames_is_refused(to: Format) -> None:
     with pytest.raises(UsageError, match="no frames"):
-        next(export([], make_array(), {}, to, Slice()))
+        next(export(content_of([]), make_array(), {}, to, Slice()))
 
 
 @pytest.mark.parametrize("to", FORMATS)
@@ -256,7 +258,7 @@ def test_an_error_on_the_way_is_not_the_end_of_a_file(to: Format) -> None:
         yield frames(), {}
         raise OSError("the disk is gone")
 
-    chunks = export(broken(), make_array(), {}, to, Slice())
+    chunks = export(content_of(broken()), make_array(), {}, to, Slice())
     next(chunks)
     with pytest.raises(OSError, match="the disk is gone"):
         list(chunks)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from storage.formats.export import FORMATS, Format, export
+from storage.formats.export import FORMATS, Format, content_of, export
 from storage.formats.slice import Slice
 from storage.schema import FRAMES
 from tests.builders.arrays import make_array
@@ -87,7 +87,11 @@ def test_a_column_that_is_not_there_is_refused_before_the_first_chunk(
     to: Format, unknown: str
 ) -> None:
     chunks = export(
-        cut(frames(), extra(), 20), make_array(), {}, to, Slice(columns=("seq", unknown))
+        content_of(cut(frames(), extra(), 20)),
+        make_array(),
+        {},
+        to,
+        Slice(columns=("seq", unknown)),
     )
     with pytest.raises(UsageError, match="no column") as caught:
         next(chunks)

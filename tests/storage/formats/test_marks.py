@@ -17,7 +17,7 @@ from devices.errors import UsageError
 from devices.frames import FrameBatch
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import FORMATS, Format, export
+from storage.formats.export import FORMATS, Format, content_of, export
 from storage.formats.marks import NEAREST_NS, TIMES, Marks, place
 from storage.formats.slice import Slice
 from storage.schema import Array
@@ -153,7 +153,9 @@ def test_any_pieces_give_the_frames_that_a_search_of_all_frames_gives(
 def exported(to: Format, marks: Marks | None, columns: tuple[str, ...] = ()) -> bytes:
     frames, part = session()
     pieces = ((frames.rows(a, a + 20), {"part": part[a : a + 20]}) for a in range(0, ROWS, 20))
-    return b"".join(export(pieces, make_array(), {}, to, Slice(columns=columns), None, marks))
+    return b"".join(
+        export(content_of(pieces), make_array(), {}, to, Slice(columns=columns), None, marks)
+    )
 
 
 def read(content: bytes, to: Format) -> pa.Table:

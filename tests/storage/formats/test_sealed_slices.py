@@ -20,7 +20,7 @@ from devices.frames import FrameBatch
 from storage.clock.file import write_clock
 from storage.clock.log import ClockOffset
 from storage.clock.table import StreamFacts
-from storage.formats.export import ClockName, export
+from storage.formats.export import ClockName, content_of, export
 from storage.formats.marks import TIMES, place
 from storage.formats.sealed import export_file, marks_of
 from storage.formats.slice import Slice
@@ -131,7 +131,7 @@ def of_the_whole(
         marks = place(events, [times], table, part) if events else None
         return outcome(
             lambda: export(
-                [(frames, extra)],
+                content_of([(frames, extra)]),
                 reader.info,
                 reader.notes,
                 "arrow",

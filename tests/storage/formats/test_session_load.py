@@ -11,7 +11,7 @@ import pytest
 
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
-from storage.formats.export import FORMATS, Format, export
+from storage.formats.export import FORMATS, Format, content_of, export
 from storage.formats.load_trace import read_load_trace
 from storage.formats.slice import Slice
 from storage.schema import Array
@@ -51,7 +51,7 @@ def written(path: Path, columns: dict[str, Array]) -> Path:
 def exported(folder: Path, to: Format, columns: dict[str, Array], *names: str) -> Path:
     path = folder / f"out.{to}"
     pieces = [(make_frames(ROWS, 3), columns)]
-    path.write_bytes(b"".join(export(pieces, ARRAY, {}, to, Slice(columns=names))))
+    path.write_bytes(b"".join(export(content_of(pieces), ARRAY, {}, to, Slice(columns=names))))
     return path
 
 

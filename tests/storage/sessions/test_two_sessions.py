@@ -11,7 +11,7 @@ import pytest
 
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import export
+from storage.formats.export import content_of, export
 from storage.formats.slice import Slice
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
@@ -69,7 +69,7 @@ class Node:
         rows = dict.fromkeys(names[:measured_parts], self.rows(seed))
         clock = ClockTable(rows, [StreamFacts(name) for name in names], names)
         pieces = iter([(frames, {"part": part})])
-        path.write_bytes(b"".join(export(pieces, info, {}, "parquet", Slice(), clock)))
+        path.write_bytes(b"".join(export(content_of(pieces), info, {}, "parquet", Slice(), clock)))
 
 
 @pytest.fixture
