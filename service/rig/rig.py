@@ -248,9 +248,7 @@ class Rig:
             return None
         sys.setswitchinterval(_SWITCH_S)
         pressed = options.foot.pressed_on(scene)
-        world = options.foot.world(scene, self._line_clock, pressed, looped=True)
-        stack.enter_context(world.foresight())
-        return world
+        return options.foot.world(scene, self._line_clock, pressed, looped=True, in_real_time=True)
 
     def _servo(self, scene: ServoScene, world: World | None, stack: ExitStack) -> ServoReader:
         port = scene.port
