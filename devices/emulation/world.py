@@ -7,7 +7,6 @@ its servo, and nothing else. Truth is there to judge an estimate by.
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -37,10 +36,6 @@ from devices.emulation.surroundings import Surroundings
 from devices.scene.emulated import BUS, LEAK_S, FaultKind, MudGround, PartFault
 from devices.scene.file import Scene
 from devices.scene.hardware import ServoScene
-
-_FORESIGHT_S = 0.4  # a thread that is late by less delays no sample
-_GIVE_WAY_S = 0.001
-_LOOKS_MAX = 10
 
 Effect = Literal["gas", "rubber", "hysteresis", "surroundings"]
 """What makes a dome's pressure differ from the static curve's; the last: warmth, head of water."""
@@ -80,6 +75,7 @@ class World:
         looped: press it, or hop, over and over again.
         begun: the scene's time begins now; else at `begin`, and until then all is as at its first
             instant.
+        in_real_time: the clock goes on by itself, and so does the physics, see `Domes`.
     """
 
     def __init__(
@@ -93,9 +89,11 @@ class World:
         pressed: PressedTrace | None = None,
         looped: bool = False,
         begun: bool = True,
+        in_real_time: bool = False,
     ) -> None:
         self.scene = scene
-        self._clock = clock
+        self.clock = clock
+        """What the emulated bus takes its time from."""
         self._begun = False
         self.epoch_ns = 0
         """Instant of the clock at which the scene's time began."""
@@ -109,7 +107,14 @@ class World:
         self._around = surroundings = self._surroundings(draw)
         bare = [tile.reference for tile in scene.tile]
         self._domes = Domes(
-            domes, serials, self.ground, scene.emulation, surroundings, label=draw, bare=bare
+            domes,
+            serials,
+            self.ground,
+            scene.emulation,
+            surroundings,
+            label=draw,
+            bare=bare,
+            in_real_time=in_real_time,
         )
         self.domes = tuple(domes)
         """What the domes are like, to judge an estimate by."""
@@ -172,7 +177,7 @@ class World:
 
     def begin(self) -> None:
         """Let the scene's time begin now: ground, faults, temperature."""
-        self.epoch_ns = self._clock.now_ns()
+        self.epoch_ns = self.clock.now_ns()
         self._begun = True
         for front_end in self._front_ends:
             front_end.begin(self.epoch_ns)
@@ -194,45 +199,6 @@ class World:
             baudrate=servo.baudrate,
         ) as emulated:
             yield emulated
-
-    @contextmanager
-    def foresight(self) -> Iterator[None]:
-        """For a real clock: compute the physics ahead in a thread while the block runs.
-
-        Without it the bus would now and then wait for it, which no silicon does. Where the thread
-        was held up, what is lacking is waited for before a transfer begins, never within it: the
-        driver is late then, and its instants are right. Only a machine that needs longer than a
-        second for the physics of a second waits within transfers, too.
-        """
-        stop = threading.Event()
-
-        def look_ahead() -> None:
-            pause_s = 0.0
-            while not stop.wait(pause_s):
-                is_there = self._domes.foresee(self._now_s() + _FORESIGHT_S)
-                # Block by block: whoever is behind must neither keep a sample waiting for more than
-                # it needs, nor the node from ending.
-                pause_s = _FORESIGHT_S / 4 if is_there else _GIVE_WAY_S
-
-        thread = threading.Thread(target=look_ahead, name="physics", daemon=True)
-        thread.start()
-        self.i2c_adapter.before_transfer = self._wait_until_ready
-        try:
-            yield
-        finally:
-            self.i2c_adapter.before_transfer = None
-            stop.set()
-            thread.join()
-
-    def _wait_until_ready(self) -> None:
-        # What was computed may have taken longer than it lasts: look again.
-        for _ in range(_LOOKS_MAX):
-            if not self._domes.be_ready(self._now_s()):
-                return
-
-    def _now_s(self) -> float:
-        """The scene's time now."""
-        return (self._clock.now_ns() - self.epoch_ns) * 1e-9 if self._begun else 0.0
 
     def truth(self, t_mono_ns: Times) -> Truth:
         """Ground truth at instants of the node's monotonic clock."""

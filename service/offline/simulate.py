@@ -98,7 +98,7 @@ class Simulation:
             self._clock,
             schedule=options.schedule,
             recovery=open_recovery_lines(scene, self._clock, self.world),
-            reference_n=open_reference_sensor(scene, self._clock, self.world, stack),
+            reference_n=open_reference_sensor(scene, self.world, stack),
         )
         self.choice = ready.choice
         self.unmeasured = ready.unmeasured

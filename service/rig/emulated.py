@@ -39,14 +39,20 @@ class EmulatedFoot:
         )
 
     def world(
-        self, scene: Scene, clock: Clock, pressed: PressedTrace | None, *, looped: bool = False
+        self,
+        scene: Scene,
+        clock: Clock,
+        pressed: PressedTrace | None,
+        *,
+        looped: bool = False,
+        in_real_time: bool = False,
     ) -> World:
         """Chips, domes and ground of a scene, before they begin.
 
         Raises:
             MissingExtraError: the physics needs packages that are not installed.
         """
-        # Here, because a real node need not wait for scipy, nor have room for it.
+        # Here, because a real node need not wait for numba, nor have room for it.
         with needs_extra("emulation", "an emulated array"):
             from devices.emulation.world import World
 
@@ -59,4 +65,5 @@ class EmulatedFoot:
             pressed=pressed,
             looped=looped,
             begun=False,
+            in_real_time=in_real_time,
         )

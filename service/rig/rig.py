@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 def open_reference_sensor(
-    scene: Scene, clock: Clock, world: World | None, stack: ExitStack
+    scene: Scene, world: World | None, stack: ExitStack
 ) -> Callable[[], float] | None:
     """A function that reads the scene's reference force in newtons; None if it has no sensor.
 
@@ -53,12 +53,12 @@ def open_reference_sensor(
     emulated = None
     if reference.port == EMULATED:
         mill = world.mill if world is not None else None
-        if mill is None:
+        if world is None or mill is None:
             raise UsageError(
                 f"scene {scene.name!r} has an emulated reference sensor and no emulated mill",
                 remedy='Set ground.kind = "indentation", or reference.port to a device',
             )
-        emulated = mill.adc(reference, clock)
+        emulated = mill.adc(reference, world.clock)
     device = open_spi(reference.port, emulated)
     stack.callback(device.close)
     return ReferenceForce(Mcp3208(device, where=reference.port), reference).read_n
@@ -82,7 +82,8 @@ _TRIAL_FRAMES = 100
 _RENEW_AGAIN_NS = 2_000_000_000
 """Between attempts to identify a part that is being plugged."""
 
-# Threads of an emulated world must not make the bus wait for Python's lock longer than a bit or so.
+# The thread that plays an emulated servo must not make the bus wait for Python's lock for longer
+# than a bit or so.
 _SWITCH_S = 0.0002
 
 
@@ -117,7 +118,7 @@ class Rig:
         scene = options.scene
         sharpen_timers()
         self._options = options
-        self._clock = SpinningClock()
+        self._clock: Clock = SpinningClock()
         # What runs beside the loop, or plays the wires, must not keep it from its core.
         self._line_clock = SystemClock()
         self._lead: Lead | None = None
@@ -125,7 +126,7 @@ class Rig:
         self._bus = open_bus(scene.array.bus, world.i2c_adapter if world is not None else None)
         stack.callback(self._bus.close)
         self._recovery = open_recovery_lines(scene, self._clock, world)
-        self._reference_n = open_reference_sensor(scene, self._clock, world, stack)
+        self._reference_n = open_reference_sensor(scene, world, stack)
         self._ready = make_ready(
             self._bus,
             scene,
@@ -248,9 +249,13 @@ class Rig:
             return None
         sys.setswitchinterval(_SWITCH_S)
         pressed = options.foot.pressed_on(scene)
-        world = options.foot.world(scene, self._line_clock, pressed, looped=True)
-        stack.enter_context(world.foresight())
-        return world
+        clock: Clock = self._line_clock
+        if options.emulated:
+            from devices.emulation.hosted_clock import HostedClock, WireClock
+
+            self._clock = driver = HostedClock(self._clock)
+            clock = WireClock(driver, self._line_clock)
+        return options.foot.world(scene, clock, pressed, looped=True, in_real_time=True)
 
     def _servo(self, scene: ServoScene, world: World | None, stack: ExitStack) -> ServoReader:
         port = scene.port

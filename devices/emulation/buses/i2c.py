@@ -13,7 +13,7 @@ import ctypes
 import errno
 import os
 import random
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial, reduce
 from operator import and_
 from typing import Protocol
@@ -77,8 +77,6 @@ class EmulatedI2cAdapter:
         self, muxes: Sequence[MuxDevice], clock: Clock, scl_hz: float, line: Line | None = None
     ) -> None:
         self.line = line if line is not None else Line(Faults(()), "")
-        self.before_transfer: Callable[[], None] | None = None
-        """On a real clock: waits until all is computed that a transfer may touch."""
         self._muxes = muxes
         self._mux_addresses = frozenset(mux.address for mux in muxes)
         self._clock = clock
@@ -105,8 +103,6 @@ class EmulatedI2cAdapter:
                 touches the bus, EREMOTEIO for a missing acknowledge, ETIMEDOUT if SCL is stuck.
         """
         _refuse_unsupported(i2c_msgs)
-        if self.before_transfer is not None:
-            self.before_transfer()
         begin_ns = self._clock.now_ns()
         disturbed = None if self.line.sound else self.line
         if disturbed is not None:

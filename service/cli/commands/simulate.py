@@ -63,7 +63,7 @@ def simulate_command(
     the same bytes. Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but the bus cannot keep
     the scene's frame rate.
     """
-    # Imported here: the physics pulls in scipy, which `--help` need not wait for.
+    # Imported here: the physics pulls in numba, which `--help` need not wait for.
     from service.estimation.ladder.chosen import check_models
     from service.offline.calibrations import find_calibration, with_tiles
     from service.offline.simulate import SimulateOptions, simulate

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from devices.arrays import Floats
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 from service.estimation.models.flow import flowed
 from service.estimation.models.hysteresis import WIDTHS_N, played
 from service.estimation.models.rubber import crept_parts

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from devices.arrays import Floats, Ints, Times
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 from service.estimation.ladder.lower import ApparentForces
 from service.estimation.ladder.plan import EstimationPlan
 from service.estimation.models import denoise

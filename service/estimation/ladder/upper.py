@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from devices.arrays import Arrays, Bools, Floats, Times
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 from service.estimation.ladder.averaged import averaged, summed
 from service.estimation.ladder.chosen import Ladder
 from service.estimation.ladder.lower import ApparentForces

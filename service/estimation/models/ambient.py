@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats, Times
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 
 SMOOTHING_S = 0.03  # long against noise, short against a foot that sinks in
 HELD_S = 0.2

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from devices.arrays import Floats, Ints, Times
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 
 PAST_NS = 250_000_000  # how far the longest window reaches back
 REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Arrays, Floats, Times
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 from service.estimation.foot.contact import UNSEEN_NS
 
 RESTART = 5.0

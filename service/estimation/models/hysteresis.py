@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 
 WIDTHS_N = np.array([0.6, 1.5, 4.0])
 """Half widths of the plays; their parts are what is fitted."""

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Floats
+from devices.compiled import compiled
 from service.estimation.calibration import BASIS, CURVE_OPENS_N, LOOP_OPENS_N, TileCalibration
-from service.estimation.compiled import compiled
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.arrays import Arrays, Floats, Times
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 
 SETTLE_S = 0.5
 """How long the mean of the chip's temperature is taken as that of the gas."""

@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from devices.arrays import Bools, Floats, Times
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 from service.estimation.watch.state import State, copied
 
 LOST_KPA = 0.4

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from devices.arrays import Floats
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 from service.estimation.watch.state import State, copied
 
 ENOUGH = 11.0

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats, Ints
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 from service.estimation.watch.state import State, copied
 
 HOURS = 100.0

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats, Ints, Times
+from devices.compiled import compiled
 from devices.frames import NOT_READ
-from service.estimation.compiled import compiled
 from service.estimation.watch.state import State, copied
 
 SMOOTH_S = 0.5  # long against the noise of half a count

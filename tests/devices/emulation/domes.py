@@ -47,14 +47,19 @@ def nothing(t_s: Floats) -> Floats:
 
 
 def domes_of(
-    force: Force = nothing, *parts: DomePart, label: str = "test", **effects: Any
+    force: Force = nothing,
+    *parts: DomePart,
+    label: str = "test",
+    in_real_time: bool = False,
+    **effects: Any,
 ) -> Domes:
     """Domes under a force, with only the named effects on."""
     scene = EmulationScene(**({"gas": False, "rubber": False, "hysteresis": False} | effects))
     parts = parts or (PART,)
     serials = [f"S{i}" for i in range(len(parts))]
     load = Pressing(force, len(parts))
-    return Domes(parts, serials, load, scene, Surroundings(scene), label=label)
+    around = Surroundings(scene)
+    return Domes(parts, serials, load, scene, around, label=label, in_real_time=in_real_time)
 
 
 def kpa_at(domes: Domes, t_s: npt.ArrayLike, dome: int = 0) -> Floats:

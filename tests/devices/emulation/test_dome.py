@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import functools
 import math
-import threading
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from devices.emulation.dome import GRID_S, decaying
+from devices.emulation import dome
+from devices.emulation.dome import GRID_S
+from devices.emulation.families import dome_of
 from devices.emulation.parts import DomePart
 from tests.devices.emulation.domes import (
     PART,
@@ -183,8 +184,8 @@ def test_the_physics_does_not_know_who_asks_or_when() -> None:
 
 
 @pytest.mark.parametrize("shift_s", [0.3, 0.7895, 0.79, 0.7905])
-def test_a_seam_between_blocks_does_not_show(shift_s: float) -> None:
-    # At a shift of 0.79 the load ends its rise where the first block of one second ends.
+def test_a_seam_between_pieces_does_not_show(shift_s: float) -> None:
+    # At a shift of 0.79 the load ends its rise where a piece ends.
     def shifted(t_s: Floats) -> Floats:
         return tap(t_s - shift_s)
 
@@ -212,47 +213,20 @@ def test_a_dome_does_not_feel_its_neighbours() -> None:
     np.testing.assert_allclose(kpa_at(swapped, t_s, dome=1), alone, atol=1e-6)
 
 
-# A real clock
+# When it is computed
 
 
-def test_computing_ahead_changes_no_pressure() -> None:
-    def force(t_s: Floats) -> Floats:
-        return np.where(t_s > 0.3, 8.0, 0.0)
-
-    t_s = np.linspace(0.0, 2.5, 400)
-    expected = kpa_at(domes_of(force, **ALL), t_s)
-    ahead = domes_of(force, **ALL)
-    got = []
-    for t in t_s:
-        ahead.foresee(float(t) + 0.4)
-        got.append(ahead.pressure_kpa(0, float(t)))
-    assert np.array(got).tobytes() == expected.tobytes()
-
-
-def test_threads_that_ask_and_compute_ahead_at_once_see_the_same_pressures() -> None:
-    def force(t_s: Floats) -> Floats:
-        return np.where(t_s > 0.3, 8.0, 0.0)
-
-    t_s = np.linspace(0.0, 4.0, 3000)
-    expected = kpa_at(domes_of(force, **ALL), t_s)
-    domes = domes_of(force, **ALL)
-    ahead_of = [0.0]
-    done = threading.Event()
-
-    def look_ahead() -> None:
-        while not done.is_set():
-            domes.foresee(ahead_of[0] + 0.4)
-            done.wait(1e-4)
-
-    thread = threading.Thread(target=look_ahead)
-    thread.start()
-    got = []
-    for t in t_s:
-        ahead_of[0] = float(t)
-        got.append(domes.pressure_kpa(0, float(t)))
-    done.set()
-    thread.join()
-    assert np.array(got).tobytes() == expected.tobytes()
+@pytest.mark.parametrize("family", ["default", "broad"])
+def test_the_bits_do_not_tell_how_much_was_computed_at_once(
+    family: Literal["default", "broad"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = dome_of(family, "T01", 0)
+    everything: dict[str, Any] = ALL | {"repeatability": 0.03, "temperature_step_k": -4.0}
+    t_s = grid(0.0, 2.2)
+    expected = kpa_at(domes_of(tap, part, **everything), t_s)
+    for points in (1, 7, 4000):
+        monkeypatch.setattr(dome, "_PIECE", points)
+        assert kpa_at(domes_of(tap, part, **everything), t_s).tobytes() == expected.tobytes()
 
 
 def rising(t_s: Floats) -> Floats:
@@ -272,19 +246,16 @@ def rising_kpa() -> Floats:
 @settings(max_examples=25, deadline=None)
 @given(
     pauses_s=st.lists(st.floats(0.0, 9.0), min_size=1, max_size=6),
-    lateness_s=st.lists(st.floats(0.0, 40.0), min_size=6, max_size=6),
     back_s=st.lists(st.floats(0.0, 0.9), min_size=6, max_size=6),
+    in_real_time=st.booleans(),
 )
 def test_however_late_a_driver_is_it_reads_what_the_dome_was_like_at_that_instant(
-    pauses_s: list[float], lateness_s: list[float], back_s: list[float]
+    pauses_s: list[float], back_s: list[float], in_real_time: bool
 ) -> None:
-    domes = domes_of(rising, **BESIDE_GAS)
+    domes = domes_of(rising, in_real_time=in_real_time, **BESIDE_GAS)
     t_s = 0.0
-    for pause_s, late_s, before_s in zip(pauses_s, lateness_s, back_s, strict=False):
+    for pause_s, before_s in zip(pauses_s, back_s, strict=False):
         t_s += pause_s
-        # The bus has read its clock; then the process was held up, but not what computes ahead.
-        while not domes.foresee(t_s + late_s) and late_s < 20.0:
-            pass
         for asked_s in (t_s, max(0.0, t_s - before_s)):
             point = round(asked_s / GRID_S)
             assert domes.pressure_kpa(0, point * GRID_S) == pytest.approx(
@@ -292,64 +263,28 @@ def test_however_late_a_driver_is_it_reads_what_the_dome_was_like_at_that_instan
             )
 
 
-def test_a_transfer_whose_pressures_are_there_does_not_wait_for_those_that_are_computed() -> None:
-    is_computing, may_go_on = threading.Event(), threading.Event()
-
-    def slow(t_s: Floats) -> Floats:
-        if t_s[0] > 0.5:
-            is_computing.set()
-            assert may_go_on.wait(10.0)
-        return rising(t_s)
-
-    domes = domes_of(slow)
-    ahead = threading.Thread(target=domes.foresee, args=(1.4,))
-    ahead.start()
-    try:
-        assert is_computing.wait(10.0)
-        transfer = threading.Thread(target=domes.be_ready, args=(0.9,))
-        transfer.start()
-        transfer.join(5.0)
-        assert not transfer.is_alive()
-    finally:
-        may_go_on.set()
-        ahead.join()
-    assert not domes.be_ready(1.9)
-    assert domes.be_ready(2.0)
-
-
-def test_what_is_computed_ahead_for_a_driver_that_asks_nothing_is_bounded() -> None:
+def test_what_is_kept_of_the_past_is_bounded() -> None:
     domes = domes_of(rising)
-    for _ in range(200):
-        domes.foresee(1000.0)
-    assert domes._next <= 31 * 2000
-    begin_kpa = domes.pressure_kpa(0, 0.0)
-    assert begin_kpa == pytest.approx(100.0)
-    assert domes.pressure_kpa(0, 1000.0) > begin_kpa
-    assert len(domes._blocks) <= 3
+    for t_s in range(20):
+        domes.pressure_kpa(0, float(t_s))
+    assert sum(len(piece) for piece in domes._pieces.values()) < 2 / GRID_S
 
 
-@settings(max_examples=20)
-@given(columns=st.integers(1, 40), before=st.floats(-9.0, 9.0))
-def test_many_lags_at_once_give_the_bits_of_each_alone(columns: int, before: float) -> None:
-    rng = np.random.default_rng(columns)
-    drive, gain = rng.normal(size=(50, columns)), rng.uniform(size=(columns, 8))
-    decay, begin = rng.uniform(size=(columns, 8)), np.full((columns, 8), before)
-    together = decaying(drive, gain, decay, begin)
-    for i in range(columns):
-        one = slice(i, i + 1)
-        alone = decaying(drive[:, one], gain[one], decay[one], begin[one])
-        assert together[:, one].tobytes() == alone.tobytes()
-
-
-@pytest.mark.parametrize("late_s", [2.0, 5.5, 55.5])
+@pytest.mark.parametrize("late_s", [2.0, 12.5, 55.5])
 def test_a_driver_that_was_away_for_long_finds_the_dome_as_it_is_by_now(late_s: float) -> None:
+    points = [0]
+
     def pressed(t_s: Floats) -> Floats:
         """Twenty newtons and nothing in turn, three seconds each; nothing for the last three."""
+        points[0] += len(t_s)
         return np.where(np.mod(t_s - late_s, 6.0) < 3.0, 0.0, 20.0)
 
     present = domes_of(pressed, **ALL)
     present_kpa = kpa_at(present, grid(0.0, late_s))[-1]
-    away = domes_of(pressed, **ALL)
-    away.be_ready(late_s)
+    away = domes_of(pressed, in_real_time=True, **ALL)
+    points[0] = 0
     assert away.pressure_kpa(0, late_s) == pytest.approx(present_kpa, abs=0.05)
-    assert len(away._blocks) <= 6
+    assert points[0] < 12 / GRID_S, "a machine that slept has not all of it to compute"
+    assert away.pressure_kpa(0, late_s - 0.9) == pytest.approx(
+        present.pressure_kpa(0, late_s - 0.9), abs=0.05
+    )

@@ -18,7 +18,6 @@ from devices.buses.i2c import I2cBus, open_bus
 from devices.chips.dynamixel.reader import open_servo
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa
 from devices.clock import VirtualClock
-from devices.emulation.dome import Domes
 from devices.emulation.parts import draw_chip, draw_dome
 from devices.emulation.world import World
 from devices.errors import TileSetupError
@@ -314,24 +313,3 @@ def test_a_punctured_dome_loses_its_gas_and_its_neighbour_does_not() -> None:
     assert before[0] > after[0] + 1.0
     assert after[1] == pytest.approx(before[1], abs=0.5)
     assert after[0] == pytest.approx(world._surroundings(f"{scene.name}/0").ambient_kpa, abs=0.3)
-
-
-def test_physics_that_takes_long_is_waited_for_before_a_transfer_and_not_within(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    clock = VirtualClock()
-    world = World(load_scene("standing"), clock)
-    forces_n = world.ground.forces_n
-
-    def slow(t_s: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        clock.sleep_until_ns(clock.now_ns() + 600_000_000)  # for a second
-        return forces_n(t_s)
-
-    # The thread that computes ahead was held up all this time.
-    monkeypatch.setattr(Domes, "foresee", lambda *_: True)
-    with world.foresight():
-        monkeypatch.setattr(world.ground, "forces_n", slow)
-        clock.sleep_until_ns(1_500_000_000)
-        assert world.i2c_adapter.before_transfer is not None
-        world.i2c_adapter.before_transfer()
-        assert not world._domes.be_ready(clock.now_ns() * 1e-9)

@@ -9,7 +9,7 @@ import numba.core.caching
 import numba.core.config
 import pytest
 
-from service.estimation.compiled import compiled
+from devices.compiled import compiled
 
 
 def tripled(x: float) -> float:
