@@ -2,8 +2,8 @@
 
 A float32 has 24 bits for a force of which five or six are more than noise, and noise does not
 compress. So each column has one step, a power of two, for the whole of a recording, known before
-its first frame from calibration and tares alone. What it adds to an uncertainty is 1/28 of it in
-its square root, 0.07 % (an even distribution over a step of sigma/8).
+its first frame from calibration and tares alone. A step of sigma/8 has a standard deviation of
+sigma/28, and makes of sigma 0.07 % more.
 
 The least sigma of every column is worked out from the same terms as the estimate's own, each at
 its least; none of them can make it less:

@@ -58,15 +58,14 @@ def test_a_download_before_the_seal_has_the_rounded_estimates_of_the_sealed_file
     before = pa.ipc.open_stream(session.data(format="arrow").content).read_all()
     tared.finish(session)
     sealed = pq.read_table(session.folder / "frames.parquet")
-    steps = {
-        f.name: f.metadata[b"rounded_to"] for f in sealed.schema if b"rounded_to" in f.metadata
-    }
+    said = {field.name: field.metadata or {} for field in sealed.schema}
+    steps = {name: float(m[b"rounded_to"]) for name, m in said.items() if b"rounded_to" in m}
     assert {"force_n_0", "force_n_1", "grf_n", "grf_sigma_n"} <= set(steps)
     for name, step in steps.items():
-        assert before.schema.field(name).metadata[b"rounded_to"] == step
+        assert (before.schema.field(name).metadata or {})[b"rounded_to"] == repr(step).encode()
         found = before[name].to_numpy()[:100]  # later ones had less look-ahead
         np.testing.assert_array_equal(found, sealed[name].to_numpy()[:100], err_msg=name)
-        whole = found.astype(np.float64) / float(step)
+        whole = found.astype(np.float64) / step
         np.testing.assert_array_equal(whole, np.rint(whole), err_msg=name)
 
 
@@ -82,7 +81,7 @@ def test_a_server_that_is_told_so_seals_estimates_as_computed(
     node.deliver(200, [20.0, 60.0], noise=1)
     node.finish(session)
     schema = pq.read_schema(session.folder / "frames.parquet")
-    assert not any(b"rounded_to" in field.metadata for field in schema)
+    assert not any(b"rounded_to" in (field.metadata or {}) for field in schema)
     with session.reader() as file:
         assert file.notes["rounded_to"] == {}
 
