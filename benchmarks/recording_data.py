@@ -153,7 +153,8 @@ def _simulated(title: str, scene: Scene, seconds: float, load: LoadTrace | None)
 
 
 def _on_real_clock(tiles: int, seconds: float) -> Recording:
-    from service.rig.rig import Rig, RigOptions
+    from service.rig.options import RigOptions
+    from service.rig.rig import Rig
 
     with ExitStack() as stack:
         rig = Rig(RigOptions(_arc(tiles), "bench"), stack)

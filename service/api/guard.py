@@ -145,13 +145,3 @@ def _hardened(send: Send) -> Send:
         await send(message)
 
     return with_headers
-
-
-def is_loopback(host: str) -> bool:
-    """Does this address reach only this machine?"""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -21,7 +21,8 @@ from multiprocessing.connection import Connection
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from service.node.notices import Notices
-from service.rig.rig import Rig, RigOptions
+from service.rig.options import RigOptions
+from service.rig.rig import Rig
 from storage.schema import wire_schema
 from storage.wire import EncodedBatch, encode
 

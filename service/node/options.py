@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.estimation.calibration import Calibration
-from service.rig.rig import RigOptions
+from service.rig.options import RigOptions
 
 
 @dataclass(frozen=True)

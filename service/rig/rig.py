@@ -9,8 +9,6 @@ import sys
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from devices.acquisition import Acquisition
@@ -29,8 +27,8 @@ from devices.reference import ReferenceForce
 from devices.scene.file import Scene
 from devices.scene.hardware import EMULATED, ServoScene
 from service.rig.description import describe
-from service.rig.emulated import EmulatedFoot
 from service.rig.lead import Lead
+from service.rig.options import RigOptions
 from service.rig.pace import Pace, undisturbed_hz
 from storage.journal.node.in_flight import InFlight, open_in_flight
 
@@ -85,22 +83,6 @@ _RENEW_AGAIN_NS = 2_000_000_000
 # The thread that plays an emulated servo must not make the bus wait for Python's lock for longer
 # than a bit or so.
 _SWITCH_S = 0.0002
-
-
-@dataclass(frozen=True)
-class RigOptions:
-    """What to open; `foot` is for emulation only."""
-
-    scene: Scene
-    node: str
-    foot: EmulatedFoot = EmulatedFoot()  # noqa: RUF009  # frozen, so one for all is safe
-    streams: Path | None = None
-    """Folder of the node's journals: frames in flight are kept there, each stream's in its own."""
-
-    @property
-    def emulated(self) -> bool:
-        """Are the tiles emulated?"""
-        return self.scene.array.bus == EMULATED
 
 
 class Rig:

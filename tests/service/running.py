@@ -17,9 +17,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from devices.frames import FrameBatch
+from service.api.address import listen, urls_of
 from service.api.app import make_app
 from service.api.doors import Bounds
-from service.api.serve import listen, serving, urls_of
+from service.api.serve import serving
 from service.link import SUBPROTOCOL
 from service.server.server import Server
 from storage.journal.journal import Journal

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,6 +26,8 @@ from service.cli.options import (
 )
 
 if TYPE_CHECKING:
+    import socket
+
     from service.server.server import Server
 
 NODE = "demo"
@@ -56,7 +59,7 @@ def demo_command(
     from platformdirs import user_data_path
 
     from service.api.doors import raise_open_files
-    from service.rig.rig import RigOptions
+    from service.rig.options import RigOptions
 
     raise_open_files()
     the_scene = scene_with(scene, bus=None, servo=None)
@@ -72,22 +75,19 @@ def demo_command(
 async def _demo(
     host: str, port: int, data: Path, seconds: float | None, node_arguments: list[str]
 ) -> None:
-    from service.api.app import make_app
-    from service.api.serve import listen, serving, token_for, urls_of
-    from service.server.server import Server
+    from service.api.address import listen, token_for, urls_of
     from storage.private import keep_private
 
     stop = stop_on_signals()
     keep_private(data)
     with listen(host, port) as listening:
-        server = Server(data)
         given = os.environ.get("FOOTTILE_TOKEN")
         token = token_for(host, given, data)
-        remark(PREPARING)
-        async with serving(make_app(server, token=token), listening):
-            urls = urls_of(listening, host)
-            node = await _start_node(urls[-1], token, node_arguments)
-            try:
+        urls = urls_of(listening, host)
+        # First: while the server is imported and prepared, the tiles are found and measured.
+        node = await _start_node(urls[-1], token, node_arguments)
+        try:
+            async with _server(listening, data, token) as server:
                 announce(urls, data, token, is_kept=not given)
                 remark(f"what was recorded: foottile sessions --server {urls[-1]}")
                 ended = asyncio.create_task(node.wait())
@@ -102,10 +102,24 @@ async def _demo(
                         remedy="What it said stands above",
                     )
                 await _stop_recording(server)
+                await _end(node)  # before its server, which it would miss
                 if not stop.is_set():
                     remark(f"ended after {seconds:g} s; data in {data}")
-            finally:
-                await _end(node)
+        finally:
+            await _end(node)
+
+
+@asynccontextmanager
+async def _server(listening: socket.socket, data: Path, token: str | None) -> AsyncIterator[Server]:
+    """A server that answers, while the block runs."""
+    from service.api.app import make_app
+    from service.api.serve import serving
+    from service.server.server import Server
+
+    server = Server(data)
+    remark(PREPARING)
+    async with serving(make_app(server, token=token), listening):
+        yield server
 
 
 async def _start_node(
@@ -131,6 +145,9 @@ async def _stop_recording(server: Server) -> None:
 
 
 async def _end(node: asyncio.subprocess.Process) -> None:
+    """End the node, if it has not ended."""
+    if node.returncode is not None:
+        return
     with suppress(ProcessLookupError):
         node.terminate()
     try:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from service.estimation.calibration import Calibration
     from service.node.options import NodeOptions
     from service.node.run import Outcome
-    from service.rig.rig import RigOptions
+    from service.rig.options import RigOptions
 
 SERVER = "http://127.0.0.1:8000"
 
@@ -75,7 +75,7 @@ def node_command(
 
     from service.node.dial import ingest_url
     from service.node.options import NodeOptions
-    from service.rig.rig import RigOptions
+    from service.rig.options import RigOptions
     from storage.private import keep_private
 
     if end_with_parent:

@@ -84,8 +84,9 @@ def serve_command(
 
 
 async def _serve(settings: Settings) -> None:
+    from service.api.address import listen, token_for, urls_of
     from service.api.app import make_app
-    from service.api.serve import listen, serving, token_for, urls_of
+    from service.api.serve import serving
     from service.server.server import Server
     from storage.private import keep_private
 
@@ -120,7 +121,7 @@ def announce(urls: list[str], data: Path, token: str | None, *, is_kept: bool) -
         token: what it asks for.
         is_kept: is the token the one that is kept in the data folder?
     """
-    from service.api.serve import KEPT_IN
+    from service.api.address import KEPT_IN
 
     for url in urls:
         say(f"FootTile is at {url}/" + (f"#token={token}" if token and sys.stdout.isatty() else ""))

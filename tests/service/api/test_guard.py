@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from service.api.guard import is_loopback
-from service.api.serve import token_for
+from service.api.address import is_loopback, token_for
 from service.link import INGEST_PATH
 from tests.service.fake_node import NodeOf
 from tests.service.running import Running, ServeWith

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.api.serve import token_for
+from service.api.address import token_for
 from storage.durable import set_aside
 from storage.private import keep_private
 from tests.service.fake_node import FakeNode

@@ -15,7 +15,7 @@ import pytest
 import service.node.acquisition
 from devices.errors import FootTileError
 from devices.scene.file import load_scene
-from service.rig.rig import RigOptions
+from service.rig.options import RigOptions
 from tests.builders.scenes import ONE_TILE_FILE
 from tests.service.process import Process, Start, acquisition_of
 from tests.service.running import Running

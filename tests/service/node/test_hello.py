@@ -10,7 +10,7 @@ from devices.errors import CalibrationError
 from service.link import Status
 from service.node.connection import hello_of
 from service.node.options import NodeOptions
-from service.rig.rig import RigOptions
+from service.rig.options import RigOptions
 from storage.journal.node.journal import NodeJournal
 from tests.builders.arrays import make_array
 from tests.builders.scenes import make_scene

@@ -11,7 +11,8 @@ from devices.array.startup import Ready
 from devices.frames import FrameStatus
 from devices.scene.file import load_scene
 from service.rig.emulated import EmulatedFoot
-from service.rig.rig import Rig, RigOptions
+from service.rig.options import RigOptions
+from service.rig.rig import Rig
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from devices.errors import StorageError
-from service.api.serve import token_for
+from service.api.address import token_for
 from service.offline.calibrations import read_calibration, write_calibration
 from service.server.data_folder import DataFolder
 from service.server.nodes import ServerNodes

@@ -1,0 +1,113 @@
+"""Where a server is found, and by which token: what a node has to know before the server has begun.
+
+Nothing here needs what the server itself is made of, which takes long to import.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import re
+import secrets
+import socket
+from pathlib import Path
+
+from devices.errors import DamagedFileError, LinkError
+from storage.durable import put_aside, read_whole, storage_errors, write_whole
+
+log = logging.getLogger("foottile.serve")
+
+KEPT_IN = "token"
+"""File of the data folder with the token that was made."""
+_BACKLOG = 128
+_UNREAD_MS = 60_000
+"""A connection whose other end takes nothing of what is sent for so long is closed by the kernel:
+no time-out of ours sees how much of a download has arrived."""
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket; port 0 is any that is free.
+
+    Raises:
+        LinkError: the port is in use, or the address is not this machine's.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listening = socket.socket(family, kind, protocol)
+    except OSError as error:
+        raise LinkError(f"cannot listen on {host}: {error}") from error
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # those that come to it inherit this
+            listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
+        listening.bind(address)
+        listening.listen(_BACKLOG)
+    except OSError as error:
+        listening.close()
+        raise LinkError(
+            f"cannot listen on {host} port {port}: {error.strerror}",
+            remedy="Stop what uses the port, or choose another one with --port",
+        ) from error
+    return listening
+
+
+def urls_of(listening: socket.socket, host: str) -> list[str]:
+    """Addresses under which it is reached, from other machines first if they can."""
+    port = listening.getsockname()[1]
+    names = [host]
+    if host in ("0.0.0.0", "::", ""):  # noqa: S104  # compared only
+        names = [*_own_addresses(), "127.0.0.1"]
+    return [f"http://[{n}]:{port}" if ":" in n else f"http://{n}:{port}" for n in names]
+
+
+def _own_addresses() -> list[str]:
+    """This machine's address towards other networks, if it is in one."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            # Nothing is sent: connecting a datagram socket only chooses the way out.
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return []
+        return [name for name in (probe.getsockname()[0],) if not is_loopback(name)]
+
+
+def token_for(host: str, given: str | None, data: Path) -> str | None:
+    """The token to ask for: the one given; off loopback one that is kept in the data folder.
+
+    Raises:
+        StorageError: it cannot be read or kept.
+    """
+    if given or is_loopback(host):
+        return given or None
+    path = data / KEPT_IN
+    try:
+        kept = read_whole(path).decode("ascii", "replace").strip()
+        if not _TOKEN.fullmatch(kept):
+            raise DamagedFileError("it holds no token", where=str(path))  # noqa: TRY301  # caught below
+    except FileNotFoundError:
+        pass
+    except DamagedFileError as error:
+        log.warning("%s, and a new token is made", put_aside(path, error))
+    else:
+        return kept
+    with storage_errors(path):
+        data.mkdir(parents=True, exist_ok=True)
+        kept = secrets.token_urlsafe(18)
+        write_whole(path, kept.encode() + b"\n", mode=0o600)
+    return kept
+
+
+_TOKEN = re.compile(r"[!-~]{8,200}")
+"""What people may have put there themselves, too."""
+
+
+def is_loopback(host: str) -> bool:
+    """Does this address reach only this machine?"""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
