@@ -30,6 +30,8 @@ from devices.frames import (
 ARRAY_INFO_KEY = b"foottile.array_info"
 ARRAY_HASH_KEY = b"foottile.array_info_sha256"
 """In a journal's segments, whose header has no other checksum."""
+ROUNDED_TO = "rounded_to"
+"""In the notes of a file, and in the metadata of each field: the step of a column of estimates."""
 
 Array = npt.NDArray[Any]
 """A numpy column; which type it has is said by the column table, not by the checker."""
@@ -51,9 +53,13 @@ class Column:
         """Names of its columns in a flat file."""
         return [f"{self.name}_{i}" for i in range(tiles)] if self.per_tile else [self.name]
 
-    def field(self, name: str, type_: pa.DataType, *, nullable: bool) -> pa.Field[Any]:
-        """An Arrow field with unit and description in its metadata."""
+    def field(
+        self, name: str, type_: pa.DataType, *, nullable: bool, step: float | None = None
+    ) -> pa.Field[Any]:
+        """An Arrow field with unit and description in its metadata, and to what it is rounded."""
         metadata = {"unit": self.unit, "description": self.description}
+        if step is not None:
+            metadata[ROUNDED_TO] = repr(step)
         return pa.field(name, type_, nullable=nullable, metadata=metadata)
 
 
@@ -260,22 +266,36 @@ def flat_of(tiles: int) -> dict[str, Column]:
 
 
 def flat_columns(
-    columns: Sequence[Column], values: Mapping[str, Array]
+    columns: Sequence[Column],
+    values: Mapping[str, Array],
+    notes: Mapping[str, object] | None = None,
 ) -> list[tuple[pa.Field[Any], pa.Array[Any]]]:
-    """Fields and arrays of a flat table, in the order of `columns`; missing values become null."""
+    """Fields and arrays of a flat table, in the order of `columns`; missing values become null.
+
+    Args:
+        columns: which.
+        values: by their names, (n,) or (n, tiles).
+        notes: of the file, which may say to what columns were rounded.
+    """
     out = []
     for column in columns:
         data = values[column.name]
         parts = data.T if column.per_tile else data[None]
         for name, part in zip(column.flat_names(len(parts)), parts, strict=True):
-            out.append(flat_column(column, name, part))
+            out.append(flat_column(column, name, part, notes))
     return out
 
 
-def flat_column(column: Column, name: str, values: Array) -> tuple[pa.Field[Any], pa.Array[Any]]:
+def flat_column(
+    column: Column, name: str, values: Array, notes: Mapping[str, object] | None = None
+) -> tuple[pa.Field[Any], pa.Array[Any]]:
     """Field and array of one flat column, n rows; missing values become null."""
     may_miss = column.missing is not None or not np.issubdtype(values.dtype, np.integer)
-    field = column.field(name, column.type, nullable=may_miss)
+    steps = (notes or {}).get(ROUNDED_TO)
+    step = steps.get(name) if isinstance(steps, dict) else None
+    field = column.field(
+        name, column.type, nullable=may_miss, step=step if isinstance(step, float) else None
+    )
     return field, _to_arrow(np.ascontiguousarray(values), column)
 
 

@@ -39,6 +39,8 @@ class Settings(Bounds, BaseSettings):
     loopback and none is given."""
     allow_host: tuple[str, ...] = ()
     """Names under which the server is reached, in addition to its addresses."""
+    exact: bool = False
+    """Are estimates in recorded sessions as computed, and not rounded?"""
 
 
 def load_settings(config: Path | None, **given: object) -> Settings:

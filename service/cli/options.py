@@ -34,6 +34,10 @@ SECONDS_MAX = NUMBER_MAX = 1e9
 """Thirty years; and more than any metre, newton or factor can be."""
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+ExactOption = Annotated[
+    bool,
+    typer.Option("--exact", help="Keep estimates as computed: do not round off their noise."),
+]
 
 
 class _Output(Console):

@@ -44,6 +44,7 @@ def estimate_session(
     lag_ms: float,
     scene: str | None,
     tare_s: tuple[float, float] | None,
+    exact: bool = False,
     remark: Callable[[str], None],
 ) -> Estimated:
     """Estimate a session; see `foottile estimate --help` for what is taken from where.
@@ -60,6 +61,7 @@ def estimate_session(
             lag_ms=lag_ms,
             tare_s=tare_s,
             tares=_recorded_tares(session) if tare_s is None else (),
+            exact=exact,
         )
         kept = [c.name for c in (*PARTS, *TRUTH, *MILL) if session.has(c.name)]
         stream = EstimateStream(info, options)
@@ -70,7 +72,7 @@ def estimate_session(
             ordered = in_order(session.batches(*kept), where=str(source))
             for batch, extra in stream.run(ordered):
                 if not frames and stream.plan is not None:
-                    writer.add_notes(notes_of(stream.plan, options.tares))
+                    writer.add_notes(notes_of(stream.plan, stream.rounding, options.tares))
                 writer.append(batch, extra)
                 frames += len(batch)
                 found.feed(batch, extra)

@@ -181,7 +181,7 @@ def simulate(
         began_s = time.perf_counter()
         for batch, extra in pieces:
             if stream is not None and stream.plan is not None and not frames:
-                writer.add_notes(notes_of(stream.plan))
+                writer.add_notes(notes_of(stream.plan, stream.rounding))
             writer.append(batch, extra)
             first_ns = first_ns or int(batch.t_ns[0])
             last_ns = int(batch.t_ns[-1])

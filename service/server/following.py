@@ -224,8 +224,8 @@ def ledger_now(session: Session, node: ServerNode | None) -> Ledger:
     return ledger_of(about.parts, states_of(about, streams), finished=finished)
 
 
-def sources_now(session: Session, node: ServerNode) -> Sources:
-    """Sources that a session can be sealed or exported from."""
+def sources_now(session: Session, node: ServerNode, *, exact: bool = False) -> Sources:
+    """Sources that a session can be sealed or exported from; `exact`: estimates not rounded."""
     session, streams = _provisional(session, node)
     return sources_of(
         session,
@@ -233,6 +233,7 @@ def sources_now(session: Session, node: ServerNode) -> Sources:
         tares=lambda: node.tares,
         emulated=node.hello.emulated,
         no_array=node.info,
+        exact=exact,
     )
 
 

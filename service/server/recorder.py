@@ -16,7 +16,7 @@ from devices.errors import (
 from service.link import ClockRow, StreamNumbers, Wanted
 from service.server import following
 from service.server.book import SessionBook
-from service.server.following import ledger_now, sources_now
+from service.server.following import ledger_now
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.settling import Settling
@@ -247,7 +247,7 @@ class Recorder:
             UnknownError: no such session, or its node is not known here.
         """
         session = self._book.get(session_id)
-        return sources_now(session, self._nodes.get(session.node))
+        return self._settling.sources(session)
 
     def needed(self, node_name: str) -> dict[str, Intervals]:
         """Numbers by boot_id that sessions of a node, not sealed yet, need in its journals.

@@ -71,12 +71,13 @@ class Server:
 
     Args:
         data: its data folder.
+        exact: are estimates of recorded sessions not rounded?
 
     Raises:
         StorageError: the folder cannot be written.
     """
 
-    def __init__(self, data: Path) -> None:
+    def __init__(self, data: Path, *, exact: bool = False) -> None:
         self.data = data
         self.folder = DataFolder(data)
         self.id = self.folder.id
@@ -91,7 +92,7 @@ class Server:
             self.sessions = SessionBook(
                 SessionFolder(data / "sessions"), Trash(data / "trash"), self._tell_session
             )
-            self.settling = Settling(self.sessions, self.nodes, self._ask_again)
+            self.settling = Settling(self.sessions, self.nodes, self._ask_again, exact=exact)
             self.recorder = Recorder(self.sessions, self.nodes, self.settling)
         except FootTileError:
             self.folder.close()

@@ -19,6 +19,7 @@ from service.server.following import is_all_here, ledger_now, sources_now
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.sessions.sealing import seal
+from service.sessions.sources import Sources
 from storage.intervals import Intervals
 from storage.sessions.beside import write_events
 from storage.sessions.folder import Session
@@ -35,11 +36,18 @@ class Settling:
         book: the sessions.
         nodes: whose frames they are made of.
         ask_again: called with a node that may still have frames that are damaged here.
+        exact: are estimates not rounded?
     """
 
     def __init__(
-        self, book: SessionBook, nodes: ServerNodes, ask_again: Callable[[ServerNode], None]
+        self,
+        book: SessionBook,
+        nodes: ServerNodes,
+        ask_again: Callable[[ServerNode], None],
+        *,
+        exact: bool = False,
     ) -> None:
+        self._exact = exact
         self._book = book
         self._nodes = nodes
         self._ask_again = ask_again
@@ -62,6 +70,10 @@ class Settling:
                     self._follow(session)
                 except DamagedFramesError as error:
                     self._disown(session, error)
+
+    def sources(self, session: Session) -> Sources:
+        """What a session can be sealed or exported from."""
+        return sources_now(session, self._nodes.get(session.node), exact=self._exact)
 
     def settle(self) -> None:
         """Find the end of stopped sessions, and seal those whose frames are all there."""
@@ -141,7 +153,7 @@ class Settling:
         try:
             session, folder = book.get(session_id), book.folder.path(session_id)
             node = self._nodes.get(session.node)
-            sources, ledger = sources_now(session, node), ledger_now(session, node)
+            sources, ledger = self.sources(session), ledger_now(session, node)
             if not is_all_here(session, node):
                 # A disk did not keep what it had taken: these frames have to come once more.
                 book.keep(session.model_copy(update={"state": "pending"}))

@@ -60,12 +60,16 @@ class SessionFrames:
             from service.sessions.pipeline import EstimateOptions, EstimateStream, notes_of
         assert sources.calibration is not None  # noqa: S101  # or there is nothing to estimate with
         options = EstimateOptions(
-            sources.calibration, sources.info.models, OFFLINE_LAG_MS, tares=sources.tares
+            sources.calibration,
+            sources.info.models,
+            OFFLINE_LAG_MS,
+            tares=sources.tares,
+            exact=sources.exact,
         )
         stream = EstimateStream(sources.info, options)
         for frames, columns in stream.run(self.raw()):
             if not self.notes and stream.plan is not None:
-                self.notes = notes_of(stream.plan, sources.tares)
+                self.notes = notes_of(stream.plan, stream.rounding, sources.tares)
                 if any(tare.is_lost for tare in sources.tares):
                     self.problem = TARE_LOST
             yield frames, columns

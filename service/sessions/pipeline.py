@@ -23,8 +23,10 @@ from service.estimation.calibration import Calibration
 from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates
 from service.estimation.ladder.plan import EstimationPlan, make_plan
+from service.estimation.rounding import Rounding
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import RECOGNISE_WITHIN_NS, take_tare
+from storage.schema import ROUNDED_TO
 
 Extra = Mapping[str, npt.NDArray[Any]]
 Columns = dict[str, npt.NDArray[Any]]
@@ -43,6 +45,8 @@ class EstimateOptions:
     tare_s: tuple[float, float] | None = None
     tares: tuple[Tare, ...] = ()
     """Tares that were taken while the stream ran, oldest first; they win over what can be found."""
+    exact: bool = False
+    """Is nothing rounded?"""
 
 
 class EstimateRun:
@@ -75,11 +79,13 @@ class EstimateStream:
 
     Attributes:
         plan: what the estimates begin with.
+        rounding: of all of them; known with `plan`.
         tare: in force in the frames that came last.
     """
 
     def __init__(self, info: ArrayInfo, options: EstimateOptions) -> None:
         self.plan: EstimationPlan | None = None
+        self.rounding = Rounding()
         self.tare: Tare | None = None
         self._info = info
         self._options = options
@@ -95,11 +101,17 @@ class EstimateStream:
     def run(
         self, pieces: Iterable[tuple[FrameBatch, Extra]]
     ) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Frames with their extra columns and estimates, in order, every frame once.
+        """Frames with their extra columns and estimates, rounded, in order, every frame once.
 
         Raises:
             TareError: no tare can be found.
         """
+        for frames, columns in self._estimated(pieces):
+            yield frames, self.rounding.rounded(columns)
+
+    def _estimated(
+        self, pieces: Iterable[tuple[FrameBatch, Extra]]
+    ) -> Iterator[tuple[FrameBatch, Columns]]:
         pieces = iter(pieces)
         changes = deque(self._options.tares[1:])
         if self._options.tares:
@@ -108,6 +120,8 @@ class EstimateStream:
             taken = self._until_tare(pieces)
             self.plan = self._make_plan(self._find_tare([frames for frames, _ in taken]))
             pieces = chain(taken, pieces)
+        if not self._options.exact:
+            self.rounding = Rounding.of(chain([self.plan], map(self._make_plan, changes)))
         run = EstimateRun(self.plan)
         self.tare = self.plan.tare
         last_t_mono_ns = 0
@@ -197,11 +211,14 @@ def estimate_columns(estimates: Estimates) -> dict[str, npt.NDArray[Any]]:
     }
 
 
-def notes_of(plan: EstimationPlan, tares: tuple[Tare, ...] = ()) -> dict[str, object]:
+def notes_of(
+    plan: EstimationPlan, rounding: Rounding, tares: tuple[Tare, ...] = ()
+) -> dict[str, object]:
     """What a file says of how its estimates were made; enough to make them again.
 
     Args:
         plan: constants of the estimate.
+        rounding: of its columns.
         tares: all tares of the recording, if they were taken while it ran.
     """
     notes: dict[str, object] = {
@@ -211,6 +228,7 @@ def notes_of(plan: EstimationPlan, tares: tuple[Tare, ...] = ()) -> dict[str, ob
         "models": list(plan.models),
         "lag_ms": plan.lag_ns * 1e-6,
         "tare": plan.tare.as_dict(),
+        ROUNDED_TO: rounding.by_column(),
     }
     if tares:
         notes["tares"] = [tare.as_dict() for tare in tares]

@@ -33,6 +33,7 @@ class Sources:
         problem: why there is none.
         tares: that were in force, oldest first; `Tare.lost` where one is lost.
         notes: more for the file's metadata.
+        exact: are estimates not rounded?
     """
 
     session: Session
@@ -42,6 +43,7 @@ class Sources:
     problem: str | None
     tares: tuple[Tare, ...]
     notes: Mapping[str, object]
+    exact: bool = False
 
     @property
     def streams(self) -> tuple[StreamFacts, ...]:
@@ -71,6 +73,7 @@ def sources_of(
     tares: Callable[[], TareHistory] | None,
     emulated: bool | None,
     no_array: ArrayInfo | None = None,
+    exact: bool = False,
 ) -> Sources:
     """What a session is made from.
 
@@ -80,6 +83,7 @@ def sources_of(
         tares: gives those of its node; None: nothing is kept of them.
         emulated: are its frames emulated? None: not known.
         no_array: used as the array if no stream describes one.
+        exact: are estimates not rounded?
     """
     infos = [streams[part.boot_id].info for part in session.parts]
     info = next((info for info in infos if info is not None), no_array or _no_array(session))
@@ -101,6 +105,7 @@ def sources_of(
         problem=problem,
         tares=in_force,
         notes=notes,
+        exact=exact,
     )
 
 

@@ -131,7 +131,7 @@ def export(
         NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
         EXPORT_KEY: json.dumps(made_of).encode(),
     }
-    tables = _tables(content, len(info.tiles), metadata, part, clock, marks)
+    tables = _tables(content, len(info.tiles), metadata, notes, part, clock, marks)
     first = next(tables)
     sink = _Sink()
     writer = _open(sink, first.schema, to)
@@ -148,6 +148,7 @@ def _tables(
     content: Content,
     tiles: int,
     metadata: dict[bytes | str, bytes | str],
+    notes: Mapping[str, object],
     part: Slice,
     clock: ClockTable | None,
     marks: Marks | None,
@@ -169,7 +170,7 @@ def _tables(
             values |= clock.columns(*times)
         if marks is not None:
             values["event"] = marks.column(values["seq"], values.get("part"))
-        columns = [flat_column(KNOWN[of], name, values[name]) for name, of in chosen.items()]
+        columns = [flat_column(KNOWN[of], name, values[name], notes) for name, of in chosen.items()]
         table = pa.Table.from_arrays(
             [array for _, array in columns],
             schema=pa.schema([field for field, _ in columns], metadata=metadata),

@@ -47,6 +47,7 @@ class Running:
         token: str | None = None,
         hosts: Sequence[str] = (),
         bounds: Bounds | None = None,
+        exact: bool = False,
     ) -> None:
         self.data = data
         self.server: Server
@@ -55,6 +56,7 @@ class Running:
         self._token = token
         self._hosts = tuple(hosts)
         self._bounds = bounds
+        self._exact = exact
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop
         self._stop: asyncio.Event
@@ -169,7 +171,7 @@ class Running:
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
         with listen("127.0.0.1", self.port) as listening:
-            self.server = Server(self.data)
+            self.server = Server(self.data, exact=self._exact)
             app = make_app(self.server, hosts=self._hosts, token=self._token)
             async with serving(app, listening, self._bounds):
                 self.port = int(urls_of(listening, "127.0.0.1")[-1].rsplit(":", 1)[1])

@@ -28,6 +28,7 @@ from storage.formats.export import MEDIA_TYPES, ClockName, Format, content_of, e
 from storage.formats.marks import TIMES, Marks, place
 from storage.formats.sealed import export_file, marks_of
 from storage.formats.slice import SECONDS_MAX, Slice
+from storage.schema import ROUNDED_TO
 from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])
@@ -251,7 +252,9 @@ def _chunks(
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
         pieces, source = SessionFrames(sources), {"session": session.id, "state": session.state}
-        yield from export(content_of(pieces), sources.info, {}, to, part, clock, marks, source)
+        content = content_of(pieces)  # the first frames: then it is known how they are estimated
+        notes = {name: pieces.notes[name] for name in (ROUNDED_TO,) if name in pieces.notes}
+        yield from export(content, sources.info, notes, to, part, clock, marks, source)
         return
     with server.sessions.frames(session.id, only_slices=not part.is_all) as reader:
         yield from export_file(reader, to, part, clock=query.clock, marks=marks)

@@ -9,6 +9,7 @@ import typer
 
 from devices.errors import needs_extra
 from service.cli.options import (
+    ExactOption,
     JsonOption,
     output_path,
     pair,
@@ -45,6 +46,7 @@ def estimate_command(
         str | None,
         typer.Option(metavar="A,B", help="Unloaded interval in seconds from the first frame."),
     ] = None,
+    exact: ExactOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate a recorded session again and write it with the new estimates.
@@ -67,6 +69,7 @@ def estimate_command(
             lag_ms=lag_ms,
             scene=scene,
             tare_s=pair(tare_s, "--tare-s"),
+            exact=exact,
             remark=remark,
         )
     plan = result.plan

@@ -32,6 +32,13 @@ def serve_command(
         list[str] | None,
         typer.Option(help="Name under which the server is reached; may be given several times."),
     ] = None,
+    exact: Annotated[
+        bool | None,
+        typer.Option(
+            "--exact",
+            help="Seal sessions with estimates as computed: do not round off their noise.",
+        ),
+    ] = None,
     max_connections: Annotated[int | None, _bound("Requests and screens at once; 512.")] = None,
     max_connections_per_address: Annotated[
         int | None, _bound("The same from one address, as all phones of a hotspot are; 256.")
@@ -63,6 +70,7 @@ def serve_command(
         port=port,
         data=data,
         allow_host=tuple(allow_host or ()) or None,
+        exact=exact,
         max_connections=max_connections,
         max_connections_per_address=max_connections_per_address,
         max_nodes=max_nodes,
@@ -85,7 +93,7 @@ async def _serve(settings: Settings) -> None:
     stop = stop_on_signals()
     keep_private(settings.data)
     with listen(settings.host, settings.port) as listening:
-        server = Server(settings.data)
+        server = Server(settings.data, exact=settings.exact)
         token = token_for(settings.host, settings.token, settings.data)
         app = make_app(server, hosts=settings.allow_host, token=token)
         remark(PREPARING)

@@ -11,6 +11,7 @@ from devices.errors import UsageError, needs_extra
 from devices.scene.file import load_scene
 from devices.scene.hardware import AnySchedule, ScheduleName
 from service.cli.options import (
+    ExactOption,
     FootOptions,
     JsonOption,
     check_emulated,
@@ -53,6 +54,7 @@ def simulate_command(
         bool, typer.Option("--truth", help="Add the true_* columns and print the error.")
     ] = False,
     no_estimates: Annotated[bool, typer.Option("--no-estimates", help="Raw frames only.")] = False,
+    exact: ExactOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a scene on emulated hardware in virtual time and write the session.
@@ -90,7 +92,7 @@ def simulate_command(
             family=the_scene.emulation.family,
             progress=remark,
         )
-        return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS)
+        return EstimateOptions(calibration, the_scene.models, OFFLINE_LAG_MS, exact=exact)
 
     with progress(f"simulating {the_scene.name}"):
         result = simulate(

@@ -256,7 +256,7 @@ def estimates_of(
     Raises:
         FootTileError: no estimate with these models.
     """
-    options = EstimateOptions(recording.calibration, models, lag_ms)
+    options = EstimateOptions(recording.calibration, models, lag_ms, exact=True)
     stream = EstimateStream(recording.info, options)
     judged: list[Mapping[str, npt.NDArray[Any]]] = []
     for frames, columns in stream.run([(recording.frames, recording.truth)]):

@@ -6,6 +6,7 @@ import json
 import time
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -16,7 +17,7 @@ from service.sessions.sealing import seal
 from tests.builders.arrays import COUNT_KPA
 from tests.builders.frames import assert_same_bits
 from tests.service.fake_node import FakeNode, NodeOf
-from tests.service.running import Running, assert_refused
+from tests.service.running import Running, ServeWith, assert_refused
 from tests.storage.faulty_disk import failing_once
 from tests.waiting import PATIENCE_S, until
 
@@ -32,7 +33,8 @@ def test_a_sealed_session_has_estimates_with_the_tare_in_force(tared: FakeNode) 
         found = session.column(f"force_n_{tile}")[middle]
         assert found == pytest.approx(np.full(80, force_n), abs=0.01)
         found = session.column(f"gauge_kpa_{tile}")[middle]
-        assert found == pytest.approx(np.full(80, force_n * COUNT_KPA), abs=0.001)
+        # Rounded to an eighth of a noise of half a count, so half of that off.
+        assert found == pytest.approx(np.full(80, force_n * COUNT_KPA), abs=COUNT_KPA / 32)
     assert session.column("grf_n")[middle] == pytest.approx(np.full(80, 80.0), abs=0.02)
     with session.reader() as file:
         notes = file.notes
@@ -46,6 +48,42 @@ def test_a_sealed_session_has_estimates_with_the_tare_in_force(tared: FakeNode) 
     assert notes["tare"]["frames"] == 60
     assert notes["emulated"] is False
     assert sealed["absolute_scale"] == "measured"
+
+
+def test_a_download_before_the_seal_has_the_rounded_estimates_of_the_sealed_file(
+    tared: FakeNode,
+) -> None:
+    session = tared.record()
+    tared.deliver(200, [20.0, 60.0], noise=1)
+    before = pa.ipc.open_stream(session.data(format="arrow").content).read_all()
+    tared.finish(session)
+    sealed = pq.read_table(session.folder / "frames.parquet")
+    said = {field.name: field.metadata or {} for field in sealed.schema}
+    steps = {name: float(m[b"rounded_to"]) for name, m in said.items() if b"rounded_to" in m}
+    assert {"force_n_0", "force_n_1", "grf_n", "grf_sigma_n"} <= set(steps)
+    for name, step in steps.items():
+        assert (before.schema.field(name).metadata or {})[b"rounded_to"] == repr(step).encode()
+        found = before[name].to_numpy()[:100]  # later ones had less look-ahead
+        np.testing.assert_array_equal(found, sealed[name].to_numpy()[:100], err_msg=name)
+        whole = found.astype(np.float64) / step
+        np.testing.assert_array_equal(whole, np.rint(whole), err_msg=name)
+
+
+def test_a_server_that_is_told_so_seals_estimates_as_computed(
+    serve_with: ServeWith, node_of: NodeOf
+) -> None:
+    running = serve_with(exact=True)
+    node = node_of(running)
+    node.connect()
+    node.tared()
+    node.acknowledged(69)
+    session = node.record()
+    node.deliver(200, [20.0, 60.0], noise=1)
+    node.finish(session)
+    schema = pq.read_schema(session.folder / "frames.parquet")
+    assert not any(b"rounded_to" in (field.metadata or {}) for field in schema)
+    with session.reader() as file:
+        assert file.notes["rounded_to"] == {}
 
 
 def test_a_tare_under_load_is_refused_and_names_the_tile(running: Running, tared: FakeNode) -> None:

@@ -36,6 +36,7 @@ def options(**changes: Any) -> EstimateOptions:
         "calibration": calibration(),
         "models": ("unwrap", "static"),
         "lag_ms": 10.0,
+        "exact": True,
     }
     return EstimateOptions(**chosen | changes)
 

@@ -213,7 +213,7 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
     batch = frames(hopping(300, loaded_from=100), lead=100)
     stream, _, columns = run([(batch, {})], lag_ms=9.2, models=("static",))
     assert stream.plan is not None
-    notes = json.loads(json.dumps(notes_of(stream.plan), allow_nan=False))
+    notes = json.loads(json.dumps(notes_of(stream.plan, stream.rounding), allow_nan=False))
     kept = notes["tare"]
     tare = Tare(
         baseline_kpa=np.array(kept["baseline_kpa"]),
@@ -247,7 +247,7 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
 def test_the_notes_say_what_was_used() -> None:
     stream, _, _ = run([(frames(hopping(300, loaded_from=100), lead=100), {})], lag_ms=100.0)
     assert stream.plan is not None
-    notes = notes_of(stream.plan)
+    notes = notes_of(stream.plan, stream.rounding)
     assert notes["calibration_id"] == calibration().id
     assert notes["absolute_scale"] == "measured"
     assert notes["models"] == ["unwrap", "static"]
@@ -261,7 +261,7 @@ def test_an_assumed_scale_is_said_in_the_notes() -> None:
     assumed = calibration(absolute_scale="assumed")
     stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=assumed)
     assert stream.plan is not None
-    assert notes_of(stream.plan)["absolute_scale"] == "assumed"
+    assert notes_of(stream.plan, stream.rounding)["absolute_scale"] == "assumed"
 
 
 def test_the_calibration_in_the_notes_is_the_one_that_they_name() -> None:
@@ -269,7 +269,7 @@ def test_the_calibration_in_the_notes_is_the_one_that_they_name() -> None:
     many = calibration("T07", "T02", "T01", "T05")
     stream, _, _ = run([(frames(hopping(99, loaded_from=50), lead=50), {})], calibration=many)
     assert stream.plan is not None
-    notes = notes_of(stream.plan)
+    notes = notes_of(stream.plan, stream.rounding)
     assert Calibration.model_validate(notes["calibration"]).id == notes["calibration_id"]
 
 

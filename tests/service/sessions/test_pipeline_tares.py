@@ -96,10 +96,10 @@ def test_all_tares_are_in_the_notes_and_none_if_none_were_taken() -> None:
     tares = (taken_at(0, 0.0), taken_at(10**8, 5.0))
     stream, _, _ = run([(frames(hopping(99, loaded_from=50)), {})], tares=tares)
     assert stream.plan is not None
-    notes = json.loads(json.dumps(notes_of(stream.plan, tares), allow_nan=False))
+    notes = json.loads(json.dumps(notes_of(stream.plan, stream.rounding, tares), allow_nan=False))
     assert [kept["t_ns"] for kept in notes["tares"]] == [tare.t_ns for tare in tares]
     assert notes["tare"] == notes["tares"][0]
-    assert "tares" not in notes_of(stream.plan)
+    assert "tares" not in notes_of(stream.plan, stream.rounding)
 
 
 def later_part(batch: FrameBatch, after_ns: int) -> FrameBatch:

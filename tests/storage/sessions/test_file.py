@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -81,7 +82,12 @@ def test_units_survive_the_file(tmp_path: Path) -> None:
     assert said["padc_1"][b"unit"] == b"counts"
 
 
-def test_integers_are_delta_encoded_floats_split_and_all_of_it_zstd(tmp_path: Path) -> None:
+STEADY = {"seq", "t_mono_ns", "t_ns", "servo_counts"}
+
+
+def test_what_goes_on_steadily_is_delta_encoded_and_the_rest_split_into_its_bytes(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "s.parquet"
     write(
         path,
@@ -95,14 +101,40 @@ def test_integers_are_delta_encoded_floats_split_and_all_of_it_zstd(tmp_path: Pa
     chunks = [group.column(i) for i in range(group.num_columns)]
     assert {chunk.compression for chunk in chunks} == {"ZSTD"}
     for chunk in chunks:
-        expected = {
-            "FLOAT": "BYTE_STREAM_SPLIT",
-            "DOUBLE": "BYTE_STREAM_SPLIT",
-            "INT32": "DELTA_BINARY_PACKED",
-            "INT64": "DELTA_BINARY_PACKED",
-            "BYTE_ARRAY": "RLE_DICTIONARY",
-        }[chunk.physical_type]
+        numbers = "DELTA_BINARY_PACKED" if chunk.path_in_schema in STEADY else "BYTE_STREAM_SPLIT"
+        expected = "RLE_DICTIONARY" if chunk.physical_type == "BYTE_ARRAY" else numbers
         assert expected in chunk.encodings, chunk.path_in_schema
+
+
+def test_a_file_whose_integers_are_all_delta_encoded_as_before_is_read_as_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def as_before(schema: pa.Schema) -> dict[str, Any]:
+        floats = [pa.types.is_floating(field.type) for field in schema]
+        names = ["BYTE_STREAM_SPLIT" if is_float else "DELTA_BINARY_PACKED" for is_float in floats]
+        return {
+            "compression": "zstd",
+            "use_dictionary": False,
+            "write_page_checksum": True,
+            "column_encoding": dict(zip(schema.names, names, strict=True)),
+        }
+
+    now = write(tmp_path / "now.parquet", frames(500))
+    monkeypatch.setattr("storage.sessions.file.parquet_options", as_before)
+    before = write(tmp_path / "before.parquet", frames(500))
+    with SessionReader(now) as one, SessionReader(before) as other:
+        assert_same_bits(one.frames(), other.frames())
+        assert one.content_sha256 == other.content_sha256
+
+
+def test_a_column_says_to_what_it_was_rounded(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    notes = {"rounded_to": {"grf_n": 0.0625, "padc": "much"}}
+    with SessionWriter(path, make_array(), notes) as writer:
+        writer.append(frames(5), {"grf_n": np.zeros(5), "grf_sigma_n": np.zeros(5)})
+    said = {field.name: field.metadata or {} for field in pq.read_schema(path)}
+    assert said["grf_n"][b"rounded_to"] == b"0.0625"
+    assert [name for name, metadata in said.items() if b"rounded_to" in metadata] == ["grf_n"]
 
 
 def test_a_quiet_hour_is_small(tmp_path: Path) -> None:

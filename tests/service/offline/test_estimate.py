@@ -1,0 +1,125 @@
+"""A session estimated again: the same numbers to the bit, rounded or as computed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from service.offline.estimate import estimate_session
+from service.sessions.pipeline import EstimateStream
+from storage.formats.export import content_of, export
+from storage.formats.slice import Slice
+from storage.schema import ESTIMATES
+from storage.sessions.file import SessionWriter
+from storage.sessions.reader import SessionReader
+from tests.service.sessions.pieces import array, calibration, frames, hopping, options
+
+NAMES = [column.name for column in ESTIMATES]
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session without estimates, with the calibration for them."""
+    path = tmp_path_factory.mktemp("raw") / "raw.parquet"
+    notes = {"calibration": calibration().model_dump(mode="json")}
+    with SessionWriter(path, array(), notes) as writer:
+        writer.append(frames(hopping(3000, loaded_from=300), lead=200), {})
+    return path
+
+
+def estimated(source: Path, out: Path, *, exact: bool = False) -> SessionReader:
+    estimate_session(
+        source,
+        out,
+        calibration=None,
+        models=("static", "denoise"),
+        lag_ms=100.0,
+        scene=None,
+        tare_s=None,
+        exact=exact,
+        remark=lambda _: None,
+    )
+    return SessionReader(out)
+
+
+def estimates_of(reader: SessionReader) -> dict[str, np.ndarray]:
+    pieces = list(reader.columns(*NAMES))
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in NAMES}
+
+
+def bits(columns: dict[str, np.ndarray]) -> dict[str, bytes]:
+    return {name: values.tobytes() for name, values in columns.items()}
+
+
+def test_estimated_again_from_its_own_file_a_session_has_the_same_content(
+    raw: Path, tmp_path: Path
+) -> None:
+    with estimated(raw, tmp_path / "once.parquet") as once:
+        with estimated(tmp_path / "once.parquet", tmp_path / "twice.parquet") as twice:
+            assert once.content_sha256 == twice.content_sha256
+            assert once.content_sha256 is not None
+        with estimated(raw, tmp_path / "exact.parquet", exact=True) as exact:
+            assert exact.notes["rounded_to"] == {}
+            assert bits(estimates_of(exact)) != bits(estimates_of(once))
+        with estimated(tmp_path / "exact.parquet", tmp_path / "rounded.parquet") as rounded:
+            assert rounded.content_sha256 == once.content_sha256
+
+
+def test_what_is_in_the_file_is_what_was_computed_rounded_to_the_steps_it_states(
+    raw: Path, tmp_path: Path
+) -> None:
+    batch = frames(hopping(3000, loaded_from=300), lead=200)
+    stream = EstimateStream(array(), options(models=("static", "denoise"), lag_ms=100.0))
+    pieces = [columns for _, columns in stream.run([(batch, {})])]
+    computed = {name: np.concatenate([piece[name] for piece in pieces]) for name in NAMES}
+    with estimated(raw, tmp_path / "s.parquet") as reader:
+        found, steps = estimates_of(reader), reader.notes["rounded_to"]
+        said = {f.name: float((f.metadata or {}).get(b"rounded_to", 0)) for f in _fields(reader)}
+    for name in NAMES:
+        values = computed[name].reshape(len(batch), -1).T
+        for i, (one, other) in enumerate(
+            zip(values, found[name].reshape(len(batch), -1).T, strict=True)
+        ):
+            flat = f"{name}_{i}" if len(values) > 1 else name
+            assert said[flat] == steps.get(flat, 0.0)
+            whole = np.floor if name == "grf_at_least_n" else np.rint
+            expected = whole(one / steps[flat]) * steps[flat] + 0.0 if flat in steps else one
+            np.testing.assert_array_equal(other, expected.astype(other.dtype), err_msg=flat)
+
+
+def test_exports_say_to_what_their_columns_were_rounded(raw: Path, tmp_path: Path) -> None:
+    with estimated(raw, tmp_path / "s.parquet") as reader:
+        columns = [column.name for column in ESTIMATES]
+        content = content_of(reader.batches(*columns))
+        part = Slice(columns=("grf_n", "contact"))
+        out = tmp_path / "export.parquet"
+        out.write_bytes(b"".join(export(content, reader.info, reader.notes, "parquet", part)))
+        step = reader.notes["rounded_to"]["grf_n"]
+    schema = pq.read_schema(out)
+    assert (schema.field("grf_n").metadata or {})[b"rounded_to"] == repr(step).encode()
+    assert b"rounded_to" not in (schema.field("contact").metadata or {})
+
+
+def test_rounded_estimates_take_less_than_half_of_the_bytes(raw: Path, tmp_path: Path) -> None:
+    estimated(raw, tmp_path / "s.parquet").close()
+    estimated(raw, tmp_path / "exact.parquet", exact=True).close()
+    rounded, exact = (_page_bytes(tmp_path / name) for name in ("s.parquet", "exact.parquet"))
+    assert rounded < 0.5 * exact
+
+
+def _page_bytes(path: Path) -> int:
+    group = pq.ParquetFile(path).metadata.row_group(0)
+    columns = [group.column(i) for i in range(group.num_columns)]
+    return sum(c.total_compressed_size for c in columns if _is_estimate(c.path_in_schema))
+
+
+def _is_estimate(flat: str) -> bool:
+    return any(flat.startswith(name) for name in NAMES)
+
+
+def _fields(reader: SessionReader) -> list[Any]:
+    return list(reader.footer.schema)
