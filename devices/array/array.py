@@ -38,6 +38,8 @@ _LOOK_FRAMES, _LOOK_PART = 10, 0.008
 _BUDGET_PART = 8
 _BUDGET_MIN_NS = 500_000
 """Second attempts may take an eighth of a frame, but always one reading and a look at who it is."""
+_LEARN_NS, _FORGET_NS = 10_000, 2_000
+"""In each frame so much more of the driver's own time is taken for granted, and so much less."""
 _DISTURBED_BUDGETS = 4
 """On a line with flipped bits, correct readings are worth some of the rate."""
 
@@ -94,7 +96,8 @@ class TileArray:
         self._watch = ConversionWatch(self._ports, clock, self.health, timing)
         self._schedule = SCHEDULES[schedule]
         self._audit_due_ns = clock.now_ns() + AUDIT_NS
-        self._turns_ns = [round(turn_s * 1e9) for turn_s in turns_s(timing)]
+        self._wire_turns_ns = [round(turn_s * 1e9) for turn_s in turns_s(timing)]
+        self._turns_ns = list(self._wire_turns_ns)
         self._waits_for_slow_ones = schedule != "pipelined" or len(tiles) == 1
         self._temperature_every = temperature_every
         self._reference_n = reference_n
@@ -168,6 +171,8 @@ class TileArray:
             if not scan.bus_fault:
                 self._audit(scan)
         self._conclude(scan)
+        if scan.budget_ns == budget_ns:
+            self._learn_turns()
         if all(padc == NOT_READ for padc in scan.padc):
             # No tile answers, so nothing was waited for: do not run faster because of it.
             self._clock.sleep_until_ns(begin_ns + self._frame_ns)
@@ -300,6 +305,18 @@ class TileArray:
         self._busy_since_ns = self._clock.now_ns()  # waiting spends nothing
 
     # Frame by frame
+
+    def _learn_turns(self) -> None:
+        """How long after a frame's begin each tile has its turn, if nothing holds the frame up.
+
+        Beside the wires' time that is the driver's own, in which a conversion goes on as well. It
+        is believed little by little, where nothing was asked twice, and forgotten again: else a
+        tile that was late once would be waited for as one that always is.
+        """
+        begin_ns = self._started_ns[0] - self._wire_turns_ns[0]
+        for i, started_ns in enumerate(self._started_ns):
+            known_ns = min(started_ns - begin_ns, self._turns_ns[i] + _LEARN_NS)
+            self._turns_ns[i] = max(self._wire_turns_ns[i], known_ns - _FORGET_NS)
 
     def _bus_comes_back(self, scan: Scan) -> bool:
         if self.bus.comes_back():

@@ -102,8 +102,8 @@ class EmulatedI2cAdapter:
             OSError: EINVAL and EOPNOTSUPP for what the kernel or the adapter refuses before it
                 touches the bus, EREMOTEIO for a missing acknowledge, ETIMEDOUT if SCL is stuck.
         """
-        _refuse_unsupported(i2c_msgs)
         begin_ns = self._clock.now_ns()
+        _refuse_unsupported(i2c_msgs)
         disturbed = None if self.line.sound else self.line
         if disturbed is not None:
             for mux in self._muxes:
@@ -213,7 +213,7 @@ def _write(
     message: i2c_msg, listeners: Sequence[I2cDevice], t_ns: int, disturbed: Line | None
 ) -> int:
     """Give the bytes of a message to the listening devices; return how many were acknowledged."""
-    sent = bytes(message)
+    sent = ctypes.string_at(message.buf, message.len)
     if disturbed is None and len(listeners) == 1:
         write = listeners[0].write
         for count, value in enumerate(sent, start=1):

@@ -34,7 +34,8 @@ log = logging.getLogger("foottile.journal")
 WAITING_BYTES = 32 << 20
 """What may wait in memory for the disk: some minutes."""
 SYNC_S = 0.2
-"""Less than half of `PROMISE_S`: what just missed one sync is on the disk with the next."""
+"""Between two syncs, before which all is written that has come. Less than half of `PROMISE_S`: what
+just missed one is on the disk with the next."""
 _TIDY_S = 2.0
 """Between two looks at what can be dropped, which is minutes old."""
 _AGAIN_S = 1.0
@@ -131,10 +132,10 @@ class NodeJournal:
     def put(self, stream: NodeStream, batch: EncodedBatch, missed_slots: int = 0) -> None:
         """Keep the newest frames; returns at once."""
         stream.put(batch, missed_slots)
+        # The writer is not woken: what comes until its next sync is written with that.
         while sum(each.waiting_bytes for each in self.streams) > WAITING_BYTES:
             if not self._drop_oldest():  # the writer has taken them meanwhile
                 break
-        self._wake.set()
 
     def want(self, server_id: str, wants: ServerWants) -> None:
         """A server has said what its sessions need."""
