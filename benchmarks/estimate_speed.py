@@ -22,7 +22,7 @@ from static_kernel import StaticKernel
 
 from devices.frames import FrameBatch
 from service.estimation.calibration import paper_eq2_shape
-from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimate import Estimator
 from service.estimation.ladder.plan import EstimationPlan, make_plan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -73,10 +73,10 @@ def frames_of(n: int, count: int = 4) -> FrameBatch:
 
 def estimate(plan: EstimationPlan, frames: FrameBatch, batch: int) -> None:
     """All frames in batches."""
-    state = EstimationState()
+    estimator = Estimator(plan)
     for begin in range(0, len(frames), batch):
-        _, state = step(plan, frames.rows(begin, min(begin + batch, len(frames))), state)
-    finish(plan, state)
+        estimator.step(frames.rows(begin, min(begin + batch, len(frames))))
+    estimator.finish()
 
 
 def bare(frames: FrameBatch, batch: int) -> None:
@@ -98,8 +98,8 @@ def by_hand(kernel: StaticKernel, frames: FrameBatch, batch: int) -> None:
 def check_same(plan: EstimationPlan, frames: FrameBatch) -> None:
     """The kernel does the same job, or a comparison of times means nothing."""
     theirs = StaticKernel(plan, len(frames))(frames)
-    first, state = step(plan, frames, EstimationState())
-    last = finish(plan, state)
+    estimator = Estimator(plan)
+    first, last = estimator.step(frames), estimator.finish()
     assert last is not None
     for name, values in theirs.items():
         # What warmth and late instants may have done to a force is in our sigma only, and masks

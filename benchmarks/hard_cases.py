@@ -18,13 +18,13 @@ import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from devices.arrays import Bools, Floats, Times
+from devices.arrays import Bools, Floats
 from devices.chips.compensation import Compensation
 from devices.clock import VirtualClock
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace
@@ -39,11 +39,10 @@ from devices.frames import (
 )
 from devices.scene.file import Scene, load_scene
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimate import Estimator
 from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.ladder.plan import EstimationPlan, make_plan
 from service.estimation.tare.unloaded import take_tare
-from service.estimation.watch.watch import Watch, WatchState
 from service.offline.calibrations import find_calibration
 from service.offline.simulate import SimulateOptions, Simulation
 from service.rig.emulated import EmulatedFoot
@@ -61,33 +60,6 @@ WARM = ("unwrap", "temperature", *LADDERS["whole"][1:])
 JUDGED = EstimateStatus.STUCK | EstimateStatus.CLIPPED | EstimateStatus.BASELINE_LOST
 BEGIN_S = 5.3
 """When most faults begin, in the middle of a step."""
-
-
-class Blind(Watch):
-    """Sees nothing: what an estimate was before there was a watch."""
-
-    def readings(
-        self, frames: FrameBatch, kpa: Floats, state: WatchState
-    ) -> tuple[Bools, Floats | None, WatchState]:
-        """No repeats, no edge."""
-        return np.zeros(kpa.shape, dtype=bool), None, state
-
-    def lost_kpa(
-        self,
-        gauge_kpa: Floats,
-        variance: Floats,
-        warmed_kpa: Floats,
-        t_ns: Times,
-        state: WatchState,
-    ) -> tuple[Floats, Bools, WatchState]:
-        """Nothing is lost."""
-        return np.zeros(gauge_kpa.shape), np.zeros(len(gauge_kpa), dtype=bool), state
-
-    def warmed_kpa(
-        self, frames: FrameBatch, t_ns: Times, state: WatchState
-    ) -> tuple[Floats, WatchState]:
-        """Nothing has warmed."""
-        return np.zeros(t_ns.shape), state
 
 
 @dataclass(frozen=True)
@@ -118,11 +90,10 @@ def record(scene: Scene, foot: EmulatedFoot, seconds: float | None) -> Recorded:
 
 def estimated(plan: EstimationPlan, frames: FrameBatch) -> Estimates:
     """All estimates of a recording."""
-    state, pieces = EstimationState(), []
+    estimator, pieces = Estimator(plan), []
     for begin in range(0, len(frames), CHUNK):
-        part, state = step(plan, frames.rows(begin, min(begin + CHUNK, len(frames))), state)
-        pieces.append(part)
-    last = finish(plan, state)
+        pieces.append(estimator.step(frames.rows(begin, min(begin + CHUNK, len(frames)))))
+    last = estimator.finish()
     return Estimates.concatenate(pieces if last is None else [*pieces, last])
 
 
@@ -131,10 +102,7 @@ def plan_of(recorded: Recorded, models: Sequence[str], *, blind: bool = False) -
     info, calibration = recorded.info, recorded.calibration
     tare = take_tare(recorded.frames, Compensation(info.tiles), calibration, info.serials)
     plan = make_plan(info, calibration, tare, models=models, lag_ms=LAG_MS)
-    if not blind:
-        return plan
-    watch = Blind(**{f.name: getattr(plan.watch, f.name) for f in fields(Watch)})
-    return replace(plan, watch=watch)
+    return replace(plan, watch=None) if blind else plan
 
 
 def walk(seconds: float) -> LoadTrace:
@@ -308,15 +276,14 @@ def count_alarms(
 ) -> None:
     """Add hours, and onsets of each flag under both ladders."""
     counts = found.setdefault(name, [0.0] * 4)
-    plans: list[EstimationPlan] = []
-    states = [EstimationState() for _ in LADDERS]
+    estimators: list[Estimator] = []
     for batch in frames:
         counts[0] += len(batch) / recorded.info.nominal_rate_hz / 3600.0
-        if not plans:
+        if not estimators:
             first = replace(recorded, frames=batch)
-            plans = [plan_of(first, models) for models in LADDERS.values()]
-        for i, plan in enumerate(plans):
-            part, states[i] = step(plan, batch, states[i])
+            estimators = [Estimator(plan_of(first, models)) for models in LADDERS.values()]
+        for estimator in estimators:
+            part = estimator.step(batch)
             for k, bit in enumerate(JUDGED, start=1):
                 there = (part.estimate_status & bit) != 0
                 counts[k] += float((np.diff(there.astype(int), prepend=0) == 1).sum())

@@ -20,7 +20,16 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def compiled(function: F) -> F:
     """`function` as machine code, made at its first call and kept on disk where that can be."""
-    dispatcher: Any = numba.njit(nogil=True, error_model="numpy")(function)
+    return _compiled(function, forceinline=False)
+
+
+def inlined(function: F) -> F:
+    """The same for parts of one that take many arrays: counting references costs more than they."""
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: F, *, forceinline: bool) -> F:
+    dispatcher: Any = numba.njit(nogil=True, error_model="numpy", forceinline=forceinline)(function)
     with contextlib.suppress(RuntimeError):  # nowhere to keep it: no home, read-only installation
         # As numba.njit(cache=True) does, which stops at a cache that it cannot read or write.
         dispatcher._cache = _Kept(function)  # type: ignore[no-untyped-call]  # noqa: SLF001  # numba's own seam

@@ -15,17 +15,17 @@ _ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of what rounding to one co
 
 
 class Compensation:
-    """The coefficients of an array's chips, as arrays over tiles."""
+    """The coefficients of an array's chips, a0, b1, b2 and c12, as arrays over tiles."""
 
     def __init__(self, tiles: Sequence[TileInfo]) -> None:
         chips = [Coefficients.from_words(tile.coefficient_words) for tile in tiles]
-        self._a0, self._b1, self._b2, self._c12 = (
+        self.a0, self.b1, self.b2, self.c12 = (
             np.array([getattr(chip, name) for chip in chips]) for name in ("a0", "b1", "b2", "c12")
         )
 
     def kpa(self, padc: npt.ArrayLike, tadc: npt.ArrayLike) -> Floats:
         """Absolute pressure, (n, tiles), of raw counts of that shape."""
-        return compensate_kpa(padc, tadc, self._a0, self._b1, self._b2, self._c12)
+        return compensate_kpa(padc, tadc, self.a0, self.b1, self.b2, self.c12)
 
     def readable_kpa(self, frames: FrameBatch) -> Floats:
         """Absolute pressure of frames, NaN wherever a tile gave none."""
@@ -38,7 +38,7 @@ class Compensation:
 
     def kpa_per_count(self, tadc: npt.ArrayLike) -> Floats:
         """Pressure step of one count of `padc`; negative."""
-        return kpa_per_padc(tadc, self._b1, self._c12)
+        return kpa_per_padc(tadc, self.b1, self.c12)
 
     def rounding_kpa(self, tadc: npt.ArrayLike) -> Floats:
         """Standard uncertainty that rounding to a count leaves."""

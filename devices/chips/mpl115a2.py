@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -113,8 +114,12 @@ def compensate_kpa(
     """
     p = np.asarray(padc, dtype=np.float64)
     t = np.asarray(tadc, dtype=np.float64)
-    pcomp = a0 + (b1 + c12 * t) * p + b2 * t
-    return np.asarray(pcomp * _KPA_PER_PCOMP + PRESSURE_MIN_KPA)
+    return np.asarray(kpa_of(p, t, a0, b1, b2, c12))
+
+
+def kpa_of(p: Any, t: Any, a0: Any, b1: Any, b2: Any, c12: Any) -> Any:
+    """The same as bare arithmetic of floats or arrays, which can be compiled."""
+    return (a0 + (b1 + c12 * t) * p + b2 * t) * _KPA_PER_PCOMP + PRESSURE_MIN_KPA
 
 
 def padc_of_kpa(
@@ -129,7 +134,12 @@ def padc_of_kpa(
 
 def kpa_per_padc(tadc: npt.ArrayLike, b1: float | Floats, c12: float | Floats) -> Floats:
     """Pressure step of one count of `padc` in kPa; negative: `padc` falls as pressure rises."""
-    return np.asarray((b1 + c12 * np.asarray(tadc, dtype=np.float64)) * _KPA_PER_PCOMP)
+    return np.asarray(kpa_per_count_of(np.asarray(tadc, dtype=np.float64), b1, c12))
+
+
+def kpa_per_count_of(t: Any, b1: Any, c12: Any) -> Any:
+    """The same as bare arithmetic."""
+    return (b1 + c12 * t) * _KPA_PER_PCOMP
 
 
 class Mpl115a2:

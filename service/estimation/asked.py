@@ -16,7 +16,7 @@ from devices.arrays import Bools
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import EstimationState, step
+from service.estimation.estimate import Estimator
 from service.estimation.ladder.plan import EstimationPlan, make_plan
 from service.estimation.tare.tare import Tare
 
@@ -48,8 +48,7 @@ class Asking:
         self._named = tuple(name for name in models if name != "denoise")
         self._tare: Tare | None = None
         self._offered: tuple[str, ...] | None = None
-        self._plans: dict[str, EstimationPlan] = {}
-        self._states: dict[str, EstimationState] = {}
+        self._estimators: dict[str, Estimator] = {}
         self._sums: dict[str, int] = {}
         self._frames = 0
         self._last_t_mono_ns = 0
@@ -65,12 +64,9 @@ class Asking:
         if tare is not self._tare:
             self._begin(tare)
         if int(frames.t_mono_ns[0]) < self._last_t_mono_ns:  # the node was switched on again
-            self._states = dict.fromkeys(self._plans, EstimationState())
+            self._estimators = {n: Estimator(e.plan) for n, e in self._estimators.items()}
         self._last_t_mono_ns = int(frames.t_mono_ns[-1])
-        grf_n = {}
-        for name, plan in self._plans.items():
-            estimates, self._states[name] = step(plan, frames, self._states[name])
-            grf_n[name] = estimates.grf_n
+        grf_n = {name: each.step(frames).grf_n for name, each in self._estimators.items()}
         if not grf_n:
             return
         whole_n = grf_n.pop(_WHOLE)
@@ -100,10 +96,10 @@ class Asking:
         if not self._offered:
             return
         every = (*self._named, *self._offered)
-        self._plans = {_WHOLE: self._plan(every, tare)}
+        plans = {_WHOLE: self._plan(every, tare)}
         for name in self._offered:
-            self._plans[name] = self._plan([other for other in every if other != name], tare)
-        self._states = dict.fromkeys(self._plans, EstimationState())
+            plans[name] = self._plan([other for other in every if other != name], tare)
+        self._estimators = {name: Estimator(plan) for name, plan in plans.items()}
 
     def _is_offered(self, name: str, tare: Tare) -> bool:
         try:

@@ -30,7 +30,8 @@ _MOST = 1e12
 """Far beyond every quantity here, and near enough that no sum, product or cube overflows."""
 Number = Annotated[float, Field(ge=-_MOST, le=_MOST)]
 NotNegative = Annotated[float, Field(ge=0, le=_MOST)]
-Some = Field(max_length=32)
+PARTS_MAX = 32
+Some = Field(max_length=PARTS_MAX)
 """Of parts that a model has some of."""
 
 

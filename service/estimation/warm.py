@@ -26,7 +26,7 @@ from service.estimation.effects import (
     RubberEffect,
     TemperatureEffect,
 )
-from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimate import Estimator
 from service.estimation.ladder.chosen import MODELS
 from service.estimation.ladder.plan import make_plan
 from service.estimation.models.hysteresis import WIDTHS_N
@@ -56,8 +56,9 @@ def warm_up() -> None:
     # What the temperature does is followed by its model or, without it, by the watch.
     for models in (MODELS, ("static",)):
         plan = make_plan(info, _calibration(), tare, models=models, lag_ms=4.0)
-        _, state = step(plan, _frames(), EstimationState())
-        finish(plan, state)
+        estimator = Estimator(plan)
+        estimator.step(_frames())
+        estimator.finish()
 
 
 def _tile(channel: int) -> TileInfo:

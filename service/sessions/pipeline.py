@@ -20,7 +20,7 @@ from devices.chips.compensation import Compensation
 from devices.errors import TareError, UsageError
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimate import Estimator
 from service.estimation.estimates import Estimates
 from service.estimation.ladder.plan import EstimationPlan, make_plan
 from service.estimation.rounding import Rounding
@@ -54,7 +54,7 @@ class EstimateRun:
 
     def __init__(self, plan: EstimationPlan) -> None:
         self.plan = plan
-        self._state = EstimationState()
+        self._estimator = Estimator(plan)
         self._held: deque[tuple[FrameBatch, Extra]] = deque()
 
     def feed(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
@@ -63,13 +63,12 @@ class EstimateRun:
             end = min(begin + CHUNK, len(frames))
             rows = frames.rows(begin, end)
             self._held.append((rows, {name: v[begin:end] for name, v in extra.items()}))
-            estimates, self._state = step(self.plan, rows, self._state)
-            yield from _paired(self._held, estimates)
+            yield from _paired(self._held, self._estimator.step(rows))
 
     def finish(self) -> Iterator[tuple[FrameBatch, Columns]]:
         """Return the frames that still wait for their look-ahead: no more frames will come."""
-        last = finish(self.plan, self._state)
-        self._state = EstimationState()
+        last = self._estimator.finish()
+        self._estimator = Estimator(self.plan)
         if last is not None:
             yield from _paired(self._held, last)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from devices.frames import ArrayInfo, FrameBatch
 from service.estimation.calibration import TileCalibration
-from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimate import Estimator
 from service.estimation.estimates import Estimates
 from service.estimation.ladder.plan import EstimationPlan, make_plan
 from tests.builders.arrays import COUNT_KPA
@@ -32,12 +32,9 @@ def newton_plan(
 
 def estimate(plan: EstimationPlan, *batches: FrameBatch) -> Estimates:
     """All estimates of these batches, stepped through one after the other."""
-    state = EstimationState()
-    pieces = []
-    for batch in batches:
-        estimates, state = step(plan, batch, state)
-        pieces.append(estimates)
-    last = finish(plan, state)
+    estimator = Estimator(plan)
+    pieces = [estimator.step(batch) for batch in batches]
+    last = estimator.finish()
     return joined(pieces if last is None else [*pieces, last])
 
 

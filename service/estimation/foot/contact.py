@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats, Ints, Times
+from devices.compiled import compiled, inlined
+from service.estimation.records import Record, record_type
 
 UNKNOWN = 255
 UNSEEN_NS = 50_000_000
@@ -33,71 +35,48 @@ class ContactRule:
     min_ns: int
 
 
-@dataclass(frozen=True)
-class RunState:
-    """What a frame needs to know of those before it."""
-
-    loaded: int
-    since_ns: int
+STATE = record_type([("loaded", np.int64), ("since_ns", np.int64)])
+"""Does the foot seem loaded, and since when has it seemed so? Zeros before the first frame."""
 
 
-UNLOADED = RunState(loaded=0, since_ns=0)
-"""Before the first frame."""
-
-
+@compiled
 def seeming(
-    rule: ContactRule,
-    grf_n: Floats,
-    t_ns: Times,
-    broken: Bools,
-    state: RunState,
-) -> tuple[Ints, Times, RunState]:
-    """Per frame whether the foot seems loaded (0 or 1), and since when it has seemed so.
-
-    Frames without a force change nothing; at a frame that is `broken` from the one before (a gap)
-    a new run begins.
-    """
-    with np.errstate(invalid="ignore"):
-        decided = np.where(grf_n >= rule.on_n, 1, np.where(grf_n <= rule.off_n, 0, -1))
-    loaded = _filled_forward(decided, decided >= 0, state.loaded)
-    before = np.concatenate([[state.loaded], loaded[:-1]])
-    begins = (loaded != before) | broken
-    since_ns = _filled_forward(t_ns, begins, state.since_ns)
-    return loaded, since_ns, RunState(int(loaded[-1]), int(since_ns[-1]))
-
-
-def believed(
-    rule: ContactRule,
-    lag_ns: int,
-    rows: int,
-    loaded: Ints,
-    since_ns: Times,
-    t_ns: Times,
-    contact: int,
-) -> Ints:
-    """Contact of the first `rows` frames, looking `lag_ns` ahead.
+    on_n: float, off_n: float, state: Record, grf_n: float, t_ns: int, broken: bool
+) -> None:
+    """Whether the foot seems loaded in the next frame, and since when it has seemed so.
 
     Args:
-        rule: the thresholds and the minimum time.
-        lag_ns: look-ahead.
-        rows: how many frames to decide; those within their look-ahead must all be here.
-        loaded: per frame, from `seeming`, of these and all later frames known.
-        since_ns: likewise.
-        t_ns: likewise, instants.
-        contact: contact of the frame before the first.
+        on_n: of `ContactRule`.
+        off_n: likewise.
+        state: from the frame before; becomes that after this one.
+        grf_n: NaN changes nothing.
+        t_ns: instant.
+        broken: is the frame broken from the one before, by a gap? Then a new run begins.
     """
-    n = len(t_ns)
-    changes = np.flatnonzero(since_ns[1:] != since_ns[:-1])
-    run_end = np.append(changes, n - 1)[np.searchsorted(changes, np.arange(rows))]
-    seen = np.searchsorted(t_ns, t_ns[:rows] + lag_ns, side="right") - 1
-    lasted_ns = t_ns[np.minimum(run_end, seen)] - since_ns[:rows]
-    return _filled_forward(loaded[:rows], lasted_ns >= rule.min_ns, contact)
+    loaded = 1 if grf_n >= on_n else (0 if grf_n <= off_n else state.loaded)
+    if loaded != state.loaded or broken:
+        state.since_ns = t_ns
+    state.loaded = loaded
 
 
-def _filled_forward(values: Ints, valid: Bools, before: int) -> Ints:
-    """Every value, or where it is not valid the last valid one."""
-    last = np.maximum.accumulate(np.where(valid, np.arange(len(values)), -1))
-    return np.where(last >= 0, values[last], before)
+@inlined
+def has_lasted(since_ns: Times, t_ns: Times, i: int, end: int, min_ns: int, lag_ns: int) -> bool:
+    """Has what the foot seems to be in frame `i` lasted long enough, as far as can be seen?
+
+    Args:
+        since_ns: (n,), per frame since when it has seemed so; `seeming` tells.
+        t_ns: (n,), instants.
+        i: frame.
+        end: frame after the last that is there; those within the look-ahead must all be.
+        min_ns: of `ContactRule`.
+        lag_ns: look-ahead.
+    """
+    at = i
+    while at < end and since_ns[at] == since_ns[i] and t_ns[at] <= t_ns[i] + lag_ns:
+        if t_ns[at] - since_ns[i] >= min_ns:
+            return True
+        at += 1
+    return False
 
 
 @dataclass(frozen=True)

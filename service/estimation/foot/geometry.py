@@ -6,9 +6,12 @@ A positive angle is a roll forward (right-handed about y).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from devices.arrays import Floats
+from devices.compiled import compiled
 from devices.frames import ServoInfo
 
 _SAME_PLACE_M = 1e-6  # tiles that differ by less stand in one line
@@ -67,20 +70,16 @@ def lost_by_tilt(positions_m: Floats) -> Floats:
     return np.asarray(1.0 - np.cos(np.arctan(slope + 2.0 * bend * x_m)))
 
 
-def angle_rad(servo: ServoInfo, servo_counts: Floats) -> Floats:
-    """Segment angle from signed multi-turn servo counts; NaN where they are."""
-    per_count = servo.sign * servo.ratio * 2.0 * np.pi / servo.counts_per_turn
-    return (servo_counts - servo.zero_counts) * per_count
+def rad_per_count(servo: ServoInfo) -> float:
+    """Of the segment's angle, per count of the servo from its zero; signed."""
+    return servo.sign * servo.ratio * 2.0 * math.pi / servo.counts_per_turn
 
 
-def to_ground_x_m(
-    x_m: Floats, z_m: Floats, angle_rad: Floats, ankle_travel_m_per_rad: float | None
-) -> Floats:
+@compiled
+def to_ground_x_m(x_m: float, z_m: float, angle_rad: float, ankle_travel_m_per_rad: float) -> float:
     """A point of the foot frame in the ground frame, along x (paper eq. 3 with l = -z, r = -x).
 
-    ankle travel + x cos(angle) + z sin(angle); NaN where the ankle's travel is not known.
+    ankle travel + x cos(angle) + z sin(angle); NaN where the ankle's travel is.
     """
-    if ankle_travel_m_per_rad is None:
-        return np.full_like(x_m, np.nan)
-    turned_m = x_m * np.cos(angle_rad) + z_m * np.sin(angle_rad)
-    return np.asarray(ankle_travel_m_per_rad * angle_rad + turned_m)
+    turned_m = x_m * math.cos(angle_rad) + z_m * math.sin(angle_rad)
+    return ankle_travel_m_per_rad * angle_rad + turned_m

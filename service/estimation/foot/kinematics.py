@@ -7,100 +7,101 @@ taken from the straight line between the two, else the reading before is held.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
-import numpy.typing as npt
 
-from devices.arrays import Arrays, Bools, Floats, Ints, Times
-from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
+from devices.compiled import inlined
+from devices.frames import NO_SERVO_COUNTS, FrameStatus
+from service.estimation.records import Records, record_type
 
 _AGE_UNIT_NS = 1000
 """Ages are cut to microseconds: two frames may date one reading this far apart."""
+_STALE = int(FrameStatus.SERVO_STALE)
+
+READING = record_type(
+    [
+        ("t_ns", np.int64),  # instant of the frame
+        ("sampled_ns", np.int64),  # of its reading; without meaning where there is no age
+        ("counts", np.int64),
+        ("known", np.int64),  # is there one, and it is not stale?
+        ("dated", np.int64),  # and is its age known?
+        ("begins", np.int64),  # is it another than that of the frame before, or none?
+        ("joins", np.int64),  # is it the reading next after that of the frame before?
+    ]
+)
+"""A reading of the servo as a frame carries it."""
 
 
-@dataclass(frozen=True)
-class Readings(Arrays):
-    """The servo's readings as n frames carry them, one row per frame.
-
-    Attributes:
-        t_ns: int64[n], instant of the frame.
-        sampled_ns: int64[n], instant of its reading; without meaning where there is no age.
-        counts: int64[n], its position.
-        known: bool[n], there is one, and it is not stale.
-        dated: bool[n], and its age is known.
-        begins: bool[n], this is another reading than that of the frame before, or none.
-        joins: bool[n], this is the reading next after that of the frame before.
-    """
-
-    t_ns: Times
-    sampled_ns: Times
-    counts: Ints
-    known: Bools
-    dated: Bools
-    begins: Bools
-    joins: Bools
-
-
-def readings_of(
-    frames: FrameBatch,
-    broken: Bools,
-    before: Readings | None,
+@inlined
+def carry(
+    readings: Records,
+    i: int,
+    t_ns: int,
+    counts: np.int64,
+    age_us: np.int64,
+    frame_status: int,
     counts_per_turn: int,
-) -> Readings:
-    """What n > 0 frames carry of the servo.
+    broken: bool,
+) -> None:
+    """Note what frame `i` carries of the servo.
 
     Args:
-        frames: n frames.
-        broken: (n,), which of them come after a gap: there a reading follows upon nothing.
-        before: the row of the frame before the first; None if there is none.
+        readings: (n,), those of the frames before.
+        i: row; 0 is the first frame of all.
+        t_ns: instant of the frame.
+        counts: `servo_counts`.
+        age_us: `servo_age_us`.
+        frame_status: bits of `FrameStatus`.
         counts_per_turn: of the servo. Between two readings it does not move half a turn, so one
             that seems to has wrapped from the end of its turn to the beginning.
+        broken: does the frame come after a gap? There a reading follows upon nothing.
     """
-    known = (frames.servo_counts != NO_SERVO_COUNTS) & (
-        (frames.frame_status & FrameStatus.SERVO_STALE) == 0
-    )
-    dated = known & (frames.servo_age_us >= 0)
-    counts = frames.servo_counts.astype(np.int64)
-    sampled_ns = frames.t_mono_ns - frames.servo_age_us.astype(np.int64) * _AGE_UNIT_NS
-    later_ns = np.diff(sampled_ns, prepend=before.sampled_ns if before else sampled_ns[:1])
-    moved = np.diff(counts, prepend=before.counts if before else counts[:1])
-    dated_before = np.concatenate([before.dated if before else [False], dated[:-1]])
-    unbroken = dated & dated_before & ~broken
-    same = unbroken & (np.abs(later_ns) < _AGE_UNIT_NS) & (moved == 0)
-    joins = unbroken & (later_ns >= _AGE_UNIT_NS) & (2 * np.abs(moved) < counts_per_turn)
-    return Readings(frames.t_mono_ns, sampled_ns, counts, known, dated, ~same, joins)
+    now, before = readings[i], readings[max(i - 1, 0)]
+    now.t_ns, now.sampled_ns, now.counts = t_ns, t_ns - age_us * _AGE_UNIT_NS, counts
+    now.known = 1 if counts != NO_SERVO_COUNTS and (frame_status & _STALE) == 0 else 0
+    now.dated = 1 if now.known == 1 and age_us >= 0 else 0
+    unbroken = i > 0 and now.dated == 1 and before.dated == 1 and not broken
+    later_ns, moved = now.sampled_ns - before.sampled_ns, abs(counts - before.counts)
+    same = unbroken and abs(later_ns) < _AGE_UNIT_NS and moved == 0
+    now.begins = 0 if same else 1
+    joins = unbroken and later_ns >= _AGE_UNIT_NS and 2 * moved < counts_per_turn
+    now.joins = 1 if joins else 0
 
 
-def counts_at(readings: Readings, rows: int, lag_ns: int) -> Floats:
-    """Position at the instants of the first `rows` frames, in counts; NaN where it is unknown.
+@inlined
+def counts_at(readings: Records, i: int, end: int, lag_ns: int) -> float:
+    """Position at the instant of frame `i`, in counts; NaN where it is unknown.
 
     Args:
-        readings: of these and of all frames up to `lag_ns` after each of them.
-        rows: how many frames to decide.
+        readings: of all frames up to `lag_ns` after it.
+        i: row.
+        end: row after the last that is there.
         lag_ns: look-ahead.
     """
-    n = len(readings.t_ns)
-    frame = np.arange(rows)
-    t_ns = readings.t_ns[:rows]
-    last_seen = np.searchsorted(readings.t_ns, t_ns + lag_ns, side="right") - 1
-    # The frame in which the next reading is seen; n: no more of them.
-    begins = np.append(np.flatnonzero(readings.begins), n)
-    joins = np.append(readings.joins, False)
-    sampled_ns = np.append(readings.sampled_ns, 0)
-
-    def following(at: npt.NDArray[np.intp]) -> tuple[npt.NDArray[np.intp], Bools]:
-        after = begins[np.searchsorted(begins, at, side="right")]
-        return after, (after <= last_seen) & joins[after]
-
-    after, seen = following(frame)
+    t_ns, here = readings[i].t_ns, i
+    if readings[i].known == 0:
+        return math.nan
+    after = _following(readings, here, end, t_ns + lag_ns)
     # A reading that was on its way at the frame's instant was sampled before it.
-    passed = seen & (sampled_ns[after] <= t_ns)
-    here = np.where(passed, after, frame)
-    after, seen = following(here)
-    between = seen & (sampled_ns[after] > t_ns)
-    after = np.where(between, after, here)
-    interval_ns = np.where(between, sampled_ns[after] - sampled_ns[here], 1)
-    part = np.where(between, t_ns - sampled_ns[here], 0) / interval_ns
-    counts = readings.counts[here] + part * (readings.counts[after] - readings.counts[here])
-    return np.where(readings.known[:rows], counts, np.nan)
+    if after >= 0 and readings[after].sampled_ns <= t_ns:
+        here = after
+        after = _following(readings, here, end, t_ns + lag_ns)
+    counts = float(readings[here].counts)
+    if after < 0 or readings[after].sampled_ns <= t_ns:
+        return counts
+    interval_ns = readings[after].sampled_ns - readings[here].sampled_ns
+    part = (t_ns - readings[here].sampled_ns) / interval_ns
+    between: float = counts + part * (readings[after].counts - readings[here].counts)
+    return between
+
+
+@inlined
+def _following(readings: Records, at: int, end: int, until_ns: int) -> int:
+    """Frame in which the reading next after that of frame `at` is seen; -1: none is."""
+    after = at + 1
+    while after < end and readings[after].t_ns <= until_ns:
+        if readings[after].begins == 1:
+            return after if readings[after].joins == 1 else -1
+        after += 1
+    return -1

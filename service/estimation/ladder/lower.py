@@ -1,331 +1,250 @@
 """The lower part of the ladder: counts to the apparent force on every dome, reading by reading.
 
 Apparent is what the static curve gives, before hysteresis and creep of the rubber are undone.
-
-`Pending` holds the frames whose look-ahead is not complete.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
 
-import numpy as np
-import numpy.typing as npt
-
-from devices.arrays import Arrays, Bools, Floats, Ints, Times
-from devices.chips.mpl115a2 import PRESSURE_MAX_KPA, PRESSURE_MIN_KPA
-from devices.frames import NOT_READ, FrameBatch, TileStatus
+from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
+from devices.compiled import compiled, inlined
+from devices.frames import NOT_READ
 from service.estimation.estimates import EstimateStatus
-from service.estimation.foot.kinematics import Readings
-from service.estimation.ladder.plan import SIGMAS, SUCTION_MAX_KPA, TARE_OLD_NS, EstimationPlan
-from service.estimation.ladder.unseen import EVENLY, Unseen, farthest, was_away
-from service.estimation.models import ambient, denoise, gas, skew, temperature
-from service.estimation.models.gas import Gas, GasState
-from service.estimation.models.outliers import despiked
-from service.estimation.models.unwrap import unwrap
-from service.estimation.tare.tare import has_warmed
-from service.estimation.watch.watch import WatchState
+from service.estimation.foot.contact import seeming
+from service.estimation.ladder.laws import Laws
+from service.estimation.ladder.plan import SUCTION_MAX_KPA, TARE_OLD_NS
+from service.estimation.ladder.room import Room
+from service.estimation.ladder.unseen import EVENLY, farthest, guess_n, was_away
+from service.estimation.models import gas
+from service.estimation.models.ambient import around
+from service.estimation.models.outliers import is_spike
+from service.estimation.models.skew import at_frame
+from service.estimation.models.static import curve
+from service.estimation.models.temperature import at_tare
+from service.estimation.records import Record, Records
+from service.estimation.tare.tare import WARMED_COUNTS
+from service.estimation.watch.baseline import LOST_KPA, lost
+from service.estimation.watch.clip import end_of_range
+from service.estimation.watch.repeats import is_stuck
+from service.estimation.watch.warmth import moved_kpa
+
+_SATURATED = int(EstimateStatus.SATURATED)
+_EXTRAPOLATED = int(EstimateStatus.EXTRAPOLATED)
+_OUTLIER_REPLACED = int(EstimateStatus.OUTLIER_REPLACED)
+_GAP = int(EstimateStatus.GAP)
+_TILE_MISSING = int(EstimateStatus.TILE_MISSING)
+_ASSUMED_SCALE = int(EstimateStatus.ASSUMED_SCALE)
+_TARE_OLD = int(EstimateStatus.TARE_OLD)
+_OVER_RATED = int(EstimateStatus.OVER_RATED)
+_TARE_LOST = int(EstimateStatus.TARE_LOST)
+_STUCK = int(EstimateStatus.STUCK)
+_CLIPPED = int(EstimateStatus.CLIPPED)
+_BASELINE_LOST = int(EstimateStatus.BASELINE_LOST)
 
 
-@dataclass(frozen=True)
-class PendingFrames(Arrays):
-    """Facts of frames that are needed once, when their estimate is due; arrays (n,).
-
-    Attributes:
-        seq: number in the stream.
-        t_ns: UTC.
-        loaded: does the foot seem loaded, from `contact.seeming`?
-        since_ns: since when it has seemed so.
-    """
-
-    seq: npt.NDArray[np.uint64]
-    t_ns: Times
-    loaded: Ints
-    since_ns: Times
-
-
-@dataclass(frozen=True)
-class Pending:
-    """What is known of frames without an estimate so far.
-
-    Attributes:
-        forces: of these frames, after those that are only there to be reached back to.
-        frames: these frames.
-        readings: of the servo in these frames; None without one.
-    """
-
-    forces: ApparentForces
-    frames: PendingFrames
-    readings: Readings | None
-
-    @property
-    def first(self) -> int:
-        """Row of `forces` at which `frames` begins."""
-        return len(self.forces.run) - len(self.frames.seq)
-
-    def followed_by(self, later: Pending) -> Pending:
-        """These frames and then later ones."""
-        readings = later.readings
-        if readings is not None and self.readings is not None:
-            readings = Readings.concatenate([self.readings, readings])
-        return Pending(
-            ApparentForces.concatenate([self.forces, later.forces]),
-            PendingFrames.concatenate([self.frames, later.frames]),
-            readings,
-        )
-
-    def after(self, given: int, *, reach_back: bool) -> Pending:
-        """These without the first `given`, but with those that averages will reach back to."""
-        n, end = len(self.frames.seq), len(self.forces.run)
-        keep = first = self.first + given
-        if reach_back:
-            t_mono_ns = self.forces.t_mono_ns
-            # The next one may not be here yet; it will be no earlier than the last that is.
-            oldest_ns = t_mono_ns[min(first, end - 1)] - denoise.PAST_NS
-            keep = max(int(np.searchsorted(t_mono_ns, oldest_ns)), first - int(denoise.REACHES[-1]))
-        return Pending(
-            self.forces.rows(keep, end),
-            self.frames.rows(given, n),
-            None if self.readings is None else self.readings.rows(given, n),
-        )
-
-
-@dataclass(frozen=True)
-class ApparentForces(Arrays):
-    """Forces as they appear in n frames; arrays (n, bearing tiles) unless said otherwise.
-
-    Attributes:
-        gauge_kpa: (n, all tiles), pressure above the baseline.
-        apparent_n: force by the static curve.
-        noise_n: standard deviation that a single reading's noise gives it; averages away.
-        sigma_n: standard uncertainty from all else but the gas; does not.
-        gas_n: standard uncertainty that the gas' correction leaves, with the correction's sign: all
-            tiles err to the same side.
-        unseen_gas_n: standard uncertainty from what the gas did unseen, with a sign likewise.
-        warm_n: what warmth that no model corrects makes of the force, signed; likewise.
-        sampled_ns: when each tile was sampled, on the monotonic clock.
-        beyond: beyond the calibrated range, or the chip's: a lower bound.
-        guess_n: what the force may be where there is only that bound; NaN elsewhere.
-        t_mono_ns: (n,), instants of the frames.
-        run: (n,), number of the unbroken run that each frame belongs to.
-        status: (n,), bits of `EstimateStatus` that these frames have by themselves.
-    """
-
-    gauge_kpa: Floats
-    apparent_n: Floats
-    noise_n: Floats
-    sigma_n: Floats
-    gas_n: Floats
-    unseen_gas_n: Floats
-    warm_n: Floats
-    sampled_ns: Times
-    beyond: Bools
-    guess_n: Floats
-    t_mono_ns: Times
-    run: Ints
-    status: npt.NDArray[np.uint16]
-
-
-@dataclass(frozen=True)
-class LowerState:
-    """What the lower models remember; None for those that are not named."""
-
-    temperature: temperature.TemperatureState | None = None
-    ambient: ambient.AmbientState = ambient.AT_REST
-    gas: GasState | None = None
-    gas_else: GasState | None = None
-    """After the pressures farthest from those that were taken; None: nothing was unseen."""
-    skew: skew.SkewState | None = None
-    watch: WatchState = WatchState()  # noqa: RUF009  # frozen, so one for all is safe
-
-
-def tile_kpa(plan: EstimationPlan, frames: FrameBatch) -> Floats:
-    """Absolute pressure (n, all tiles), NaN where a tile gave none that could be one."""
-    kpa = plan.compensation.readable_kpa(frames)
-    if plan.ladder.unwrap:
-        kpa = unwrap(kpa, plan.compensation.kpa_per_count(frames.tadc))
-    return np.where(kpa >= PRESSURE_MIN_KPA, kpa, np.nan)
-
-
-def apparent_forces(
-    plan: EstimationPlan,
-    frames: FrameBatch,
-    kpa: Floats,
-    neighbours: tuple[Floats, Floats] | None,
-    broken: Bools,
-    run: Ints,
-    state: LowerState,
-) -> tuple[ApparentForces, LowerState]:
-    """Force on every dome by its static curve.
+@inlined
+def feel(laws: Laws, scene: Record, tiles: Records, room: Room, i: int) -> None:
+    """Work out what the domes feel in row `i`, the next that is only read.
 
     Args:
-        plan: constants of the estimate.
-        frames: n frames, temperatures held.
-        kpa: their absolute pressures (n, all tiles), from `tile_kpa`.
-        neighbours: those of the frames before and after each; None without look-ahead.
-        broken: (n,), frames after a gap.
-        run: (n,), number of the unbroken run that each frame belongs to.
-        state: from the frames before.
+        laws: constants of the estimate.
+        scene: state of the whole foot.
+        tiles: state of the tiles.
+        room: with this row as it was taken and, if frames wait for it, the next.
+        i: row.
     """
-    ladder, columns = plan.ladder, plan.bearing
-    status = _frame_status(plan, frames, kpa, broken)
-    stuck, edge_kpa, watched = plan.watch.readings(frames, kpa, state.watch)
-    if stuck.any():
-        status[stuck.any(axis=1)] |= np.uint16(EstimateStatus.STUCK)
-        kpa = np.where(stuck, np.nan, kpa)
-    if ladder.denoise and neighbours is not None:
-        kpa, replaced = despiked(kpa, *neighbours, plan.tare.noise_kpa)
-        status[replaced[:, columns].any(axis=1)] |= np.uint16(EstimateStatus.OUTLIER_REPLACED)
-    # Owned, in row order: what is compiled is compiled for that.
-    t_mono_ns = np.array(frames.t_mono_ns)
-    offset_ns = 1000 * frames.sample_offset_us[:, columns].astype(np.int64, order="C")
-    sampled_ns = t_mono_ns[:, None] + offset_ns + plan.late_ns
-    gauge_kpa = kpa - plan.tare.baseline_kpa
-    bearing_kpa = np.ascontiguousarray(kpa[:, columns])
-    baseline_variance = np.zeros(bearing_kpa.shape) + plan.baseline_sigma_kpa**2
-    if ladder.temperature is not None:
-        before = state.temperature or temperature.at_rest(len(columns))
-        tadc = np.where(frames.tadc == NOT_READ, np.nan, frames.tadc.astype(np.float64))
-        bearing_kpa, sigma_kpa, after = ladder.temperature.at_tare(
-            bearing_kpa, tadc[:, columns], sampled_ns, before
-        )
-        baseline_variance = baseline_variance + sigma_kpa**2
-        state = replace(state, temperature=after)
-    if ladder.ambient is not None:
+    law, row, n = laws.scene[0], room.rows[i], len(tiles)
+    t_ns = room.t_mono_ns[i]
+    row.status = _of_frame(law, row)
+    # Without a model for the temperature, a tare at another one is old.
+    judges_warmth = law.temperature == 0 and law.tare_lost == 0
+    after = room.rows[i + 1] if i + 1 < scene.end else row
+    has_after = i + 1 < scene.end and after.broken == 0
+    head_kpa, outside_kpa, outside = 0.0, 0.0, 0
+    for j in range(n):
+        of_tile, cell = laws.tiles[j], room.cells[i, j]
+        if judges_warmth and _has_warmed(of_tile, cell):
+            row.status |= _TARE_OLD
+        after_kpa = room.cells[i + 1, j].kpa if has_after else math.nan
+        _judge(law, of_tile, scene, tiles[j], row, cell, after_kpa, n)
+        gauge_kpa = cell.kpa - of_tile.baseline_kpa
         # A bare tile beyond the chip's range shows a fault of its own, not the surroundings.
-        beyond_chip = (frames.status & np.uint8(TileStatus.OVER_RANGE)) != 0
-        outside_kpa = np.where(beyond_chip, np.nan, gauge_kpa)
-        passed_kpa, sigma_kpa, outside = ladder.ambient.passed_on(
-            _mean_of(outside_kpa, plan.references), t_mono_ns, state.ambient
-        )
-        bearing_kpa = bearing_kpa - passed_kpa
-        baseline_variance = baseline_variance + sigma_kpa**2
-        state = replace(state, ambient=outside)
-    if ladder.temperature is not None or ladder.ambient is not None:
-        gauge_kpa = gauge_kpa.copy()
-        gauge_kpa[:, columns] = bearing_kpa - plan.baseline_kpa
-    torn = bearing_kpa - plan.baseline_kpa < -SUCTION_MAX_KPA
-    if torn.any():
-        bearing_kpa = np.where(torn, np.nan, bearing_kpa)
+        if of_tile.bears == 0 and cell.over_range == 0 and math.isfinite(gauge_kpa):
+            outside_kpa += gauge_kpa
+            outside += 1
+    if law.ambient == 1:
+        mean_kpa = outside_kpa / outside if outside > 0 else math.nan
+        head_kpa = around(scene.ambient, mean_kpa, t_ns)
+    total_n = known_n = noise_n2 = usable_n = 0.0
+    late_ns = 0
+    for j in range(n):
+        of_tile, cell = laws.tiles[j], room.cells[i, j]
+        if of_tile.bears == 0:
+            cell.gauge_kpa = cell.kpa - of_tile.baseline_kpa
+            continue
+        at_ns = room.sampled_ns[i, j]
+        slope = _feel_tile(law, of_tile, tiles[j], row, cell, at_ns, t_ns, head_kpa)
+        noise_n = abs(slope) * of_tile.noise_kpa
+        # A lower bound would be averaged with what is no bound.
+        usable = math.nan if cell.beyond == 1 else cell.apparent_n
+        room.noise_n[i, j], room.usable_n[i, j] = noise_n, usable
+        total_n += cell.apparent_n
+        known_n += 0.0 if math.isnan(cell.apparent_n) else cell.apparent_n
+        usable_n += usable
+        noise_n2 += noise_n**2
+        # Of offsets: so many instants may add up to more than there are bits.
+        late_ns += at_ns - t_ns
+    # Tiles that are known may show contact by themselves.
+    judged_n = known_n if math.isnan(total_n) and known_n >= law.on_n else total_n
+    seeming(law.on_n, law.off_n, scene.contact, judged_n, t_ns, row.unseen == 1)
+    row.loaded, room.since_ns[i] = scene.contact.loaded, scene.contact.since_ns
+    room.usable_n[i, n], room.noise_n[i, n] = usable_n, math.sqrt(noise_n2)
+    room.sampled_ns[i, n] = t_ns + late_ns // law.bearing
+
+
+@compiled
+def _of_frame(law: Record, row: Record) -> int:
+    status = _GAP if row.broken == 1 else 0
+    if law.assumed_scale == 1:
+        status |= _ASSUMED_SCALE
+    if law.tare_lost == 1:
+        return status | _TARE_LOST
+    return status | _TARE_OLD if row.t_ns - law.tare_ns > TARE_OLD_NS else status
+
+
+@compiled
+def _has_warmed(law: Record, cell: Record) -> bool:
+    """Is it warmer or colder than at the tare by more than the baseline can bear?"""
+    moved_counts = abs(cell.tadc - law.tare_counts)
+    return law.bears == 1 and moved_counts > WARMED_COUNTS and not math.isnan(cell.kpa)
+
+
+@compiled
+def _judge(
+    scene_law: Record,
+    law: Record,
+    scene: Record,
+    tile: Record,
+    row: Record,
+    cell: Record,
+    after_kpa: float,
+    tiles: int,
+) -> None:
+    """What a tile's own readings show to be wrong: repeats, an edge, a single reading far off."""
+    as_read = cell.kpa
+    if scene_law.watched == 1:
+        if law.bears == 1:
+            end_of_range(tile.clip, as_read, law.baseline_kpa, law.unloaded_kpa, law.noise_kpa)
+        above_kpa = math.nan if as_read >= law.end_kpa else as_read - law.baseline_kpa
+        stuck, scene.toggles = is_stuck(
+            scene_law, law.repeats, tile.repeats, cell.padc, above_kpa, law.unloaded_kpa,
+            scene.toggles, tiles,
+        )  # fmt: skip
+        if stuck:
+            row.status |= _STUCK
+            cell.kpa = math.nan
+    if scene_law.waits == 1:
+        before_kpa = math.nan if row.broken == 1 else tile.before_kpa
+        tile.before_kpa = as_read
+        if is_spike(before_kpa, cell.kpa, after_kpa, law.noise_kpa):
+            cell.kpa = 0.5 * (before_kpa + after_kpa)
+            if law.bears == 1:
+                row.status |= _OUTLIER_REPLACED
+
+
+@compiled
+def _feel_tile(
+    scene: Record,
+    law: Record,
+    tile: Record,
+    row: Record,
+    cell: Record,
+    t_ns: int,
+    frame_t_ns: int,
+    head_kpa: float,
+) -> float:
+    """What a dome that bears load feels; returns the slope of its curve there in N/kPa."""
+    status = 0
+    kpa, variance = cell.kpa, law.baseline_variance
+    if scene.temperature == 1:
+        counts = math.nan if cell.tadc == NOT_READ else float(cell.tadc)
+        kpa, sigma_kpa = at_tare(law.temperature, tile.temperature, kpa, counts, t_ns)
+        variance += sigma_kpa**2
+    if scene.ambient == 1:
+        passed_kpa = head_kpa * law.ambient.passed
+        kpa -= passed_kpa
+        variance += (law.ambient.relative_sigma * passed_kpa) ** 2
+    cell.gauge_kpa = kpa - law.baseline_kpa
+    if cell.gauge_kpa < -SUCTION_MAX_KPA:  # a torn dome, or another fault
+        kpa = math.nan
     # The chip's range is judged by what was read, the calibrated one by what the gas settles at.
-    end_kpa = plan.chip_end_kpa
-    if edge_kpa is not None:
-        end_kpa = np.minimum(end_kpa, edge_kpa)
-        status[(kpa[:, columns] > edge_kpa).any(axis=1)] |= np.uint16(EstimateStatus.CLIPPED)
-    hidden = kpa[:, columns] > end_kpa
+    end_kpa = law.chip_end_kpa
+    if tile.clip.end_kpa < math.inf:
+        end_kpa = min(end_kpa, tile.clip.end_kpa)
+        status |= _CLIPPED if cell.kpa > tile.clip.end_kpa else 0
+    hidden = cell.kpa > end_kpa
     # As if the chip's end had been read, with what warmth and surroundings have put into it.
-    least_kpa = bearing_kpa - np.where(hidden, kpa[:, columns] - end_kpa, 0.0)
-    settled_kpa = bearing_kpa
-    gas_kpa = unseen_kpa = np.zeros(bearing_kpa.shape)
-    if ladder.gas is not None:
-        settled_kpa, unseen_kpa, state = _settled(
-            ladder.gas, plan.unseen, bearing_kpa, least_kpa, hidden, sampled_ns, state
-        )
-        gas_kpa = settled_kpa - bearing_kpa
+    least_kpa = kpa - (cell.kpa - end_kpa if hidden else 0.0)
+    settled_kpa, gas_kpa, unseen_kpa = kpa, 0.0, 0.0
+    if scene.gas == 1:
+        found_kpa, unseen_kpa = _settled(law, tile, kpa, least_kpa, t_ns, hidden)
+        gas_kpa = found_kpa - kpa
         # A tile whose bench does not tell of its gas goes without, and is that uncertain.
-        settled_kpa = np.where(ladder.gas_known, settled_kpa, bearing_kpa)
-        least_kpa = ladder.gas.settled_at_least(least_kpa)
-    guess_kpa = settled_kpa - plan.baseline_kpa
-    settled_kpa = np.where(hidden, least_kpa, settled_kpa)
-    static_kpa = settled_kpa - plan.baseline_kpa
-    warmed_kpa, watched = plan.watch.warmed_kpa(frames, sampled_ns, watched)
-    lost_kpa, astray, watched = plan.watch.lost_kpa(
-        np.where(hidden, np.nan, static_kpa), baseline_variance, warmed_kpa, sampled_ns, watched
-    )
-    baseline_variance = baseline_variance + lost_kpa**2
-    status[astray] |= np.uint16(EstimateStatus.BASELINE_LOST)
-    static = ladder.curves.force(static_kpa)
-    unknown = np.isnan(kpa[:, columns] if plan.tare.is_lost else static.force_n)
-    status[unknown.any(axis=1)] |= np.uint16(EstimateStatus.TILE_MISSING)
-    beyond = (static_kpa > ladder.curves.high_kpa) | hidden
-    guess_n = np.full(beyond.shape, np.nan)
-    if beyond.any():
-        guess_n = np.where(beyond, plan.unseen.guess_n(ladder.curves, guess_kpa), guess_n)
-    status[beyond.any(axis=1)] |= np.uint16(EstimateStatus.SATURATED)
-    low_kpa = ladder.curves.low_kpa - SIGMAS * plan.still_kpa
-    status[(static_kpa < low_kpa).any(axis=1)] |= np.uint16(EstimateStatus.EXTRAPOLATED)
-    over = (kpa[:, columns] > PRESSURE_MAX_KPA) & ~beyond
-    status[over.any(axis=1)] |= np.uint16(EstimateStatus.OVER_RATED)
-    apparent_n = static.force_n
-    if ladder.skew and not ladder.denoise:
-        apparent_n, row = skew.aligned(
-            apparent_n,
-            sampled_ns,
-            t_mono_ns,
-            broken,
-            state.skew or skew.at_rest(len(columns)),
-        )
-        state = replace(state, skew=row)
-    forces = ApparentForces(
-        gauge_kpa=gauge_kpa,
-        apparent_n=apparent_n,
-        noise_n=np.abs(static.slope_n_per_kpa) * plan.noise_kpa,
-        sigma_n=np.sqrt(static.slope_n_per_kpa**2 * baseline_variance + static.fit_sigma_n**2),
-        gas_n=static.slope_n_per_kpa * ladder.gas_misfit * gas_kpa,
-        unseen_gas_n=static.slope_n_per_kpa * unseen_kpa,
-        warm_n=static.slope_n_per_kpa * warmed_kpa,
-        sampled_ns=sampled_ns,
-        beyond=beyond,
-        guess_n=guess_n,
-        t_mono_ns=t_mono_ns,
-        run=run,
-        status=status,
-    )
-    return forces, replace(state, watch=watched)
+        settled_kpa = found_kpa if law.gas_known == 1 else kpa
+        least_kpa = gas.settled_at_least(law.gas, least_kpa)
+    static_kpa = (least_kpa if hidden else settled_kpa) - law.baseline_kpa
+    warmed_kpa = lost_kpa = 0.0
+    if scene.watched == 1:
+        if scene.warms == 1:
+            warmed_kpa = moved_kpa(tile.warmth, cell.tadc, law.tare_counts, law.warms_kpa, t_ns)
+        seen_kpa = math.nan if hidden else static_kpa
+        lost_kpa = lost(tile.baseline, law.even, seen_kpa, variance, warmed_kpa, t_ns)
+        if lost_kpa > 0.0 or abs(warmed_kpa) > LOST_KPA:
+            status |= _BASELINE_LOST
+    variance += lost_kpa**2
+    force_n, slope, fit_sigma_n = curve(law.static, static_kpa)
+    if math.isnan(cell.kpa if scene.tare_lost == 1 else force_n):
+        status |= _TILE_MISSING
+    beyond = hidden or static_kpa > law.static.high_kpa
+    cell.guess_n = math.nan
+    if beyond:
+        status |= _SATURATED
+        gauge_kpa = settled_kpa - law.baseline_kpa
+        cell.guess_n = guess_n(law.unseen, curve(law.static, gauge_kpa)[0], gauge_kpa)
+    elif cell.kpa > PRESSURE_MAX_KPA:
+        status |= _OVER_RATED
+    if static_kpa < law.low_kpa:
+        status |= _EXTRAPOLATED
+    if scene.skew == 1 and scene.denoise == 0:
+        force_n = at_frame(tile.skew, force_n, t_ns, frame_t_ns, row.broken == 1)
+    row.status |= status
+    cell.apparent_n, cell.beyond = force_n, 1 if beyond else 0
+    cell.sigma_n = math.sqrt(slope**2 * variance + fit_sigma_n**2)
+    cell.gas_n = slope * law.gas_misfit * gas_kpa
+    cell.unseen_gas_n, cell.warm_n = slope * unseen_kpa, slope * warmed_kpa
+    return slope
 
 
+@compiled
 def _settled(
-    model: Gas,
-    unseen: Unseen,
-    kpa: Floats,
-    least_kpa: Floats,
-    hidden: Bools,
-    t_ns: Times,
-    state: LowerState,
-) -> tuple[Floats, Floats, LowerState]:
-    """Pressures that the gas settles at, and their uncertainty from what it did unseen.
+    law: Record, tile: Record, kpa: float, least_kpa: float, t_ns: int, hidden: bool
+) -> tuple[float, float]:
+    """Pressure that the gas settles at, and its uncertainty from what it did unseen.
 
     What is hidden behind the chip's end is taken as it reads: the best guess, which is no more than
     a guess.
     """
-    before = state.gas or gas.at_rest(kpa.shape[1])
-    taken_kpa = np.where(hidden, np.minimum(kpa, unseen.most_hot_kpa), kpa)
-    settled_kpa, after = model.settled(taken_kpa, t_ns, before)
-    unseen_kpa, after_else = np.zeros(kpa.shape), state.gas_else
-    last_ns = np.where(np.isnan(before.ln_kpa), t_ns[0], before.t_ns)
-    if after_else is not None or hidden.any() or was_away(~np.isnan(kpa), t_ns, last_ns):
-        else_kpa = np.where(hidden, farthest(taken_kpa, least_kpa, unseen.most_hot_kpa), kpa)
-        at_else_kpa, after_else = model.settled(
-            else_kpa, t_ns, after_else or before, away_kpa=unseen.end_hot_kpa
-        )
-        unseen_kpa = np.where(hidden, 0.0, EVENLY * (at_else_kpa - settled_kpa))
-        if after_else.is_same(after):
-            after_else = None
-    return settled_kpa, unseen_kpa, replace(state, gas=after, gas_else=after_else)
-
-
-def _frame_status(
-    plan: EstimationPlan, frames: FrameBatch, kpa: Floats, broken: Bools
-) -> npt.NDArray[np.uint16]:
-    status = np.zeros(len(frames), dtype=np.uint16)
-    known = ~np.isnan(kpa)
-    status[broken] |= np.uint16(EstimateStatus.GAP)
-    if plan.assumed_scale:
-        status |= np.uint16(EstimateStatus.ASSUMED_SCALE)
-    if plan.tare.is_lost:
-        return status | np.uint16(EstimateStatus.TARE_LOST)
-    doubtful = frames.t_ns - plan.tare.t_ns > TARE_OLD_NS
-    if plan.ladder.temperature is None:
-        doubtful |= (known & has_warmed(plan.tare, frames.tadc))[:, plan.bearing].any(axis=1)
-    status[doubtful] |= np.uint16(EstimateStatus.TARE_OLD)
-    return status
-
-
-def _mean_of(values: Floats, columns: npt.NDArray[np.intp]) -> Floats:
-    """Mean over columns, without NaN; summed column by column, as every sum here."""
-    total, count = np.zeros(len(values)), np.zeros(len(values))
-    for column in columns:
-        good = np.isfinite(values[:, column])
-        total = total + np.where(good, values[:, column], 0.0)
-        count = count + good
-    return np.where(count > 0.0, total, np.nan) / np.maximum(count, 1.0)
+    most_kpa = law.unseen.most_hot_kpa
+    taken_kpa = min(kpa, most_kpa) if hidden and not math.isnan(kpa) else kpa
+    known = 0.0 < taken_kpa < math.inf and not math.isnan(tile.gas.ln_kpa)
+    away = known and was_away(t_ns, tile.gas.t_ns)
+    if tile.has_gas_else == 0 and not hidden and not away:
+        return gas.settled(law.gas, tile.gas, taken_kpa, t_ns, math.nan), 0.0
+    if tile.has_gas_else == 0:
+        gas.copy(tile.gas, tile.gas_else)
+    found = gas.settled(law.gas, tile.gas, taken_kpa, t_ns, math.nan)
+    else_kpa = farthest(taken_kpa, least_kpa, most_kpa) if hidden else kpa
+    other = gas.settled(law.gas, tile.gas_else, else_kpa, t_ns, law.unseen.end_hot_kpa)
+    tile.has_gas_else = 0 if gas.is_same(tile.gas, tile.gas_else) else 1
+    return found, 0.0 if hidden else EVENLY * (other - found)

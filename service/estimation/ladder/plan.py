@@ -73,7 +73,8 @@ class EstimationPlan:
     """Absolute pressure above which a chip is not known to tell the pressure: the end of its rated
     range, or of what it told on the bench if that is more, or less because it told no more."""
     unseen: Unseen
-    watch: Watch
+    watch: Watch | None
+    """None: nothing is watched, as benchmarks may want."""
     still_kpa: Floats
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats

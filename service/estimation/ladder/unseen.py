@@ -12,10 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Bools, Floats, Times
+from devices.arrays import Floats
+from devices.compiled import compiled
 from service.estimation.foot.contact import UNSEEN_NS
 from service.estimation.models.gas import Gas
 from service.estimation.models.static import StaticCurves
+from service.estimation.records import Record, Records, record_type, records
 
 MOST = 2.0
 """A load beyond what a tile can tell is at most so many times the load where that ends. The paper's
@@ -24,6 +26,18 @@ assumption; where loads are greater the dome is the wrong one (`foottile domes`)
 EVENLY = 1.0 / 3.0**0.5
 """Standard uncertainty of a guess, in units of the farthest that it may be off: all between is as
 likely. 1.96 of it reach a little farther than that."""
+
+
+LAW = record_type(
+    [
+        (name, np.float64)
+        for name in (
+            *("high_kpa", "end_n", "slope_n_per_kpa", "most_n"),
+            *("end_hot_kpa", "most_hot_kpa"),
+        )
+    ]
+)
+"""Constants of a tile, as in `Unseen`."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +61,24 @@ class Unseen:
     end_hot_kpa: Floats
     most_hot_kpa: Floats
 
-    def guess_n(self, curves: StaticCurves, gauge_kpa: Floats) -> Floats:
-        """Load at pressures that may be beyond the range, at most the greatest."""
-        beyond_kpa = np.maximum(gauge_kpa - self.high_kpa, 0.0)
-        guess_n = curves.force(gauge_kpa).force_n + self.slope_n_per_kpa * beyond_kpa
-        return np.asarray(np.minimum(guess_n, self.most_n))
+    def laws(self) -> Records:
+        """The constants, tile by tile."""
+        return records(LAW, len(self.end_n), **vars(self))
+
+
+@compiled
+def guess_n(law: Record, curve_n: float, gauge_kpa: float) -> float:
+    """Load at a pressure that may be beyond the range, at most the greatest; NaN stays NaN.
+
+    Args:
+        law: constants of the tile.
+        curve_n: force by the static curve, which stays where it ends.
+        gauge_kpa: pressure above the baseline.
+    """
+    beyond_kpa = gauge_kpa - law.high_kpa
+    guess = curve_n + law.slope_n_per_kpa * beyond_kpa if beyond_kpa > 0.0 else curve_n
+    most_n: float = law.most_n
+    return most_n if guess > most_n else guess
 
 
 def make_unseen(
@@ -82,19 +109,13 @@ def make_unseen(
     return Unseen(curves.high_kpa, end_n, slope, most_n, end_hot_kpa, most_hot_kpa)
 
 
-def farthest(of: Floats, least: Floats, most: Floats) -> Floats:
+@compiled
+def farthest(of: float, least: float, most: float) -> float:
     """Whichever of two is farther."""
-    return np.where(most - of > of - least, most, least)
+    return most if most - of > of - least else least
 
 
-def was_away(known: Bools, t_ns: Times, last_ns: Times) -> bool:
-    """Did a tile give a reading after a stretch of more than `UNSEEN_NS` without?
-
-    Args:
-        known: (n, tiles), where there are readings.
-        t_ns: (n, tiles), their instants.
-        last_ns: (tiles,), of the last ones before; before the first any instant that is later.
-    """
-    read_ns = np.maximum.accumulate(np.where(known, t_ns, last_ns), axis=0)
-    before_ns = np.concatenate([last_ns[None], read_ns[:-1]])
-    return bool((known & (t_ns - before_ns > UNSEEN_NS)).any())
+@compiled
+def was_away(t_ns: int, last_ns: int) -> bool:
+    """Does a tile give a reading after a stretch of more than `UNSEEN_NS` without?"""
+    return t_ns - last_ns > UNSEEN_NS

@@ -1,290 +1,266 @@
 """The upper part of the ladder: force on every dome once the look-ahead is there, GRF and COP.
 
-Whatever is summed here is summed over tiles, one after the other: numpy's own sum over an axis may
-round in another order, and a matrix product does for one row and for many.
+Whatever is summed here is summed over tiles, one after the other.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from devices.arrays import Arrays, Bools, Floats, Times
-from devices.compiled import compiled
-from service.estimation.ladder.averaged import averaged, summed
-from service.estimation.ladder.chosen import Ladder
-from service.estimation.ladder.lower import ApparentForces
-from service.estimation.ladder.plan import EstimationPlan
+from devices.compiled import compiled, inlined
+from service.estimation.ladder.laws import Laws
+from service.estimation.ladder.room import Room
 from service.estimation.ladder.unseen import EVENLY, farthest, was_away
-from service.estimation.models.flow import FlowState
-from service.estimation.models.rubber import RubberState
+from service.estimation.models import denoise, flow, hysteresis, rubber
+from service.estimation.records import Record, Records, record_type
 
 BOUND_SIGMAS = 2.33
 """A stated bound lies so many standard uncertainties below: one in a hundred is above the truth."""
+PARTS = 8
+"""Parts of an uncertainty that all tiles share: corrections of gas and rubber, what either did
+unseen, what averages smooth away of the load, warmth that nothing corrects, when the bench's
+reference was read, and whether the ground pushes along the axes of tiles or along the segment."""
 
 
-@dataclass(frozen=True)
-class DomeState:
-    """What a dome remembers; None for models that are not named, or have not begun."""
-
-    plays_n: Floats | None = None
-    flow: FlowState | None = None
-    rubber: RubberState | None = None
-
-    def is_same(self, other: DomeState) -> bool:
-        """Does the other remember the same?"""
-        if self.plays_n is not None and other.plays_n is not None:
-            plays = np.array_equal(self.plays_n, other.plays_n)
-        else:
-            plays = self.plays_n is other.plays_n
-        return plays and _same(self.flow, other.flow) and _same(self.rubber, other.rubber)
-
-
-def _same(one: Arrays | None, other: Arrays | None) -> bool:
-    if one is not None and other is not None:
-        return one.is_same(other)
-    return one is other
+BORNE = record_type(
+    [
+        # Force; if `beyond`, what it is at least if nothing is uncertain. NaN where nothing is
+        # known, or of a tile that bears no load.
+        ("force_n", np.float64),
+        ("sigma_n", np.float64),  # its standard uncertainty
+        ("own_n", np.float64),  # the part of it that is every tile's own
+        ("common_n", np.float64, (PARTS,)),  # the rest, signed: all tiles share the error
+        ("beyond", np.int64),  # is the force only a bound?
+        ("noise_n", np.float64),  # what averages leave of the noise
+        ("bend_n", np.float64),  # how far an average is from that of a window of half the length
+        ("of_bend_n", np.float64),  # standard deviation that noise gives that
+        ("smoothed_n", np.float64),  # what averages smooth away, as far as the sum of tiles shows
+        ("weight", np.float64),  # in a sum over tiles
+    ]
+)
+"""What a tile bears in one frame."""
 
 
-@dataclass(frozen=True)
-class UpperState:
-    """What the upper models remember."""
-
-    dome: DomeState = DomeState()  # frozen, so one for all is safe
-    dome_else: DomeState | None = None
-    """After the forces farthest from those that were taken; None: nothing was unseen."""
-    last_n: Floats | None = None
-    """Forces of the frame before, ..."""
-    last_ns: Times | None = None
-    """... and its instants; None: there was none."""
-
-
-@dataclass(frozen=True)
-class TileForces:
-    """Force on the bearing tiles and its standard uncertainty, (n, bearing tiles).
-
-    Attributes:
-        force_n: forces; where `beyond`, what they are at least if nothing is uncertain.
-        sigma_n: their standard uncertainties.
-        own_n: the part of these that is every tile's own.
-        common_n: (parts, n, bearing tiles), the rest, of corrections of gas and rubber, of what
-            either did unseen, of what averages smooth away of the load, of warmth that nothing
-            corrects, and of when the bench's reference was read: all tiles share the error, so
-            these are signed.
-        beyond: where forces are only bounds.
-        unsettled: (n,), has what was unseen left more than the noise of a reading in any tile?
-    """
-
-    force_n: Floats
-    sigma_n: Floats
-    own_n: Floats
-    common_n: Floats
-    beyond: Bools
-    unsettled: Bools
-
-    @property
-    def stated_n(self) -> Floats:
-        """Forces, or bounds that the truth exceeds in 99 of 100 frames."""
-        return np.where(self.beyond, self.force_n - BOUND_SIGMAS * self.sigma_n, self.force_n)
-
-    @property
-    def stated_sigma_n(self) -> Floats:
-        """Standard uncertainties; a bound has none."""
-        return np.where(self.beyond, np.nan, self.sigma_n)
-
-
-def tile_forces(
-    plan: EstimationPlan, apparent: ApparentForces, first: int, stop: int, state: UpperState
-) -> tuple[TileForces, UpperState]:
-    """Forces in frames `first` to `stop`.
+@inlined
+def bear(
+    laws: Laws,
+    tiles: Records,
+    room: Room,
+    i: int,
+    rows: tuple[int, int],
+    windows: denoise.Scratch,
+    borne: Records,
+) -> bool:
+    """Work out what the tiles bear in row `i`.
 
     Args:
-        plan: constants of the estimate.
-        apparent: in these frames, in those before them that are still needed, and in those ahead.
-        first: row.
-        stop: row after the last.
-        state: from the frames before.
+        laws: constants of the estimate.
+        tiles: state of the tiles.
+        room: with this row, those that windows reach back to, and those within the look-ahead.
+        i: row.
+        rows: oldest and newest that windows may reach.
+        windows: scratch of `denoise`.
+        borne: (tiles,), the answer.
+
+    Returns:
+        Has what was unseen left more than the noise of a reading in any tile?
     """
-    ladder, now = plan.ladder, apparent.rows(first, stop)
-    force_n, noise_n, at_ns = now.apparent_n, now.noise_n, now.sampled_ns
-    bend_n = np.zeros(force_n.shape)
-    if ladder.denoise:
-        force_n, noise_n, bend_n, at_ns = averaged(plan, apparent, first, stop)
-    own_n = np.sqrt(noise_n**2 + now.sigma_n**2)
-    averaged_n = force_n
-    force_n, unseen_n, state = _undone(plan, now, averaged_n, at_ns, state)
-    rubber_n = ladder.rubber_misfit * (force_n - averaged_n)
-    rate_n_per_s, state = _rate(force_n, at_ns, state)
-    own_n = np.hypot(own_n, rate_n_per_s * plan.late_sigma_s)
-    late_n = rate_n_per_s * plan.late_common_s
-    common_n = np.stack(
-        [now.gas_n, rubber_n, now.unseen_gas_n, unseen_n, bend_n, now.warm_n, late_n]
+    scene, n = laws.scene[0], len(tiles)
+    for j in range(n):
+        now = borne[j]
+        now.force_n = room.cells[i, j].apparent_n if laws.tiles[j].bears == 1 else math.nan
+        now.noise_n, now.smoothed_n = room.noise_n[i, j], 0.0
+    if scene.denoise == 1:
+        average(laws, room, i, rows, windows, borne)
+    unsettled = False
+    for j in range(n):
+        law, cell = laws.tiles[j], room.cells[i, j]
+        if law.bears == 1:
+            at_ns = room.t_mono_ns[i] if _at_frame(scene) else room.sampled_ns[i, j]
+            left_n = _bear_tile(scene, law, tiles[j], cell, borne[j], at_ns)
+            unsettled = unsettled or (cell.beyond == 0 and left_n > room.noise_n[i, j])
+    return unsettled
+
+
+@compiled
+def _at_frame(scene: Record) -> bool:
+    """Are averages evaluated at the frame's instant, and not at each tile's?"""
+    return bool(scene.skew == 1 and scene.denoise == 1)
+
+
+@compiled
+def _bear_tile(
+    scene: Record, law: Record, tile: Record, cell: Record, now: Record, at_ns: int
+) -> float:
+    """What a tile bears, from its averaged force; returns what was unseen may have left, in N."""
+    averaged_n, unseen_n = now.force_n, 0.0
+    force_n = averaged_n
+    if scene.hysteresis == 1 or scene.rubber == 1:
+        force_n, unseen_n = _undone(scene, law, tile, cell, averaged_n, at_ns)
+    rate = _rate(tile, force_n, at_ns)
+    own_n = math.hypot(math.sqrt(now.noise_n**2 + cell.sigma_n**2), rate * law.late_sigma_s)
+    common_n = now.common_n
+    common_n[0], common_n[1] = cell.gas_n, law.rubber_misfit * (force_n - averaged_n)
+    common_n[2], common_n[3] = cell.unseen_gas_n, unseen_n
+    common_n[4], common_n[5] = now.smoothed_n, cell.warm_n
+    common_n[6], common_n[7] = rate * law.late_common_s, law.tilted * force_n
+    variance = own_n**2
+    for part in range(PARTS - 1):
+        variance += common_n[part] ** 2
+    now.force_n, now.own_n, now.sigma_n, now.beyond = (
+        force_n,
+        own_n,
+        math.sqrt(variance),
+        cell.beyond,
     )
-    sigma_n = np.sqrt(own_n**2 + (common_n**2).sum(axis=0))
-    unsettled = (~now.beyond & (np.hypot(now.unseen_gas_n, unseen_n) > now.noise_n)).any(axis=1)
-    return TileForces(force_n, sigma_n, own_n, common_n, now.beyond, np.asarray(unsettled)), state
+    return math.hypot(cell.unseen_gas_n, unseen_n)
 
 
+@inlined
+def average(
+    laws: Laws,
+    room: Room,
+    i: int,
+    rows: tuple[int, int],
+    windows: denoise.Scratch,
+    borne: Records,
+) -> None:
+    """Forces without their noise. Windows of the sum of all tiles bound those of each.
+
+    Tiles bear the same load. What shakes it, or lets it go, is above the noise of their sum before
+    it is above the noise of any of them, and what each would smooth away a little of is missing in
+    the GRF as often as there are tiles.
+    """
+    scene, n, within = laws.scene[0], len(laws.tiles), denoise.ANYWHERE
+    columns = room.usable_n, room.noise_n, room.sampled_ns, room.run
+    at_frame, frame_ns = _at_frame(scene), room.t_mono_ns[i]
+    if scene.bearing > 1 and not math.isnan(room.usable_n[i, n]):
+        at_ns = frame_ns if at_frame else room.sampled_ns[i, n]
+        _, within = denoise.averaged(columns, i, n, at_ns, rows, scene.noise_left, within, windows)
+    for j in range(n):
+        now, law = borne[j], laws.tiles[j]
+        now.bend_n = math.nan
+        if law.bears == 0 or math.isnan(room.usable_n[i, j]):
+            continue
+        at_ns = frame_ns if at_frame else room.sampled_ns[i, j]
+        (now.force_n, left, now.bend_n, of_bend), _ = denoise.averaged(
+            columns, i, j, at_ns, rows, law.noise_left, within, windows
+        )
+        now.of_bend_n = now.noise_n * math.sqrt(of_bend)
+        now.noise_n *= math.sqrt(left)
+    denoise.share_bend(borne)
+
+
+@compiled
 def _undone(
-    plan: EstimationPlan, now: ApparentForces, force_n: Floats, at_ns: Times, state: UpperState
-) -> tuple[Floats, Floats, UpperState]:
-    """Forces without loop and creep, and their uncertainty from what the domes did unseen."""
-    ladder, unseen = plan.ladder, plan.unseen
-    if ladder.hysteresis is None and ladder.rubber is None:
-        return force_n, np.zeros(force_n.shape), state
-    before, borne_n = state.dome, None
-    beyond, other, after_else = now.beyond.any(), state.dome_else, None
+    scene: Record, law: Record, tile: Record, cell: Record, force_n: float, at_ns: int
+) -> tuple[float, float]:
+    """Force without loop and creep, and its uncertainty from what the dome did unseen."""
+    beyond, away = cell.beyond == 1, False
+    if scene.rubber == 1:
+        last = tile.dome.rubber
+        away = not math.isnan(last.force_n) and was_away(at_ns, last.t_ns)
+    elif scene.flow == 1:
+        last_of_flow = tile.dome.flow
+        away = not math.isnan(last_of_flow.force_n) and was_away(at_ns, last_of_flow.t_ns)
+    away = away and not math.isnan(force_n)
+    borne_n = cell.guess_n if beyond else math.nan
+    if tile.has_dome_else == 0 and not beyond and not away:
+        found_n = _without_loop_and_creep(scene, law, tile.dome, force_n, at_ns, borne_n, math.nan)
+        return found_n, 0.0
+    if tile.has_dome_else == 0:
+        _copy(tile.dome, tile.dome_else)
+    found_n = _without_loop_and_creep(scene, law, tile.dome, force_n, at_ns, borne_n, math.nan)
     if beyond:
-        borne_n = now.guess_n
-    out_n, after = _without_loop_and_creep(ladder, force_n, at_ns, before, borne_n, None)
-    last_ns = at_ns[0]
-    if (last := before.rubber or before.flow) is not None:
-        last_ns = np.where(np.isnan(last.force_n), last_ns, last.t_ns)
-    unseen_n = np.zeros(out_n.shape)
-    if other is not None or beyond or was_away(~np.isnan(force_n), at_ns, last_ns):
-        if beyond:
-            borne_n = np.where(
-                now.beyond, farthest(now.guess_n, now.apparent_n, unseen.most_n), np.nan
-            )
-        else_n, after_else = _without_loop_and_creep(
-            ladder, force_n, at_ns, other or before, borne_n, unseen.end_n
-        )
-        unseen_n = np.where(now.beyond, 0.0, EVENLY * (else_n - out_n))
-        out_n = np.where(now.beyond, np.minimum(out_n, else_n), out_n)
-        if after_else.is_same(after):
-            after_else = None
-    return out_n, unseen_n, replace(state, dome=after, dome_else=after_else)
+        borne_n = farthest(cell.guess_n, cell.apparent_n, law.unseen.most_n)
+    other_n = _without_loop_and_creep(
+        scene, law, tile.dome_else, force_n, at_ns, borne_n, law.unseen.end_n
+    )
+    tile.has_dome_else = 0 if _is_same(scene, tile.dome, tile.dome_else) else 1
+    if beyond:
+        return other_n if other_n < found_n else found_n, 0.0
+    return found_n, EVENLY * (other_n - found_n)
 
 
-def _rate(force_n: Floats, at_ns: Times, state: UpperState) -> tuple[Floats, UpperState]:
-    """How fast forces rise since the frame before in N/s; 0 where that is not known."""
-    first_n = force_n[:1] if state.last_n is None else state.last_n[None]
-    first_ns = at_ns[:1] if state.last_ns is None else state.last_ns[None]
-    step_s = 1e-9 * np.diff(at_ns, axis=0, prepend=first_ns)
-    rise_n = np.diff(force_n, axis=0, prepend=first_n)
-    known = np.isfinite(rise_n) & (step_s > 0.0)
-    rate = np.where(known, rise_n, 0.0) / np.where(known, step_s, 1.0)
-    return rate, replace(state, last_n=force_n[-1].copy(), last_ns=at_ns[-1].copy())
-
-
+@compiled
 def _without_loop_and_creep(
-    ladder: Ladder,
-    force_n: Floats,
-    at_ns: Times,
-    state: DomeState,
-    borne_n: Floats | None,
-    away_n: Floats | None,
-) -> tuple[Floats, DomeState]:
-    plays_n, flow, crept = state.plays_n, state.flow, state.rubber
-    if ladder.flow is not None:
-        flow = ladder.flow.at_rest() if flow is None else flow
-        force_n, flow = ladder.flow.compensated(
-            force_n, at_ns, flow, borne_n=borne_n, away_n=away_n
-        )
-    if ladder.hysteresis is not None:
-        plays_n = ladder.hysteresis.at_rest() if plays_n is None else plays_n
-        force_n, plays_n = ladder.hysteresis.compensated(force_n, plays_n, borne_n=borne_n)
-    if ladder.rubber is not None:
-        crept = ladder.rubber.at_rest() if crept is None else crept
-        force_n, crept = ladder.rubber.compensated(
-            force_n, at_ns, crept, borne_n=borne_n, away_n=away_n
-        )
-    return force_n, DomeState(plays_n, flow, crept)
-
-
-@dataclass(frozen=True)
-class Foot:
-    """GRF and centre of pressure of n frames with their standard uncertainties, each (n,).
-
-    `at_least_n` is what the truth exceeds in 99 of 100 frames: NaN only if no tile is known.
-    """
-
-    grf_n: Floats
-    grf_sigma_n: Floats
-    at_least_n: Floats
-    cop_m: tuple[Floats, Floats, Floats]
-    cop_sigma_m: tuple[Floats, Floats]
-
-
-def foot_of(plan: EstimationPlan, tiles: TileForces) -> Foot:
-    """Sum of the tile forces, and the force-weighted mean of the tiles' places.
-
-    Where a tile is missing or saturated there is neither, but a bound: a tile bears at least what
-    it states, and one that states nothing at least nothing.
-    """
-    # Whether the ground pushes along the axes of tiles or along the segment, no tile can tell.
-    tilted_n = plan.tilted * tiles.force_n
-    common_n = np.concatenate([tiles.common_n, tilted_n[None]])
-    columns = _foot(tiles.force_n, tiles.own_n, common_n, tiles.beyond, plan.bearing_m)
-    grf_n, sigma_n, at_least_n, x_m, y_m, z_m, sigma_x_m, sigma_y_m = columns.T
-    return Foot(grf_n, sigma_n, at_least_n, (x_m, y_m, z_m), (sigma_x_m, sigma_y_m))
+    scene: Record,
+    law: Record,
+    dome: Record,
+    force_n: float,
+    at_ns: int,
+    borne_n: float,
+    away_n: float,
+) -> float:
+    if scene.flow == 1:
+        force_n = flow.compensated(law.flow, dome.flow, force_n, at_ns, borne_n, away_n)
+    if scene.hysteresis == 1:
+        force_n = hysteresis.compensated(law.hysteresis, dome.hysteresis, force_n, borne_n)
+    if scene.rubber == 1:
+        force_n = rubber.compensated(law.rubber, dome.rubber, force_n, at_ns, borne_n, away_n)
+    return force_n
 
 
 @compiled
-def _foot(
-    force_n: Floats, own_n: Floats, common_n: Floats, beyond: Bools, places_m: Floats
-) -> Floats:
-    """GRF, its sigma and bound, centre x, y, z, sigmas of x and y, to first order: (n, 8)."""
-    n, tiles = force_n.shape
-    out = np.full((n, 8), math.nan)
-    weights = np.empty(tiles)
-    for i in range(n):
-        total, stating, telling = 0.0, 0, 0
-        for j in range(tiles):
-            weights[j] = 0.0
-            if not math.isnan(force_n[i, j]):
-                total += force_n[i, j]
-                weights[j] = 1.0
-                stating += 1
-                telling += not beyond[i, j]
-        sigma = _sigma(own_n, common_n, i, weights)
-        if stating > 0:
-            out[i, 2] = total - BOUND_SIGMAS * sigma
-        if telling < tiles:
-            continue
-        out[i, 0], out[i, 1] = total, sigma
-        if total == 0.0:
-            continue
-        for axis in range(3):
-            moment = 0.0
-            for j in range(tiles):
-                moment += force_n[i, j] * places_m[j, axis]
-            out[i, 3 + axis] = moment / total
-        for axis in range(2):
-            for j in range(tiles):
-                weights[j] = places_m[j, axis] - out[i, 3 + axis]
-            out[i, 6 + axis] = _sigma(own_n, common_n, i, weights) / abs(total)
-    return out
+def _copy(dome: Record, to: Record) -> None:
+    to.flow.stress_n, to.flow.force_n, to.flow.t_ns = (
+        dome.flow.stress_n,
+        dome.flow.force_n,
+        dome.flow.t_ns,
+    )
+    to.rubber.force_n, to.rubber.t_ns = dome.rubber.force_n, dome.rubber.t_ns
+    for m in range(len(dome.rubber.crept_n)):
+        to.rubber.crept_n[m] = dome.rubber.crept_n[m]
+    for m in range(len(dome.hysteresis.plays_n)):
+        to.hysteresis.plays_n[m] = dome.hysteresis.plays_n[m]
 
 
 @compiled
-def _sigma(own_n: Floats, common_n: Floats, i: int, weights: Floats) -> float:
-    """Of a weighted sum over the tiles of frame `i`: own parts add as squares, others as is.
+def _is_same(scene: Record, one: Record, other: Record) -> bool:
+    """Do both remember the same of the models that are named?"""
+    for m in range(len(one.hysteresis.plays_n)):
+        if one.hysteresis.plays_n[m] != other.hysteresis.plays_n[m]:
+            return False
+    if scene.flow == 1 and (
+        one.flow.stress_n != other.flow.stress_n
+        or one.flow.force_n != other.flow.force_n
+        or one.flow.t_ns != other.flow.t_ns
+    ):
+        return False
+    if scene.rubber == 0:
+        return True
+    for m in range(len(one.rubber.crept_n)):
+        if one.rubber.crept_n[m] != other.rubber.crept_n[m]:
+            return False
+    forces = one.rubber.force_n == other.rubber.force_n
+    return bool(forces and one.rubber.t_ns == other.rubber.t_ns)
+
+
+@compiled
+def _rate(tile: Record, force_n: float, at_ns: int) -> float:
+    """How fast the force rises since the frame before in N/s; 0 where that is not known."""
+    rise_n, step_s = force_n - tile.last_n, 1e-9 * (at_ns - tile.last_ns)
+    known = tile.has_last == 1 and math.isfinite(rise_n) and step_s > 0.0
+    tile.last_n, tile.last_ns, tile.has_last = force_n, at_ns, 1
+    return rise_n / step_s if known else 0.0
+
+
+@inlined
+def sigma_of_sum(borne: Records) -> float:
+    """Of a sum over the tiles by `weight`: own parts add as squares, others as is.
 
     A tile without weight may be unknown.
     """
     variance = 0.0
-    for j in range(len(weights)):
-        if weights[j] != 0.0:
-            variance += (weights[j] * own_n[i, j]) ** 2
-    for part in range(len(common_n)):
+    for j in range(len(borne)):
+        if borne[j].weight != 0.0:
+            variance += (borne[j].weight * borne[j].own_n) ** 2
+    for part in range(PARTS):
         shared = 0.0
-        for j in range(len(weights)):
-            if weights[j] != 0.0:
-                shared += weights[j] * common_n[part, i, j]
+        for j in range(len(borne)):
+            if borne[j].weight != 0.0:
+                shared += borne[j].weight * borne[j].common_n[part]
         variance += shared * shared
     return math.sqrt(variance)
-
-
-def grid_index(plan: EstimationPlan, gauge_kpa: Floats) -> tuple[Floats, Floats]:
-    """Paper eq. 4 to the letter: grid indices from 1, weighted by gauge pressure."""
-    if plan.grid is None:
-        nothing = np.full(len(gauge_kpa), np.nan)
-        return nothing, nothing
-    weight_kpa = np.ascontiguousarray(gauge_kpa[:, plan.bearing])
-    total_kpa = summed(weight_kpa)
-    divisor_kpa = np.where(total_kpa == 0.0, np.nan, total_kpa)
-    x, y = (summed(weight_kpa * index) / divisor_kpa for index in plan.grid)
-    return x, y

@@ -14,22 +14,22 @@ import numpy as np
 
 from devices.arrays import Floats, Times
 from devices.compiled import compiled
+from service.estimation.records import Record, Records, copied, record_type, records
 
 SMOOTHING_S = 0.03  # long against noise, short against a foot that sinks in
 HELD_S = 0.2
 """A foot sinks or is lifted in this time: older readings do not tell its depth."""
 
 
-@dataclass(frozen=True)
-class AmbientState:
-    """Averaged pressure around the foot above the tare's, and when; NaN before the first."""
-
-    head_kpa: float
-    t_ns: int
+LAW = record_type([("passed", np.float64), ("relative_sigma", np.float64)])
+"""Constants of a tile, as in `Ambient`."""
+STATE = record_type([("head_kpa", np.float64), ("t_ns", np.int64)])
+"""Averaged pressure around the foot above the tare's, and when; NaN before the first."""
 
 
-AT_REST = AmbientState(math.nan, 0)
-"""Before the first reading."""
+def at_rest() -> Records:
+    """Before the first reading."""
+    return records(STATE, 1, head_kpa=np.nan)
 
 
 @dataclass(frozen=True)
@@ -44,43 +44,51 @@ class Ambient:
     passed: Floats
     relative_sigma: float
 
+    def laws(self) -> Records:
+        """The constants, tile by tile."""
+        return records(LAW, len(self.passed), **vars(self))
+
     def passed_on(
-        self, reference_gauge_kpa: Floats, t_ns: Times, state: AmbientState
-    ) -> tuple[Floats, Floats, AmbientState]:
+        self, reference_gauge_kpa: Floats, t_ns: Times, state: Records
+    ) -> tuple[Floats, Floats, Records]:
         """Pressure in each dome that comes from around it.
 
         Args:
-            reference_gauge_kpa: (n,), mean of the bare tiles above their tare; NaN where none
-                could be read, and then the last one holds for `HELD_S`.
+            reference_gauge_kpa: (n,), mean of the bare tiles above their tare; see `around`.
             t_ns: (n,) instants.
             state: from the frames before.
 
         Returns:
             (n, tiles) pressures, their standard uncertainty, and the next state.
         """
-        head_kpa = np.empty(len(reference_gauge_kpa))
-        value, last_ns = _averaged(
-            np.ascontiguousarray(reference_gauge_kpa), t_ns, state.head_kpa, state.t_ns, head_kpa
-        )
+        head_kpa, after = np.empty(len(reference_gauge_kpa)), copied(state)
+        _average(after, reference_gauge_kpa, t_ns, head_kpa)
         passed_kpa = head_kpa[:, None] * self.passed
-        return passed_kpa, np.abs(self.relative_sigma * passed_kpa), AmbientState(value, last_ns)
+        return passed_kpa, np.abs(self.relative_sigma * passed_kpa), after
 
 
 @compiled
-def _averaged(
-    kpa: Floats,
-    t_ns: Times,
-    value: float,
-    last_ns: int,
-    out: Floats,
-) -> tuple[float, int]:
+def around(state: Record, kpa: float, t_ns: int) -> float:
+    """Averaged pressure around the foot above the tare's; NaN where it is not known.
+
+    Args:
+        state: from the frames before; becomes that after this one.
+        kpa: mean of the bare tiles above their tare; NaN if none could be read, and then the last
+            one holds for `HELD_S`.
+        t_ns: instant.
+    """
+    if math.isfinite(kpa):
+        if math.isnan(state.head_kpa):
+            state.head_kpa = kpa
+        else:
+            passed_s = max(0.0, (t_ns - state.t_ns) * 1e-9)
+            state.head_kpa -= math.expm1(-passed_s / SMOOTHING_S) * (kpa - state.head_kpa)
+        state.t_ns = t_ns
+    head_kpa: float = state.head_kpa
+    return head_kpa if t_ns - state.t_ns <= HELD_S * 1e9 else math.nan
+
+
+@compiled
+def _average(state: Records, kpa: Floats, t_ns: Times, out: Floats) -> None:
     for i in range(len(kpa)):
-        if math.isfinite(kpa[i]):
-            if math.isnan(value):
-                value = kpa[i]
-            else:
-                passed_s = max(0.0, (t_ns[i] - last_ns) * 1e-9)
-                value -= math.expm1(-passed_s / SMOOTHING_S) * (kpa[i] - value)
-            last_ns = t_ns[i]
-        out[i] = value if t_ns[i] - last_ns <= HELD_S * 1e9 else math.nan
-    return value, last_ns
+        out[i] = around(state[0], kpa[i], t_ns[i])

@@ -15,7 +15,8 @@ import math
 import numpy as np
 
 from devices.arrays import Floats, Ints, Times
-from devices.compiled import compiled
+from devices.compiled import compiled, inlined
+from service.estimation.records import Records
 
 PAST_NS = 250_000_000  # how far the longest window reaches back
 REACHES = np.array([1, 2, 4, 8, 16, 32, 64, 128])
@@ -34,6 +35,157 @@ such a curve, as at two instants a parabola; for windows of equal steps it is a 
 """
 
 
+Rows = tuple[int, int, int, int]
+"""That a window reaches: of a line the first and the last, and of a parabola."""
+ANYWHERE: Rows = (0, 1 << 62, 0, 1 << 62)
+"""Windows may reach all rows."""
+Columns = tuple[Floats, Floats, Times, Ints]
+"""Values (n, columns), NaN where there is none; standard deviations of single ones, and instants of
+the samples, both likewise; and (n,) the number of the unbroken run that a frame belongs to."""
+Scratch = tuple[Floats, Floats, Floats]
+"""Room that `averaged` works in, from `scratch_of_windows`."""
+KEPT_MAX = 4 * len(REACHES) + 1
+
+
+@compiled
+def scratch_of_windows() -> Scratch:
+    """Room that `averaged` works in."""
+    return np.empty(8), np.empty(8), np.empty((KEPT_MAX, 3))
+
+
+@inlined
+def in_sight(
+    frame_t_ns: Times, i: int, first: int, end: int, rows: tuple[int, int], look_ns: int
+) -> tuple[int, int]:
+    """Oldest and newest row that windows of row `i` may reach.
+
+    Args:
+        frame_t_ns: instants of all rows.
+        i: row.
+        first: first row that is there.
+        end: row after the last that is there.
+        rows: what this gave for the row before, or any row twice.
+        look_ns: look-ahead; all frames within it are there, or will never come.
+    """
+    oldest, newest = rows
+    while oldest > first and frame_t_ns[oldest - 1] >= frame_t_ns[i] - PAST_NS:
+        oldest -= 1
+    while frame_t_ns[oldest] < frame_t_ns[i] - PAST_NS:
+        oldest += 1
+    newest = max(newest, i)
+    while newest + 1 < end and frame_t_ns[newest + 1] <= frame_t_ns[i] + look_ns:
+        newest += 1
+    return oldest, newest
+
+
+@compiled
+def averaged(
+    columns: Columns,
+    i: int,
+    j: int,
+    at_ns: int,
+    rows: tuple[int, int],
+    noise_left: Floats,
+    within: Rows,
+    scratch: Scratch,
+) -> tuple[tuple[float, float, float, float], Rows]:
+    """Averaged value of row `i`, column `j`, where there is one.
+
+    Args:
+        columns: what is averaged.
+        i: row.
+        j: column.
+        at_ns: instant that is asked for.
+        rows: oldest and newest that windows may reach, from `in_sight`.
+        noise_left: (`AVERAGED_MAX` + 1,), how much more of the noise's variance is left of an
+            average of so many readings than of white noise.
+        within: rows that windows may reach: `ANYWHERE`, or what those of the sum of tiles reached.
+        scratch: from `scratch_of_windows`.
+
+    Returns:
+        The value, and its squared standard uncertainty in units of that of a single one: what is
+        left of the noise, and what curvature within the window adds. And how far it is from that of
+        a window of half the length, with the variance that noise gives that, in the same units: for
+        `shared_bend`. And the rows that the windows reached, as `within`.
+    """
+    values, sigmas, t_ns, run = columns
+    oldest, newest = rows
+    sigma = sigmas[i, j]
+    # Times relative to the instant asked for, in milliseconds.
+    moments, trial, kept = scratch
+    line_low, line_high, bent_low, bent_high = within
+    moments[:] = 0.0
+    _add(moments, (t_ns[i, j] - at_ns) * 1e-6, values[i, j])
+    best = shorter = shortest = values[i, j]
+    variance = shorter_variance = shortest_variance = 1.0
+    kept[0, 0], kept[0, 1], kept[0, 2] = best, variance, 1.0
+    stored = 1
+    low = high = straight_low = straight_high = i
+    open_low = open_high = straight = True
+    for reach in REACHES:
+        before, before_variance = best, variance
+        for ahead in (False, True):
+            if not (open_high if ahead else open_low):
+                continue
+            way, edge = (1, high) if ahead else (-1, low)
+            reached = min(newest, i + reach, bent_high), max(oldest, i - reach, bent_low)
+            end = reached[0] if ahead else reached[1]
+            trial[:] = moments
+            at = edge
+            while at != end and run[at + way] == run[i]:
+                at += way
+                if not math.isnan(values[at, j]):
+                    _add(trial, (t_ns[at, j] - at_ns) * 1e-6, values[at, j])
+            if at == edge:
+                continue
+            accepted, remains = math.nan, 0.0
+            agrees = True
+            if ahead:
+                is_beyond = low < line_low or at > line_high
+            else:
+                is_beyond = at < line_low or high > line_high
+            for bent in (True, False):
+                if not bent and (not straight or is_beyond):
+                    break
+                value, of_noise = _parabola(trial) if bent else _line(trial)
+                if math.isnan(value):
+                    continue
+                of_noise *= _left(noise_left, of_noise)
+                if not _agree(kept, stored, value, of_noise, bent, (AGREE * sigma) ** 2):
+                    agrees = not bent
+                    straight = False
+                    break
+                kept[stored, 0], kept[stored, 1], kept[stored, 2] = value, of_noise, bent
+                stored += 1
+                accepted, remains = value, of_noise
+            if not agrees:
+                if ahead:
+                    open_high = False
+                else:
+                    open_low = False
+                continue
+            moments[:] = trial
+            if ahead:
+                high = at
+            else:
+                low = at
+            if straight:
+                straight_low, straight_high = low, high
+            if not math.isnan(accepted) and remains < (1.0 - SAME) * variance:
+                best, variance = accepted, remains
+        if variance < before_variance:
+            shortest, shortest_variance = shorter, shorter_variance
+            shorter, shorter_variance = before, before_variance
+        if not open_low and not open_high:
+            break
+    # A window of half the length gives the same but for noise; if not, neither curve is a
+    # good description of what happens here.
+    bend, of_bend = best - shortest, shortest_variance - variance
+    if sigma > 0.0:
+        variance += max(0.0, (bend / sigma) ** 2 - of_bend)
+    return (best, variance, bend, of_bend), (straight_low, straight_high, low, high)
+
+
 @compiled
 def denoised(
     values: Floats,
@@ -42,16 +194,10 @@ def denoised(
     frame_t_ns: Times,
     at_ns: Times,
     run: Times,
-    first: int,
-    stop: int,
     look_ns: int,
-    past_ns: int,
-    reaches: Times,
-    agree: float,
     noise_left: Floats,
-    within: Ints,
-) -> tuple[Floats, Floats, Floats, Floats, Ints]:
-    """Averaged values of rows `first` to `stop`.
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Columns averaged each on its own; NaN where there is no value. See `averaged`.
 
     Args:
         values: (n, tiles), NaN where there is none.
@@ -60,157 +206,47 @@ def denoised(
         frame_t_ns: (n,), of the frames, which bound the windows.
         at_ns: (n, tiles), the instants that are asked for.
         run: (n,), number of the unbroken run that a frame belongs to.
-        first: row.
-        stop: row after the last.
-        look_ns: look-ahead; all frames within it are there, or will never come.
-        past_ns: how far a window may reach back.
-        reaches: as `REACHES`.
-        agree: as `AGREE`.
-        noise_left: (tiles, `AVERAGED_MAX` + 1), how much more of the noise's variance is left of an
-            average of so many readings than of white noise.
-        within: (stop - first, 4), rows that a window may reach: of a line the first and the last,
-            and of a parabola; `anywhere`, or what windows of the sum of tiles reached.
-
-    Returns:
-        Values (stop - first, tiles), and their squared standard uncertainty in units of that of a
-        single one: what is left of the noise, and what curvature within the window adds. And how
-        far they are from those of a window of half the length, with the variance that noise gives
-        that, in the same units: for `shared_bend`. And the rows that the windows of the last tile
-        reached, as `within`.
+        look_ns: look-ahead.
+        noise_left: (tiles, `AVERAGED_MAX` + 1).
     """
     n, tiles = values.shape
-    out = np.full((stop - first, tiles), math.nan)
-    left = np.full((stop - first, tiles), math.nan)
-    bend = np.full((stop - first, tiles), math.nan)
-    of_bend = np.full((stop - first, tiles), math.nan)
-    reached = np.empty((stop - first, 4), dtype=np.int64)
-    moments, trial = np.empty(8), np.empty(8)
-    kept = np.empty((4 * len(reaches) + 1, 3))
-    newest = oldest = first
-    while oldest > 0 and frame_t_ns[oldest - 1] >= frame_t_ns[first] - past_ns:
-        oldest -= 1
-    for i in range(first, stop):
-        newest = max(newest, i)
-        while newest + 1 < n and frame_t_ns[newest + 1] <= frame_t_ns[i] + look_ns:
-            newest += 1
-        while frame_t_ns[oldest] < frame_t_ns[i] - past_ns:
-            oldest += 1
-        line_low, line_high, bent_low, bent_high = within[i - first]
+    out = np.full((4, n, tiles), math.nan)
+    scratch, rows = scratch_of_windows(), (0, 0)
+    for i in range(n):
+        rows = in_sight(frame_t_ns, i, 0, n, rows, look_ns)
         for j in range(tiles):
-            if math.isnan(values[i, j]):
-                reached[i - first] = within[i - first]
-                continue
-            sigma = sigmas[i, j]
-            # Times relative to the instant asked for, in milliseconds.
-            moments[:] = 0.0
-            _add(moments, (t_ns[i, j] - at_ns[i, j]) * 1e-6, values[i, j])
-            best = shorter = shortest = values[i, j]
-            variance = shorter_variance = shortest_variance = 1.0
-            kept[0, 0], kept[0, 1], kept[0, 2] = best, variance, 1.0
-            stored = 1
-            low = high = straight_low = straight_high = i
-            open_low = open_high = straight = True
-            for reach in reaches:
-                before, before_variance = best, variance
-                for ahead in (False, True):
-                    if not (open_high if ahead else open_low):
-                        continue
-                    way, edge = (1, high) if ahead else (-1, low)
-                    if ahead:
-                        end = min(newest, i + reach, bent_high)
-                    else:
-                        end = max(oldest, i - reach, bent_low)
-                    trial[:] = moments
-                    at = edge
-                    while at != end and run[at + way] == run[i]:
-                        at += way
-                        if not math.isnan(values[at, j]):
-                            _add(trial, (t_ns[at, j] - at_ns[i, j]) * 1e-6, values[at, j])
-                    if at == edge:
-                        continue
-                    accepted, remains = math.nan, 0.0
-                    agrees = True
-                    if ahead:
-                        is_beyond = low < line_low or at > line_high
-                    else:
-                        is_beyond = at < line_low or high > line_high
-                    for bent in (True, False):
-                        if not bent and (not straight or is_beyond):
-                            break
-                        value, of_noise = _parabola(trial) if bent else _line(trial)
-                        if math.isnan(value):
-                            continue
-                        of_noise *= _left(noise_left[j], of_noise)
-                        if not _agree(kept, stored, value, of_noise, bent, (agree * sigma) ** 2):
-                            agrees = not bent
-                            straight = False
-                            break
-                        kept[stored, 0], kept[stored, 1], kept[stored, 2] = value, of_noise, bent
-                        stored += 1
-                        accepted, remains = value, of_noise
-                    if not agrees:
-                        if ahead:
-                            open_high = False
-                        else:
-                            open_low = False
-                        continue
-                    moments[:] = trial
-                    if ahead:
-                        high = at
-                    else:
-                        low = at
-                    if straight:
-                        straight_low, straight_high = low, high
-                    if not math.isnan(accepted) and remains < (1.0 - SAME) * variance:
-                        best, variance = accepted, remains
-                if variance < before_variance:
-                    shortest, shortest_variance = shorter, shorter_variance
-                    shorter, shorter_variance = before, before_variance
-                if not open_low and not open_high:
-                    break
-            # A window of half the length gives the same but for noise; if not, neither curve is a
-            # good description of what happens here.
-            bend[i - first, j] = best - shortest
-            of_bend[i - first, j] = shortest_variance - variance
-            if sigma > 0.0:
-                off = ((best - shortest) / sigma) ** 2
-                variance += max(0.0, off - (shortest_variance - variance))
-            out[i - first, j], left[i - first, j] = best, variance
-            reached[i - first, 0], reached[i - first, 1] = straight_low, straight_high
-            reached[i - first, 2], reached[i - first, 3] = low, high
-    return out, left, bend, of_bend, reached
+            if not math.isnan(values[i, j]):
+                found, _ = averaged(
+                    (values, sigmas, t_ns, run), i, j, at_ns[i, j], rows, noise_left[j], ANYWHERE,
+                    scratch,
+                )  # fmt: skip
+                for part in range(4):
+                    out[part, i, j] = found[part]
+    return out[0], out[1], out[2], out[3]
 
 
-def anywhere(rows: int, n: int) -> Ints:
-    """`within` of so many rows if windows may reach all of n."""
-    return np.tile(np.array([0, n - 1, 0, n - 1]), (rows, 1))
-
-
-@compiled
-def shared_bend(bend_n: Floats, noise_n: Floats) -> Floats:
-    """What of the tiles' bends is more than noise in their sum, (n, tiles), signed.
+@inlined
+def share_bend(tiles: Records) -> None:
+    """What of the tiles' bends is more than noise in their sum, signed, into `smoothed_n`.
 
     Tiles bear the same load: what a window smooths away of it, it does in all of them, to the same
     side. One tile does not show that above its noise; their sum may.
 
     Args:
-        bend_n: (n, tiles), how far averages are from those of shorter windows; NaN: there is none.
-        noise_n: standard deviations that noise gives that.
+        tiles: records with `bend_n`, how far averages are from those of shorter windows, NaN: there
+            is none; `of_bend_n`, the standard deviation that noise gives that; and `smoothed_n`.
     """
-    n, tiles = bend_n.shape
-    out = np.zeros((n, tiles))
-    for i in range(n):
-        total, variance = 0.0, 0.0
-        for j in range(tiles):
-            if not math.isnan(bend_n[i, j]):
-                total += bend_n[i, j]
-                variance += noise_n[i, j] * noise_n[i, j]
-        if total * total > AGREE * AGREE * variance:
-            part = math.sqrt(1.0 - variance / (total * total))
-            for j in range(tiles):
-                if not math.isnan(bend_n[i, j]):
-                    out[i, j] = part * bend_n[i, j]
-    return out
+    total, variance = 0.0, 0.0
+    for j in range(len(tiles)):
+        if not math.isnan(tiles[j].bend_n):
+            total += tiles[j].bend_n
+            variance += tiles[j].of_bend_n * tiles[j].of_bend_n
+    part = 0.0
+    if total * total > AGREE * AGREE * variance:
+        part = math.sqrt(1.0 - variance / (total * total))
+    for j in range(len(tiles)):
+        known = not math.isnan(tiles[j].bend_n)
+        tiles[j].smoothed_n = part * tiles[j].bend_n if known else 0.0
 
 
 @compiled

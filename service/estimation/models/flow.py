@@ -18,24 +18,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Arrays, Floats, Times
+from devices.arrays import Floats, Times
 from devices.compiled import compiled
 from service.estimation.foot.contact import UNSEEN_NS
+from service.estimation.records import Record, Records, copied, record_type, records
 
 STROKE_N_PER_S = 10.0
 """R: about that of a bench's slow stroke, so that what is fitted is what the stroke shows."""
 _ITERATIONS = 50  # a bound; three to five are the rule
 _CLOSE = 1e-14  # of the force, or of a newton
-_NONE = np.empty((0, 0))
-
-
-@dataclass(frozen=True)
-class FlowState(Arrays):
-    """Of every tile: what the branch bears, and the force before (NaN: none)."""
-
-    stress_n: Floats
-    force_n: Floats
-    t_ns: Times
+LAW = record_type([("part", np.float64), ("stress_n", np.float64), ("power", np.float64)])
+"""Constants of a tile, as in `Flow`."""
+STATE = record_type([("stress_n", np.float64), ("force_n", np.float64), ("t_ns", np.int64)])
+"""Of a tile: what the branch bears, and the force before (NaN: none)."""
 
 
 @dataclass(frozen=True)
@@ -52,48 +47,54 @@ class Flow:
     stress_n: Floats
     power: Floats
 
-    def at_rest(self) -> FlowState:
+    def laws(self) -> Records:
+        """The constants, tile by tile."""
+        return records(LAW, len(self.part), **vars(self))
+
+    def at_rest(self) -> Records:
         """Before the first reading."""
-        tiles = len(self.part)
-        return FlowState(np.zeros(tiles), np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64))
+        return records(STATE, len(self.part), force_n=np.nan)
 
     def compensated(
-        self,
-        apparent_n: Floats,
-        t_ns: Times,
-        state: FlowState,
-        *,
-        borne_n: Floats | None = None,
-        away_n: Floats | None = None,
-    ) -> tuple[Floats, FlowState]:
-        """Forces that appear as these.
-
-        Args:
-            apparent_n: (n, tiles); NaN stays NaN and changes nothing after it.
-            t_ns: instants (n, tiles).
-            state: from the readings before.
-            borne_n: (n, tiles), forces under which the branch flows, whatever the apparent ones
-                say; NaN: what they say.
-            away_n: (tiles,), force that may have been borne while there was no reading for more
-                than `UNSEEN_NS`: it or nothing was, whichever is farther from the straight line;
-                None: the straight line.
-        """
-        out = np.empty_like(apparent_n)
-        after = state.copy()
-        _compensate(
-            np.ascontiguousarray(apparent_n),
-            np.ascontiguousarray(t_ns),
-            self.part,
-            self.stress_n,
-            self.power,
-            _NONE if borne_n is None else np.ascontiguousarray(borne_n),
-            np.full(len(self.part), math.nan) if away_n is None else away_n,
-            after.stress_n,
-            after.force_n,
-            after.t_ns,
-            out,
-        )
+        self, apparent_n: Floats, t_ns: Times, state: Records
+    ) -> tuple[Floats, Records]:
+        """Forces that appear as these at instants, both (n, tiles); see `compensated`."""
+        out, after = np.empty(apparent_n.shape), copied(state)
+        _compensate(self.laws(), after, apparent_n, t_ns, out)
         return out, after
+
+
+@compiled
+def compensated(
+    law: Record, state: Record, apparent_n: float, t_ns: int, borne_n: float, away_n: float
+) -> float:
+    """Force that appears as this; NaN stays NaN and changes nothing after it.
+
+    Args:
+        law: constants of the tile.
+        state: from its readings before; becomes that after this one.
+        apparent_n: force that appears.
+        t_ns: instant.
+        borne_n: force under which the branch flows, whatever the apparent one says; NaN: what that
+            says.
+        away_n: force that may have been borne while there was no reading for more than
+            `UNSEEN_NS`: it or nothing was, whichever is farther from the straight line; NaN: the
+            straight line.
+    """
+    if not math.isfinite(apparent_n):
+        return math.nan
+    if math.isnan(state.force_n):  # the first reading: at rest without a force
+        state.force_n, state.t_ns = 0.0, t_ns
+    before, stress, passed_ns = state.force_n, state.stress_n, t_ns - state.t_ns
+    dt = max(0.0, passed_ns * 1e-9)
+    if away_n > 0.0 and passed_ns > UNSEEN_NS:  # until just now
+        before = away_n if before + apparent_n < away_n else 0.0
+        stress, dt = 0.0, 0.0
+    found: float = _inverted(apparent_n, before, stress, law.part, law.stress_n, law.power, dt)
+    now = found if math.isnan(borne_n) else borne_n
+    state.stress_n = flowed(stress, law.part, law.stress_n, law.power, now - before, dt)
+    state.force_n, state.t_ns = now, t_ns
+    return found
 
 
 @compiled
@@ -146,36 +147,10 @@ def _inverted(
 
 @compiled
 def _compensate(
-    apparent_n: Floats,
-    t_ns: Times,
-    part: Floats,
-    stress_n: Floats,
-    power: Floats,
-    borne: Floats,
-    away: Floats,
-    stress: Floats,
-    force: Floats,
-    last_ns: Times,
-    out: Floats,
+    laws: Records, state: Records, apparent_n: Floats, t_ns: Times, out: Floats
 ) -> None:
     n, tiles = apparent_n.shape
-    for j in range(tiles):
-        before, before_ns, s = force[j], last_ns[j], stress[j]
-        law = (part[j], stress_n[j], power[j])
-        for i in range(n):
-            apparent = apparent_n[i, j]
-            if not math.isfinite(apparent):
-                out[i, j] = math.nan
-                continue
-            if math.isnan(before):  # the first reading: at rest without a force
-                before, before_ns = 0.0, t_ns[i, j]
-            dt = max(0.0, (t_ns[i, j] - before_ns) * 1e-9)
-            if away[j] > 0.0 and t_ns[i, j] - before_ns > UNSEEN_NS:  # until just now
-                before = away[j] if before + apparent < away[j] else 0.0
-                s, dt = 0.0, 0.0
-            out[i, j] = now = _inverted(apparent, before, s, *law, dt)
-            if len(borne) > 0 and not math.isnan(borne[i, j]):
-                now = borne[i, j]
-            s = flowed(s, *law, now - before, dt)
-            before, before_ns = now, t_ns[i, j]
-        stress[j], force[j], last_ns[j] = s, before, before_ns
+    for i in range(n):
+        for j in range(tiles):
+            law, tile = laws[j], state[j]
+            out[i, j] = compensated(law, tile, apparent_n[i, j], t_ns[i, j], math.nan, math.nan)

@@ -20,26 +20,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Arrays, Floats, Times
+from devices.arrays import Floats, Times
 from devices.compiled import compiled
 from service.estimation.foot.contact import UNSEEN_NS
+from service.estimation.records import Record, Records, copied, record_type, records
 
 RESTART = 5.0
 """After this many gamma tau without a reading the gas is as warm as its wall."""
 
 
-@dataclass(frozen=True)
-class GasState(Arrays):
-    """Of every tile: temperature over the wall's, and the reading before (NaN: none)."""
+LAW = record_type(
+    [(name, np.float64) for name in ("gamma", "tau_s", "wall_per_kpa", "baseline_kpa")]
+)
+"""Constants of a tile, as in `Gas`."""
+STATE = record_type([("temperature", np.float64), ("ln_kpa", np.float64), ("t_ns", np.int64)])
+"""Of a tile: temperature over the wall's, and the reading before (NaN: none)."""
 
-    temperature: Floats
-    ln_kpa: Floats
-    t_ns: Times
 
-
-def at_rest(tiles: int) -> GasState:
+def at_rest(tiles: int) -> Records:
     """Before the first reading."""
-    return GasState(np.ones(tiles), np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64))
+    return records(STATE, tiles, temperature=1.0, ln_kpa=np.nan)
 
 
 @dataclass(frozen=True)
@@ -58,46 +58,87 @@ class Gas:
     wall_per_kpa: Floats
     baseline_kpa: Floats
 
-    def settled_at_least(self, kpa: Floats) -> Floats:
-        """Least pressure that the gas can settle at from one that it has now, or had more of.
-
-        None of its heat has gone: p (p0/p)^k. Heat that has gone before only leaves it colder.
-
-        Args:
-            kpa: absolute pressures over tiles; below the baseline it may have settled already.
-        """
-        k = (self.gamma - 1.0) / self.gamma
-        return np.asarray(kpa * (self.baseline_kpa / np.maximum(kpa, self.baseline_kpa)) ** k)
+    def laws(self) -> Records:
+        """The constants, tile by tile."""
+        return records(LAW, len(self.gamma), **vars(self))
 
     def settled(
-        self, kpa: Floats, t_ns: Times, state: GasState, *, away_kpa: Floats | None = None
-    ) -> tuple[Floats, GasState]:
-        """Pressures that measured ones would settle at.
+        self, kpa: Floats, t_ns: Times, state: Records, *, away_kpa: Floats | None = None
+    ) -> tuple[Floats, Records]:
+        """Pressures that measured ones would settle at; see `settled`.
 
         Args:
-            kpa: absolute pressures (n, tiles); NaN stays NaN and changes nothing after it.
+            kpa: absolute pressures (n, tiles).
             t_ns: instants of the readings (n, tiles).
             state: from the readings before.
-            away_kpa: (tiles,), pressure that the gas may have had until just now, if there was no
-                reading for more than `UNSEEN_NS`: it had this one or its baseline, whichever is
-                farther from the present; None: a straight line was between, or it has cooled.
+            away_kpa: (tiles,), see `settled`; None: a straight line was between.
         """
-        out = np.empty_like(kpa)
-        after = state.copy()
-        _settle(
-            np.ascontiguousarray(kpa),
-            np.ascontiguousarray(t_ns),
-            self.gamma,
-            self.tau_s,
-            self.wall_per_kpa,
-            self.baseline_kpa,
-            np.full(len(self.gamma), math.nan) if away_kpa is None else away_kpa,
-            after.temperature,
-            after.ln_kpa,
-            after.t_ns,
-            out,
-        )
+        out, after = np.empty(kpa.shape), copied(state)
+        away_kpa = np.full(len(self.gamma), math.nan) if away_kpa is None else away_kpa
+        _settle(self.laws(), after, kpa, t_ns, away_kpa, out)
         return out, after
+
+
+@compiled
+def settled(law: Record, state: Record, kpa: float, t_ns: int, away_kpa: float) -> float:
+    """Pressure that a measured one would settle at; NaN stays NaN and changes nothing after it.
+
+    Args:
+        law: constants of the tile.
+        state: from its readings before; becomes that after this one.
+        kpa: absolute pressure.
+        t_ns: instant of the reading.
+        away_kpa: pressure that the gas may have had until just now, if there was no reading for
+            more than `UNSEEN_NS`: it had this one or its baseline, whichever is farther from the
+            present; NaN: a straight line was between, or it has cooled.
+    """
+    if not 0.0 < kpa < math.inf:
+        return math.nan
+    k = (law.gamma - 1.0) / law.gamma
+    c, p0 = law.wall_per_kpa, law.baseline_kpa
+    ln_p, passed_ns = math.log(kpa), t_ns - state.t_ns
+    h = passed_ns / (law.gamma * law.tau_s * 1e9)
+    known = not math.isnan(state.ln_kpa)
+    if known and away_kpa > p0 and passed_ns > UNSEEN_NS:
+        farther = away_kpa if away_kpa * p0 > kpa * kpa else p0
+        state.temperature = (kpa / farther) ** k
+    elif known and 0.0 <= h <= RESTART:
+        state.temperature = warmed(state.temperature, ln_p - state.ln_kpa, h, k)
+    else:
+        state.temperature = 1.0
+    state.ln_kpa, state.t_ns = ln_p, t_ns
+    iso = kpa / state.temperature
+    of_iso: float = iso * (1.0 + c * (kpa - p0)) / (1.0 + c * (iso - p0))
+    return of_iso
+
+
+@compiled
+def copy(state: Record, to: Record) -> None:
+    """Remember the same."""
+    to.temperature, to.ln_kpa, to.t_ns = state.temperature, state.ln_kpa, state.t_ns
+
+
+@compiled
+def is_same(one: Record, other: Record) -> bool:
+    """Do both remember the same?"""
+    pressure = one.ln_kpa == other.ln_kpa or (math.isnan(one.ln_kpa) and math.isnan(other.ln_kpa))
+    return pressure and one.temperature == other.temperature and one.t_ns == other.t_ns
+
+
+@compiled
+def settled_at_least(law: Record, kpa: float) -> float:
+    """Least pressure that the gas can settle at from one that it has now, or had more of.
+
+    None of its heat has gone: p (p0/p)^k. Heat that has gone before only leaves it colder.
+
+    Args:
+        law: constants of the tile.
+        kpa: absolute pressure; below the baseline it may have settled already.
+    """
+    if not kpa > law.baseline_kpa:
+        return kpa
+    cooled: float = kpa * (law.baseline_kpa / kpa) ** ((law.gamma - 1.0) / law.gamma)
+    return cooled
 
 
 @compiled
@@ -111,39 +152,9 @@ def warmed(before: float, change_ln_p: float, h: float, k: float) -> float:
 
 @compiled
 def _settle(
-    kpa: Floats,
-    t_ns: Times,
-    gamma: Floats,
-    tau_s: Floats,
-    wall_per_kpa: Floats,
-    baseline_kpa: Floats,
-    away_kpa: Floats,
-    temperature: Floats,
-    ln_kpa: Floats,
-    last_ns: Times,
-    out: Floats,
+    laws: Records, state: Records, kpa: Floats, t_ns: Times, away_kpa: Floats, out: Floats
 ) -> None:
     n, tiles = kpa.shape
-    for j in range(tiles):
-        gamma_tau_ns = gamma[j] * tau_s[j] * 1e9
-        k = (gamma[j] - 1.0) / gamma[j]
-        c, p0 = wall_per_kpa[j], baseline_kpa[j]
-        now, before, before_ns = temperature[j], ln_kpa[j], last_ns[j]
-        for i in range(n):
-            p = kpa[i, j]
-            if not 0.0 < p < math.inf:
-                out[i, j] = math.nan
-                continue
-            ln_p = math.log(p)
-            h = (t_ns[i, j] - before_ns) / gamma_tau_ns
-            if math.isnan(before) or not 0.0 <= h <= RESTART:
-                now = 1.0
-            else:
-                now = warmed(now, ln_p - before, h, k)
-            if away_kpa[j] > p0 and t_ns[i, j] - before_ns > UNSEEN_NS and not math.isnan(before):
-                farther = away_kpa[j] if away_kpa[j] * p0 > p * p else p0
-                now = (p / farther) ** k
-            before, before_ns = ln_p, t_ns[i, j]
-            iso = p / now
-            out[i, j] = iso * (1.0 + c * (p - p0)) / (1.0 + c * (iso - p0))
-        temperature[j], ln_kpa[j], last_ns[j] = now, before, before_ns
+    for i in range(n):
+        for j in range(tiles):
+            out[i, j] = settled(laws[j], state[j], kpa[i, j], t_ns[i, j], away_kpa[j])

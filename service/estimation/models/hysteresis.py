@@ -18,6 +18,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.compiled import compiled
+from service.estimation.records import Record, Records, copied, record_type, records
 
 WIDTHS_N = np.array([0.6, 1.5, 4.0])
 """Half widths of the plays; their parts are what is fitted."""
@@ -25,7 +26,11 @@ OPENS = 0.4
 _ITERATIONS = 100  # a bound; see `_inverted`
 _CLOSE = 1e-14
 """Relative; a smaller step changes nothing any more."""
-_NONE = np.empty((0, 0))
+PLAYS = len(WIDTHS_N)
+LAW = record_type([("part", np.float64, (PLAYS,))])
+"""Constants of a tile, as in `Hysteresis`."""
+STATE = record_type([("plays_n", np.float64, (PLAYS,))])
+"""Of a tile: where its plays are."""
 
 
 @dataclass(frozen=True)
@@ -34,26 +39,38 @@ class Hysteresis:
 
     part: Floats
 
-    def at_rest(self) -> Floats:
-        """State before the first reading: plays (tiles, plays) at zero load."""
-        return np.zeros(self.part.shape)
+    def laws(self) -> Records:
+        """The constants, tile by tile."""
+        return records(LAW, len(self.part), part=self.part)
 
-    def compensated(
-        self, apparent_n: Floats, plays_n: Floats, *, borne_n: Floats | None = None
-    ) -> tuple[Floats, Floats]:
-        """Forces that appear as these, and the plays after them.
+    def at_rest(self) -> Records:
+        """State before the first reading: plays at zero load."""
+        return records(STATE, len(self.part))
 
-        Args:
-            apparent_n: (n, tiles); NaN stays NaN and changes nothing after it.
-            plays_n: state from the readings before.
-            borne_n: (n, tiles), forces that move the plays, whatever the apparent ones say; NaN:
-                what they say.
-        """
-        borne_n = _NONE if borne_n is None else np.ascontiguousarray(borne_n)
-        out = np.empty_like(apparent_n)
-        plays_n = plays_n.copy()
-        _compensate(np.ascontiguousarray(apparent_n), self.part, WIDTHS_N, borne_n, plays_n, out)
-        return out, plays_n
+    def compensated(self, apparent_n: Floats, state: Records) -> tuple[Floats, Records]:
+        """Forces that appear as these (n, tiles), and the plays after them; see `compensated`."""
+        out, after = np.empty(apparent_n.shape), copied(state)
+        _compensate(self.laws(), after, apparent_n, out)
+        return out, after
+
+
+@compiled
+def compensated(law: Record, state: Record, apparent_n: float, borne_n: float) -> float:
+    """Force that appears as this; NaN stays NaN and changes nothing after it.
+
+    Args:
+        law: constants of the tile.
+        state: its plays before; becomes those after this force.
+        apparent_n: force that appears.
+        borne_n: force that moves the plays, whatever the apparent one says; NaN: what that says.
+    """
+    if not math.isfinite(apparent_n):
+        return math.nan
+    found: float = _inverted(apparent_n, law.part, state.plays_n)
+    force = found if math.isnan(borne_n) else borne_n
+    for m in range(PLAYS):
+        state.plays_n[m] = played(force, WIDTHS_N[m], state.plays_n[m])
+    return found
 
 
 @compiled
@@ -64,7 +81,7 @@ def played(force: float, width: float, before: float) -> float:
 
 
 @compiled
-def _inverted(apparent: float, part: Floats, widths: Floats, plays: Floats) -> float:
+def _inverted(apparent: float, part: Floats, plays: Floats) -> float:
     """The force that these plays show as `apparent`.
 
     It is piecewise linear over the force and rises with it: Newton's steps end on the right piece
@@ -75,9 +92,9 @@ def _inverted(apparent: float, part: Floats, widths: Floats, plays: Floats) -> f
     low, high, force = 0.0, math.inf, apparent
     for _ in range(_ITERATIONS):
         value, slope = force, 1.0
-        for m in range(len(widths)):
-            value += part[m] * (played(force, widths[m], plays[m]) - force)
-            slope += part[m] * _play_slope(force, widths[m], plays[m])
+        for m in range(PLAYS):
+            value += part[m] * (played(force, WIDTHS_N[m], plays[m]) - force)
+            slope += part[m] * _play_slope(force, WIDTHS_N[m], plays[m])
         if value > apparent:
             high = force
         else:
@@ -100,22 +117,8 @@ def _play_slope(force: float, width: float, before: float) -> float:
 
 
 @compiled
-def _compensate(
-    apparent_n: Floats,
-    part: Floats,
-    widths: Floats,
-    borne: Floats,
-    plays: Floats,
-    out: Floats,
-) -> None:
+def _compensate(laws: Records, state: Records, apparent_n: Floats, out: Floats) -> None:
     n, tiles = apparent_n.shape
-    for j in range(tiles):
-        for i in range(n):
-            if not math.isfinite(apparent_n[i, j]):
-                out[i, j] = math.nan
-                continue
-            out[i, j] = force = _inverted(apparent_n[i, j], part[j], widths, plays[j])
-            if len(borne) > 0 and not math.isnan(borne[i, j]):
-                force = borne[i, j]
-            for m in range(len(widths)):
-                plays[j, m] = played(force, widths[m], plays[j, m])
+    for i in range(n):
+        for j in range(tiles):
+            out[i, j] = compensated(laws[j], state[j], apparent_n[i, j], math.nan)

@@ -7,13 +7,16 @@ needs the reading after it, so frames wait for one more.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from devices.arrays import Bools, Floats
+from devices.compiled import compiled
 
 FAR = 3.0
 """In units of the noise that a reading has about the mean of two; one healthy reading in 600."""
-_ABOUT_MEAN = np.sqrt(1.5)  # of a reading's own noise and that of a mean of two
+_ABOUT_MEAN = math.sqrt(1.5)  # of a reading's own noise and that of a mean of two
 
 
 def spikes(kpa: Floats, noise_kpa: Floats) -> Bools:
@@ -24,27 +27,20 @@ def spikes(kpa: Floats, noise_kpa: Floats) -> Bools:
         noise_kpa: (tiles,), standard deviation of a reading.
     """
     found = np.zeros(kpa.shape, dtype=bool)
-    if len(kpa) > 2:
-        found[1:-1] = _is_spike(kpa[:-2], kpa[1:-1], kpa[2:], noise_kpa)
+    _find(kpa, noise_kpa, found)
     return found
 
 
-def despiked(kpa: Floats, before: Floats, after: Floats, noise_kpa: Floats) -> tuple[Floats, Bools]:
-    """Readings with outliers replaced, and which those are.
-
-    Args:
-        kpa: (n, tiles).
-        before: the readings before each, as they came.
-        after: the readings after each.
-        noise_kpa: (tiles,).
-    """
-    found = _is_spike(before, kpa, after, noise_kpa)
-    return np.where(found, 0.5 * (before + after), kpa), found
+@compiled
+def is_spike(before: float, kpa: float, after: float, noise_kpa: float) -> bool:
+    """Is a reading an outlier, between those before and after it? Beside a NaN none is."""
+    off_kpa = abs(kpa - 0.5 * (before + after))
+    return off_kpa > FAR * _ABOUT_MEAN * noise_kpa and abs(after - before) < off_kpa
 
 
-def _is_spike(before: Floats, kpa: Floats, after: Floats, noise_kpa: Floats) -> Bools:
-    with np.errstate(invalid="ignore"):
-        off_kpa = np.abs(kpa - 0.5 * (before + after))
-        return np.asarray(
-            (off_kpa > FAR * _ABOUT_MEAN * noise_kpa) & (np.abs(after - before) < off_kpa)
-        )
+@compiled
+def _find(kpa: Floats, noise_kpa: Floats, found: Bools) -> None:
+    n, tiles = kpa.shape
+    for i in range(1, n - 1):
+        for j in range(tiles):
+            found[i, j] = is_spike(kpa[i - 1, j], kpa[i, j], kpa[i + 1, j], noise_kpa[j])

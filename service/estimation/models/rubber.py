@@ -16,20 +16,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Arrays, Floats, Times
+from devices.arrays import Floats, Times
 from devices.compiled import compiled
+from service.estimation.effects import PARTS_MAX
 from service.estimation.foot.contact import UNSEEN_NS
+from service.estimation.records import Record, Records, copied, record_type, records
 
-_NONE = np.empty((0, 0))
-
-
-@dataclass(frozen=True)
-class RubberState(Arrays):
-    """Of every tile: crept parts (tiles, terms), and the force before (NaN: none)."""
-
-    crept_n: Floats
-    force_n: Floats
-    t_ns: Times
+LAW = record_type(
+    [
+        ("part", np.float64, (PARTS_MAX,)),
+        ("tau_s", np.float64, (PARTS_MAX,)),
+        ("terms", np.int64),
+    ]
+)
+"""Constants of a tile, as in `Rubber`, and how many of the terms there are."""
+STATE = record_type(
+    [
+        ("force_n", np.float64),
+        ("t_ns", np.int64),
+        ("crept_n", np.float64, (PARTS_MAX,)),
+        ("share", np.float64, (PARTS_MAX,)),  # of the force now; needed within a reading only
+    ]
+)
+"""Of a tile: crept parts, and the force before (NaN: none)."""
 
 
 @dataclass(frozen=True)
@@ -39,49 +48,66 @@ class Rubber:
     part: Floats
     tau_s: Floats
 
-    def at_rest(self) -> RubberState:
+    def laws(self) -> Records:
+        """The constants, tile by tile."""
+        tiles, terms = self.part.shape
+        made = records(LAW, tiles, terms=terms)
+        made["part"][:, :terms], made["tau_s"][:, :terms] = self.part, self.tau_s
+        return made
+
+    def at_rest(self) -> Records:
         """Before the first reading."""
-        tiles = len(self.part)
-        return RubberState(
-            np.zeros(self.part.shape), np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64)
-        )
+        return records(STATE, len(self.part), force_n=np.nan)
 
     def compensated(
-        self,
-        apparent_n: Floats,
-        t_ns: Times,
-        state: RubberState,
-        *,
-        borne_n: Floats | None = None,
-        away_n: Floats | None = None,
-    ) -> tuple[Floats, RubberState]:
-        """Forces that appear as these.
-
-        Args:
-            apparent_n: (n, tiles); NaN stays NaN and changes nothing after it.
-            t_ns: instants (n, tiles).
-            state: from the readings before.
-            borne_n: (n, tiles), forces under which the dome creeps, whatever the apparent ones
-                say; NaN: what they say.
-            away_n: (tiles,), force that may have been borne while there was no reading for more
-                than `UNSEEN_NS`: it or nothing was, whichever is farther from the straight line;
-                None: the straight line.
-        """
-        out = np.empty_like(apparent_n)
-        after = state.copy()
-        _compensate(
-            np.ascontiguousarray(apparent_n),
-            np.ascontiguousarray(t_ns),
-            self.part,
-            self.tau_s,
-            _NONE if borne_n is None else np.ascontiguousarray(borne_n),
-            np.full(len(self.part), math.nan) if away_n is None else away_n,
-            after.crept_n,
-            after.force_n,
-            after.t_ns,
-            out,
-        )
+        self, apparent_n: Floats, t_ns: Times, state: Records
+    ) -> tuple[Floats, Records]:
+        """Forces that appear as these at instants, both (n, tiles); see `compensated`."""
+        out, after = np.empty(apparent_n.shape), copied(state)
+        _compensate(self.laws(), after, apparent_n, t_ns, out)
         return out, after
+
+
+@compiled
+def compensated(
+    law: Record, state: Record, apparent_n: float, t_ns: int, borne_n: float, away_n: float
+) -> float:
+    """Force that appears as this; NaN stays NaN and changes nothing after it.
+
+    Args:
+        law: constants of the tile.
+        state: from its readings before; becomes that after this one.
+        apparent_n: force that appears.
+        t_ns: instant.
+        borne_n: force under which the dome creeps, whatever the apparent one says; NaN: what that
+            says.
+        away_n: force that may have been borne while there was no reading for more than
+            `UNSEEN_NS`: it or nothing was, whichever is farther from the straight line; NaN: the
+            straight line.
+    """
+    if not math.isfinite(apparent_n):
+        return math.nan
+    if math.isnan(state.force_n):  # the first reading: at rest without a force
+        state.force_n, state.t_ns = 0.0, t_ns
+    before, passed_ns = state.force_n, t_ns - state.t_ns
+    was_away = away_n > 0.0 and passed_ns > UNSEEN_NS
+    meanwhile = away_n if before + apparent_n < away_n else 0.0
+    left, known = 1.0, apparent_n
+    for m in range(law.terms):
+        decay, of_before, of_now = crept_parts(max(0.0, passed_ns * 1e-9 / law.tau_s[m]))
+        if was_away:  # until just now
+            carried, share = decay * state.crept_n[m] + (1.0 - decay) * meanwhile, 0.0
+        else:
+            carried, share = decay * state.crept_n[m] + of_before * before, of_now
+        left -= law.part[m] * (1.0 - share)
+        known -= law.part[m] * carried
+        state.crept_n[m], state.share[m] = carried, share
+    found: float = known / left
+    now = found if math.isnan(borne_n) else borne_n
+    for m in range(law.terms):
+        state.crept_n[m] += state.share[m] * now
+    state.force_n, state.t_ns = now, t_ns
+    return found
 
 
 @compiled
@@ -94,46 +120,10 @@ def crept_parts(h: float) -> tuple[float, float, float]:
 
 @compiled
 def _compensate(
-    apparent_n: Floats,
-    t_ns: Times,
-    part: Floats,
-    tau_s: Floats,
-    borne: Floats,
-    away: Floats,
-    crept: Floats,
-    force: Floats,
-    last_ns: Times,
-    out: Floats,
+    laws: Records, state: Records, apparent_n: Floats, t_ns: Times, out: Floats
 ) -> None:
     n, tiles = apparent_n.shape
-    terms = part.shape[1]
-    carried = np.empty(terms)
-    share = np.empty(terms)
-    for j in range(tiles):
-        before, before_ns = force[j], last_ns[j]
-        for i in range(n):
-            apparent = apparent_n[i, j]
-            if not math.isfinite(apparent):
-                out[i, j] = math.nan
-                continue
-            if math.isnan(before):  # the first reading: at rest without a force
-                before, before_ns = 0.0, t_ns[i, j]
-            was_away = away[j] > 0.0 and t_ns[i, j] - before_ns > UNSEEN_NS
-            meanwhile = away[j] if before + apparent < away[j] else 0.0
-            left, known = 1.0, apparent
-            for m in range(terms):
-                h = max(0.0, (t_ns[i, j] - before_ns) * 1e-9 / tau_s[j, m])
-                decay, of_before, of_now = crept_parts(h)
-                if was_away:  # until just now
-                    carried[m], share[m] = decay * crept[j, m] + (1.0 - decay) * meanwhile, 0.0
-                else:
-                    carried[m], share[m] = decay * crept[j, m] + of_before * before, of_now
-                left -= part[j, m] * (1.0 - share[m])
-                known -= part[j, m] * carried[m]
-            out[i, j] = now = known / left
-            if len(borne) > 0 and not math.isnan(borne[i, j]):
-                now = borne[i, j]
-            for m in range(terms):
-                crept[j, m] = carried[m] + share[m] * now
-            before, before_ns = now, t_ns[i, j]
-        force[j], last_ns[j] = before, before_ns
+    for i in range(n):
+        for j in range(tiles):
+            law, tile = laws[j], state[j]
+            out[i, j] = compensated(law, tile, apparent_n[i, j], t_ns[i, j], math.nan, math.nan)

@@ -6,48 +6,36 @@ own. With `denoise` there is no need of it: a window is evaluated at that instan
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
 
-from devices.arrays import Bools, Floats, Times
+from devices.compiled import compiled
+from service.estimation.records import Record, Records, record_type, records
+
+STATE = record_type([("value", np.float64), ("t_ns", np.int64)])
+"""Of a tile: the value before (NaN: none), and its instant."""
 
 
-@dataclass(frozen=True)
-class SkewState:
-    """The last row: values and instants of all tiles."""
-
-    values: Floats
-    t_ns: Times
-
-
-def at_rest(tiles: int) -> SkewState:
+def at_rest(tiles: int) -> Records:
     """Before the first frame."""
-    return SkewState(np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64))
+    return records(STATE, tiles, value=np.nan)
 
 
-def aligned(
-    values: Floats,
-    t_ns: Times,
-    frame_t_ns: Times,
-    broken: Bools,
-    state: SkewState,
-) -> tuple[Floats, SkewState]:
-    """Values at the frames' instants.
+@compiled
+def at_frame(state: Record, value: float, t_ns: int, frame_t_ns: int, broken: bool) -> float:
+    """Value at the frame's instant.
 
     Args:
-        values: (n, tiles), NaN where there is none.
-        t_ns: (n, tiles), when they were sampled.
-        frame_t_ns: (n,), the frames' instants.
-        broken: (n,), frames after a gap: there is no line across it.
-        state: from the frames before.
+        state: from the frame before; becomes that after this one.
+        value: NaN if there is none.
+        t_ns: when it was sampled.
+        frame_t_ns: the frame's instant.
+        broken: is it the first after a gap? There is no line across it.
     """
-    before = np.concatenate([state.values[None], values[:-1]])
-    before_ns = np.concatenate([state.t_ns[None], t_ns[:-1]])
-    step_ns = (t_ns - before_ns).astype(np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        back = (t_ns - frame_t_ns[:, None]) / step_ns
-        usable = (step_ns > 0.0) & (back >= 0.0) & (back <= 1.0) & ~broken[:, None]
-        line = values - back * (values - before)
-    out = np.where(usable & np.isfinite(before), line, values)
-    return out, SkewState(values[-1], t_ns[-1])
+    before, step_ns = state.value, float(t_ns - state.t_ns)
+    state.value, state.t_ns = value, t_ns
+    if broken or step_ns <= 0.0 or not math.isfinite(before):
+        return value
+    back = (t_ns - frame_t_ns) / step_ns
+    return value - back * (value - before) if 0.0 <= back <= 1.0 else value

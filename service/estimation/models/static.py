@@ -16,6 +16,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.compiled import compiled
 from service.estimation.calibration import BASIS, CURVE_OPENS_N, LOOP_OPENS_N, TileCalibration
+from service.estimation.records import Record, Records, record_type, records
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,18 @@ class StaticForce:
     slope_n_per_kpa: Floats
     fit_sigma_n: Floats
     """Standard uncertainty from the calibration: its coefficients, and a new loading's spread."""
+
+
+LAW = record_type(
+    [
+        *((name, np.float64) for name in ("high_kpa", "offset_kpa", "scale_kpa", "u_zero")),
+        ("coefficients", np.float64, (BASIS,)),
+        ("covariance", np.float64, (BASIS, BASIS)),
+        *((name, np.float64) for name in ("zero_n", "slope_at_zero", "misfit", "scatter")),
+        *((name, np.float64) for name in ("loop_n", "curve_n")),
+    ]
+)
+"""Constants of a tile."""
 
 
 class StaticCurves:
@@ -55,70 +68,65 @@ class StaticCurves:
         self.low_kpa = np.array([t.range_kpa[0] for t in tiles])
         self.high_kpa = np.array([t.range_kpa[1] for t in tiles])
         self.slope_at_zero_n_per_kpa = (c1 + u0 * (2.0 * c2 + u0 * (3.0 * c3))) / scale_kpa
-        self._constants = (
-            self.high_kpa,
-            offset_kpa,
-            scale_kpa,
-            u0,
-            np.stack([c1, c2, c3]),
-            np.array(zero_n),
-            self.slope_at_zero_n_per_kpa,
-            np.array([np.array(t.covariance) * t.f_scale_n**2 for t in tiles]),
-            np.array([t.relative_misfit for t in tiles]),
-            scatter,
-            np.array([t.loop_misfit_n for t in tiles]),
-            curve_misfit_n,
+        self._laws = records(
+            LAW,
+            len(tiles),
+            high_kpa=self.high_kpa,
+            offset_kpa=offset_kpa,
+            scale_kpa=scale_kpa,
+            u_zero=u0,
+            coefficients=np.stack([c1, c2, c3], axis=1),
+            zero_n=zero_n,
+            slope_at_zero=self.slope_at_zero_n_per_kpa,
+            covariance=[np.array(t.covariance) * t.f_scale_n**2 for t in tiles],
+            misfit=[t.relative_misfit for t in tiles],
+            scatter=scatter,
+            loop_n=[t.loop_misfit_n for t in tiles],
+            curve_n=curve_misfit_n,
         )
+
+    def laws(self) -> Records:
+        """The constants, tile by tile."""
+        return self._laws
 
     def force(self, gauge_kpa: Floats) -> StaticForce:
         """Force, slope and calibration uncertainty at gauge pressures of shape (n, tiles)."""
-        return StaticForce(*_curve(np.ascontiguousarray(gauge_kpa), *self._constants))
+        force, slope, sigma = (np.empty(gauge_kpa.shape) for _ in range(3))
+        _curve(self._laws, gauge_kpa, force, slope, sigma)
+        return StaticForce(force, slope, sigma)
 
 
 @compiled
-def _curve(
-    gauge_kpa: Floats,
-    high_kpa: Floats,
-    offset_kpa: Floats,
-    scale_kpa: Floats,
-    u_zero: Floats,
-    coefficients: Floats,
-    zero_n: Floats,
-    slope_at_zero: Floats,
-    covariance: Floats,
-    misfit: Floats,
-    scatter: Floats,
-    loop_n: Floats,
-    curve_n: Floats,
-) -> tuple[Floats, Floats, Floats]:
+def curve(law: Record, gauge_kpa: float) -> tuple[float, float, float]:
+    """Force, its slope and its uncertainty from the calibration at a gauge pressure."""
+    inside = gauge_kpa if math.isnan(gauge_kpa) else min(max(gauge_kpa, 0.0), law.high_kpa)
+    u, u0 = (inside - law.offset_kpa) / law.scale_kpa, law.u_zero
+    c1, c2, c3 = law.coefficients[0], law.coefficients[1], law.coefficients[2]
+    # The polynomial about u0 rather than about 0: exactly zero at zero pressure.
+    d = u - u0
+    value = d * (c1 + c2 * (u + u0) + c3 * (u * u + u * u0 + u0 * u0))
+    if gauge_kpa < 0.0:
+        value += gauge_kpa * law.slope_at_zero
+    rise = (c1 + u * (2.0 * c2 + u * (3.0 * c3))) / law.scale_kpa
+    basis = (d, u * u - u0 * u0, u * u * u - u0 * u0 * u0)
+    variance = 0.0
+    for k in range(BASIS):
+        for m in range(BASIS):
+            variance += law.covariance[k, m] * basis[k] * basis[m]
+    size = abs(value)
+    variance = max(variance, 0.0)  # rounding may leave a trace below zero
+    variance += (law.misfit * value) ** 2 + (law.scatter * rise * inside) ** 2
+    variance += (law.loop_n * (1.0 - LOOP_OPENS_N / (size + LOOP_OPENS_N))) ** 2
+    variance += (law.curve_n * (1.0 - CURVE_OPENS_N / (size + CURVE_OPENS_N))) ** 2
+    return value + law.zero_n, rise, math.sqrt(variance)
+
+
+@compiled
+def _curve(laws: Records, gauge_kpa: Floats, force: Floats, slope: Floats, sigma: Floats) -> None:
     n, tiles = gauge_kpa.shape
-    force, slope, sigma = np.empty((n, tiles)), np.empty((n, tiles)), np.empty((n, tiles))
-    basis = np.empty(BASIS)
     for i in range(n):
         for j in range(tiles):
-            gauge = gauge_kpa[i, j]
-            inside = gauge if math.isnan(gauge) else min(max(gauge, 0.0), high_kpa[j])
-            u, u0 = (inside - offset_kpa[j]) / scale_kpa[j], u_zero[j]
-            c1, c2, c3 = coefficients[0, j], coefficients[1, j], coefficients[2, j]
-            # The polynomial about u0 rather than about 0: exactly zero at zero pressure.
-            d = u - u0
-            value = d * (c1 + c2 * (u + u0) + c3 * (u * u + u * u0 + u0 * u0))
-            if gauge < 0.0:
-                value += gauge * slope_at_zero[j]
-            rise = (c1 + u * (2.0 * c2 + u * (3.0 * c3))) / scale_kpa[j]
-            basis[0], basis[1], basis[2] = d, u * u - u0 * u0, u * u * u - u0 * u0 * u0
-            variance = 0.0
-            for k in range(BASIS):
-                for m in range(BASIS):
-                    variance += covariance[j, k, m] * basis[k] * basis[m]
-            size = abs(value)
-            variance = max(variance, 0.0)  # rounding may leave a trace below zero
-            variance += (misfit[j] * value) ** 2 + (scatter[j] * rise * inside) ** 2
-            variance += (loop_n[j] * (1.0 - LOOP_OPENS_N / (size + LOOP_OPENS_N))) ** 2
-            variance += (curve_n[j] * (1.0 - CURVE_OPENS_N / (size + CURVE_OPENS_N))) ** 2
-            force[i, j], slope[i, j] = value + zero_n[j], rise
-            sigma[i, j] = math.sqrt(variance)
-    return force, slope, sigma
+            force[i, j], slope[i, j], sigma[i, j] = curve(laws[j], gauge_kpa[i, j])
 
 
 def _lasting(tile: TileCalibration) -> TileCalibration:

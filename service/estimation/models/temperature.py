@@ -18,8 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Arrays, Floats, Times
+from devices.arrays import Floats, Times
 from devices.compiled import compiled
+from service.estimation.records import Record, Records, copied, record_type, records
 
 SETTLE_S = 0.5
 """How long the mean of the chip's temperature is taken as that of the gas."""
@@ -33,25 +34,41 @@ NOISE_COUNTS = 0.5
 """Of a reading of `tadc` (hardware.md 1.3)."""
 
 
-@dataclass(frozen=True)
-class TemperatureState(Arrays):
-    """Of every tile: counts of its chip, smoothed once, twice and not, the first, and instants.
+LAW = record_type(
+    [
+        ("kpa_per_count", np.float64),
+        ("relative_sigma", np.float64),
+        ("lag_s", np.float64),
+        ("lag_sigma_s", np.float64),
+        ("tare_counts", np.float64),
+        ("baseline_kpa", np.float64),
+        ("smoothing_s", np.float64),
+        ("noise_counts", np.float64),
+    ]
+)
+"""Constants of a tile, as in `Temperature`; the last two follow from the others."""
+STATE = record_type(
+    [
+        ("once_counts", np.float64),
+        ("twice_counts", np.float64),
+        ("chip_counts", np.float64),
+        ("first_counts", np.float64),
+        ("first_ns", np.int64),
+        ("t_ns", np.int64),
+        ("gas_counts", np.float64),
+        ("rise_per_s", np.float64),
+    ]
+)
+"""Of a tile: counts of its chip, smoothed once, twice and not, the first, and instants; and what
+follows for its gas: counts, and how fast they rise. NaN before the first reading."""
 
-    NaN before the first reading.
-    """
 
-    once_counts: Floats
-    twice_counts: Floats
-    chip_counts: Floats
-    first_counts: Floats
-    first_ns: Times
-    t_ns: Times
-
-
-def at_rest(tiles: int) -> TemperatureState:
+def at_rest(tiles: int) -> Records:
     """Before the first reading."""
-    unknown, never = np.full(tiles, np.nan), np.zeros(tiles, dtype=np.int64)
-    return TemperatureState(unknown, unknown, unknown, unknown, never, never)
+    unknown = ("once", "twice", "chip", "first", "gas")
+    return records(
+        STATE, tiles, **{f"{name}_counts": np.nan for name in unknown}, rise_per_s=np.nan
+    )
 
 
 @dataclass(frozen=True)
@@ -76,38 +93,34 @@ class Temperature:
     baseline_kpa: Floats
     step_s: float
 
+    def laws(self) -> Records:
+        """The constants, tile by tile."""
+        given = {name: value for name, value in vars(self).items() if name != "step_s"}
+        return records(
+            LAW,
+            len(self.lag_s),
+            **given,
+            smoothing_s=smoothing_s(self.lag_s),
+            noise_counts=noise_counts(self.lag_s, self.step_s),
+        )
+
     def at_tare(
-        self, kpa: Floats, tadc: Floats, t_ns: Times, state: TemperatureState
-    ) -> tuple[Floats, Floats, TemperatureState]:
-        """Pressures as they would be at the tare's temperature.
+        self, kpa: Floats, tadc: Floats, t_ns: Times, state: Records
+    ) -> tuple[Floats, Floats, Records]:
+        """Pressures as they would be at the tare's temperature, arrays (n, tiles); see `at_tare`.
 
         Args:
-            kpa: absolute pressures (n, tiles).
-            tadc: counts (n, tiles), NaN where there are none.
-            t_ns: instants (n, tiles).
+            kpa: absolute pressures.
+            tadc: counts, NaN where there are none.
+            t_ns: instants.
             state: from the readings before.
 
         Returns:
             The pressures, their standard uncertainty from temperature, and the next state.
         """
-        gas, rise, after = followed(tadc, t_ns, self.lag_s, state)
-        # Where the chip began away from the tare's temperature, it is not known how far the gas is
-        # from it: all of that is uncertain, and less so with every lag that passes.
-        since_s = np.maximum(t_ns - after.first_ns, 0) * 1e-9
-        away = after.first_counts - self.tare_counts
-        gone = np.exp(-since_s / np.maximum(np.abs(self.lag_s), SMOOTH_LEAST_S))
-        unknown = np.where(np.abs(away) > NEAR_COUNTS, away, 0.0) * gone
-        noise = noise_counts(self.lag_s, self.step_s)
-        warmed_kpa = self.kpa_per_count * (gas - self.tare_counts)
-        scale = 1.0 + warmed_kpa / self.baseline_kpa
-        sigma_kpa = np.sqrt(
-            (self.relative_sigma * warmed_kpa) ** 2
-            + (self.kpa_per_count * self.lag_sigma_s * rise) ** 2
-            + (self.kpa_per_count * unknown) ** 2
-            + (self.kpa_per_count * noise) ** 2
-        )
-        # Counts below absolute zero are not valid.
-        return kpa / np.where(scale > 0.0, scale, np.nan), sigma_kpa, after
+        out, sigma_kpa, after = np.empty(kpa.shape), np.empty(kpa.shape), copied(state)
+        _take_back(self.laws(), after, kpa, tadc, t_ns, out, sigma_kpa)
+        return out, sigma_kpa, after
 
 
 def smoothing_s(lag_s: Floats) -> Floats:
@@ -126,8 +139,8 @@ def noise_counts(lag_s: Floats, step_s: float) -> Floats:
 
 
 def followed(
-    tadc: Floats, t_ns: Times, lag_s: Floats, state: TemperatureState
-) -> tuple[Floats, Floats, TemperatureState]:
+    tadc: Floats, t_ns: Times, lag_s: Floats, state: Records
+) -> tuple[Floats, Floats, Records]:
     """Counts of every tile's gas, how fast they rise in counts a second, and the next state.
 
     Args:
@@ -136,68 +149,96 @@ def followed(
         lag_s: (tiles,), negative where the chip is behind.
         state: from the readings before.
     """
-    gas, rise = np.empty(tadc.shape), np.empty(tadc.shape)
-    after = state.copy()
-    _follow(
-        np.ascontiguousarray(tadc),
-        np.ascontiguousarray(t_ns),
-        lag_s,
-        smoothing_s(lag_s),
-        after.once_counts,
-        after.twice_counts,
-        after.chip_counts,
-        after.first_counts,
-        after.first_ns,
-        after.t_ns,
-        gas,
-        rise,
-    )
+    gas, rise, after = np.empty(tadc.shape), np.empty(tadc.shape), copied(state)
+    laws = records(LAW, len(lag_s), lag_s=lag_s, smoothing_s=smoothing_s(lag_s))
+    _follow(laws, after, tadc, t_ns, gas, rise)
     return gas, rise, after
 
 
 @compiled
-def _follow(
+def at_tare(law: Record, state: Record, kpa: float, tadc: float, t_ns: int) -> tuple[float, float]:
+    """Pressure as it would be at the tare's temperature, and its uncertainty from temperature.
+
+    Args:
+        law: constants of the tile.
+        state: from its readings before; becomes that after this one.
+        kpa: absolute pressure.
+        tadc: counts, NaN if there are none.
+        t_ns: instant.
+    """
+    follow(law, state, tadc, t_ns)
+    # Where the chip began away from the tare's temperature, it is not known how far the gas is
+    # from it: all of that is uncertain, and less so with every lag that passes.
+    away = state.first_counts - law.tare_counts
+    unknown = 0.0
+    if abs(away) > NEAR_COUNTS:
+        since_s = max(t_ns - state.first_ns, 0) * 1e-9
+        unknown = away * math.exp(-since_s / max(abs(law.lag_s), SMOOTH_LEAST_S))
+    warmed_kpa = law.kpa_per_count * (state.gas_counts - law.tare_counts)
+    sigma_kpa = math.sqrt(
+        (law.relative_sigma * warmed_kpa) ** 2
+        + (law.kpa_per_count * law.lag_sigma_s * state.rise_per_s) ** 2
+        + (law.kpa_per_count * unknown) ** 2
+        + (law.kpa_per_count * law.noise_counts) ** 2
+    )
+    scale = 1.0 + warmed_kpa / law.baseline_kpa
+    # Counts below absolute zero are not valid.
+    return kpa / scale if scale > 0.0 else math.nan, sigma_kpa
+
+
+@compiled
+def follow(law: Record, state: Record, tadc: float, t_ns: int) -> None:
+    """Take another reading of the chip, or none (NaN), for what its gas does."""
+    smooth = law.smoothing_s
+    if math.isfinite(tadc):
+        if math.isnan(state.once_counts):  # as warm as its chip, as far as one can know
+            state.once_counts = state.twice_counts = state.first_counts = tadc
+            state.first_ns = t_ns
+        else:
+            dt = max(0.0, (t_ns - state.t_ns) * 1e-9)
+            known_s = (t_ns - state.first_ns) * 1e-9
+            # At first a plain mean: a single noisy count would stay for the whole lag.
+            time = smooth if known_s > SETTLE_S else min(smooth, max(dt, known_s))
+            if dt > 0.0:
+                # Exact for a chip whose temperature is linear between readings; so is taken what
+                # is smoothed once.
+                decay = math.exp(-dt / time)
+                mean = -math.expm1(-dt / time) * time / dt
+                before, twice = state.once_counts, state.twice_counts
+                once = decay * before + (mean - decay) * state.chip_counts + (1.0 - mean) * tadc
+                state.twice_counts = decay * twice + (mean - decay) * before + (1.0 - mean) * once
+                state.once_counts = once
+        state.chip_counts, state.t_ns = tadc, t_ns
+    once, ahead = state.once_counts, state.chip_counts - state.once_counts
+    if law.lag_s < 0.0:
+        ahead = once - state.twice_counts
+    state.gas_counts = once + (1.0 - law.lag_s / smooth) * ahead
+    state.rise_per_s = ahead / smooth
+
+
+@compiled
+def _take_back(
+    laws: Records,
+    state: Records,
+    kpa: Floats,
     tadc: Floats,
     t_ns: Times,
-    lag_s: Floats,
-    time_s: Floats,
-    once_counts: Floats,
-    twice_counts: Floats,
-    chip_counts: Floats,
-    first_counts: Floats,
-    first_ns: Times,
-    last_ns: Times,
-    gas: Floats,
-    rise: Floats,
+    out: Floats,
+    sigma_kpa: Floats,
+) -> None:
+    n, tiles = kpa.shape
+    for i in range(n):
+        for j in range(tiles):
+            law, tile = laws[j], state[j]
+            out[i, j], sigma_kpa[i, j] = at_tare(law, tile, kpa[i, j], tadc[i, j], t_ns[i, j])
+
+
+@compiled
+def _follow(
+    laws: Records, state: Records, tadc: Floats, t_ns: Times, gas: Floats, rise: Floats
 ) -> None:
     n, tiles = tadc.shape
-    for j in range(tiles):
-        once, twice, chip = once_counts[j], twice_counts[j], chip_counts[j]
-        lag, smooth = lag_s[j], time_s[j]
-        for i in range(n):
-            counts = tadc[i, j]
-            if math.isfinite(counts):
-                if math.isnan(once):  # as warm as its chip, as far as one can know
-                    once, twice = counts, counts
-                    first_counts[j], first_ns[j] = counts, t_ns[i, j]
-                else:
-                    dt = max(0.0, (t_ns[i, j] - last_ns[j]) * 1e-9)
-                    known_s = (t_ns[i, j] - first_ns[j]) * 1e-9
-                    # At first a plain mean: a single noisy count would stay for the whole lag.
-                    time = smooth if known_s > SETTLE_S else min(smooth, max(dt, known_s))
-                    if dt > 0.0:
-                        # Exact for a chip whose temperature is linear between readings; so is taken
-                        # what is smoothed once.
-                        decay = math.exp(-dt / time)
-                        mean = -math.expm1(-dt / time) * time / dt
-                        before = once
-                        once = decay * once + (mean - decay) * chip + (1.0 - mean) * counts
-                        twice = decay * twice + (mean - decay) * before + (1.0 - mean) * once
-                chip, last_ns[j] = counts, t_ns[i, j]
-            if lag >= 0.0:
-                gas[i, j] = once + (1.0 - lag / smooth) * (chip - once)
-                rise[i, j] = (chip - once) / smooth
-            else:
-                gas[i, j] = once + (1.0 - lag / smooth) * (once - twice)
-                rise[i, j] = (once - twice) / smooth
-        once_counts[j], twice_counts[j], chip_counts[j] = once, twice, chip
+    for i in range(n):
+        for j in range(tiles):
+            follow(laws[j], state[j], tadc[i, j], t_ns[i, j])
+            gas[i, j], rise[i, j] = state[j].gas_counts, state[j].rise_per_s

@@ -8,22 +8,19 @@ case: the driver flags it, and it never becomes a pressure.
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
-
-from devices.arrays import Floats
 from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MIN_KPA
+from devices.compiled import compiled
 
 
-def unwrap(kpa: Floats, kpa_per_count: npt.ArrayLike) -> Floats:
-    """Absolute pressure with wrapped counts taken back below zero.
+@compiled
+def unwrapped(kpa: float, kpa_per_count: float) -> float:
+    """Absolute pressure with a wrapped count taken back below zero.
 
     Args:
-        kpa: compensated pressure, any shape.
-        kpa_per_count: pressure step of one count of `padc` (negative), broadcast to that shape.
+        kpa: compensated pressure.
+        kpa_per_count: pressure step of one count of `padc` (negative).
 
     Returns:
-        Pressure in kPa; beyond every calibrated range wherever a count had wrapped.
+        Pressure in kPa; beyond every calibrated range if the count had wrapped.
     """
-    wrapped = kpa < PRESSURE_MIN_KPA
-    return np.where(wrapped, kpa - (COUNTS_MAX + 1) * np.asarray(kpa_per_count), kpa)
+    return kpa - (COUNTS_MAX + 1) * kpa_per_count if kpa < PRESSURE_MIN_KPA else kpa

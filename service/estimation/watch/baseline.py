@@ -17,9 +17,8 @@ import math
 
 import numpy as np
 
-from devices.arrays import Bools, Floats, Times
 from devices.compiled import compiled
-from service.estimation.watch.state import State, copied
+from service.estimation.records import Record, Records, record_type, records
 
 LOST_KPA = 0.4
 """Four fifths of a newton; creep and hysteresis leave half of that of a fast release."""
@@ -42,7 +41,7 @@ PAUSE_S = 0.5
 """Of a longer gap in the readings nothing is known."""
 NEVER_NS = -(1 << 62)
 
-STATE = np.dtype(
+STATE = record_type(
     [
         ("kpa", np.float64),  # smoothed, above the baseline; NaN before the first
         ("t_ns", np.int64),
@@ -57,92 +56,51 @@ STATE = np.dtype(
 """What is remembered of each tile."""
 
 
-def at_rest(tiles: int) -> State:
+def at_rest(tiles: int) -> Records:
     """Before the first reading."""
-    state = np.zeros(tiles, dtype=STATE)
-    state["kpa"], state["below_ns"] = np.nan, NEVER_NS
-    return state
-
-
-def lost(
-    gauge_kpa: Floats,
-    variance: Floats,
-    warmed_kpa: Floats,
-    t_ns: Times,
-    even: Floats,
-    state: State,
-) -> tuple[Floats, Bools, State]:
-    """How wrong each tile's baseline may be, from when it shows until the next tare.
-
-    Args:
-        gauge_kpa: (n, tiles), above the baseline, with all that models correct; NaN where unknown.
-        variance: (n, tiles), of the baseline, as far as it is known to be uncertain.
-        warmed_kpa: (n, tiles), what warmth that no model corrects has moved it by.
-        t_ns: (n, tiles), instants.
-        even: (tiles,), `EVEN` or `EVEN_WITHOUT_GAS`.
-        state: from the readings before.
-
-    Returns:
-        (n, tiles), 0 where nothing shows; (n,), frames in which a baseline is lost or has moved by
-        `LOST_KPA`; and the next state.
-    """
-    after = copied(state)
-    lost_kpa, astray = np.empty(gauge_kpa.shape), np.zeros(len(gauge_kpa), dtype=np.bool_)
-    _follow(
-        np.ascontiguousarray(gauge_kpa),
-        np.ascontiguousarray(variance),
-        np.ascontiguousarray(warmed_kpa),
-        np.ascontiguousarray(t_ns),
-        even,
-        after,
-        lost_kpa,
-        astray,
-    )
-    return lost_kpa, astray, after
+    return records(STATE, tiles, kpa=np.nan, below_ns=NEVER_NS)
 
 
 @compiled
-def _follow(
-    gauge_kpa: Floats,
-    variance: Floats,
-    warmed_kpa: Floats,
-    t_ns: Times,
-    even: Floats,
-    state: State,
-    lost_kpa: Floats,
-    astray: Bools,
-) -> None:
-    n, tiles = gauge_kpa.shape
-    for j in range(tiles):
-        tile = state[j]
-        for i in range(n):
-            now, warmed = gauge_kpa[i, j], abs(warmed_kpa[i, j])
-            if not math.isnan(now):
-                step_s = max(0.0, (t_ns[i, j] - tile.t_ns) * 1e-9)
-                if math.isnan(tile.kpa) or step_s > PAUSE_S:
-                    tile.kpa, tile.below_ns, step_s = now, NEVER_NS, 0.0
-                tile.kpa -= math.expm1(-step_s / SMOOTH_S) * (now - tile.kpa)
-                tile.t_ns = t_ns[i, j]
-                bound = LOST_KPA + SIGMAS * math.sqrt(variance[i, j]) + WARMTH * warmed
-                kept = math.exp(-step_s / FORGET_S)
-                tile.more_kpa_s *= kept
-                tile.less_kpa_s *= kept
-                if tile.kpa >= -bound:
-                    tile.below_ns = NEVER_NS
-                    if tile.kpa > bound:
-                        tile.more_kpa_s += step_s * tile.kpa
-                        tile.highest_kpa = max(tile.highest_kpa, tile.kpa)
-                else:
-                    tile.deepest_kpa = max(tile.deepest_kpa, -tile.kpa)
-                    if tile.kpa < -bound - tile.lost_kpa:  # a dip, beyond what has moved for good
-                        tile.less_kpa_s -= step_s * tile.kpa
-                    if tile.below_ns == NEVER_NS:
-                        tile.below_ns = tile.t_ns
-                    if tile.t_ns - tile.below_ns > HELD_NS:
-                        tile.lost_kpa = max(tile.lost_kpa, -tile.kpa)
-                    least = max(EVEN_MIN_KPA_S, even[j] * tile.more_kpa_s)
-                    if tile.less_kpa_s > least and tile.highest_kpa > 0.0:
-                        # Then nothing of it is force.
-                        tile.lost_kpa = max(tile.lost_kpa, tile.highest_kpa, tile.deepest_kpa)
-            lost_kpa[i, j] = tile.lost_kpa
-            astray[i] = astray[i] or tile.lost_kpa > 0.0 or warmed > LOST_KPA
+def lost(
+    tile: Record, even: float, gauge_kpa: float, variance: float, warmed_kpa: float, t_ns: int
+) -> float:
+    """How wrong a tile's baseline may be, from when it shows until the next tare; 0: nothing shows.
+
+    Args:
+        tile: state from its readings before; becomes that after this one.
+        even: `EVEN` or `EVEN_WITHOUT_GAS`.
+        gauge_kpa: above the baseline, with all that models correct; NaN where unknown.
+        variance: of the baseline, as far as it is known to be uncertain.
+        warmed_kpa: what warmth that no model corrects has moved it by.
+        t_ns: instant.
+    """
+    if not math.isnan(gauge_kpa):
+        step_s = max(0.0, (t_ns - tile.t_ns) * 1e-9)
+        if math.isnan(tile.kpa) or step_s > PAUSE_S:
+            tile.kpa, tile.below_ns, step_s = gauge_kpa, NEVER_NS, 0.0
+        tile.kpa -= math.expm1(-step_s / SMOOTH_S) * (gauge_kpa - tile.kpa)
+        tile.t_ns = t_ns
+        bound = LOST_KPA + SIGMAS * math.sqrt(variance) + WARMTH * abs(warmed_kpa)
+        kept = math.exp(-step_s / FORGET_S)
+        tile.more_kpa_s *= kept
+        tile.less_kpa_s *= kept
+        if tile.kpa >= -bound:
+            tile.below_ns = NEVER_NS
+            if tile.kpa > bound:
+                tile.more_kpa_s += step_s * tile.kpa
+                tile.highest_kpa = max(tile.highest_kpa, tile.kpa)
+        else:
+            tile.deepest_kpa = max(tile.deepest_kpa, -tile.kpa)
+            if tile.kpa < -bound - tile.lost_kpa:  # a dip, beyond what has moved for good
+                tile.less_kpa_s -= step_s * tile.kpa
+            if tile.below_ns == NEVER_NS:
+                tile.below_ns = tile.t_ns
+            if tile.t_ns - tile.below_ns > HELD_NS:
+                tile.lost_kpa = max(tile.lost_kpa, -tile.kpa)
+            least = max(EVEN_MIN_KPA_S, even * tile.more_kpa_s)
+            if tile.less_kpa_s > least and tile.highest_kpa > 0.0:
+                # Then nothing of it is force.
+                tile.lost_kpa = max(tile.lost_kpa, tile.highest_kpa, tile.deepest_kpa)
+    lost_kpa: float = tile.lost_kpa
+    return lost_kpa

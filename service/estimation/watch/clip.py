@@ -12,13 +12,11 @@ What is at the edge is a lower bound from then on, as it is at the chip's own en
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from devices.arrays import Floats
 from devices.compiled import compiled
-from service.estimation.watch.state import State, copied
+from service.estimation.records import Record, Records, record_type, records
 
 ENOUGH = 11.0
 """Natural logarithm: after a healthy loading with a flat top the chance of as much is one in
@@ -57,7 +55,7 @@ FOLLOW = 0.5
 SMOOTH = 8.0
 """Readings over which the first loading's highest level is averaged."""
 
-STATE = np.dtype(
+STATE = record_type(
     [
         ("inside", np.int64),  # is it loaded?
         ("smooth_kpa", np.float64),
@@ -77,79 +75,51 @@ STATE = np.dtype(
 """What is remembered of each tile."""
 
 
-def at_rest(tiles: int) -> State:
+def at_rest(tiles: int) -> Records:
     """Before the first reading."""
-    state = np.zeros(tiles, dtype=STATE)
-    state["edge_kpa"], state["end_kpa"] = np.nan, np.inf
-    return state
+    return records(STATE, tiles, edge_kpa=np.nan, end_kpa=np.inf)
 
 
+@compiled
 def end_of_range(
-    kpa: Floats, baseline_kpa: Floats, unloaded_kpa: Floats, noise_kpa: Floats, state: State
-) -> tuple[Floats | None, State]:
-    """Above which pressure each reading may have been clipped; infinite where nothing shows it.
+    tile: Record, kpa: float, baseline_kpa: float, unloaded_kpa: float, noise_kpa: float
+) -> float:
+    """Above which pressure a reading may have been clipped; infinite where nothing shows it.
 
     Args:
-        kpa: (n, tiles), absolute; NaN where there is none.
-        baseline_kpa: (tiles,).
-        unloaded_kpa: (tiles,), so near the baseline no load is seen.
-        noise_kpa: (tiles,), standard deviation of a reading.
-        state: from the readings before.
-
-    Returns:
-        (n, tiles), absolute pressures, or None if nothing shows anywhere, and the next state.
+        tile: state from its readings before; becomes that after this one.
+        kpa: absolute; NaN where there is none.
+        baseline_kpa: absolute, unloaded.
+        unloaded_kpa: so near the baseline no load is seen.
+        noise_kpa: standard deviation of a reading.
     """
-    after = copied(state)
-    end_kpa = np.empty(kpa.shape)
-    shows = _follow(
-        np.ascontiguousarray(kpa), baseline_kpa, unloaded_kpa, noise_kpa, after, end_kpa
-    )
-    return end_kpa if shows else None, after
+    above = kpa - baseline_kpa
+    if not math.isnan(above):
+        if tile.inside == 0 and above > 2.0 * unloaded_kpa:
+            tile.inside, tile.at, tile.middle, tile.slope, tile.over = 1, 0, 0, 0, 0
+            tile.at_kpa = 0.0
+            tile.smooth_kpa = tile.peak_kpa = kpa
+        if tile.inside == 1:
+            tile.smooth_kpa += (kpa - tile.smooth_kpa) / SMOOTH
+            tile.peak_kpa = max(tile.peak_kpa, tile.smooth_kpa)
+            off = kpa - tile.edge_kpa
+            if off > OVER * noise_kpa:
+                tile.over += 1
+            elif off > -EDGE * noise_kpa:
+                tile.at += 1
+                tile.at_kpa += off
+                if abs(off) < 0.5 * EDGE * noise_kpa:
+                    tile.middle += 1
+            elif off > -2.0 * EDGE * noise_kpa:
+                tile.slope += 1
+            if above < unloaded_kpa:
+                _end_of_loading(tile, noise_kpa)
+    end_kpa: float = tile.end_kpa
+    return end_kpa
 
 
 @compiled
-def _follow(
-    kpa: Floats,
-    baseline_kpa: Floats,
-    unloaded_kpa: Floats,
-    noise_kpa: Floats,
-    state: State,
-    end_kpa: Floats,
-) -> bool:
-    n, tiles = kpa.shape
-    shows = False
-    for j in range(tiles):
-        tile, noise = state[j], noise_kpa[j]
-        for i in range(n):
-            now = kpa[i, j]
-            above = now - baseline_kpa[j]
-            if not math.isnan(above):
-                if tile.inside == 0 and above > 2.0 * unloaded_kpa[j]:
-                    tile.inside, tile.at, tile.middle, tile.slope, tile.over = 1, 0, 0, 0, 0
-                    tile.at_kpa = 0.0
-                    tile.smooth_kpa = tile.peak_kpa = now
-                if tile.inside == 1:
-                    tile.smooth_kpa += (now - tile.smooth_kpa) / SMOOTH
-                    tile.peak_kpa = max(tile.peak_kpa, tile.smooth_kpa)
-                    off = now - tile.edge_kpa
-                    if off > OVER * noise:
-                        tile.over += 1
-                    elif off > -EDGE * noise:
-                        tile.at += 1
-                        tile.at_kpa += off
-                        if abs(off) < 0.5 * EDGE * noise:
-                            tile.middle += 1
-                    elif off > -2.0 * EDGE * noise:
-                        tile.slope += 1
-                    if above < unloaded_kpa[j]:
-                        _end_of_loading(tile, noise)
-            end_kpa[i, j] = tile.end_kpa
-            shows = shows or tile.end_kpa < math.inf
-    return shows
-
-
-@compiled
-def _end_of_loading(tile: Any, noise: float) -> None:
+def _end_of_loading(tile: Record, noise: float) -> None:
     tile.inside = 0
     if tile.peak_kpa < tile.edge_kpa - 2.0 * EDGE * noise:
         if tile.peak_kpa > tile.edge_kpa - NEAR * noise:

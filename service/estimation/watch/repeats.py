@@ -18,11 +18,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from devices.arrays import Bools, Floats, Ints
+from devices.arrays import Floats, Ints
 from devices.compiled import compiled
-from service.estimation.watch.state import State, copied
+from service.estimation.records import Record, Records, record_type, records
 
 HOURS = 100.0
 """A healthy array is called stuck once in so many hours, if it repeats as often as it has shown."""
@@ -45,7 +44,7 @@ LOADINGS = 5
 UNLIMITED = 1 << 40
 _STEP_MIN, _STEP_MAX = 0.02, 20.0
 
-STATE = np.dtype(
+STATE = record_type(
     [
         ("padc", np.int64),  # the last word; -1 before the first
         ("run", np.int64),  # how often in a row
@@ -55,17 +54,18 @@ STATE = np.dtype(
         ("repeats", np.int64),  # of these, equal
         ("twos", np.int64),  # of these, two counts apart
         ("loaded", np.int64),
-        ("all_toggles", np.int64),  # of all tiles so far; the same for each
     ]
 )
 """What is remembered of each tile."""
 
 
-def at_rest(tiles: int) -> State:
+LAW = record_type([("repeats", np.float64), ("twos", np.float64), ("least", np.int64)])
+"""Constants of a tile, as in `Limits`."""
+
+
+def at_rest(tiles: int) -> Records:
     """Before the first reading."""
-    state = np.zeros(tiles, dtype=STATE)
-    state["padc"] = -1
-    return state
+    return records(STATE, tiles, padc=-1)
 
 
 def limits(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
@@ -133,6 +133,12 @@ class Limits:
     by_repeats: Ints
     by_twos: Ints
 
+    def laws(self) -> Records:
+        """What differs from tile to tile."""
+        return records(
+            LAW, len(self.repeats), repeats=self.repeats, twos=self.twos, least=self.least
+        )
+
 
 def make_limits(noise_counts: Floats, rate_hz: float) -> Limits:
     """The limits of tiles with such noise at the tare, outliers and rounding in it, in counts."""
@@ -148,105 +154,68 @@ def make_limits(noise_counts: Floats, rate_hz: float) -> Limits:
     )
 
 
-def repeating(
-    padc: npt.NDArray[np.uint16],
-    kpa: Floats,
-    baseline_kpa: Floats,
-    end_kpa: Floats,
-    unloaded_kpa: Floats,
-    most: Limits,
-    state: State,
-) -> tuple[Bools, State]:
-    """Which readings are repeats that noise does not explain.
+@compiled
+def is_stuck(
+    scene: Record,
+    law: Record,
+    tile: Record,
+    word: int,
+    above_kpa: float,
+    unloaded_kpa: float,
+    toggles: int,
+    tiles: int,
+) -> tuple[bool, int]:
+    """Is a reading a repeat that noise does not explain?
 
     Args:
-        padc: (n, tiles).
-        kpa: (n, tiles), absolute pressures; NaN where none could be read.
-        baseline_kpa: (tiles,).
-        end_kpa: (tiles,), from here on a chip may stand still, and is no tile that repeats itself.
-        unloaded_kpa: (tiles,), so near the baseline no load is seen.
-        most: from `make_limits`.
-        state: from the readings before.
+        scene: with `by_repeats` and `by_twos` of `Limits`.
+        law: constants of the tile.
+        tile: state from its readings before; becomes that after this one.
+        word: `padc`.
+        above_kpa: pressure above the baseline; NaN where none could be read, or where it is so
+            great that a chip may stand still, and is no tile that repeats itself.
+        unloaded_kpa: so near the baseline no load is seen.
+        toggles: how often tiles have been loaded and let go so far, all together.
+        tiles: how many there are.
 
     Returns:
-        (n, tiles), and the next state.
+        Whether it is, and how often tiles have been loaded and let go.
     """
-    after = copied(state)
-    found = np.zeros(padc.shape, dtype=np.bool_)
-    _follow(
-        padc.astype(np.int64, order="C"),  # owned: what is compiled is compiled for that
-        np.ascontiguousarray(kpa),
-        baseline_kpa,
-        end_kpa,
-        unloaded_kpa,
-        most.repeats,
-        most.twos,
-        most.least,
-        most.by_repeats,
-        most.by_twos,
-        after,
-        found,
-    )
-    return found, after
-
-
-@compiled
-def _follow(
-    padc: Ints,
-    kpa: Floats,
-    baseline_kpa: Floats,
-    end_kpa: Floats,
-    unloaded_kpa: Floats,
-    supposed_repeats: Floats,
-    supposed_twos: Floats,
-    least: Ints,
-    most_by_repeats: Ints,
-    most_by_twos: Ints,
-    state: State,
-    found: Bools,
-) -> None:
-    n, tiles = padc.shape
-    toggles = state[0].all_toggles
-    for i in range(n):
-        for j in range(tiles):
-            tile = state[j]
-            above = kpa[i, j] - baseline_kpa[j]
-            if math.isnan(above) or kpa[i, j] >= end_kpa[j]:
-                tile.quiet = 0
-                continue
-            word = padc[i, j]
-            step = abs(word - tile.padc)
-            quiet = abs(above) < unloaded_kpa[j]
-            loaded = 1 if above > 2.0 * unloaded_kpa[j] else (0 if quiet else tile.loaded)
-            if loaded != tile.loaded:
-                toggles += 1
-                tile.loaded = loaded
-            if step == 0:
-                tile.run += 1
-            else:
-                tile.padc, tile.run, tile.toggles = word, 1, toggles
-            if tile.run > RUN_MIN:
-                weight = PRIOR_PAIRS + tile.pairs
-                share = (PRIOR_PAIRS * supposed_repeats[j] + tile.repeats) / weight
-                share += DOUBT * math.sqrt(share * (1.0 - share) / weight)
-                two = (PRIOR_PAIRS * supposed_twos[j] + tile.twos) / weight
-                two -= DOUBT * math.sqrt(two * (1.0 - two) / weight)
-                limit = max(
-                    least[j],
-                    most_by_repeats[min(math.ceil(share * SHARES), SHARES)],
-                    most_by_twos[max(int(two * SHARES), 0)],
-                )
-                others = toggles - tile.toggles
-                held = loaded == 1 and tiles > 1 and others >= 2 * LOADINGS * (tiles - 1)
-                found[i, j] = tile.run >= limit or held
-            if quiet and tile.quiet == 1 and not found[i, j]:
-                tile.pairs += 1
-                tile.repeats += 1 if step == 0 else 0
-                tile.twos += 1 if step == 2 else 0
-                if tile.pairs > LEARNT_MAX:
-                    tile.pairs //= 2
-                    tile.repeats //= 2
-                    tile.twos //= 2
-            tile.quiet = 1 if quiet else 0
-    for j in range(tiles):
-        state[j].all_toggles = toggles
+    if math.isnan(above_kpa):
+        tile.quiet = 0
+        return False, toggles
+    step = abs(word - tile.padc)
+    quiet = abs(above_kpa) < unloaded_kpa
+    loaded = 1 if above_kpa > 2.0 * unloaded_kpa else (0 if quiet else tile.loaded)
+    if loaded != tile.loaded:
+        toggles += 1
+        tile.loaded = loaded
+    if step == 0:
+        tile.run += 1
+    else:
+        tile.padc, tile.run, tile.toggles = word, 1, toggles
+    found = False
+    if tile.run > RUN_MIN:
+        weight = PRIOR_PAIRS + tile.pairs
+        share = (PRIOR_PAIRS * law.repeats + tile.repeats) / weight
+        share += DOUBT * math.sqrt(share * (1.0 - share) / weight)
+        two = (PRIOR_PAIRS * law.twos + tile.twos) / weight
+        two -= DOUBT * math.sqrt(two * (1.0 - two) / weight)
+        limit = max(
+            law.least,
+            scene.by_repeats[min(math.ceil(share * SHARES), SHARES)],
+            scene.by_twos[max(int(two * SHARES), 0)],
+        )
+        others = toggles - tile.toggles
+        held = loaded == 1 and tiles > 1 and others >= 2 * LOADINGS * (tiles - 1)
+        found = tile.run >= limit or held
+    if quiet and tile.quiet == 1 and not found:
+        tile.pairs += 1
+        tile.repeats += 1 if step == 0 else 0
+        tile.twos += 1 if step == 2 else 0
+        if tile.pairs > LEARNT_MAX:
+            tile.pairs //= 2
+            tile.repeats //= 2
+            tile.twos //= 2
+    tile.quiet = 1 if quiet else 0
+    return found, toggles

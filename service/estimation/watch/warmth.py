@@ -9,77 +9,44 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from devices.arrays import Floats, Ints, Times
 from devices.compiled import compiled
 from devices.frames import NOT_READ
-from service.estimation.watch.state import State, copied
+from service.estimation.records import Record, Records, record_type, records
 
 SMOOTH_S = 0.5  # long against the noise of half a count
 LAG_S = 5.0  # of the gas behind its chip, at most
 
-STATE = np.dtype([("chip", np.float64), ("gas", np.float64), ("t_ns", np.int64)])
+STATE = record_type([("chip", np.float64), ("gas", np.float64), ("t_ns", np.int64)])
 """What is remembered of each tile: counts from the tare's, NaN before the first."""
 
 
-def at_rest(tiles: int) -> State:
+def at_rest(tiles: int) -> Records:
     """Before the first reading."""
-    state = np.zeros(tiles, dtype=STATE)
-    state["chip"] = state["gas"] = np.nan
-    return state
-
-
-def moved_kpa(
-    tadc: npt.NDArray[np.uint16],
-    tare_counts: Floats,
-    kpa_per_count: Floats,
-    t_ns: Times,
-    state: State,
-) -> tuple[Floats, State]:
-    """What warmth since the tare has moved baselines by, signed; 0 where it is not known.
-
-    Args:
-        tadc: (n, tiles), `NOT_READ` where unknown.
-        tare_counts: (tiles,), at the tare, NaN where not known.
-        kpa_per_count: (tiles,), of the baseline.
-        t_ns: (n, tiles), instants.
-        state: from the readings before.
-    """
-    after = copied(state)
-    kpa = np.empty(tadc.shape)
-    _follow(
-        tadc.astype(np.int64, order="C"),
-        tare_counts,
-        kpa_per_count,
-        np.ascontiguousarray(t_ns),
-        after,
-        kpa,
-    )
-    return kpa, after
+    return records(STATE, tiles, chip=np.nan, gas=np.nan)
 
 
 @compiled
-def _follow(
-    tadc: Ints,
-    tare_counts: Floats,
-    kpa_per_count: Floats,
-    t_ns: Times,
-    state: State,
-    kpa: Floats,
-) -> None:
-    n, tiles = tadc.shape
-    for j in range(tiles):
-        tile = state[j]
-        for i in range(n):
-            now = tadc[i, j] - tare_counts[j]
-            if tadc[i, j] != NOT_READ and not math.isnan(now):
-                if math.isnan(tile.chip):
-                    tile.chip = tile.gas = now
-                else:
-                    step_s = max(0.0, (t_ns[i, j] - tile.t_ns) * 1e-9)
-                    tile.chip -= math.expm1(-step_s / SMOOTH_S) * (now - tile.chip)
-                    tile.gas -= math.expm1(-step_s / LAG_S) * (tile.chip - tile.gas)
-                tile.t_ns = t_ns[i, j]
-            more = tile.chip if abs(tile.chip) > abs(tile.gas) else tile.gas
-            kpa[i, j] = 0.0 if math.isnan(more) else kpa_per_count[j] * more
+def moved_kpa(
+    tile: Record, tadc: int, tare_counts: float, kpa_per_count: float, t_ns: int
+) -> float:
+    """What warmth since the tare has moved the baseline by, signed; 0 where it is not known.
+
+    Args:
+        tile: state from its readings before; becomes that after this one.
+        tadc: `NOT_READ` where unknown.
+        tare_counts: at the tare, NaN where not known.
+        kpa_per_count: of the baseline.
+        t_ns: instant.
+    """
+    now = tadc - tare_counts
+    if tadc != NOT_READ and not math.isnan(now):
+        if math.isnan(tile.chip):
+            tile.chip = tile.gas = now
+        else:
+            step_s = max(0.0, (t_ns - tile.t_ns) * 1e-9)
+            tile.chip -= math.expm1(-step_s / SMOOTH_S) * (now - tile.chip)
+            tile.gas -= math.expm1(-step_s / LAG_S) * (tile.chip - tile.gas)
+        tile.t_ns = t_ns
+    more = tile.chip if abs(tile.chip) > abs(tile.gas) else tile.gas
+    return 0.0 if math.isnan(more) else kpa_per_count * more

@@ -23,7 +23,7 @@ from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.scene.file import Scene
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimate import Estimator
 from service.estimation.ladder.plan import EstimationPlan, make_plan
 from service.estimation.tare.unloaded import take_tare
 from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
@@ -110,15 +110,15 @@ def plan_of(recording: Recording, models: tuple[str, ...], lag_ms: float) -> Est
 
 def ns_per_frame(plan: EstimationPlan, stream: Endless, frames: int, batch: int) -> float:
     """CPU time of estimating the first `frames` frames of a stream, `batch` of them a step."""
-    state = EstimationState()
+    estimator = Estimator(plan)
     spent_ns = 0
     for begin in range(0, frames, batch):
         rows = stream.rows(begin, min(begin + batch, frames))
         began_ns = time.thread_time_ns()
-        _, state = step(plan, rows, state)
+        estimator.step(rows)
         spent_ns += time.thread_time_ns() - began_ns
     began_ns = time.thread_time_ns()
-    finish(plan, state)
+    estimator.finish()
     return (spent_ns + time.thread_time_ns() - began_ns) / frames
 
 

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from devices.chips.compensation import Compensation
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa, padc_of_kpa
 from devices.frames import FrameBatch
-from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimate import Estimator
 from service.estimation.estimates import EstimateStatus
-from service.estimation.ladder.lower import ApparentForces
 from service.estimation.ladder.plan import make_plan
 from service.estimation.tare.unloaded import take_tare
 from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
@@ -77,50 +76,50 @@ def test_time_may_begin_anywhere(start_ns: int) -> None:
 
 def test_estimates_come_when_their_look_ahead_is_complete() -> None:
     plan, frames = newton_plan(array_at(SQUARE), lag_ms=10), loaded_frames(held([0] * 4, 9))
-    state, due = EstimationState(), []
-    for i in range(9):
-        estimates, state = step(plan, frames.rows(i, i + 1), state)
-        due.append(estimates.seq.tolist())
+    estimator = Estimator(plan)
+    due = [estimator.step(frames.rows(i, i + 1)).seq.tolist() for i in range(9)]
     assert due == [[], [], [], [], [], [0], [1], [2], [3]]  # frame 0 at 0 ms, due at 10 ms
-    last = finish(plan, state)
+    last = estimator.finish()
     assert last is not None
     assert last.seq.tolist() == [4, 5, 6, 7, 8]
 
 
 def test_without_look_ahead_nothing_waits() -> None:
     plan = newton_plan(array_at(SQUARE))
-    estimates, state = step(plan, loaded_frames(held([0] * 4, 3)), EstimationState())
-    assert len(estimates) == 3
-    assert finish(plan, state) is None
-    assert finish(plan, EstimationState()) is None
+    estimator = Estimator(plan)
+    assert len(estimator.step(loaded_frames(held([0] * 4, 3)))) == 3
+    assert estimator.finish() is None
+    assert Estimator(plan).finish() is None
 
 
-def test_a_step_changes_neither_its_frames_nor_its_state() -> None:
+def test_a_step_leaves_its_frames_as_they_are_and_what_it_gave_before() -> None:
     plan = newton_plan(array_at(SQUARE, servo=make_servo()), lag_ms=10)
     frames = wild_frames(60, 4, 3)
-    _, state = step(plan, frames.rows(0, 30), EstimationState())
-    before, kept = copy.deepcopy(state), copy.deepcopy(frames)
-    first, after = step(plan, frames.rows(30, 60), state)
-    finish(plan, state)
-    again, after_again = step(plan, frames.rows(30, 60), state)
-    assert_same_bits(first, again)
-    assert state.pending is not None
-    assert before.pending is not None
-    for f in fields(ApparentForces):
-        kept_values, values = (
-            getattr(before.pending.forces, f.name),
-            getattr(state.pending.forces, f.name),
-        )
-        assert values.tobytes() == kept_values.tobytes(), f.name
-    assert (state.contact_run, state.contact, state.last_seq, state.last_t_ns) == (
-        before.contact_run,
-        before.contact,
-        before.last_seq,
-        before.last_t_ns,
-    )
-    assert (after.contact_run, after.contact) == (after_again.contact_run, after_again.contact)
+    kept, estimator = copy.deepcopy(frames), Estimator(plan)
+    first = estimator.step(frames.rows(0, 30))
+    given = copy.deepcopy(first)
+    estimator.step(frames.rows(30, 60))
+    estimator.finish()
+    assert_same_bits(first, given)
     for f in fields(FrameBatch):
         assert getattr(frames, f.name).tobytes() == getattr(kept, f.name).tobytes(), f.name
+
+
+@pytest.mark.parametrize("lag_ms", [0.0, 10.0, 3000.0])
+@pytest.mark.parametrize("models", [("static",), ("static", "denoise")])
+def test_however_many_frames_have_passed_or_wait_each_has_its_estimate(
+    lag_ms: float, models: tuple[str, ...]
+) -> None:
+    # The room for frames is used up, and made greater, several times over.
+    plan = newton_plan(array_at(SQUARE), models=models, lag_ms=lag_ms)
+    forces_n = np.random.default_rng(2).normal(9.0, 1.0, (9000, 4))
+    frames = loaded_frames(forces_n)
+    sizes = [1, 5000, 2, 7, 1500, 1, 2489]
+    edges = np.cumsum([0, *sizes]).tolist()
+    pieces = [frames.rows(*pair) for pair in pairwise(edges)]
+    assert_same_bits(estimate(plan, frames), estimate(plan, *pieces))
+    one_by_one = estimate(plan, *(frames.rows(i, i + 3) for i in range(0, 9000, 3)))
+    assert_same_bits(estimate(plan, frames), one_by_one)
 
 
 def test_a_batch_of_no_frames_gives_none_and_changes_nothing() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 import service.estimation
 from service.estimation import warm
-from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimate import Estimator
 from service.estimation.ladder.chosen import MODELS
 from service.estimation.ladder.plan import EstimationPlan, make_plan
 from storage.schema import wire_schema
@@ -43,13 +43,14 @@ def test_nothing_is_compiled_after_the_warm_up(
     monkeypatch.setattr(warm, "make_plan", noted)
     warm.warm_up()
     before = compiled_for()
-    assert before["service.estimation.models.denoise.denoised"] >= 1
+    assert before["service.estimation.estimate._step"] == 1
+    assert before["service.estimation.estimate._finish"] == 1
     info, calibration, _ = made[0]
     tare = make_tare(
         3, baseline_kpa=97.0, baseline_sigma_kpa=0.01, noise_kpa=0.1, tadc_counts=507.0
     )
     plan = make_plan(info, calibration, tare, models=models, lag_ms=10.0)
-    state = EstimationState()
+    estimator = Estimator(plan)
     first = warm._frames()
     for number in range(6):  # as they come over the wire: views of what was received, read-only
         later = with_columns(
@@ -58,6 +59,6 @@ def test_nothing_is_compiled_after_the_warm_up(
             t_mono_ns=first.t_mono_ns + 2_000_000 * number * len(first),
         )
         schema = wire_schema(info)
-        _, state = step(plan, decode(bytes(encode(later, schema)), schema), state)
-    finish(plan, state)
+        estimator.step(decode(bytes(encode(later, schema)), schema))
+    estimator.finish()
     assert compiled_for() == before

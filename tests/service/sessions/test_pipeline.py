@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from devices.errors import CalibrationError, TareError, UsageError
 from devices.frames import FrameBatch, TileStatus
 from service.estimation.calibration import Calibration
-from service.estimation.estimate import EstimationState, finish, step
+from service.estimation.estimate import Estimator
 from service.estimation.estimates import Estimates
 from service.estimation.ladder.plan import make_plan
 from service.estimation.tare.tare import Tare
@@ -233,8 +233,8 @@ def test_the_notes_are_enough_to_make_the_same_estimates_again() -> None:
         models=notes["models"],
         lag_ms=notes["lag_ms"],
     )
-    first, state = step(plan, batch, EstimationState())
-    last = finish(plan, state)
+    estimator = Estimator(plan)
+    first, last = estimator.step(batch), estimator.finish()
     assert last is not None
     again = {
         f.name: np.concatenate([getattr(first, f.name), getattr(last, f.name)])
@@ -280,7 +280,7 @@ def test_estimate_columns_are_those_of_the_estimates_without_number_and_time() -
         Tare(np.zeros(2), np.zeros(2), np.ones(2), np.zeros(2), 0, 0.0, 0.0, 0, "interval"),
         models=("static",),
     )
-    estimates, _ = step(plan, frames(np.zeros((3, 2))), EstimationState())
+    estimates = Estimator(plan).step(frames(np.zeros((3, 2))))
     columns = estimate_columns(estimates)
     assert set(columns) == {f.name for f in fields(Estimates)} - {"seq", "t_ns"}
     assert columns["grf_n"] is estimates.grf_n

@@ -158,7 +158,7 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
     kpa = with_holes(rng, rng.normal(0, 1.0, 60))
     t_ns = wild_instants(rng, 60)
     model = ambient.Ambient(passed=np.array([0.11]), relative_sigma=0.1)
-    state, out = ambient.AT_REST, []
+    state, out = ambient.at_rest(), []
     for rows in in_two_parts(60):
         passed_kpa, _, state = model.passed_on(kpa[rows], t_ns[rows], state)
         out.append(passed_kpa)
@@ -187,21 +187,15 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -
     missing = rng.random(n) < (0.6 if kind == "few" else 0.05)
     run = np.arange(n) // 10 if kind == "crowded" else np.cumsum(rng.random(n) < 0.03)
     column = np.where(missing, NAN, values)
-    averaged, left, bend, of_bend, _ = denoise.denoised(
+    averaged, left, bend, of_bend = denoise.denoised(
         column[:, None],
         np.full((n, 1), 0.3),
         t_ns[:, None],
         frame_ns,
         frame_ns[:, None].copy(),
         run.astype(np.int64),
-        0,
-        n,
         look_ms * 1_000_000,
-        denoise.PAST_NS,
-        denoise.REACHES,
-        denoise.AGREE,
         noise_left[None, :],
-        denoise.anywhere(n, n),
     )
     found = upper.denoised(
         digits.exact(column),

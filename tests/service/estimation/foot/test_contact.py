@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.estimation.foot.contact import UNLOADED, ContactRule, believed, seeming
+from service.estimation.foot.contact import STATE, ContactRule, has_lasted, seeming
+from service.estimation.records import records
 
 RULE = ContactRule(on_n=5.0, off_n=3.0, min_ns=10_000_000)
 MS = 1_000_000
-
-Ints = npt.NDArray[np.int64]
 
 
 def contact_of(
@@ -22,21 +20,21 @@ def contact_of(
     t_ms: list[int] | None = None,
     lag_ms: int = 0,
     gaps: tuple[int, ...] = (),
-    cuts: tuple[int, ...] = (),
 ) -> list[int]:
-    """Contact of a recording that is looked at in pieces."""
+    """Contact of a recording."""
     n = len(grf_n)
     t_ns = np.array(t_ms if t_ms is not None else range(0, 2 * n, 2), dtype=np.int64) * MS
-    broken = np.isin(np.arange(n), gaps)
-    force_n = np.array(grf_n, dtype=np.float64)
-    state, loaded, since_ns = UNLOADED, np.zeros(0, np.int64), np.zeros(0, np.int64)
-    for begin, end in zip((0, *cuts), (*cuts, n), strict=True):
-        if begin < end:
-            part = slice(begin, end)
-            new, since, state = seeming(RULE, force_n[part], t_ns[part], broken[part], state)
-            loaded, since_ns = np.append(loaded, new), np.append(since_ns, since)
-    out = believed(RULE, lag_ms * MS, n, loaded, since_ns, t_ns, 0)
-    return [int(c) for c in out]
+    (state,), since_ns, loaded = records(STATE, 1), np.empty(n, np.int64), []
+    for i, force_n in enumerate(grf_n):
+        seeming(RULE.on_n, RULE.off_n, state, float(force_n), t_ns[i], i in gaps)
+        since_ns[i] = state["since_ns"]
+        loaded.append(int(state["loaded"]))
+    contact, out = 0, []
+    for i in range(n):
+        if has_lasted(since_ns, t_ns, i, n, RULE.min_ns, lag_ms * MS):
+            contact = loaded[i]
+        out.append(contact)
+    return out
 
 
 def plainly(grf_n: list[float], t_ms: list[int], lag_ms: int, gaps: tuple[int, ...]) -> list[int]:
@@ -70,23 +68,22 @@ forces = st.one_of(
 
 
 @st.composite
-def recordings(draw: st.DrawFn) -> tuple[list[float], list[int], tuple[int, ...], tuple[int, ...]]:
+def recordings(draw: st.DrawFn) -> tuple[list[float], list[int], tuple[int, ...]]:
     stretches = draw(st.lists(st.tuples(forces, st.integers(1, 8)), min_size=1, max_size=12))
     grf_n = [force for force, repeated in stretches for _ in range(repeated)]
     n = len(grf_n)
     steps = draw(st.lists(st.sampled_from([1, 2, 2, 2, 3, 5, 40]), min_size=n, max_size=n))
     gaps = draw(st.sets(st.integers(1, n), max_size=2))
-    cuts = draw(st.sets(st.integers(1, n), max_size=3))
-    return grf_n, np.cumsum(steps).tolist(), tuple(gaps), tuple(sorted(cuts))
+    return grf_n, np.cumsum(steps).tolist(), tuple(gaps)
 
 
 @settings(max_examples=300)
 @given(recordings(), st.sampled_from([0, 2, 5, 10, 11, 20, 100]))
 def test_contact_is_what_the_rules_say_read_one_frame_at_a_time(
-    recording: tuple[list[float], list[int], tuple[int, ...], tuple[int, ...]], lag_ms: int
+    recording: tuple[list[float], list[int], tuple[int, ...]], lag_ms: int
 ) -> None:
-    grf_n, t_ms, gaps, cuts = recording
-    contact = contact_of(grf_n, t_ms=t_ms, lag_ms=lag_ms, gaps=gaps, cuts=cuts)
+    grf_n, t_ms, gaps = recording
+    contact = contact_of(grf_n, t_ms=t_ms, lag_ms=lag_ms, gaps=gaps)
     assert contact == plainly(grf_n, t_ms, lag_ms, gaps)
 
 

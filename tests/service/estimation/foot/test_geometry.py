@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from devices.frames import ServoInfo
 from service.estimation.foot.geometry import (
-    angle_rad,
     grid_indices,
     hull,
     lost_by_tilt,
+    rad_per_count,
     to_ground_x_m,
 )
 from tests.builders.arrays import make_servo
@@ -33,7 +33,7 @@ def beyond_m(positions: list[tuple[float, float]], point: tuple[float, float]) -
 
 
 def angle_at(info: ServoInfo, counts: float) -> float:
-    return float(angle_rad(info, np.array([counts], dtype=np.float64))[0])
+    return (counts - info.zero_counts) * rad_per_count(info)
 
 
 # --- hull -----------------------------------------------------------------------------------------
@@ -152,8 +152,7 @@ def test_unknown_counts_have_no_angle() -> None:
 
 
 def ground_x_m(x_m: float, z_m: float, angle: float, travel: float | None) -> float:
-    out = to_ground_x_m(np.array([x_m]), np.array([z_m]), np.array([angle]), travel)
-    return float(out[0])
+    return float(to_ground_x_m(x_m, z_m, angle, math.nan if travel is None else travel))
 
 
 @given(st.floats(-math.pi / 2, math.pi / 2))

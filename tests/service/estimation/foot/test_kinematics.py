@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import NO_SERVO_COUNTS, FrameBatch, FrameStatus
-from service.estimation.estimate import EstimationState, finish, step
-from service.estimation.foot.kinematics import Readings, counts_at, readings_of
+from service.estimation.estimate import Estimator
+from service.estimation.foot.kinematics import READING, carry, counts_at
+from service.estimation.records import Records, records
 from tests.builders.arrays import array_at, make_servo
 from tests.builders.estimates import newton_plan
 from tests.builders.frames import loaded_frames
@@ -42,12 +43,29 @@ def carried(
     return loaded_frames(np.zeros((n, tiles)), **columns)
 
 
+def readings_of(frames: FrameBatch, broken: Sequence[bool]) -> Records:
+    """What frames carry of the servo, some of them after a gap."""
+    readings = records(READING, len(frames))
+    for i, after_gap in enumerate(broken):
+        carry(
+            readings,
+            i,
+            frames.t_mono_ns[i],
+            np.int64(frames.servo_counts[i]),
+            np.int64(frames.servo_age_us[i]),
+            frames.frame_status[i],
+            TURN,
+            bool(after_gap),
+        )
+    return readings
+
+
 def positions(
     frames: FrameBatch, lag_ms: float, broken: Sequence[bool] | None = None
 ) -> list[float]:
-    gaps = np.zeros(len(frames), bool) if broken is None else np.array(broken)
-    readings = readings_of(frames, gaps, None, TURN)
-    return list(counts_at(readings, len(frames), round(lag_ms * MS)).tolist())
+    readings = readings_of(frames, [False] * len(frames) if broken is None else broken)
+    n = len(frames)
+    return [float(counts_at(readings, i, n, round(lag_ms * MS))) for i in range(n)]
 
 
 # Frames every 2 ms; readings at 0 and 8 ms, each known half a millisecond later.
@@ -118,34 +136,36 @@ def test_a_position_of_unknown_age_is_held() -> None:
 def test_ages_cut_to_microseconds_make_no_new_readings() -> None:
     t_ns = [1_000_000, 3_000_999, 5_000_500, 7_000_001, 9_000_000]
     frames = carried(t_ns, [(123, 100)] * 4 + [(8_000_123, 900)])
-    readings = readings_of(frames, np.zeros(5, bool), None, TURN)
-    assert readings.begins.tolist() == [True, False, False, False, True]
-    assert readings.joins.tolist() == [False, False, False, False, True]
+    readings = readings_of(frames, [False] * 5)
+    assert readings["begins"].tolist() == [1, 0, 0, 0, 1]
+    assert readings["joins"].tolist() == [0, 0, 0, 0, 1]
 
 
-def loop(readings: Readings, lag_ns: int) -> list[float]:
+def loop(readings: Records, lag_ns: int) -> list[float]:
     """What `counts_at` says, frame by frame."""
     result = []
-    n = len(readings.t_ns)
+    n = len(readings["t_ns"])
     for i in range(n):
-        t_ns = int(readings.t_ns[i])
+        t_ns = int(readings["t_ns"][i])
         here, after = i, None
         for j in range(i + 1, n):
-            if readings.t_ns[j] > t_ns + lag_ns or (readings.begins[j] and not readings.joins[j]):
+            if readings["t_ns"][j] > t_ns + lag_ns or (
+                readings["begins"][j] and not readings["joins"][j]
+            ):
                 break
-            if readings.joins[j]:
-                if readings.sampled_ns[j] > t_ns:
+            if readings["joins"][j]:
+                if readings["sampled_ns"][j] > t_ns:
                     after = j
                     break
                 if here != i:
                     break
                 here = j
-        counts = float(readings.counts[here])
+        counts = float(readings["counts"][here])
         if after is not None:
-            begin_ns, end_ns = int(readings.sampled_ns[here]), int(readings.sampled_ns[after])
+            begin_ns, end_ns = int(readings["sampled_ns"][here]), int(readings["sampled_ns"][after])
             part = (t_ns - begin_ns) / (end_ns - begin_ns)
-            counts += part * int(readings.counts[after] - readings.counts[here])
-        result.append(counts if readings.known[i] else np.nan)
+            counts += part * int(readings["counts"][after] - readings["counts"][here])
+        result.append(counts if readings["known"][i] else np.nan)
     return result
 
 
@@ -169,11 +189,9 @@ def test_any_readings_give_what_a_loop_over_the_frames_gives(
         frame_status=drawn(st.sampled_from([0] * 8 + [STALE])),
     )
     broken = data.draw(st.lists(st.sampled_from([False] * 8 + [True]), min_size=n, max_size=n))
-    readings = readings_of(frames, np.array(broken), None, TURN)
-    expected = loop(readings, lag_ms * MS)
-    np.testing.assert_allclose(
-        counts_at(readings, n, lag_ms * MS), expected, rtol=0, atol=1e-9, equal_nan=True
-    )
+    expected = loop(readings_of(frames, broken), lag_ms * MS)
+    found = positions(frames, lag_ms, broken)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9, equal_nan=True)
 
 
 @settings(deadline=None)
@@ -198,24 +216,12 @@ def test_a_steady_turn_is_followed_to_a_count_over_any_number_of_turns(
     assert np.abs(at - true)[followed].max(initial=0.0) <= 1.01
 
 
-def test_batches_do_not_change_where_a_reading_begins() -> None:
-    frames = carried(T_NS, SLOW)
-    whole = readings_of(frames, np.zeros(6, bool), None, TURN)
-    before, pieces = None, []
-    for i in range(6):
-        before = readings_of(frames.rows(i, i + 1), np.zeros(1, bool), before, TURN)
-        pieces.append(before)
-    for name in ("begins", "joins", "sampled_ns", "counts"):
-        joined = np.concatenate([getattr(piece, name) for piece in pieces])
-        assert joined.tolist() == getattr(whole, name).tolist()
-
-
 def test_an_estimate_turns_with_the_servo_between_its_readings() -> None:
     servo = make_servo(counts_per_turn=TURN, zero_counts=100, sign=-1, ratio=0.1)
     plan = newton_plan(array_at([(0.0, 0.0, -0.15), (0.02, 0.0, -0.15)], servo=servo), lag_ms=6)
     frames = carried(T_NS, SLOW, tiles=2)
-    estimates, state = step(plan, frames, EstimationState())
-    last = finish(plan, state)
+    estimator = Estimator(plan)
+    estimates, last = estimator.step(frames), estimator.finish()
     assert last is not None
     angle_rad = np.concatenate([estimates.angle_rad, last.angle_rad])
     expected = -0.1 * 2 * np.pi * np.array([0, 300, 500, 700, 800, 800]) / TURN

@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import NOT_READ, FrameBatch, TileStatus
-from service.estimation.estimate import EstimationState, finish, step
 from service.estimation.estimates import Estimates, EstimateStatus
 from service.estimation.ladder.chosen import MODELS
 from service.estimation.ladder.plan import EstimationPlan
@@ -167,21 +166,6 @@ def test_windows_reach_back_as_far_in_short_batches_as_in_long_ones(
     whole = estimate(plan, frames)
     assert np.std(whole.force_n[150:190, 0]) < 0.8, "it averages"
     assert_same_bits(whole, estimate(plan, *cut_up(frames, range(0, 600, size))))
-
-
-@pytest.mark.parametrize("lag_ms", [0, 10])
-def test_a_step_may_be_taken_twice_from_the_same_state(lag_ms: float) -> None:
-    plan = full_plan_of(lag_ms=lag_ms, servo=make_servo())
-    frames = troubled(loaded_frames(steps_taken(90, 4, 5)), 5)
-    _, state = step(plan, frames.rows(0, 40), EstimationState())
-    first, after_first = step(plan, frames.rows(40, 90), state)
-    finish(plan, state)
-    again, after_again = step(plan, frames.rows(40, 90), state)
-    assert_same_bits(first, again)
-    last, last_again = finish(plan, after_first), finish(plan, after_again)
-    assert (last is None) == (last_again is None)
-    if last is not None and last_again is not None:
-        assert_same_bits(last, last_again)
 
 
 # --- nothing wild gets out ------------------------------------------------------------------------

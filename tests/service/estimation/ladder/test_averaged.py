@@ -3,53 +3,48 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 
-from service.estimation.ladder.averaged import averaged
-from service.estimation.ladder.lower import ApparentForces
-from service.estimation.models.denoise import AVERAGED_MAX
+from devices.arrays import Floats
+from devices.compiled import compiled
+from service.estimation.ladder.laws import Laws, make_laws
+from service.estimation.ladder.room import Room, make_room
+from service.estimation.ladder.upper import BORNE, average
+from service.estimation.models import denoise
+from tests.builders.arrays import array_at
+from tests.builders.estimates import newton_plan
 
 SIGMA_N, PERIOD_NS, TILES = 0.3, 1_838_235, 4
 
 
-def plan(tiles: int) -> Any:
-    """As much of one as averages need."""
-    return SimpleNamespace(
-        ladder=SimpleNamespace(skew=True),
-        look_ns=100_000_000,
-        waits=True,
-        noise_left=np.ones((tiles, AVERAGED_MAX + 1)),
-    )
-
-
-def felt(forces_n: np.ndarray) -> ApparentForces:
+def smooth(forces_n: Floats) -> Floats:
+    """Averaged forces of tiles, (n, tiles), all sampled with their frame."""
     n, tiles = forces_n.shape
-    nothing = np.zeros((n, tiles))
-    t_ns = PERIOD_NS * np.arange(n)
-    return ApparentForces(
-        gauge_kpa=nothing,
-        apparent_n=forces_n,
-        noise_n=np.full((n, tiles), SIGMA_N),
-        sigma_n=nothing,
-        gas_n=nothing,
-        unseen_gas_n=nothing,
-        warm_n=nothing,
-        sampled_ns=np.repeat(t_ns[:, None], tiles, axis=1),
-        beyond=np.zeros((n, tiles), dtype=bool),
-        guess_n=np.full((n, tiles), math.nan),
-        t_mono_ns=t_ns,
-        run=np.zeros(n, dtype=np.int64),
-        status=np.zeros(n, dtype=np.uint16),
-    )
+    info = array_at([(0.01 * j, 0.0, 0.0) for j in range(tiles)])
+    laws = make_laws(newton_plan(info, models=("static", "skew", "denoise"), lag_ms=100.0))
+    room = make_room(n, tiles)
+    room.t_mono_ns[:] = PERIOD_NS * np.arange(n)
+    room.sampled_ns[:] = room.t_mono_ns[:, None]
+    room.usable_n[:, :tiles], room.noise_n[:, :tiles] = forces_n, SIGMA_N
+    room.usable_n[:, tiles], room.noise_n[:, tiles] = forces_n.sum(axis=1), tiles**0.5 * SIGMA_N
+    out = np.full((n, tiles), math.nan)
+    _average_all(laws, room, out)
+    return out
 
 
-def smooth(forces_n: np.ndarray) -> np.ndarray:
-    n, tiles = forces_n.shape
-    return averaged(plan(tiles), felt(forces_n), 0, n)[0]
+@compiled
+def _average_all(laws: Laws, room: Room, out: Floats) -> None:
+    borne = np.zeros(len(laws.tiles), BORNE)
+    rows, windows = (0, 0), denoise.scratch_of_windows()
+    for i in range(len(out)):
+        rows = denoise.in_sight(room.t_mono_ns, i, 0, len(out), rows, 100_000_000)
+        for j in range(len(borne)):
+            borne[j].force_n, borne[j].noise_n = room.usable_n[i, j], room.noise_n[i, j]
+        average(laws, room, i, rows, windows, borne)
+        for j in range(len(borne)):
+            out[i, j] = borne[j].force_n
 
 
 def noisy(load_n: np.ndarray, seed: int) -> np.ndarray:
@@ -100,12 +95,3 @@ def test_where_a_tile_is_missing_the_others_are_averaged_on_their_own() -> None:
     silent[:, 1] = math.nan
     others = [0, 2, 3]
     assert smooth(silent)[:, others].tolist() == one_by_one(forces_n)[:, others].tolist()
-
-
-@pytest.mark.parametrize("first", [1, 37, 199])
-def test_rows_are_the_same_whatever_else_is_asked_for(first: int) -> None:
-    forces_n = noisy(np.where(np.arange(200) < 100, 6.0, 3.0), 3)
-    whole = averaged(plan(TILES), felt(forces_n), 0, 200)
-    parts = [averaged(plan(TILES), felt(forces_n), *rows) for rows in ((0, first), (first, 200))]
-    for each, pieces in zip(whole, zip(*parts, strict=True), strict=True):
-        assert np.concatenate(pieces).tobytes() == each.tobytes()

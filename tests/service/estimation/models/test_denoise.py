@@ -10,14 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.estimation.ladder.upper import BORNE
 from service.estimation.models.denoise import (
     AGREE,
     AVERAGED_MAX,
-    PAST_NS,
     REACHES,
-    anywhere,
     denoised,
-    shared_bend,
+    share_bend,
 )
 from service.estimation.tare.noise import left_by_mean
 
@@ -45,14 +44,8 @@ def averaged(
         frame_ns,
         (frame_ns if at_ns is None else np.asarray(at_ns))[:, None].copy(),
         np.zeros(n, dtype=np.int64) if run is None else np.asarray(run),
-        0,
-        n,
         round(look_ms * 1e6),
-        PAST_NS,
-        REACHES,
-        AGREE,
         np.ones((1, AVERAGED_MAX + 1)) if noise_left is None else noise_left[None, :],
-        anywhere(n, n),
     )
     return out[:, 0], left[:, 0]
 
@@ -233,6 +226,15 @@ def test_any_instants_give_finite_values_among_the_readings(t_ns: list[int], see
     assert (left > 0.0).all()
 
 
+def shared_bend(bend_n: np.ndarray, noise_n: np.ndarray) -> np.ndarray:
+    """What of the bends of tiles, (n, tiles), is in all of them."""
+    tiles = np.zeros(bend_n.shape, BORNE)
+    tiles["bend_n"], tiles["of_bend_n"] = bend_n, noise_n
+    for frame in tiles:
+        share_bend(frame)
+    return tiles["smoothed_n"]
+
+
 def test_what_windows_smooth_away_of_a_load_is_found_in_the_sum_of_its_tiles() -> None:
     # Two sigma are nothing in a tile alone, and four in the sum of four.
     noise_n = np.full((1, 4), SIGMA_N)
@@ -255,21 +257,15 @@ def test_a_load_that_shakes_all_tiles_makes_their_sum_less_certain_and_a_still_o
     load_n = 6.0 + shakes_n * np.sin(2 * math.pi * 35.0 * 1e-9 * t_ns)
     rng = np.random.default_rng(3)
     sampled_ns = np.repeat(t_ns[:, None], tiles, axis=1)
-    out, left, bend, of_bend, _ = denoised(
+    out, left, bend, of_bend = denoised(
         load_n[:, None] + rng.normal(0.0, SIGMA_N, (n, tiles)),
         np.full((n, tiles), SIGMA_N),
         sampled_ns,
         t_ns,
         sampled_ns,
         np.zeros(n, dtype=np.int64),
-        0,
-        n,
         100_000_000,
-        PAST_NS,
-        REACHES,
-        AGREE,
         np.ones((tiles, AVERAGED_MAX + 1)),
-        anywhere(n, n),
     )
     off_n = (out - load_n[:, None]).sum(axis=1)
     own_n2 = (SIGMA_N**2 * left).sum(axis=1)

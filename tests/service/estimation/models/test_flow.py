@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from service.estimation.effects import PART_MOST
+from service.estimation.models import flow
 from service.estimation.models.flow import STROKE_N_PER_S, Flow
 
 PART, STRESS_N = 0.08, 0.3
@@ -25,13 +26,19 @@ def compensated(
     part: float = PART,
     stress_n: float = STRESS_N,
     power: float = 4.0,
-    **more: Any,
+    borne_n: float = math.nan,
+    away_n: float = math.nan,
 ) -> np.ndarray:
     model = Flow(np.array([part]), np.array([stress_n]), np.array([power]))
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    column = np.asarray(apparent_n, dtype=float)[:, None]
-    out, _ = model.compensated(column, t_ns[:, None], model.at_rest(), **more)
-    return out[:, 0]
+    (law,), (state,) = model.laws(), model.at_rest()
+    column = np.asarray(apparent_n, dtype=float)
+    return np.array(
+        [
+            flow.compensated(law, state, force_n, at_ns, borne_n, away_n)
+            for force_n, at_ns in zip(column, t_ns, strict=True)
+        ]
+    )
 
 
 def borne_by_branch(t_s: np.ndarray, force_n: np.ndarray, power: float) -> np.ndarray:
@@ -143,7 +150,7 @@ def test_what_is_no_force_is_nan_and_changes_nothing_after_it(nothing: float) ->
 def test_after_a_stretch_unseen_a_load_may_have_gone_just_now() -> None:
     t_s, apparent_n = [0.0, 10.0], [0.0, 1.0]
     straight = compensated(apparent_n, t_s)
-    away = compensated(apparent_n, t_s, away_n=np.array([30.0]))
+    away = compensated(apparent_n, t_s, away_n=30.0)
     # A single step of 10 s: what the branch bears of the straight line is found roughly.
     assert straight[1] == pytest.approx(1.0 + STRESS_N * 0.01**0.25, abs=0.02)
     # All of what 30 N less have put on the branch hides: 0.08 of it.

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.skew import aligned, at_rest
+from service.estimation.models.skew import at_frame, at_rest
 
 PERIOD_NS = 2_000_000
 
@@ -18,12 +18,9 @@ PERIOD_NS = 2_000_000
 def lined_up(
     values: list[float], t_ns: list[int], frame_t_ns: list[int], broken: Sequence[int] = ()
 ) -> list[float]:
-    gaps = np.zeros(len(values), dtype=bool)
-    gaps[list(broken)] = True
-    column = np.array(values, dtype=float)[:, None]
-    instants = np.array(t_ns)[:, None]
-    out, _ = aligned(column, instants, np.array(frame_t_ns), gaps, at_rest(1))
-    return [float(value) for value in out[:, 0]]
+    (state,) = at_rest(1)
+    frames = enumerate(zip(values, t_ns, frame_t_ns, strict=True))
+    return [float(at_frame(state, *frame, i in broken)) for i, frame in frames]
 
 
 @given(
@@ -59,15 +56,3 @@ def test_an_instant_that_does_not_lie_between_two_samples_is_none_of_its_busines
 
 def test_samples_at_one_instant_or_back_in_time_are_left_as_they_are() -> None:
     assert lined_up([1.0, 2.0, 3.0], [10, 10, 4], [10, 10, 4]) == [1.0, 2.0, 3.0]
-
-
-def test_it_goes_on_from_the_frame_before() -> None:
-    values, t_ns = np.array([[0.0], [4.0], [1.0]]), np.array([[5], [15], [25]])
-    frame_ns, whole_run = np.array([0, 10, 20]), np.zeros(3, dtype=bool)
-    whole, _ = aligned(values, t_ns, frame_ns, whole_run, at_rest(1))
-    state, pieces = at_rest(1), []
-    for i in range(3):
-        rows = slice(i, i + 1)
-        out, state = aligned(values[rows], t_ns[rows], frame_ns[rows], whole_run[rows], state)
-        pieces.append(out)
-    assert np.concatenate(pieces).tobytes() == whole.tobytes()

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.chips.mpl115a2 import Coefficients, compensate_kpa, kpa_per_padc
-from service.estimation.models.unwrap import unwrap
+from service.estimation.models.unwrap import unwrapped as taken_back
 from tests.builders.arrays import DATA_SHEET_CHIP, FORUM_CHIP
 
 DATA_SHEET_PART = Coefficients.from_words(DATA_SHEET_CHIP)
@@ -21,8 +23,8 @@ def kpa(counts: float, tadc: int, c: Coefficients) -> float:
 
 
 def unwrapped(padc: int, tadc: int, c: Coefficients) -> float:
-    at_face_value = compensate_kpa([padc], tadc, c.a0, c.b1, c.b2, c.c12)
-    return float(unwrap(at_face_value, kpa_per_padc(tadc, c.b1, c.c12))[0])
+    at_face_value = float(compensate_kpa(padc, tadc, c.a0, c.b1, c.b2, c.c12))
+    return float(taken_back(at_face_value, float(kpa_per_padc(tadc, c.b1, c.c12))))
 
 
 @given(
@@ -64,10 +66,10 @@ def test_one_count_past_zero_is_wrapped_already() -> None:
 
 
 def test_exactly_50_kpa_is_a_pressure_and_a_hair_less_is_none() -> None:
-    out = unwrap(np.array([50.0, np.nextafter(50.0, 0.0)]), np.full(2, -0.125))
-    assert out[0] == 50.0
-    assert out[1] == np.nextafter(50.0, 0.0) + 128.0
+    less = float(np.nextafter(50.0, 0.0))
+    assert taken_back(50.0, -0.125) == 50.0
+    assert taken_back(less, -0.125) == less + 128.0
 
 
 def test_nan_stays_nan() -> None:
-    assert np.isnan(unwrap(np.array([np.nan]), -0.1)).all()
+    assert math.isnan(taken_back(math.nan, -0.1))

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from devices.arrays import Floats
+from devices.compiled import compiled
+from service.estimation.records import Records
 from service.estimation.watch.baseline import EVEN, LOST_KPA, SIGMAS, at_rest, lost
 
 RATE_HZ = 447.0
@@ -14,13 +16,15 @@ STEP_NS = round(1e9 / RATE_HZ)
 
 def judged(gauge_kpa: Floats, explained_kpa: float = 0.03) -> Floats:
     n = len(gauge_kpa)
-    t_ns = STEP_NS * np.arange(n, dtype=np.int64)[:, None]
-    variance = np.full((n, 1), (explained_kpa / SIGMAS) ** 2)
-    found, astray, _ = lost(
-        gauge_kpa[:, None], variance, np.zeros((n, 1)), t_ns, np.array([EVEN]), at_rest(1)
-    )
-    assert (astray == (found[:, 0] > 0.0)).all()
-    return found[:, 0]
+    out = np.empty(n)
+    _judge(at_rest(1), gauge_kpa, (explained_kpa / SIGMAS) ** 2, out)
+    return out
+
+
+@compiled
+def _judge(state: Records, gauge_kpa: Floats, variance: float, out: Floats) -> None:
+    for i in range(len(gauge_kpa)):
+        out[i] = lost(state[0], EVEN, gauge_kpa[i], variance, 0.0, STEP_NS * i)
 
 
 def noise(n: int) -> Floats:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from devices.arrays import Floats
+from devices.compiled import compiled
+from service.estimation.records import Records
 from service.estimation.watch.clip import at_rest, end_of_range
 
 RATE_HZ = 447.0
@@ -24,9 +26,15 @@ def steps(count: int, *, scatter: float, top_kpa: float = 11.0, seed: int = 0) -
 
 
 def ends(kpa: Floats) -> Floats:
-    baseline, unloaded = np.array([100.0]), np.array([4.0 * NOISE_KPA])
-    found, _ = end_of_range(kpa[:, None], baseline, unloaded, np.array([NOISE_KPA]), at_rest(1))
-    return np.full(len(kpa), np.inf) if found is None else found[:, 0]
+    out = np.empty(len(kpa))
+    _judge(at_rest(1), kpa, out)
+    return out
+
+
+@compiled
+def _judge(state: Records, kpa: Floats, out: Floats) -> None:
+    for i in range(len(kpa)):
+        out[i] = end_of_range(state[0], kpa[i], 100.0, 4.0 * NOISE_KPA, NOISE_KPA)
 
 
 def noise(n: int, seed: int = 1) -> Floats:

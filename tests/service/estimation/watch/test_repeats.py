@@ -7,8 +7,10 @@ import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
-from devices.arrays import Floats
-from service.estimation.watch.repeats import Limits, apart, at_rest, make_limits, repeating
+from devices.arrays import Bools, Floats, Ints
+from devices.compiled import compiled
+from service.estimation.records import Records, record_type, records
+from service.estimation.watch.repeats import SHARES, Limits, apart, at_rest, is_stuck, make_limits
 
 RATE_HZ = 447.0
 COUNT_KPA = 0.15
@@ -30,16 +32,44 @@ def limits_of(counts: float, tiles: int) -> Limits:
     return make_limits(np.full(tiles, tared), RATE_HZ)
 
 
+def judge(
+    limits: Limits, state: Records, padc: npt.NDArray[np.uint16], kpa: Floats, unloaded_kpa: float
+) -> npt.NDArray[np.bool_]:
+    """Which readings (n, tiles) are repeats that noise does not explain."""
+    tables = record_type([(name, np.int64, (SHARES + 1,)) for name in ("by_repeats", "by_twos")])
+    scene = records(tables, 1, by_repeats=limits.by_repeats, by_twos=limits.by_twos)
+    out = np.empty(kpa.shape, dtype=bool)
+    _judge(scene, limits.laws(), state, padc.astype(np.int64), kpa, unloaded_kpa, out)
+    return out
+
+
+@compiled
+def _judge(
+    scene: Records,
+    laws: Records,
+    state: Records,
+    padc: Ints,
+    kpa: Floats,
+    unloaded_kpa: float,
+    out: Bools,
+) -> None:
+    n, tiles = kpa.shape
+    toggles = 0
+    for i in range(n):
+        for j in range(tiles):
+            out[i, j], toggles = is_stuck(
+                scene[0], laws[j], state[j], padc[i, j], kpa[i, j], unloaded_kpa, toggles, tiles
+            )
+
+
 def found(level: Floats, counts: float, *, n_lead: int = 447) -> npt.NDArray[np.bool_]:
     """Judged readings of these levels in counts, after a second without load."""
     tiles = level.shape[1]
     lead = noise(n_lead, tiles, counts, seed=99)
     padc = np.rint(400.0 - np.concatenate([lead, level])).astype(np.uint16)
     kpa = COUNT_KPA * (400.0 - padc.astype(np.float64))
-    unloaded_kpa = np.full(tiles, UNLOADED * COUNT_KPA * np.hypot(counts, 0.3))
-    zero, never = np.zeros(tiles), np.full(tiles, np.inf)
-    most = limits_of(counts, tiles)
-    judged, _ = repeating(padc, kpa, zero, never, unloaded_kpa, most, at_rest(tiles))
+    unloaded_kpa = UNLOADED * COUNT_KPA * np.hypot(counts, 0.3)
+    judged = judge(limits_of(counts, tiles), at_rest(tiles), padc, kpa, unloaded_kpa)
     assert not judged[:n_lead].any()
     return judged[n_lead:]
 
@@ -93,15 +123,8 @@ def test_a_quiet_tile_that_bears_nothing_may_stand_still_for_ever() -> None:
 
 def test_readings_that_cannot_be_read_say_nothing() -> None:
     padc = np.full((500, 1), 65535, dtype=np.uint16)
-    judged, state = repeating(
-        padc,
-        np.full((500, 1), np.nan),
-        np.zeros(1),
-        np.full(1, np.inf),
-        np.ones(1),
-        limits_of(0.85, 1),
-        at_rest(1),
-    )
+    state = at_rest(1)
+    judged = judge(limits_of(0.85, 1), state, padc, np.full((500, 1), np.nan), 1.0)
     assert not judged.any()
     assert state["pairs"].tolist() == [0]
 

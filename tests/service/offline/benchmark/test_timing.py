@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from devices.scene.file import load_scene
-from service.estimation.estimate import EstimationState, step
+from service.estimation.estimate import Estimator
 from service.estimation.estimates import EstimateStatus
 from service.offline.benchmark.draws import (
     Endless,
@@ -36,7 +36,7 @@ def test_an_endless_recording_rises_without_a_gap(recording: Recording) -> None:
     pieces = [stream.rows(begin, begin + 7) for begin in range(n - 10, n + 11, 7)]
     assert (np.concatenate([p.t_ns for p in pieces]) == rows.t_ns[n - 10 : n + 11]).all()
     plan = plan_of(recording, ("unwrap", "static"), 0.0)
-    estimates, _ = step(plan, rows, EstimationState())
+    estimates = Estimator(plan).step(rows)
     assert not (estimates.estimate_status & EstimateStatus.GAP).any()
 
 
