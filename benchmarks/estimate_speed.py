@@ -35,7 +35,7 @@ from tests.builders.frames import make_frames
 
 GOAL = 2.0
 RUNS = 7
-CHUNK = 4096
+CHUNK = 1024
 
 
 def plan_of(models: tuple[str, ...], count: int = 4) -> EstimationPlan:

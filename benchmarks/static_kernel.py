@@ -15,8 +15,8 @@ import numpy.typing as npt
 from devices.chips.mpl115a2 import COUNTS_MAX, PRESSURE_MAX_KPA, PRESSURE_MIN_KPA, Coefficients
 from devices.frames import NOT_READ, FrameBatch, TileStatus
 from service.estimation.calibration import BASIS, LOOP_OPENS_N
-from service.estimation.ladder.foot import HULL_SIGMAS
 from service.estimation.ladder.plan import SIGMAS, TARE_OLD_NS, EstimationPlan
+from service.estimation.ladder.whole import HULL_SIGMAS
 
 Floats = npt.NDArray[np.float64]
 

@@ -231,8 +231,7 @@ def with_foot_options(command: Callable[..., None]) -> Callable[..., None]:
         command(**given, options=options)
 
     parameters = [p for p in own.parameters.values() if p.name != "options"] + [*of_foot.values()]
-    # What typer reads of a function, and a function's type does not have.
-    run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]  # for typer
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
 

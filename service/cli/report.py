@@ -9,7 +9,7 @@ from statistics import median
 from rich.table import Table
 
 from service.cli.options import say, stdout
-from service.estimation.foot.contact import Stance
+from service.estimation.foot.stances import Stance
 from service.offline.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
 from service.offline.findings import Findings
 

@@ -18,10 +18,11 @@ from devices.arrays import Floats, Times
 from devices.compiled import compiled, inlined
 from devices.frames import FrameBatch
 from service.estimation.estimates import Estimates, EstimateStatus
-from service.estimation.foot.contact import UNKNOWN, has_lasted
+from service.estimation.foot.contact import has_lasted
 from service.estimation.foot.geometry import to_ground_x_m
 from service.estimation.foot.kinematics import counts_at
-from service.estimation.ladder import foot
+from service.estimation.foot.stances import UNKNOWN
+from service.estimation.ladder import whole
 from service.estimation.ladder.laws import Laws, make_laws
 from service.estimation.ladder.lower import feel
 from service.estimation.ladder.plan import EstimationPlan
@@ -84,8 +85,14 @@ class Estimator:
 
         Returns:
             The estimates due; any number, possibly none.
+
+        Raises:
+            ValueError: the frames are not of as many tiles as the plan; compiled code would read
+                beside them.
         """
         n = len(frames)
+        if frames.tile_count != len(self._tiles):
+            raise ValueError(f"frames of {frames.tile_count} tiles, a plan of {len(self._tiles)}")
         if self._scene["end"][0] + n > len(self._room.rows):
             self._make_room(n)
         columns = [_as_compiled(getattr(frames, name)) for name in _COLUMNS]
@@ -128,18 +135,18 @@ def _estimates(answers: Answers) -> Estimates:
         gauge_kpa=by_tile[_GAUGE],
         force_n=by_tile[_FORCE],
         force_sigma_n=by_tile[_SIGMA],
-        grf_n=by_frame[foot.GRF],
-        grf_sigma_n=by_frame[foot.GRF_SIGMA],
-        grf_at_least_n=by_frame[foot.AT_LEAST],
-        cop_x_m=by_frame[foot.X],
-        cop_y_m=by_frame[foot.Y],
-        cop_sigma_x_m=by_frame[foot.SIGMA_X],
-        cop_sigma_y_m=by_frame[foot.SIGMA_Y],
-        cop_index_x=by_frame[foot.INDEX_X],
-        cop_index_y=by_frame[foot.INDEX_Y],
-        cop_ground_x_m=by_frame[foot.GROUND_X],
-        cop_ground_y_m=by_frame[foot.GROUND_Y],
-        angle_rad=by_frame[foot.ANGLE],
+        grf_n=by_frame[whole.GRF],
+        grf_sigma_n=by_frame[whole.GRF_SIGMA],
+        grf_at_least_n=by_frame[whole.AT_LEAST],
+        cop_x_m=by_frame[whole.X],
+        cop_y_m=by_frame[whole.Y],
+        cop_sigma_x_m=by_frame[whole.SIGMA_X],
+        cop_sigma_y_m=by_frame[whole.SIGMA_Y],
+        cop_index_x=by_frame[whole.INDEX_X],
+        cop_index_y=by_frame[whole.INDEX_Y],
+        cop_ground_x_m=by_frame[whole.GROUND_X],
+        cop_ground_y_m=by_frame[whole.GROUND_Y],
+        angle_rad=by_frame[whole.ANGLE],
         contact=contact,
         estimate_status=status,
     )
@@ -192,9 +199,9 @@ def _released(laws: Laws, scene: Record, tiles: Records, room: Room, until: int)
     n, count, law = until - scene.due, len(tiles), laws.scene[0]
     seq, t_ns = np.empty(n, np.uint64), np.empty(n, np.int64)
     by_tile = np.full((3, n, count), math.nan)
-    by_frame = np.full((foot.COLUMNS, n), math.nan)
+    by_frame = np.full((whole.COLUMNS, n), math.nan)
     contact, status = np.empty(n, np.uint8), np.empty(n, np.uint16)
-    out, windows = np.empty(foot.COLUMNS), denoise.scratch_of_windows()
+    out, windows = np.empty(whole.COLUMNS), denoise.scratch_of_windows()
     borne = np.zeros(count, BORNE)
     # Without look-ahead the next frame is not there, and may be of the same instant.
     look_ns = law.look_ns if law.waits == 1 else -1
@@ -206,18 +213,18 @@ def _released(laws: Laws, scene: Record, tiles: Records, room: Room, until: int)
         if law.denoise == 1:
             rows = denoise.in_sight(room.t_mono_ns, i, 0, scene.read, rows, look_ns)
         unsettled = bear(laws, tiles, room, i, rows, windows, borne)
-        foot.stand(laws, borne, out)
+        whole.stand(laws, borne, out)
         if has_lasted(room.since_ns, room.t_mono_ns, i, scene.read, law.min_ns, law.look_ns):
             scene.is_contact = row.loaded
-        masked = foot.is_masked(laws, out) or scene.is_contact == 0
+        masked = whole.is_masked(laws, out) or scene.is_contact == 0
         # A bound tells that there is contact, and never that there is none.
-        known = not math.isnan(out[foot.GRF])
-        decided = known or (scene.is_contact == 1 and out[foot.AT_LEAST] >= law.on_n)
+        known = not math.isnan(out[whole.GRF])
+        decided = known or (scene.is_contact == 1 and out[whole.AT_LEAST] >= law.on_n)
         if law.servo == 1:
             counts = counts_at(room.readings, i, scene.read, law.look_ns)
-            out[foot.ANGLE] = (counts - law.zero_counts) * law.rad_per_count
+            out[whole.ANGLE] = (counts - law.zero_counts) * law.rad_per_count
         if masked:
-            out[foot.X : foot.ANGLE] = math.nan
+            out[whole.X : whole.ANGLE] = math.nan
         else:
             _place(laws, room.cells[i], out)
         for j in range(count):
@@ -239,12 +246,12 @@ def _place(laws: Laws, cells: Records, out: Floats) -> None:
     """Indices of the centre of pressure, and where it is on the ground."""
     scene = laws.scene[0]
     if scene.grid == 1:
-        foot.note_index(laws, cells, out)
+        whole.note_index(laws, cells, out)
     if scene.servo == 1 and not math.isnan(scene.travel_m_per_rad):
-        out[foot.GROUND_X] = to_ground_x_m(
-            out[foot.X], out[foot.Z], out[foot.ANGLE], scene.travel_m_per_rad
+        out[whole.GROUND_X] = to_ground_x_m(
+            out[whole.X], out[whole.Z], out[whole.ANGLE], scene.travel_m_per_rad
         )
-        out[foot.GROUND_Y] = out[foot.Y]
+        out[whole.GROUND_Y] = out[whole.Y]
 
 
 @compiled

@@ -10,18 +10,6 @@ import numpy.typing as npt
 
 from devices.arrays import Arrays, Floats, Times
 
-COP_COLUMNS = (
-    "cop_x_m",
-    "cop_y_m",
-    "cop_sigma_x_m",
-    "cop_sigma_y_m",
-    "cop_index_x",
-    "cop_index_y",
-    "cop_ground_x_m",
-    "cop_ground_y_m",
-)
-"""Fields of `Estimates` that are not known where there is no centre of pressure."""
-
 
 class EstimateStatus(IntFlag):
     """Bits of `Estimates.estimate_status`, one value per frame."""

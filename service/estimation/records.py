@@ -1,7 +1,6 @@
 """Constants and state of models, tile by tile: numpy records, which compiled code works on.
 
-All fields are eight bytes wide, or arrays of such: a record is copied as one piece, and hundreds of
-fields pass into compiled code as a single argument.
+Hundreds of fields pass into compiled code as a single argument.
 """
 
 from __future__ import annotations
@@ -32,8 +31,3 @@ def records(dtype: np.dtype[np.void], n: int, **columns: Any) -> Records:
     for name, values in columns.items():
         made[name] = values
     return made
-
-
-def copied(of: Records) -> Records:
-    """The same, to be written to. Copied as one piece: field by field takes four times as long."""
-    return of.view(np.int64).copy().view(of.dtype)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from devices.frames import FrameBatch
 from service.estimation.estimates import EstimateStatus
-from service.estimation.foot.contact import Stance, Stances
+from service.estimation.foot.stances import Stance, Stances
 from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 
 if TYPE_CHECKING:

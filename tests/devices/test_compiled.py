@@ -58,3 +58,36 @@ def test_on_a_full_disk_it_is_compiled_all_the_same(
     monkeypatch.setattr(numba.core.config, "CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(numba.core.caching.IndexDataCacheFile, "save", full)
     assert compiled(tripled)(2.0) == 6.0
+
+
+FACTOR = 2.0
+inner = compiled(tripled)
+
+
+def scaled(x: float) -> float:
+    return FACTOR * inner(x)
+
+
+def halved(x: float) -> float:
+    return 0.5 * x
+
+
+@pytest.mark.usefixtures("kept")
+@pytest.mark.parametrize(
+    ("name", "value", "expected"), [("FACTOR", 10.0, 30.0), ("inner", compiled(halved), 1.0)]
+)
+def test_what_it_calls_or_takes_from_elsewhere_has_changed_and_it_is_compiled_anew(
+    name: str, value: Any, expected: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The file of `scaled` is as it was, which is all that numba looks at.
+    assert compiled(scaled)(1.0) == 6.0
+    monkeypatch.setitem(globals(), name, value)
+    assert compiled(scaled)(1.0) == expected
+
+
+@pytest.mark.usefixtures("kept")
+def test_what_calls_others_is_found_again_while_nothing_has_changed() -> None:
+    first: Any = compiled(scaled)
+    again: Any = compiled(scaled)
+    assert first(1.0) == again(1.0) == 6.0
+    assert sum(again.stats.cache_hits.values()) == 1

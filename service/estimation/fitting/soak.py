@@ -18,7 +18,7 @@ from service.estimation.effects import Parameter, TemperatureEffect
 from service.estimation.fitting.bench.indentation import Soak
 from service.estimation.fitting.confidence import beyond_bounds, fit_covariance
 from service.estimation.fitting.least_squares import least_squares
-from service.estimation.models.temperature import at_rest, followed
+from service.estimation.models.temperature import followed
 
 STEP_MIN_K = 1.0
 LAG_S = (-10.0, 30.0)
@@ -47,7 +47,7 @@ def fit_soak(soak: Soak) -> TemperatureEffect | str:
 
     def gas_k(lag_s: float) -> tuple[Floats, Floats]:
         """Of the gas above the chip's at first, and its rise in kelvins a second."""
-        counts, rise, _ = followed(soak.tadc[:, None], t_ns, np.array([lag_s]), at_rest(1))
+        counts, rise = followed(soak.tadc[:, None], t_ns, np.array([lag_s]))
         return (
             (bins.mean(counts[:, 0]) - still_counts) / TADC_PER_KELVIN,
             bins.mean(rise[:, 0]) / TADC_PER_KELVIN,

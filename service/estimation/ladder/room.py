@@ -97,13 +97,9 @@ def make_room(n: int, tiles: int) -> Room:
 
 def moved(room: Room, first: int, end: int, more: int) -> Room:
     """Rows `first` to `end` at the front, with room for `more` after them."""
-    needed = end - first + more
-    capacity = len(room.rows)
-    # Twice what is needed, or every few steps would move all of it.
-    if 2 * needed <= capacity:
-        to = room
-    else:
-        to = make_room(max(ROWS_LEAST, 4 * needed), room.cells.shape[1])
+    # Twice what is needed, or every step would move what is kept.
+    twice = 2 * (end - first + more)
+    to = room if twice <= len(room.rows) else make_room(twice, room.cells.shape[1])
     for old, new in zip(room, to, strict=True):
         new[: end - first] = old[first:end]
     return to

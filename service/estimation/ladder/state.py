@@ -59,9 +59,13 @@ SCENE = record_type(
 def at_rest(tiles: int) -> tuple[Records, Records]:
     """Before the first frame: of the whole foot, and of every tile."""
     scene = records(SCENE, 1, ambient=ambient.at_rest())
-    dome = records(DOME, tiles)
-    for name in ("flow", "rubber"):
-        dome[name]["force_n"] = np.nan
+    dome = records(
+        DOME,
+        tiles,
+        flow=flow.at_rest(tiles),
+        hysteresis=hysteresis.at_rest(tiles),
+        rubber=rubber.at_rest(tiles),
+    )
     of_tiles = records(
         TILE,
         tiles,

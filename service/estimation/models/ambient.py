@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Floats, Times
+from devices.arrays import Floats
 from devices.compiled import compiled
-from service.estimation.records import Record, Records, copied, record_type, records
+from service.estimation.records import Record, Records, record_type, records
 
 SMOOTHING_S = 0.03  # long against noise, short against a foot that sinks in
 HELD_S = 0.2
@@ -48,24 +48,6 @@ class Ambient:
         """The constants, tile by tile."""
         return records(LAW, len(self.passed), **vars(self))
 
-    def passed_on(
-        self, reference_gauge_kpa: Floats, t_ns: Times, state: Records
-    ) -> tuple[Floats, Floats, Records]:
-        """Pressure in each dome that comes from around it.
-
-        Args:
-            reference_gauge_kpa: (n,), mean of the bare tiles above their tare; see `around`.
-            t_ns: (n,) instants.
-            state: from the frames before.
-
-        Returns:
-            (n, tiles) pressures, their standard uncertainty, and the next state.
-        """
-        head_kpa, after = np.empty(len(reference_gauge_kpa)), copied(state)
-        _average(after, reference_gauge_kpa, t_ns, head_kpa)
-        passed_kpa = head_kpa[:, None] * self.passed
-        return passed_kpa, np.abs(self.relative_sigma * passed_kpa), after
-
 
 @compiled
 def around(state: Record, kpa: float, t_ns: int) -> float:
@@ -86,9 +68,3 @@ def around(state: Record, kpa: float, t_ns: int) -> float:
         state.t_ns = t_ns
     head_kpa: float = state.head_kpa
     return head_kpa if t_ns - state.t_ns <= HELD_S * 1e9 else math.nan
-
-
-@compiled
-def _average(state: Records, kpa: Floats, t_ns: Times, out: Floats) -> None:
-    for i in range(len(kpa)):
-        out[i] = around(state[0], kpa[i], t_ns[i])

@@ -186,45 +186,6 @@ def averaged(
     return (best, variance, bend, of_bend), (straight_low, straight_high, low, high)
 
 
-@compiled
-def denoised(
-    values: Floats,
-    sigmas: Floats,
-    t_ns: Times,
-    frame_t_ns: Times,
-    at_ns: Times,
-    run: Times,
-    look_ns: int,
-    noise_left: Floats,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Columns averaged each on its own; NaN where there is no value. See `averaged`.
-
-    Args:
-        values: (n, tiles), NaN where there is none.
-        sigmas: (n, tiles), standard deviation of a single one.
-        t_ns: (n, tiles), instants of the samples.
-        frame_t_ns: (n,), of the frames, which bound the windows.
-        at_ns: (n, tiles), the instants that are asked for.
-        run: (n,), number of the unbroken run that a frame belongs to.
-        look_ns: look-ahead.
-        noise_left: (tiles, `AVERAGED_MAX` + 1).
-    """
-    n, tiles = values.shape
-    out = np.full((4, n, tiles), math.nan)
-    scratch, rows = scratch_of_windows(), (0, 0)
-    for i in range(n):
-        rows = in_sight(frame_t_ns, i, 0, n, rows, look_ns)
-        for j in range(tiles):
-            if not math.isnan(values[i, j]):
-                found, _ = averaged(
-                    (values, sigmas, t_ns, run), i, j, at_ns[i, j], rows, noise_left[j], ANYWHERE,
-                    scratch,
-                )  # fmt: skip
-                for part in range(4):
-                    out[part, i, j] = found[part]
-    return out[0], out[1], out[2], out[3]
-
-
 @inlined
 def share_bend(tiles: Records) -> None:
     """What of the tiles' bends is more than noise in their sum, signed, into `smoothed_n`.

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Floats, Times
+from devices.arrays import Floats
 from devices.compiled import compiled
 from service.estimation.foot.contact import UNSEEN_NS
-from service.estimation.records import Record, Records, copied, record_type, records
+from service.estimation.records import Record, Records, record_type, records
 
 STROKE_N_PER_S = 10.0
 """R: about that of a bench's slow stroke, so that what is fitted is what the stroke shows."""
@@ -31,6 +31,11 @@ LAW = record_type([("part", np.float64), ("stress_n", np.float64), ("power", np.
 """Constants of a tile, as in `Flow`."""
 STATE = record_type([("stress_n", np.float64), ("force_n", np.float64), ("t_ns", np.int64)])
 """Of a tile: what the branch bears, and the force before (NaN: none)."""
+
+
+def at_rest(tiles: int) -> Records:
+    """Before the first reading."""
+    return records(STATE, tiles, force_n=np.nan)
 
 
 @dataclass(frozen=True)
@@ -50,18 +55,6 @@ class Flow:
     def laws(self) -> Records:
         """The constants, tile by tile."""
         return records(LAW, len(self.part), **vars(self))
-
-    def at_rest(self) -> Records:
-        """Before the first reading."""
-        return records(STATE, len(self.part), force_n=np.nan)
-
-    def compensated(
-        self, apparent_n: Floats, t_ns: Times, state: Records
-    ) -> tuple[Floats, Records]:
-        """Forces that appear as these at instants, both (n, tiles); see `compensated`."""
-        out, after = np.empty(apparent_n.shape), copied(state)
-        _compensate(self.laws(), after, apparent_n, t_ns, out)
-        return out, after
 
 
 @compiled
@@ -143,14 +136,3 @@ def _inverted(
         if abs(step) <= _CLOSE * max(abs(force), 1.0):
             break
     return force
-
-
-@compiled
-def _compensate(
-    laws: Records, state: Records, apparent_n: Floats, t_ns: Times, out: Floats
-) -> None:
-    n, tiles = apparent_n.shape
-    for i in range(n):
-        for j in range(tiles):
-            law, tile = laws[j], state[j]
-            out[i, j] = compensated(law, tile, apparent_n[i, j], t_ns[i, j], math.nan, math.nan)

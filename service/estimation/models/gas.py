@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Floats, Times
+from devices.arrays import Floats
 from devices.compiled import compiled
 from service.estimation.foot.contact import UNSEEN_NS
-from service.estimation.records import Record, Records, copied, record_type, records
+from service.estimation.records import Record, Records, record_type, records
 
 RESTART = 5.0
 """After this many gamma tau without a reading the gas is as warm as its wall."""
@@ -61,22 +61,6 @@ class Gas:
     def laws(self) -> Records:
         """The constants, tile by tile."""
         return records(LAW, len(self.gamma), **vars(self))
-
-    def settled(
-        self, kpa: Floats, t_ns: Times, state: Records, *, away_kpa: Floats | None = None
-    ) -> tuple[Floats, Records]:
-        """Pressures that measured ones would settle at; see `settled`.
-
-        Args:
-            kpa: absolute pressures (n, tiles).
-            t_ns: instants of the readings (n, tiles).
-            state: from the readings before.
-            away_kpa: (tiles,), see `settled`; None: a straight line was between.
-        """
-        out, after = np.empty(kpa.shape), copied(state)
-        away_kpa = np.full(len(self.gamma), math.nan) if away_kpa is None else away_kpa
-        _settle(self.laws(), after, kpa, t_ns, away_kpa, out)
-        return out, after
 
 
 @compiled
@@ -148,13 +132,3 @@ def warmed(before: float, change_ln_p: float, h: float, k: float) -> float:
     # (1 - exp(-x))/x, which is 1 at x = 0
     mean = -math.expm1(-x) / x if x != 0.0 else 1.0
     return before * math.exp(-x) + h * mean
-
-
-@compiled
-def _settle(
-    laws: Records, state: Records, kpa: Floats, t_ns: Times, away_kpa: Floats, out: Floats
-) -> None:
-    n, tiles = kpa.shape
-    for i in range(n):
-        for j in range(tiles):
-            out[i, j] = settled(laws[j], state[j], kpa[i, j], t_ns[i, j], away_kpa[j])

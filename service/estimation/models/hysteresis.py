@@ -18,7 +18,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.compiled import compiled
-from service.estimation.records import Record, Records, copied, record_type, records
+from service.estimation.records import Record, Records, record_type, records
 
 WIDTHS_N = np.array([0.6, 1.5, 4.0])
 """Half widths of the plays; their parts are what is fitted."""
@@ -33,6 +33,11 @@ STATE = record_type([("plays_n", np.float64, (PLAYS,))])
 """Of a tile: where its plays are."""
 
 
+def at_rest(tiles: int) -> Records:
+    """Before the first reading."""
+    return records(STATE, tiles)
+
+
 @dataclass(frozen=True)
 class Hysteresis:
     """Parts (tiles, plays), each play of half width `WIDTHS_N`; in sum below 1."""
@@ -42,16 +47,6 @@ class Hysteresis:
     def laws(self) -> Records:
         """The constants, tile by tile."""
         return records(LAW, len(self.part), part=self.part)
-
-    def at_rest(self) -> Records:
-        """State before the first reading: plays at zero load."""
-        return records(STATE, len(self.part))
-
-    def compensated(self, apparent_n: Floats, state: Records) -> tuple[Floats, Records]:
-        """Forces that appear as these (n, tiles), and the plays after them; see `compensated`."""
-        out, after = np.empty(apparent_n.shape), copied(state)
-        _compensate(self.laws(), after, apparent_n, out)
-        return out, after
 
 
 @compiled
@@ -114,11 +109,3 @@ def _play_slope(force: float, width: float, before: float) -> float:
         return -1.0
     opening = OPENS if half < width else 0.0
     return opening if before > force else -opening
-
-
-@compiled
-def _compensate(laws: Records, state: Records, apparent_n: Floats, out: Floats) -> None:
-    n, tiles = apparent_n.shape
-    for i in range(n):
-        for j in range(tiles):
-            out[i, j] = compensated(laws[j], state[j], apparent_n[i, j], math.nan)

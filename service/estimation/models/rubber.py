@@ -16,11 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from devices.arrays import Floats, Times
+from devices.arrays import Floats
 from devices.compiled import compiled
 from service.estimation.effects import PARTS_MAX
 from service.estimation.foot.contact import UNSEEN_NS
-from service.estimation.records import Record, Records, copied, record_type, records
+from service.estimation.records import Record, Records, record_type, records
 
 LAW = record_type(
     [
@@ -41,6 +41,11 @@ STATE = record_type(
 """Of a tile: crept parts, and the force before (NaN: none)."""
 
 
+def at_rest(tiles: int) -> Records:
+    """Before the first reading."""
+    return records(STATE, tiles, force_n=np.nan)
+
+
 @dataclass(frozen=True)
 class Rubber:
     """Parameters (tiles, terms): parts of the force that appear later, and after what time."""
@@ -54,18 +59,6 @@ class Rubber:
         made = records(LAW, tiles, terms=terms)
         made["part"][:, :terms], made["tau_s"][:, :terms] = self.part, self.tau_s
         return made
-
-    def at_rest(self) -> Records:
-        """Before the first reading."""
-        return records(STATE, len(self.part), force_n=np.nan)
-
-    def compensated(
-        self, apparent_n: Floats, t_ns: Times, state: Records
-    ) -> tuple[Floats, Records]:
-        """Forces that appear as these at instants, both (n, tiles); see `compensated`."""
-        out, after = np.empty(apparent_n.shape), copied(state)
-        _compensate(self.laws(), after, apparent_n, t_ns, out)
-        return out, after
 
 
 @compiled
@@ -116,14 +109,3 @@ def crept_parts(h: float) -> tuple[float, float, float]:
     decay = math.exp(-h)
     mean = -math.expm1(-h) / h if h > 0.0 else 1.0
     return decay, mean - decay, 1.0 - mean
-
-
-@compiled
-def _compensate(
-    laws: Records, state: Records, apparent_n: Floats, t_ns: Times, out: Floats
-) -> None:
-    n, tiles = apparent_n.shape
-    for i in range(n):
-        for j in range(tiles):
-            law, tile = laws[j], state[j]
-            out[i, j] = compensated(law, tile, apparent_n[i, j], t_ns[i, j], math.nan, math.nan)

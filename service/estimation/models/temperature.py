@@ -20,7 +20,7 @@ import numpy as np
 
 from devices.arrays import Floats, Times
 from devices.compiled import compiled
-from service.estimation.records import Record, Records, copied, record_type, records
+from service.estimation.records import Record, Records, record_type, records
 
 SETTLE_S = 0.5
 """How long the mean of the chip's temperature is taken as that of the gas."""
@@ -104,24 +104,6 @@ class Temperature:
             noise_counts=noise_counts(self.lag_s, self.step_s),
         )
 
-    def at_tare(
-        self, kpa: Floats, tadc: Floats, t_ns: Times, state: Records
-    ) -> tuple[Floats, Floats, Records]:
-        """Pressures as they would be at the tare's temperature, arrays (n, tiles); see `at_tare`.
-
-        Args:
-            kpa: absolute pressures.
-            tadc: counts, NaN where there are none.
-            t_ns: instants.
-            state: from the readings before.
-
-        Returns:
-            The pressures, their standard uncertainty from temperature, and the next state.
-        """
-        out, sigma_kpa, after = np.empty(kpa.shape), np.empty(kpa.shape), copied(state)
-        _take_back(self.laws(), after, kpa, tadc, t_ns, out, sigma_kpa)
-        return out, sigma_kpa, after
-
 
 def smoothing_s(lag_s: Floats) -> Floats:
     """Over what time a chip with such a lag is smoothed: the lag itself, if the gas is behind."""
@@ -138,21 +120,18 @@ def noise_counts(lag_s: Floats, step_s: float) -> Floats:
     return np.asarray(np.where(lag_s < 0.0, NOISE_COUNTS * np.sqrt(np.minimum(power, 4.0)), 0.0))
 
 
-def followed(
-    tadc: Floats, t_ns: Times, lag_s: Floats, state: Records
-) -> tuple[Floats, Floats, Records]:
-    """Counts of every tile's gas, how fast they rise in counts a second, and the next state.
+def followed(tadc: Floats, t_ns: Times, lag_s: Floats) -> tuple[Floats, Floats]:
+    """Counts of every tile's gas from rest on, and how fast they rise in counts a second.
 
     Args:
         tadc: counts of the chips (n, tiles), NaN where there are none.
         t_ns: instants (n, tiles).
         lag_s: (tiles,), negative where the chip is behind.
-        state: from the readings before.
     """
-    gas, rise, after = np.empty(tadc.shape), np.empty(tadc.shape), copied(state)
+    gas, rise = np.empty(tadc.shape), np.empty(tadc.shape)
     laws = records(LAW, len(lag_s), lag_s=lag_s, smoothing_s=smoothing_s(lag_s))
-    _follow(laws, after, tadc, t_ns, gas, rise)
-    return gas, rise, after
+    _follow(laws, at_rest(len(lag_s)), tadc, t_ns, gas, rise)
+    return gas, rise
 
 
 @compiled
@@ -214,23 +193,6 @@ def follow(law: Record, state: Record, tadc: float, t_ns: int) -> None:
         ahead = once - state.twice_counts
     state.gas_counts = once + (1.0 - law.lag_s / smooth) * ahead
     state.rise_per_s = ahead / smooth
-
-
-@compiled
-def _take_back(
-    laws: Records,
-    state: Records,
-    kpa: Floats,
-    tadc: Floats,
-    t_ns: Times,
-    out: Floats,
-    sigma_kpa: Floats,
-) -> None:
-    n, tiles = kpa.shape
-    for i in range(n):
-        for j in range(tiles):
-            law, tile = laws[j], state[j]
-            out[i, j], sigma_kpa[i, j] = at_tare(law, tile, kpa[i, j], tadc[i, j], t_ns[i, j])
 
 
 @compiled

@@ -15,8 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.chips.compensation import Compensation
-from devices.chips.mpl115a2 import Coefficients, compensate_kpa, padc_of_kpa
-from devices.frames import FrameBatch
+from devices.chips.mpl115a2 import (
+    PRESSURE_MIN_KPA,
+    Coefficients,
+    compensate_kpa,
+    padc_of_kpa,
+)
+from devices.frames import NOT_READ, FrameBatch
+from devices.temperature import hold_temperature
 from service.estimation.estimate import Estimator
 from service.estimation.estimates import EstimateStatus
 from service.estimation.ladder.plan import make_plan
@@ -203,6 +209,27 @@ def test_a_temperature_that_was_not_read_is_that_of_the_frame_before_and_none_at
     e = estimate(newton_plan(array_at(SQUARE)), frames)
     assert np.isnan(e.grf_n[0])
     assert e.grf_n[1:] == pytest.approx([34.0] * 11)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_pressures_are_those_that_tare_and_calibration_work_with_to_the_bit(seed: int) -> None:
+    # Compiled here, numpy there: held temperatures, faults of every kind, pauses of a minute.
+    rng = np.random.default_rng(seed)
+    frames = wild_frames(60, 4, seed)
+    frames.tadc[rng.random(frames.tadc.shape) < 0.5] = NOT_READ
+    plan = newton_plan(array_at(SQUARE), models=("static",))
+    kpa = plan.compensation.readable_kpa(hold_temperature(frames)[0])
+    kpa[~(kpa >= PRESSURE_MIN_KPA)] = np.nan
+    gauge_kpa = estimate(replace(plan, watch=None), frames).gauge_kpa
+    assert gauge_kpa.tobytes() == (kpa - plan.tare.baseline_kpa).tobytes()
+
+
+def test_frames_of_another_number_of_tiles_are_refused() -> None:
+    estimator = Estimator(newton_plan(array_at(SQUARE)))
+    for tiles in (3, 5):
+        with pytest.raises(ValueError, match=f"frames of {tiles} tiles, a plan of 4"):
+            estimator.step(loaded_frames(held([0] * tiles)))
 
 
 @pytest.mark.parametrize("padc", [894, 1000, 1022, 1023])

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mpf
 
-from service.estimation.models import ambient, denoise, gas, rubber, temperature
-from service.estimation.models.flow import Flow
-from service.estimation.models.hysteresis import Hysteresis
+from service.estimation.models import ambient, denoise, flow, gas, hysteresis, rubber, temperature
 from service.estimation.tare.noise import left_by_mean
+from tests.builders.averages import denoised
+from tests.builders.readings import through
 from tests.service.estimation.exact import digits, lower, upper
 
 GOAL = 1e-9
@@ -32,11 +32,6 @@ def with_holes(rng: np.random.Generator, values: np.ndarray) -> np.ndarray:
     return np.where(rng.random(values.shape) < 0.1, rng.choice([NAN, np.inf, -np.inf]), values)
 
 
-def in_two_parts(n: int) -> list[slice]:
-    """A model goes on where the batch before has ended."""
-    return [slice(0, n // 3), slice(n // 3, n)]
-
-
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -51,13 +46,10 @@ def test_gas_is_within_a_micropascal(gamma: float, tau_s: float, seed: int) -> N
     kpa = with_holes(rng, 100.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = wild_instants(rng, 40)
     model = gas.Gas(*(np.array([x]) for x in (gamma, tau_s, 0.00124, 100.1)))
-    state, out = gas.at_rest(1), []
-    for rows in in_two_parts(40):
-        settled, state = model.settled(kpa[rows, None], t_ns[rows, None], state)
-        out.append(settled)
+    found = through(gas.settled, model.laws(), gas.at_rest(1), kpa, t_ns, NAN)
     parameters = (mpf(gamma), mpf(tau_s), mpf(0.00124), mpf(100.1))
     expected = lower.gas(digits.exact(kpa), t_ns.tolist(), *parameters)
-    assert digits.apart(np.concatenate(out), expected) < GOAL
+    assert digits.apart(found[:, None], expected) < GOAL
 
 
 @settings(max_examples=15)
@@ -73,17 +65,15 @@ def test_rubber_is_within_a_nanonewton(
     apparent_n = with_holes(rng, 15.0 + np.cumsum(rng.normal(0, 2.0, 40)))
     t_ns = wild_instants(rng, 40)
     model = rubber.Rubber(np.array([parts]), np.array([taus_s]))
-    state, out = model.at_rest(), []
-    for rows in in_two_parts(40):
-        force_n, state = model.compensated(apparent_n[rows, None], t_ns[rows, None], state)
-        out.append(force_n)
+    seen = apparent_n, t_ns, NAN, NAN
+    found = through(rubber.compensated, model.laws(), rubber.at_rest(1), *seen)
     expected = upper.rubber(
         digits.exact(apparent_n),
         t_ns.tolist(),
         [mpf(g) for g in parts],
         [mpf(tau) for tau in taus_s],
     )
-    assert digits.apart(np.concatenate(out), expected) < GOAL
+    assert digits.apart(found[:, None], expected) < GOAL
 
 
 @settings(max_examples=15)
@@ -100,15 +90,13 @@ def test_flow_is_within_a_nanonewton(
     rng = np.random.default_rng(seed)
     apparent_n = with_holes(rng, 3.0 + np.cumsum(rng.normal(0, swing_n, 40)))
     t_ns = wild_instants(rng, 40)
-    model = Flow(np.array([part]), np.array([stress_n]), np.array([power]))
-    state, out = model.at_rest(), []
-    for rows in in_two_parts(40):
-        force_n, state = model.compensated(apparent_n[rows, None], t_ns[rows, None], state)
-        out.append(force_n)
+    model = flow.Flow(np.array([part]), np.array([stress_n]), np.array([power]))
+    seen = apparent_n, t_ns, NAN, NAN
+    found = through(flow.compensated, model.laws(), flow.at_rest(1), *seen)
     expected = upper.flow(
         digits.exact(apparent_n), t_ns.tolist(), mpf(part), mpf(stress_n), mpf(power)
     )
-    assert digits.apart(np.concatenate(out), expected) < GOAL
+    assert digits.apart(found[:, None], expected) < GOAL
 
 
 @settings(max_examples=15)
@@ -124,13 +112,11 @@ def test_hysteresis_is_within_a_nanonewton(
     apparent_n = with_holes(
         rng, rng.choice([0.0, 3.0, 20.0]) + np.cumsum(rng.normal(0, swing_n, 40))
     )
-    model = Hysteresis(np.array([parts], dtype=float))
-    plays_n, out = model.at_rest(), []
-    for rows in in_two_parts(40):
-        force_n, plays_n = model.compensated(apparent_n[rows, None], plays_n)
-        out.append(force_n)
+    model = hysteresis.Hysteresis(np.array([parts], dtype=float))
+    state = hysteresis.at_rest(1)
+    found = through(hysteresis.compensated, model.laws(), state, apparent_n, NAN)
     expected = upper.hysteresis(digits.exact(apparent_n), [mpf(w) for w in parts])
-    assert digits.apart(np.concatenate(out), expected) < GOAL * max(1.0, swing_n)
+    assert digits.apart(found[:, None], expected) < GOAL * max(1.0, swing_n)
 
 
 @settings(max_examples=15)
@@ -139,16 +125,10 @@ def test_temperature_is_within_a_billionth_of_a_count(lag_s: float, seed: int) -
     rng = np.random.default_rng(seed)
     tadc = with_holes(rng, 480.0 - rng.integers(0, 40, 60))
     t_ns = wild_instants(rng, 60)
-    state, out = temperature.at_rest(1), []
-    for rows in in_two_parts(60):
-        both = temperature.followed(tadc[rows, None], t_ns[rows, None], np.array([lag_s]), state)
-        out.append(np.concatenate(both[:2], axis=1))
-        state = both[2]
-    found = np.concatenate(out)
-    for column, expected in enumerate(
-        lower.temperature(digits.exact(tadc), t_ns.tolist(), mpf(lag_s))
-    ):
-        assert digits.apart(found[:, column], expected) < 1e-9
+    found = temperature.followed(tadc[:, None], t_ns[:, None], np.array([lag_s]))
+    exactly = lower.temperature(digits.exact(tadc), t_ns.tolist(), mpf(lag_s))
+    for column, expected in zip(found, exactly, strict=True):
+        assert digits.apart(column, expected) < 1e-9
 
 
 @settings(max_examples=15)
@@ -157,14 +137,9 @@ def test_ambient_is_within_a_micropascal(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kpa = with_holes(rng, rng.normal(0, 1.0, 60))
     t_ns = wild_instants(rng, 60)
-    model = ambient.Ambient(passed=np.array([0.11]), relative_sigma=0.1)
-    state, out = ambient.at_rest(), []
-    for rows in in_two_parts(60):
-        passed_kpa, _, state = model.passed_on(kpa[rows], t_ns[rows], state)
-        out.append(passed_kpa)
-    averaged = lower.smoothed(digits.exact(kpa), t_ns.tolist())
-    expected = [None if x is None else mpf(0.11) * x for x in averaged]
-    assert digits.apart(np.concatenate(out), expected) < GOAL
+    found = through(ambient.around, None, ambient.at_rest(), kpa, t_ns)
+    expected = lower.smoothed(digits.exact(kpa), t_ns.tolist())
+    assert digits.apart(found[:, None], expected) < GOAL
 
 
 @pytest.mark.parametrize("look_ms", [0, 3, 10, 100])
@@ -187,7 +162,7 @@ def test_denoise_is_within_a_nanonewton(look_ms: int, kind: str, lasts: float) -
     missing = rng.random(n) < (0.6 if kind == "few" else 0.05)
     run = np.arange(n) // 10 if kind == "crowded" else np.cumsum(rng.random(n) < 0.03)
     column = np.where(missing, NAN, values)
-    averaged, left, bend, of_bend = denoise.denoised(
+    averaged, left, bend, of_bend = denoised(
         column[:, None],
         np.full((n, 1), 0.3),
         t_ns[:, None],

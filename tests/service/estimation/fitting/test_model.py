@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.estimation.fitting.model import pressed
-from service.estimation.models import gas
-from service.estimation.models.flow import Flow
-from service.estimation.models.hysteresis import WIDTHS_N, Hysteresis
-from service.estimation.models.rubber import Rubber
+from service.estimation.models import flow, gas, hysteresis, rubber
+from service.estimation.models.hysteresis import WIDTHS_N
+from tests.builders.readings import through
 
 CURVE = np.array([22.0, 5.0, 5.0])
 SCALE_KPA, BASE_KPA, WALL = 16.0, 100.3, 0.00124
@@ -68,12 +69,13 @@ def test_creep_and_loop_come_back_to_a_nanonewton(seed: int) -> None:
     t_ns, force_n = strides(seed)
     law = (0.08, 0.3, 4.7)
     out = modelled(t_ns, force_n, part=PART, loop=LOOP, flow=law)
-    flow, loop = Flow(*(np.array([x]) for x in law)), Hysteresis(np.array([LOOP]))
-    sprung, _ = flow.compensated(apparent_n(out[:, :1]), t_ns[:, None], flow.at_rest())
-    unlooped, _ = loop.compensated(sprung, loop.at_rest())
-    rubber = Rubber(np.array([PART]), np.array([CREEP_S]))
-    found, _ = rubber.compensated(unlooped, t_ns[:, None], rubber.at_rest())
-    assert found[:, 0] == pytest.approx(force_n, abs=1e-9)
+    sprung, loop = flow.Flow(*(np.array([x]) for x in law)), hysteresis.Hysteresis(np.array([LOOP]))
+    creep, nan = rubber.Rubber(np.array([PART]), np.array([CREEP_S])), math.nan
+    felt_n = apparent_n(out[:, 0])
+    for model, of in ((flow, sprung), (hysteresis, loop), (rubber, creep)):
+        when = () if model is hysteresis else (t_ns, nan)
+        felt_n = through(model.compensated, of.laws(), model.at_rest(1), felt_n, *when, nan)
+    assert felt_n == pytest.approx(force_n, abs=1e-9)
     assert out[:, 2] == pytest.approx(force_n - apparent_n(out[:, 0]), abs=1e-9)
 
 
@@ -86,10 +88,10 @@ def test_the_gas_comes_back_as_exactly_as_the_forward_model_is_solved(
     t_ns, force_n = strides(seed)
     out = modelled(t_ns, force_n, gamma=gamma)
     model = gas.Gas(*(np.array([x]) for x in (gamma, 0.011, WALL, BASE_KPA)))
-    settled, _ = model.settled(out[:, :1], t_ns[:, None], gas.at_rest(1))
+    settled = through(gas.settled, model.laws(), gas.at_rest(1), out[:, 0], t_ns, math.nan)
     # After a long pause the inverse begins in equilibrium, where the rest of the heat is lost.
     long = np.diff(t_ns, prepend=t_ns[0]) > gas.RESTART * gamma * 0.011e9
-    off_kpa = np.abs(settled[:, 0] - out[:, 1])[1:]
+    off_kpa = np.abs(settled - out[:, 1])[1:]
     jump_kpa = 0.5 * np.abs(np.diff(out[:, 1]))
     assert (off_kpa[~long[1:]] <= ((gamma - 1) / gamma) ** 6 * 2.0 * jump_kpa.max() + 0.05).all()
     assert np.median(off_kpa) < 0.01

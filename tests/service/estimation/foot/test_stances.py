@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.foot.contact import UNKNOWN, Stance, Stances
+from service.estimation.foot.stances import UNKNOWN, Stance, Stances
 
 STEP_NS = 2_000_000
 

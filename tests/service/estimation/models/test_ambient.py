@@ -11,21 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from service.estimation.models.ambient import SMOOTHING_S, Ambient, at_rest
+from service.estimation.models.ambient import SMOOTHING_S, around, at_rest
 from tests.builders.arrays import array_at
 from tests.builders.calibrations import make_effects, newton_tile
 from tests.builders.estimates import newton_plan
-
-MODEL = Ambient(passed=np.array([1.0, 0.1]), relative_sigma=0.2)
+from tests.builders.readings import through
 
 
 def head(kpa: Any, t_s: Any) -> np.ndarray:
     """Averaged pressure around the foot."""
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    passed_kpa, sigma_kpa, _ = MODEL.passed_on(np.asarray(kpa, dtype=float), t_ns, at_rest())
-    np.testing.assert_array_equal(passed_kpa[:, 1], 0.1 * passed_kpa[:, 0])
-    np.testing.assert_array_equal(sigma_kpa, np.abs(0.2 * passed_kpa))
-    return passed_kpa[:, 0]
+    return through(around, None, at_rest(), np.asarray(kpa, dtype=float), t_ns)
 
 
 def test_water_that_comes_at_once_is_known_after_thirty_milliseconds_to_two_thirds() -> None:
@@ -71,10 +67,9 @@ def test_a_dome_passes_on_what_its_wall_gives_way_to() -> None:
 def test_a_bare_tile_that_falls_silent_is_believed_for_a_fifth_of_a_second() -> None:
     t_ns = np.arange(300, dtype=np.int64) * 2_000_000
     kpa = np.where(np.arange(300) < 100, 1.0, np.nan)
-    passed_kpa, _, state = Ambient(np.array([0.1]), 0.1).passed_on(kpa, t_ns, at_rest())
-    assert passed_kpa[:200, 0] == pytest.approx(0.1)
-    assert np.isnan(passed_kpa[200:, 0]).all()
-    later, _, _ = Ambient(np.array([0.1]), 0.1).passed_on(
-        np.full(9, 2.0), t_ns[-1] + t_ns[1:10], state
-    )
+    state = at_rest()
+    head_kpa = through(around, None, state, kpa, t_ns)
+    assert head_kpa[:200] == pytest.approx(1.0)
+    assert np.isnan(head_kpa[200:]).all()
+    later = through(around, None, state, 2.0, t_ns[-1] + t_ns[1:10])
     assert np.isfinite(later).all(), "and again as soon as it speaks"

@@ -15,10 +15,10 @@ from service.estimation.models.denoise import (
     AGREE,
     AVERAGED_MAX,
     REACHES,
-    denoised,
     share_bend,
 )
 from service.estimation.tare.noise import left_by_mean
+from tests.builders.averages import denoised
 
 SIGMA_N, PERIOD_NS = 0.3, 1_838_235
 

@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from service.estimation.effects import PART_MOST
 from service.estimation.models import flow
 from service.estimation.models.flow import STROKE_N_PER_S, Flow
+from tests.builders.readings import through
 
 PART, STRESS_N = 0.08, 0.3
 STEP_S = 0.002
@@ -31,14 +32,8 @@ def compensated(
 ) -> np.ndarray:
     model = Flow(np.array([part]), np.array([stress_n]), np.array([power]))
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    (law,), (state,) = model.laws(), model.at_rest()
-    column = np.asarray(apparent_n, dtype=float)
-    return np.array(
-        [
-            flow.compensated(law, state, force_n, at_ns, borne_n, away_n)
-            for force_n, at_ns in zip(column, t_ns, strict=True)
-        ]
-    )
+    seen = np.asarray(apparent_n, dtype=float), t_ns, borne_n, away_n
+    return through(flow.compensated, model.laws(), flow.at_rest(1), *seen)
 
 
 def borne_by_branch(t_s: np.ndarray, force_n: np.ndarray, power: float) -> np.ndarray:

@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.gas import RESTART, Gas, at_rest
+from service.estimation.models import gas
+from service.estimation.models.gas import RESTART, Gas
+from tests.builders.readings import through
 
 GAMMA, TAU_S, WALL, BASE_KPA = 1.28, 0.011, 0.00124, 100.0
 K = (GAMMA - 1.0) / GAMMA
@@ -20,8 +22,8 @@ GAMMA_TAU_S = GAMMA * TAU_S
 def settled(kpa: Any, t_s: Any, *, gamma: float = GAMMA, wall: float = WALL) -> np.ndarray:
     model = Gas(*(np.array([x]) for x in (gamma, TAU_S, wall, BASE_KPA)))
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    out, _ = model.settled(np.asarray(kpa, dtype=float)[:, None], t_ns[:, None], at_rest(1))
-    return out[:, 0]
+    kpa = np.asarray(kpa, dtype=float)
+    return through(gas.settled, model.laws(), gas.at_rest(1), kpa, t_ns, math.nan)
 
 
 def given_way(kpa: Any, warm: Any) -> Any:

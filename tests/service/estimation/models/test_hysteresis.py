@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.hysteresis import OPENS, WIDTHS_N, Hysteresis
+from service.estimation.models import hysteresis
+from service.estimation.models.hysteresis import OPENS, WIDTHS_N
+from tests.builders.readings import through
 
 PART = (0.05, 0.04, 0.03)
 
@@ -30,9 +32,9 @@ def looped(force_n: list[float], part: tuple[float, ...]) -> list[float]:
 
 
 def compensated(apparent_n: list[float], part: tuple[float, ...] = PART) -> np.ndarray:
-    model = Hysteresis(np.array([part]))
-    out, _ = model.compensated(np.array(apparent_n, dtype=float)[:, None], model.at_rest())
-    return out[:, 0]
+    laws = hysteresis.Hysteresis(np.array([part])).laws()
+    felt_n = np.array(apparent_n, dtype=float)
+    return through(hysteresis.compensated, laws, hysteresis.at_rest(1), felt_n, math.nan)
 
 
 @given(

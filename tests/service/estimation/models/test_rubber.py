@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimation.models.rubber import Rubber
+from service.estimation.models import rubber
+from tests.builders.readings import through
 
 PART, TAU_S = (0.05, 0.04), (0.06, 1.1)
 
 
 def compensated(apparent_n: Any, t_s: Any, *, part: tuple[float, ...] = PART) -> np.ndarray:
-    model = Rubber(np.array([part]), np.array([TAU_S]))
+    model = rubber.Rubber(np.array([part]), np.array([TAU_S]))
     t_ns = np.rint(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    apparent_n = np.asarray(apparent_n, dtype=float)
-    out, _ = model.compensated(apparent_n[:, None], t_ns[:, None], model.at_rest())
-    return out[:, 0]
+    seen = np.asarray(apparent_n, dtype=float), t_ns, math.nan, math.nan
+    return through(rubber.compensated, model.laws(), rubber.at_rest(1), *seen)
 
 
 def crept(t_s: Any) -> Any:

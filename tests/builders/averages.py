@@ -1,0 +1,49 @@
+"""`denoise` on whole columns, each tile on its own."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from devices.arrays import Floats, Times
+from devices.compiled import compiled
+from service.estimation.models import denoise
+
+
+@compiled
+def denoised(
+    values: Floats,
+    sigmas: Floats,
+    t_ns: Times,
+    frame_t_ns: Times,
+    at_ns: Times,
+    run: Times,
+    look_ns: int,
+    noise_left: Floats,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """What `denoise.averaged` gives of every value, arrays (n, tiles); NaN where there is none.
+
+    Args:
+        values: (n, tiles), NaN where there is none.
+        sigmas: (n, tiles), standard deviation of a single one.
+        t_ns: (n, tiles), instants of the samples.
+        frame_t_ns: (n,), of the frames, which bound the windows.
+        at_ns: (n, tiles), the instants that are asked for.
+        run: (n,), number of the unbroken run that a frame belongs to.
+        look_ns: look-ahead.
+        noise_left: (tiles, `AVERAGED_MAX` + 1).
+    """
+    n, tiles = values.shape
+    out = np.full((4, n, tiles), math.nan)
+    columns, scratch, rows = (values, sigmas, t_ns, run), denoise.scratch_of_windows(), (0, 0)
+    for i in range(n):
+        rows = denoise.in_sight(frame_t_ns, i, 0, n, rows, look_ns)
+        for j in range(tiles):
+            if not math.isnan(values[i, j]):
+                found, _ = denoise.averaged(
+                    columns, i, j, at_ns[i, j], rows, noise_left[j], denoise.ANYWHERE, scratch
+                )
+                for part in range(4):
+                    out[part, i, j] = found[part]
+    return out[0], out[1], out[2], out[3]
