@@ -3,8 +3,9 @@
     python benchmarks/slices.py [--hours 1,10] [--turns 15] [--folder DIR]
 
 Sessions of four tiles at 544 Hz with estimates are written from noise; nothing is simulated. Ours
-are a request to the server's application in this process, and what `foottile export` does once it
-is started. Beside them stands what pyarrow needs for the same numbers, from the row groups that the
+are a request to the server's application in this process, and what `foottile export` and `foottile
+estimate` do once they are started; the latter runs its models ten seconds longer and writes all
+columns. Beside them stands what pyarrow needs for the same numbers, from the row groups that the
 footer's statistics name, with the footer read anew and with one that is kept. Jobs take turns, each
 at another place of the session; figures are CPU time of all threads, medians, in brackets the least
 and the greatest, and the ratio to pyarrow. The command as a whole is measured as a process, at a
@@ -36,6 +37,8 @@ from recording_memory import BOOT_ID, UTC_NS, array, minute
 from side_by_side import in_turns, note, spread, table
 
 from service.api.app import make_app
+from service.estimation import OFFLINE_LAG_MS
+from service.offline.estimate import Estimated, estimate_session
 from service.server.server import Server
 from storage.file_hash import sha256_of
 from storage.formats.sealed import export_file
@@ -143,6 +146,22 @@ def by_export(path: Path, start_s: float) -> Values:
         return _column(b"".join(export_file(reader, "arrow", part, clock="node", marks=None)))
 
 
+def by_estimate(path: Path, start_s: float) -> Estimated:
+    """What `foottile estimate` does."""
+    with tempfile.TemporaryDirectory() as folder:
+        return estimate_session(
+            path,
+            Path(folder) / "out.parquet",
+            calibration="paper-eq2-shape",
+            models=("unwrap", "static"),
+            lag_ms=OFFLINE_LAG_MS,
+            scene=None,
+            tare_s=(0.0, 1.0),
+            part=Slice(start_s, start_s + SECONDS),
+            remark=lambda _: None,
+        )
+
+
 def _column(content: bytes) -> Values:
     return pa.ipc.open_stream(io.BytesIO(content)).read_all().column(COLUMN).to_numpy()
 
@@ -203,12 +222,13 @@ def measure(path: Path, number: int, minutes: int, rest: Rest, turns: int) -> li
     where = {name: places(minutes) for name in _JOBS}
 
     def job(name: str) -> Callable[[], object]:
-        ways: dict[str, Callable[[float], Values]] = {
+        ways: dict[str, Callable[[float], object]] = {
             _JOBS[0]: lambda start_s: rest.slice(number, start_s),
             _JOBS[1]: lambda start_s: by_export(path, start_s),
             _JOBS[2]: lambda start_s: by_pyarrow(path, start_s, None),
             _JOBS[3]: lambda start_s: by_pyarrow(path, start_s, kept),
-            _JOBS[4]: lambda _: np.frombuffer(rest.get("/version"), np.uint8),
+            _JOBS[4]: lambda _: rest.get("/version"),
+            _JOBS[5]: lambda start_s: by_estimate(path, start_s),
         }
         return lambda: ways[name](next(where[name]))
 
@@ -238,6 +258,7 @@ _JOBS = (
     "pyarrow, footer read",
     "pyarrow, footer kept",
     "REST, of nothing",
+    "`estimate`",
 )
 
 

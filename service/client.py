@@ -1,4 +1,4 @@
-"""A client of the REST API: lists sessions and downloads them whole, resuming and verifying."""
+"""A client of the REST API: lists sessions, downloads them verified, whole or a slice."""
 
 from __future__ import annotations
 
@@ -14,10 +14,20 @@ import httpx
 from devices.errors import DamagedFileError, LinkError, StateError, UsageError
 from storage.checked_json import read_checked, write_checked
 from storage.checked_table import table_of
-from storage.durable import LOCK_NAME, set_aside, storage_errors, sync_folder, write_whole
+from storage.durable import (
+    LOCK_NAME,
+    set_aside,
+    storage_errors,
+    sync_folder,
+    temporary_of,
+    write_whole,
+)
 from storage.file_hash import sha256_of
+from storage.formats.export import Format
+from storage.formats.slice import Slice
 from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME
+from storage.verify.exported import verify_export
 
 API = "/api/v1"
 _CHUNK = 1 << 20
@@ -108,11 +118,7 @@ class Client:
             UsageError: that is a folder in which a server or node keeps its sessions.
             StorageError: it cannot be written.
         """
-        if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
-            raise UsageError(
-                f"{session_id!r} is no session id", remedy="List them with `foottile sessions`"
-            )
-        session = self._get(f"/sessions/{session_id}")
+        session = self._session(session_id)
         if session["sha256"] is None:
             raise StateError(
                 f"session {session_id} is {session['state']}"
@@ -135,6 +141,73 @@ class Client:
         for name in ("events", "clock"):
             self._pull_table(f"/sessions/{session_id}/{name}", folder / f"{name}.parquet")
         return {**session, "path": str(path), "resumed_bytes": resumed}
+
+    def pull_slice(self, session_id: str, out: Path, part: Slice, to: Format) -> dict[str, Any]:
+        """Download some seconds or columns of a session into a file in the folder `out`.
+
+        The server reads, and sends, no more than that. A slice has no hash of its own: its pages'
+        checksums prove it if it is Parquet, and its metadata say what it was made of.
+
+        Returns:
+            Where it is, and what is known of its session.
+
+        Raises:
+            LinkError: the server does not answer or refuses, or what came cannot be read.
+            UsageError: that is a folder in which a server or node keeps its sessions.
+            StorageError: it cannot be written.
+        """
+        session = self._session(session_id)
+        refuse_data_folder(out)
+        with storage_errors(out):
+            out.mkdir(parents=True, exist_ok=True)
+        end = "end" if part.end_s is None else f"{part.end_s:g}s"
+        path = out / f"{session_id}_{part.start_s or 0.0:g}s-{end}.{to}"
+        query: dict[str, object] = {"format": to, "start_s": part.start_s, "end_s": part.end_s}
+        query["columns"] = ",".join(part.columns) or None
+        asked = {name: str(value) for name, value in query.items() if value is not None}
+        # Under a name of its own until it is proven: who is cut off begins anew.
+        partial = temporary_of(path)
+        try:
+            self._write(f"/sessions/{session_id}/data", asked, partial)
+            report = verify_export(partial)
+            if report is None or report.problems:
+                why = "it cannot be read" if report is None else report.problems[0]
+                raise LinkError(
+                    f"the slice did not come whole: {why}",
+                    where=self.server,
+                    remedy="Run the same command again",
+                )
+            with storage_errors(path):
+                partial.replace(path)
+                sync_folder(path.parent)
+        finally:
+            partial.unlink(missing_ok=True)
+        return {**session, "path": str(path), "bytes": path.stat().st_size}
+
+    def _write(self, url: str, query: dict[str, str], path: Path) -> None:
+        """Write an answer to a file, on the disk."""
+        try:
+            with self._http.stream("GET", url, params=query) as answer:
+                if answer.is_error:
+                    answer.read()
+                    raise self._refused(answer)
+                with storage_errors(path), path.open("xb") as file:
+                    for chunk in answer.iter_bytes(_CHUNK):
+                        file.write(chunk)
+                    file.flush()
+                    os.fsync(file.fileno())
+        except httpx.HTTPError as error:
+            raise self._broken_off(error, "Run the same command again") from error
+
+    def _session(self, session_id: str) -> dict[str, Any]:
+        if not re.fullmatch(r"[0-9A-Za-z-]{1,64}", session_id):
+            raise UsageError(
+                f"{session_id!r} is no session id", remedy="List them with `foottile sessions`"
+            )
+        return self._get(f"/sessions/{session_id}")
+
+    def _broken_off(self, error: httpx.HTTPError, remedy: str) -> LinkError:
+        return LinkError(f"the download broke off: {error}", where=self.server, remedy=remedy)
 
     def _download(self, session: dict[str, Any], path: Path) -> int:
         """Download to a partial file that is kept if it breaks off; bytes that were there."""
@@ -160,11 +233,8 @@ class Client:
                         file.flush()
                         os.fsync(file.fileno())
         except httpx.HTTPError as error:
-            raise LinkError(
-                f"the download broke off: {error}",
-                where=self.server,
-                remedy="Run the same command again: it goes on where it stopped",
-            ) from error
+            again = "Run the same command again: it goes on where it stopped"
+            raise self._broken_off(error, again) from error
         if sha256_of(partial) != session["sha256"]:
             partial.unlink()
             raise LinkError(

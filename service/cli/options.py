@@ -38,6 +38,10 @@ ExactOption = Annotated[
     bool,
     typer.Option("--exact", help="Keep estimates as computed: do not round off their noise."),
 ]
+StartOption = Annotated[
+    float | None, typer.Option(help="From so many seconds after the first frame.")
+]
+EndOption = Annotated[float | None, typer.Option(help="Before so many seconds.")]
 
 
 class _Output(Console):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,17 @@ from service.estimation.ladder.plan import EstimationPlan
 from service.estimation.tare.tare import Tare
 from service.offline.calibrations import BENCH, find_calibration
 from service.offline.findings import Findings, FindingsOf
+from service.offline.stretch import Stretch, since, stretch_of
 from service.sessions.pipeline import EstimateOptions, EstimateStream, notes_of
+from storage.formats.slice import Slice
 from storage.schema import MILL, PARTS, TRUTH
 from storage.sessions.file import SessionWriter
 from storage.sessions.frame_order import in_order
 from storage.sessions.reader import SessionReader
+
+_ALL = Slice()
+_OF_THE_WHOLE = frozenset({"session", "ledger"})
+"""Notes of a session that its part cannot keep: it has other frames."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +50,35 @@ def estimate_session(
     lag_ms: float,
     scene: str | None,
     tare_s: tuple[float, float] | None,
+    part: Slice = _ALL,
     exact: bool = False,
     remark: Callable[[str], None],
 ) -> Estimated:
     """Estimate a session; see `foottile estimate --help` for what is taken from where.
 
+    Args:
+        source: the session.
+        out: the session to write; may be the same file if all of it is estimated.
+        calibration: file, preset or id; None: the session's own.
+        models: None: the scene's.
+        lag_ms: look-ahead.
+        scene: whose models, calibration and places are used; None: the session's.
+        tare_s: unloaded interval, in seconds from the first frame of the session.
+        part: seconds that are estimated; no more is read of the file than they need.
+        exact: nothing is rounded.
+        remark: told what is worth knowing.
+
     Raises:
-        FootTileError: the session, scene, calibration or tare is not usable; `out` is untouched.
+        FootTileError: the session, scene, calibration or tare is not usable, or no frame is in
+            the part; `out` is untouched.
     """
     the_scene = load_scene(scene) if scene is not None else None
-    with SessionReader(source) as session:
+    if not part.is_all and out.exists() and out.samefile(source):
+        raise UsageError(
+            f"--out {str(out)!r} is the session itself, of which a part would be left",
+            expected="another file",
+        )
+    with SessionReader(source, only_slices=not part.is_all) as session:
         info = _placed(session.info, the_scene)
         options = EstimateOptions(
             calibration=_calibration(session, the_scene, calibration, remark),
@@ -64,13 +89,18 @@ def estimate_session(
             exact=exact,
         )
         kept = [c.name for c in (*PARTS, *TRUTH, *MILL) if session.has(c.name)]
+        notes, stretch = session.notes, Stretch()
+        if not part.is_all:
+            options, stretch = _of_part(session, info, options, part)
+            notes = _notes_of_part(session, part, stretch)
         stream = EstimateStream(info, options)
         found = FindingsOf(judging=all(c.name in kept for c in TRUTH))
         asking = Asking(info, options.calibration, options.models)
         frames = 0
-        with SessionWriter(out, info, session.notes) as writer:
-            ordered = in_order(session.batches(*kept), where=str(source))
-            for batch, extra in stream.run(ordered):
+        with SessionWriter(out, info, notes) as writer:
+            pieces = session.batches(*kept, groups=stretch.groups)
+            ordered = in_order(pieces, where=str(source))
+            for batch, extra in stretch.given(stream.run(stretch.needed(ordered))):
                 if not frames and stream.plan is not None:
                     writer.add_notes(notes_of(stream.plan, stream.rounding, options.tares))
                 writer.append(batch, extra)
@@ -78,9 +108,29 @@ def estimate_session(
                 found.feed(batch, extra)
                 if stream.tare is not None:
                     asking.feed(stream.tare, batch, extra["contact"] == 1)
-    if stream.plan is None:
-        raise FileFormatError("the session has no frames", where=str(source))
+            if not frames or stream.plan is None:
+                what = "the session has no frames" + ("" if part.is_all else " in that time")
+                raise FileFormatError(what, where=str(source))
     return Estimated(frames, stream.plan, found.finish(stream.plan), asking.finish())
+
+
+def _of_part(
+    session: SessionReader, info: ArrayInfo, options: EstimateOptions, part: Slice
+) -> tuple[EstimateOptions, Stretch]:
+    """Options with the tares in force in a part, as in the whole session, and what is read."""
+    stream, tares = EstimateStream(info, options), options.tares
+    if not tares:
+        ordered = in_order(session.batches(), where=str(session.path))
+        tares = (stream.find_tare(ordered),)
+    stretch = stretch_of(session, part, stream.plan_of(tares[0]))
+    return replace(options, tare_s=None, tares=since(tares, stretch.from_ns)), stretch
+
+
+def _notes_of_part(session: SessionReader, part: Slice, stretch: Stretch) -> dict[str, object]:
+    """The session's, without what is true only of all of it."""
+    notes = {name: said for name, said in session.notes.items() if name not in _OF_THE_WHOLE}
+    seconds = {"start_s": part.start_s, "end_s": part.end_s, "warm_up_s": stretch.warm_up_s}
+    return {**notes, "part_of": {**session.identity, **seconds}}
 
 
 def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:

@@ -95,7 +95,7 @@ class EstimateStream:
                 expected="BEGIN,END in seconds from the first frame, BEGIN before END",
             )
         nothing = np.zeros(len(info.tiles))
-        self._make_plan(Tare(nothing, nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
+        self.plan_of(Tare(nothing, nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
 
     def run(
         self, pieces: Iterable[tuple[FrameBatch, Extra]]
@@ -108,19 +108,27 @@ class EstimateStream:
         for frames, columns in self._estimated(pieces):
             yield frames, self.rounding.rounded(columns)
 
+    def find_tare(self, pieces: Iterable[tuple[FrameBatch, Extra]]) -> Tare:
+        """The tare that `run` would find in a recording; read is no more of it than that takes.
+
+        Raises:
+            TareError: none can be found.
+        """
+        return self._find_tare([frames for frames, _ in self._until_tare(iter(pieces))])
+
     def _estimated(
         self, pieces: Iterable[tuple[FrameBatch, Extra]]
     ) -> Iterator[tuple[FrameBatch, Columns]]:
         pieces = iter(pieces)
         changes = deque(self._options.tares[1:])
         if self._options.tares:
-            self.plan = self._make_plan(self._options.tares[0])
+            self.plan = self.plan_of(self._options.tares[0])
         else:
             taken = self._until_tare(pieces)
-            self.plan = self._make_plan(self._find_tare([frames for frames, _ in taken]))
+            self.plan = self.plan_of(self._find_tare([frames for frames, _ in taken]))
             pieces = chain(taken, pieces)
         if not self._options.exact:
-            self.rounding = Rounding.of(chain([self.plan], map(self._make_plan, changes)))
+            self.rounding = Rounding.of(chain([self.plan], map(self.plan_of, changes)))
         run = EstimateRun(self.plan)
         self.tare = self.plan.tare
         last_t_mono_ns = 0
@@ -140,7 +148,7 @@ class EstimateStream:
                     rest = rest.rows(at, len(rest))
                     rest_of = {name: v[at:] for name, v in rest_of.items()}
                 yield from run.finish()
-                run = EstimateRun(self._make_plan(tare))
+                run = EstimateRun(self.plan_of(tare))
                 self.tare = tare
             if len(rest):
                 yield from run.feed(rest, rest_of)
@@ -168,7 +176,8 @@ class EstimateStream:
             interval_s=self._options.tare_s,
         )
 
-    def _make_plan(self, tare: Tare) -> EstimationPlan:
+    def plan_of(self, tare: Tare) -> EstimationPlan:
+        """Constants of the estimates with this tare."""
         options = self._options
         return make_plan(
             self._info, options.calibration, tare, models=options.models, lag_ms=options.lag_ms

@@ -102,13 +102,20 @@ class SessionReader:
         tiles = len(self.info.tiles)
         return all(self.column_names.issuperset(KNOWN[name].flat_names(tiles)) for name in names)
 
-    def batches(self, *extra: str) -> Iterator[tuple[FrameBatch, dict[str, Array]]]:
+    def batches(
+        self, *extra: str, groups: Sequence[int] | None = None
+    ) -> Iterator[tuple[FrameBatch, dict[str, Array]]]:
         """Frames in the order they were written, with the extra columns asked for.
+
+        Args:
+            extra: their names.
+            groups: the row groups to read; None: all.
 
         Raises:
             FileFormatError: a column is missing, of another type, or damaged.
         """
-        for values in self.columns(*(column.name for column in FRAMES), *extra):
+        names = (*(column.name for column in FRAMES), *extra)
+        for values in self.columns(*names, groups=groups):
             yield FrameBatch(**{column.name: values.pop(column.name) for column in FRAMES}), values
 
     def columns(
@@ -169,9 +176,7 @@ class SessionReader:
         """
         logical = flat_of(len(self.info.tiles))
         is_empty = True
-        for group, said in enumerate(self.extremes("t_ns")):
-            if said is not None and not _overlap(said, begin_t_ns, end_t_ns):
-                continue
+        for group in self.groups_within(begin_t_ns, end_t_ns):
             for table in self._tables(group, names):
                 with self._damage(group):
                     values = {name: flat_values(logical[name], name, table) for name in names}
@@ -181,6 +186,14 @@ class SessionReader:
             table = self.footer.schema.empty_table()
             with self._damage(0):
                 yield {name: flat_values(logical[name], name, table) for name in names}
+
+    def groups_within(self, begin_t_ns: int | None, end_t_ns: int | None) -> list[int]:
+        """Row groups that may hold frames of some time; bounds as for `flat`."""
+        return [
+            group
+            for group, said in enumerate(self.extremes("t_ns"))
+            if said is None or _overlap(said, begin_t_ns, end_t_ns)
+        ]
 
     def frames(self) -> FrameBatch:
         """All frames at once.

@@ -9,8 +9,10 @@ import typer
 
 from devices.errors import needs_extra
 from service.cli.options import (
+    EndOption,
     ExactOption,
     JsonOption,
+    StartOption,
     output_path,
     pair,
     print_json,
@@ -46,17 +48,23 @@ def estimate_command(
         str | None,
         typer.Option(metavar="A,B", help="Unloaded interval in seconds from the first frame."),
     ] = None,
+    start_s: StartOption = None,
+    end_s: EndOption = None,
     exact: ExactOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate a recorded session again and write it with the new estimates.
 
     The tare comes from --tare-s, else from frames flagged as lead, else from the first interval
-    that can be recognised as unloaded. Exit codes: 0 good, 1 failed, 2 wrong usage.
+    that can be recognised as unloaded. Of some seconds no more is read than they need: models begin
+    some time before them, and do not remember what was before that.
+
+    Exit codes: 0 good, 1 failed, 2 wrong usage.
     """
     from service.cli.report import findings_json, tell_findings
     from service.estimation.asked import SEEN
     from service.offline.estimate import estimate_session
+    from storage.formats.slice import Slice
 
     # The session itself may be the output: it is replaced whole, and nothing raw is lost.
     path = output_path(out, *(Path(name) for name in (calibration, scene) if name is not None))
@@ -69,6 +77,7 @@ def estimate_command(
             lag_ms=lag_ms,
             scene=scene,
             tare_s=pair(tare_s, "--tare-s"),
+            part=Slice(start_s, end_s),
             exact=exact,
             remark=remark,
         )

@@ -10,7 +10,9 @@ import typer
 from devices.errors import UsageError, needs_extra
 from devices.words import printable
 from service.cli.options import (
+    EndOption,
     JsonOption,
+    StartOption,
     data_folder,
     output_path,
     print_json,
@@ -29,6 +31,9 @@ _LONG = {"ledger", "events", "clock", "calibration", "scene_content"}
 """What a list of sessions leaves out."""
 
 ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
+ColumnsOption = Annotated[
+    str | None, typer.Option(help="Names with commas between: t_ns,grf_n,force_n_0.")
+]
 
 
 @needs_extra("server", "`foottile sessions`")
@@ -84,18 +89,32 @@ def pull_command(
     session: Annotated[str, typer.Argument(help="Id of the session.")],
     out: Annotated[Path, typer.Option(help="Folder to put it in; made if absent.")],
     server: ServerOption = None,
+    start_s: StartOption = None,
+    end_s: EndOption = None,
+    columns: ColumnsOption = None,
+    to: Annotated[str, typer.Option("--format", help="parquet, arrow or csv.")] = "parquet",
     as_json: JsonOption = False,
 ) -> None:
     """Download a sealed session: data, description, events. Goes on where it was broken off.
 
-    The data is compared with its hash. Exit code 3: the session is complete on disk, but lossy.
+    The data is compared with its hash. Some seconds or columns, or another format, are made by the
+    server for the asking, and are one file in --out. Exit code 3: the session is complete on disk,
+    but lossy.
     """
     from service.client import Client
+    from storage.formats.slice import Slice
 
+    chosen = _format(to)
+    part = Slice(start_s, end_s, _names(columns))
     with Client(server or SERVER) as client, progress(f"pulling {session}"):
-        pulled = client.pull(session, out)
+        if part.is_all and chosen == "parquet":
+            pulled = client.pull(session, out)
+        else:
+            pulled = client.pull_slice(session, out, part, chosen)
     if as_json:
         print_json(pulled)
+    elif "resumed_bytes" not in pulled:
+        say(f"{pulled['path']}: {pulled['bytes']} bytes")
     else:
         say(f"{pulled['path']}: {pulled['frames']} frames, {pulled['bytes']} bytes, hash verified")
         if pulled["resumed_bytes"]:
@@ -114,13 +133,9 @@ def export_command(
     data: Annotated[
         Path | None, typer.Option(help="Data folder of the server; default: the user's.")
     ] = None,
-    start_s: Annotated[
-        float | None, typer.Option(help="From so many seconds after the first frame.")
-    ] = None,
-    end_s: Annotated[float | None, typer.Option(help="Before so many seconds.")] = None,
-    columns: Annotated[
-        str | None, typer.Option(help="Names with commas between: t_ns,grf_n,force_n_0.")
-    ] = None,
+    start_s: StartOption = None,
+    end_s: EndOption = None,
+    columns: ColumnsOption = None,
     clock: Annotated[
         str, typer.Option(help="node, or server: adds t_server_ns and t_server_uncertainty_ns.")
     ] = "node",
@@ -135,21 +150,18 @@ def export_command(
 ) -> None:
     """Write a sealed session, or a slice of it, in another format."""
     from storage.durable import whole_file
-    from storage.formats.export import CLOCKS, FORMATS
+    from storage.formats.export import CLOCKS
     from storage.formats.sealed import export_file, marks_of
     from storage.formats.slice import Slice
     from storage.sessions.beside import EVENTS_NAME, read_events
     from storage.sessions.reader import SessionReader
 
-    if to not in FORMATS:
-        raise UsageError(f"--format {to!r}", expected=" or ".join(FORMATS))
+    chosen = _format(to)
     if clock not in CLOCKS:
         raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
-    chosen: Format = to
     source = _sealed_file(session, data)
     path = output_path(out, source)
-    names = tuple(name.strip() for name in (columns or "").split(",") if name.strip())
-    part = Slice(start_s, end_s, names)
+    part = Slice(start_s, end_s, _names(columns))
     with (
         SessionReader(source, only_slices=not part.is_all) as reader,
         progress(f"writing {path.name}"),
@@ -171,6 +183,19 @@ def export_command(
         remark(f"mark {mark.event.label!r} is not in it: {mark.left_out}")
     if marks is None and stored is None and "session" in reader.notes:
         remark(f"without marks: there is no {EVENTS_NAME} beside {source.name}")
+
+
+def _format(named: str) -> Format:
+    from storage.formats.export import FORMATS
+
+    for known in FORMATS:
+        if named == known:
+            return known
+    raise UsageError(f"--format {named!r}", expected=" or ".join(FORMATS))
+
+
+def _names(columns: str | None) -> tuple[str, ...]:
+    return tuple(name.strip() for name in (columns or "").split(",") if name.strip())
 
 
 def _in_folder(data: Path) -> list[dict[str, Any]]:

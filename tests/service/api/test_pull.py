@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import shutil
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import httpx
+import pyarrow as pa
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import LinkError, StateError, UsageError
 from service.client import Client
+from storage.formats.export import FORMATS, Format
+from storage.formats.slice import Slice
 from storage.verify.data import verdict_of, verify
 from tests.service.api.sealed import Sealed
 from tests.service.running import Running
@@ -124,3 +132,56 @@ def test_the_client_says_that_no_server_answers(running: Running, tmp_path: Path
     running.stop()
     with Client(running.url) as client, pytest.raises(LinkError, match="foottile serve"):
         client.sessions()
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_the_client_pulls_a_slice(sealed: Sealed, tmp_path: Path, to: Format) -> None:
+    part = Slice(0.25, 0.5, ("t_ns", "grf_n"))
+    with Client(sealed.running.url) as client:
+        pulled = client.pull_slice(sealed.id, tmp_path / "out", part, to)
+    path = Path(pulled["path"])
+    assert path.name == f"{sealed.id}_0.25s-0.5s.{to}"
+    assert pulled["bytes"] == path.stat().st_size
+    table = {
+        "parquet": lambda: pq.read_table(path),
+        "arrow": lambda: pa.ipc.open_stream(path.read_bytes()).read_all(),
+        "csv": lambda: pacsv.read_csv(path),
+    }[to]()
+    whole = pq.read_table(io.BytesIO(sealed.content), columns=["t_ns", "grf_n"])
+    since_ns = whole["t_ns"].to_numpy() - whole["t_ns"][0].as_py()
+    expected = whole.filter((since_ns >= 0.25e9) & (since_ns < 0.5e9))
+    assert table["t_ns"].to_pylist() == expected["t_ns"].to_pylist()
+    assert table.num_rows > 0
+    assert list(tmp_path.rglob("*.tmp")) == []
+
+
+def test_a_slice_that_is_refused_leaves_nothing_behind(sealed: Sealed, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with Client(sealed.running.url) as client:
+        with pytest.raises(LinkError, match="no column"):
+            client.pull_slice(sealed.id, out, Slice(columns=("weight_n",)), "arrow")
+        with pytest.raises(LinkError, match="is recording"):
+            client.pull_slice(sealed.recording.id, out, Slice(0.0, 1.0), "parquet")
+        with pytest.raises(UsageError, match="this is a data folder"):
+            client.pull_slice(sealed.id, sealed.session.folder, Slice(0.0, 1.0), "arrow")
+    assert list(out.iterdir()) == []
+
+
+def test_a_slice_that_is_damaged_on_its_way_is_refused(
+    sealed: Sealed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    given = httpx.Response.iter_bytes
+
+    def short(answer: httpx.Response, size: int | None = None) -> Iterator[bytes]:
+        content = b"".join(given(answer, size))
+        yield content if size is None else content[: len(content) // 2]
+
+    monkeypatch.setattr(httpx.Response, "iter_bytes", short)
+    for to in ("parquet", "arrow"):
+        with (
+            Client(sealed.running.url) as client,
+            pytest.raises(LinkError, match="did not come whole"),
+        ):
+            client.pull_slice(sealed.id, out, Slice(0.25, 0.5), to)
+    assert list(out.iterdir()) == []
