@@ -43,14 +43,18 @@ Columns = tuple[Floats, Floats, Times, Ints]
 """Values (n, columns), NaN where there is none; standard deviations of single ones, and instants of
 the samples, both likewise; and (n,) the number of the unbroken run that a frame belongs to."""
 Scratch = tuple[Floats, Floats, Floats]
-"""Room that `averaged` works in, from `scratch_of_windows`."""
+"""Room that `averaged` works in, from `scratch_of_windows`: of all windows so far the values, their
+variances, and 1 for a parabola."""
 KEPT_MAX = 4 * len(REACHES) + 1
+Moments = tuple[float, float, float, float, float, float, float, float]
+"""Of samples: how many, sums of the first four powers of their times, of their values, and of these
+times time and its square. Eight numbers that stay in registers."""
 
 
 @compiled
 def scratch_of_windows() -> Scratch:
     """Room that `averaged` works in."""
-    return np.empty(8), np.empty(8), np.empty((KEPT_MAX, 3))
+    return np.empty(KEPT_MAX), np.empty(KEPT_MAX), np.empty(KEPT_MAX)
 
 
 @inlined
@@ -112,13 +116,13 @@ def averaged(
     oldest, newest = rows
     sigma = sigmas[i, j]
     # Times relative to the instant asked for, in milliseconds.
-    moments, trial, kept = scratch
+    kept_values, kept_variances, kept_bent = scratch
     line_low, line_high, bent_low, bent_high = within
-    moments[:] = 0.0
-    _add(moments, (t_ns[i, j] - at_ns) * 1e-6, values[i, j])
+    nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    moments = _added(nothing, (t_ns[i, j] - at_ns) * 1e-6, values[i, j])
     best = shorter = shortest = values[i, j]
     variance = shorter_variance = shortest_variance = 1.0
-    kept[0, 0], kept[0, 1], kept[0, 2] = best, variance, 1.0
+    kept_values[0], kept_variances[0], kept_bent[0] = best, variance, 1.0
     stored = 1
     low = high = straight_low = straight_high = i
     open_low = open_high = straight = True
@@ -130,12 +134,11 @@ def averaged(
             way, edge = (1, high) if ahead else (-1, low)
             reached = min(newest, i + reach, bent_high), max(oldest, i - reach, bent_low)
             end = reached[0] if ahead else reached[1]
-            trial[:] = moments
-            at = edge
+            trial, at = moments, edge
             while at != end and run[at + way] == run[i]:
                 at += way
                 if not math.isnan(values[at, j]):
-                    _add(trial, (t_ns[at, j] - at_ns) * 1e-6, values[at, j])
+                    trial = _added(trial, (t_ns[at, j] - at_ns) * 1e-6, values[at, j])
             if at == edge:
                 continue
             accepted, remains = math.nan, 0.0
@@ -151,11 +154,12 @@ def averaged(
                 if math.isnan(value):
                     continue
                 of_noise *= _left(noise_left, of_noise)
-                if not _agree(kept, stored, value, of_noise, bent, (AGREE * sigma) ** 2):
+                if not _agree(scratch, stored, value, of_noise, bent, (AGREE * sigma) ** 2):
                     agrees = not bent
                     straight = False
                     break
-                kept[stored, 0], kept[stored, 1], kept[stored, 2] = value, of_noise, bent
+                kept_values[stored], kept_variances[stored] = value, of_noise
+                kept_bent[stored] = 1.0 if bent else 0.0
                 stored += 1
                 accepted, remains = value, of_noise
             if not agrees:
@@ -164,7 +168,7 @@ def averaged(
                 else:
                     open_low = False
                 continue
-            moments[:] = trial
+            moments = trial
             if ahead:
                 high = at
             else:
@@ -210,23 +214,22 @@ def share_bend(tiles: Records) -> None:
         tiles[j].smoothed_n = part * tiles[j].bend_n if known else 0.0
 
 
-@compiled
+@inlined
 def _agree(
-    kept: Floats, stored: int, value: float, of_noise: float, bent: bool, most: float
+    kept: Scratch, stored: int, value: float, of_noise: float, bent: bool, most: float
 ) -> bool:
-    """Does a window's value agree with the first `stored` of shorter ones, value, variance, bent?
+    """Does a window's value agree with the first `stored` of shorter ones?
 
     A shorter line is not a part of a longer parabola: their noise is taken for independent.
     """
-    for m in range(stored):
-        apart = value - kept[m, 0]
-        if kept[m, 2] > 0.0 or not bent:
-            of_difference = max(kept[m, 1] - of_noise, SAME * kept[m, 1])
-        else:
-            of_difference = kept[m, 1] + of_noise
-        if apart * apart > most * of_difference:
-            return False
-    return True
+    values, variances, were_bent = kept
+    apart = 0
+    for m in range(stored):  # all of them, several at a time: to stop at one would cost more
+        difference, variance = value - values[m], variances[m]
+        within = max(variance - of_noise, SAME * variance)
+        of_difference = variance + of_noise if bent and were_bent[m] == 0.0 else within
+        apart += difference * difference > most * of_difference
+    return apart == 0
 
 
 @compiled
@@ -239,21 +242,23 @@ def _left(by_readings: Floats, of_noise: float) -> float:
     return below + (readings - whole) * (above - below)
 
 
-@compiled
-def _add(moments: Floats, time: float, value: float) -> None:
+@inlined
+def _added(m: Moments, time: float, value: float) -> Moments:
     square = time * time
-    moments[0] += 1.0
-    moments[1] += time
-    moments[2] += square
-    moments[3] += square * time
-    moments[4] += square * square
-    moments[5] += value
-    moments[6] += time * value
-    moments[7] += square * value
+    return (
+        m[0] + 1.0,
+        m[1] + time,
+        m[2] + square,
+        m[3] + square * time,
+        m[4] + square * square,
+        m[5] + value,
+        m[6] + time * value,
+        m[7] + square * value,
+    )
 
 
 @compiled
-def _line(m: Floats) -> tuple[float, float]:
+def _line(m: Moments) -> tuple[float, float]:
     """Value of the fitted line at time 0, and its variance in units of a sample's."""
     det = m[0] * m[2] - m[1] * m[1]
     if m[0] < 3.0 or det <= SINGULAR * m[0] * m[2]:
@@ -262,7 +267,7 @@ def _line(m: Floats) -> tuple[float, float]:
 
 
 @compiled
-def _parabola(m: Floats) -> tuple[float, float]:
+def _parabola(m: Moments) -> tuple[float, float]:
     """Likewise of the fitted parabola, by the cofactors of its normal equations."""
     a0, a1, a2 = m[2] * m[4] - m[3] * m[3], m[2] * m[3] - m[1] * m[4], m[1] * m[3] - m[2] * m[2]
     det = m[0] * a0 + m[1] * a1 + m[2] * a2
