@@ -53,7 +53,10 @@ def frames_of(n: int, tiles: int) -> FrameBatch:
     rng = np.random.default_rng(1)
     shape = np.maximum(0.0, np.sin(2.0 * np.pi * np.arange(n) / 270.0))
     loads_n = shape[:, None] * rng.uniform(5.0, 60.0, tiles)
-    return loaded_frames(loads_n + rng.normal(0.0, 1.0, loads_n.shape))
+    frames = loaded_frames(loads_n + rng.normal(0.0, 1.0, loads_n.shape))
+    for column in vars(frames).values():
+        column.setflags(write=False)  # as those of a message are; others are copied at each step
+    return frames
 
 
 def cpu_s(plan: EstimationPlan, frames: FrameBatch, batch: int) -> float:

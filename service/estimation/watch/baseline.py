@@ -79,10 +79,11 @@ def lost(
         step_s = max(0.0, (t_ns - tile.t_ns) * 1e-9)
         if math.isnan(tile.kpa) or step_s > PAUSE_S:
             tile.kpa, tile.below_ns, step_s = gauge_kpa, NEVER_NS, 0.0
-        tile.kpa -= math.expm1(-step_s / SMOOTH_S) * (gauge_kpa - tile.kpa)
+        # The watch filters by implicit steps: stable however long, and without an exponential.
+        tile.kpa += step_s / (SMOOTH_S + step_s) * (gauge_kpa - tile.kpa)
         tile.t_ns = t_ns
         bound = LOST_KPA + SIGMAS * math.sqrt(variance) + WARMTH * abs(warmed_kpa)
-        kept = math.exp(-step_s / FORGET_S)
+        kept = FORGET_S / (FORGET_S + step_s)
         tile.more_kpa_s *= kept
         tile.less_kpa_s *= kept
         if tile.kpa >= -bound:

@@ -45,8 +45,8 @@ def moved_kpa(
             tile.chip = tile.gas = now
         else:
             step_s = max(0.0, (t_ns - tile.t_ns) * 1e-9)
-            tile.chip -= math.expm1(-step_s / SMOOTH_S) * (now - tile.chip)
-            tile.gas -= math.expm1(-step_s / LAG_S) * (tile.chip - tile.gas)
+            tile.chip += step_s / (SMOOTH_S + step_s) * (now - tile.chip)
+            tile.gas += step_s / (LAG_S + step_s) * (tile.chip - tile.gas)
         tile.t_ns = t_ns
     more = tile.chip if abs(tile.chip) > abs(tile.gas) else tile.gas
     return 0.0 if math.isnan(more) else kpa_per_count * more
