@@ -100,7 +100,7 @@ def _bear_tile(
     if scene.hysteresis == 1 or scene.rubber == 1:
         force_n, unseen_n = _undone(scene, law, tile, cell, averaged_n, at_ns)
     rate = _rate(tile, force_n, at_ns)
-    own_n = math.hypot(math.sqrt(now.noise_n**2 + cell.sigma_n**2), rate * law.late_sigma_s)
+    own_n = math.sqrt(now.noise_n**2 + cell.sigma_n**2 + (rate * law.late_sigma_s) ** 2)
     common_n = now.common_n
     common_n[0], common_n[1] = cell.gas_n, law.rubber_misfit * (force_n - averaged_n)
     common_n[2], common_n[3] = cell.unseen_gas_n, unseen_n
@@ -115,7 +115,7 @@ def _bear_tile(
         math.sqrt(variance),
         cell.beyond,
     )
-    return math.hypot(cell.unseen_gas_n, unseen_n)
+    return math.sqrt(cell.unseen_gas_n**2 + unseen_n**2)
 
 
 @inlined
@@ -254,13 +254,21 @@ def sigma_of_sum(borne: Records) -> float:
     A tile without weight may be unknown.
     """
     variance = 0.0
+    shared = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # `PARTS`, in registers
     for j in range(len(borne)):
-        if borne[j].weight != 0.0:
-            variance += (borne[j].weight * borne[j].own_n) ** 2
+        weight, common_n = borne[j].weight, borne[j].common_n
+        if weight != 0.0:
+            variance += (weight * borne[j].own_n) ** 2
+            shared = (
+                shared[0] + weight * common_n[0],
+                shared[1] + weight * common_n[1],
+                shared[2] + weight * common_n[2],
+                shared[3] + weight * common_n[3],
+                shared[4] + weight * common_n[4],
+                shared[5] + weight * common_n[5],
+                shared[6] + weight * common_n[6],
+                shared[7] + weight * common_n[7],
+            )
     for part in range(PARTS):
-        shared = 0.0
-        for j in range(len(borne)):
-            if borne[j].weight != 0.0:
-                shared += borne[j].weight * borne[j].common_n[part]
-        variance += shared * shared
+        variance += shared[part] * shared[part]
     return math.sqrt(variance)
