@@ -20,9 +20,11 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.core.caching import FunctionCache
+from numba.core import serialize
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 F = TypeVar("F", bound=Callable[..., Any])
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
 def compiled(function: F) -> F:
@@ -36,15 +38,21 @@ def inlined(function: F) -> F:
 
 
 def _compiled(function: F, *, forceinline: bool) -> F:
-    dispatcher: Any = numba.njit(nogil=True, error_model="numpy", forceinline=forceinline)(function)
+    dispatcher: Any = numba.njit(forceinline=forceinline, **_OPTIONS)(function)
     with contextlib.suppress(RuntimeError):  # nowhere to keep it: no home, read-only installation
         # As numba.njit(cache=True) does, which stops at a cache that it cannot read or write.
-        dispatcher._cache = _Kept(function)  # type: ignore[no-untyped-call]  # noqa: SLF001  # numba's own seam
+        dispatcher._cache = _Kept(function)  # noqa: SLF001  # numba's own seam
     return cast("F", dispatcher)
 
 
 class _Kept(FunctionCache):
     """Machine code on disk; a full disk, or a file that a power cut left, costs a second."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]  # numba has no types
+        self._cache_file = _Files(  # type: ignore[no-untyped-call]  # likewise
+            self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp()
+        )
 
     @cached_property
     def _made_of(self) -> str:
@@ -55,42 +63,79 @@ class _Kept(FunctionCache):
         return (*key, self._made_of)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError):
+        with contextlib.suppress(Exception):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]  # numba has no types
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # likewise
-        except (OSError, EOFError, pickle.UnpicklingError):
+        except Exception:  # there is nothing that a garbled pickle may not raise
             with contextlib.suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]  # it is written again
             return None
 
 
+class _Files(IndexDataCacheFile):
+    """An index and its files, of which each says itself what it is, and proves it.
+
+    The index is written first. If the file is not, because the disk is full or the process killed,
+    or if two processes write at once, then it points to machine code of something else, which would
+    run.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        content = serialize.dumps((self._source_stamp, key, data))  # type: ignore[no-untyped-call]  # likewise
+        super().save(key, hashlib.sha256(content).digest() + content)  # type: ignore[no-untyped-call]  # likewise
+
+    def load(self, key: Any) -> Any:
+        kept = super().load(key)  # type: ignore[no-untyped-call]  # likewise
+        if not isinstance(kept, bytes):
+            return None
+        size = hashlib.sha256().digest_size
+        if hashlib.sha256(kept[size:]).digest() != kept[:size]:
+            return None
+        stamp, of, data = pickle.loads(kept[size:])  # noqa: S301  # as numba does, and what we wrote
+        return data if (stamp, of) == (self._source_stamp, key) else None
+
+
 def _digest(function: Callable[..., Any]) -> str:
     """Of a function's code, of all compiled functions that it reaches, and of their constants."""
-    digest, seen, todo = hashlib.sha256(), set(), [function]
+    digest, seen, todo = hashlib.sha256(repr(_OPTIONS).encode()), set(), [function]
     while todo:
         each = todo.pop()
         if each in seen:
             continue
         seen.add(each)
-        digest.update(each.__code__.co_code)
-        for value in (*each.__code__.co_consts, *_globals_of(each)):
-            if isinstance(value, np.ndarray):
-                digest.update(value.tobytes())
-            elif isinstance(value, CodeType):
-                digest.update(value.co_code)
-            elif isinstance(value, int | float | str | tuple | np.dtype):
-                digest.update(repr(value).encode())
-            elif hasattr(value, "py_func"):
-                todo.append(value.py_func)
+        for code in _codes(each.__code__):
+            # The code of `a.x` is that of `a.y`, and that of `math.sin(a)` that of `math.cos(a)`.
+            _add(digest, code.co_code, repr(code.co_names).encode())
+            for value in (*code.co_consts, *_globals_of(each, code.co_names)):
+                if isinstance(value, np.ndarray):
+                    _add(digest, repr((value.dtype, value.shape)).encode(), value.tobytes())
+                elif isinstance(value, int | float | str | tuple | np.dtype | np.generic):
+                    _add(digest, repr(value).encode())
+                elif hasattr(value, "py_func"):
+                    todo.append(value.py_func)
+                else:
+                    _add(digest, getattr(value, "__qualname__", "").encode())
     return digest.hexdigest()
 
 
-def _globals_of(function: Callable[..., Any]) -> Iterator[Any]:
-    """What its names stand for in its module, and in modules that it names."""
-    names = function.__code__.co_names
+def _add(digest: Any, *parts: bytes) -> None:
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "big") + part)
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    """Of a function, and of those within it."""
+    yield code
+    for value in code.co_consts:
+        if isinstance(value, CodeType):
+            yield from _codes(value)
+
+
+def _globals_of(function: Callable[..., Any], names: tuple[str, ...]) -> Iterator[Any]:
+    """What names stand for in its module, and in modules that they name."""
     for name in names:
         value = function.__globals__.get(name)
         if isinstance(value, ModuleType):
