@@ -100,7 +100,8 @@ def counts_at(readings: Records, i: int, end: int, lag_ns: int) -> float:
 def _following(readings: Records, at: int, end: int, until_ns: int) -> int:
     """Frame in which the reading next after that of frame `at` is seen; -1: none is."""
     after = at + 1
-    while after < end and readings[after].t_ns <= until_ns:
+    # Of frames at the end of the look-ahead only the first is there for certain; without any, none.
+    while after < end and readings[after].t_ns <= until_ns and readings[after - 1].t_ns < until_ns:
         if readings[after].begins == 1:
             return after if readings[after].joins == 1 else -1
         after += 1
