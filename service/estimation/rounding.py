@@ -35,6 +35,8 @@ _RATE_MORE = 1.25
 """A window may have so many more readings than the nominal rate says: a bus catches up."""
 _PLACES = 1025
 """Of each tile's range, at which the least sigma of its force is looked for."""
+_STEP_LEAST = 2.0**-500
+"""Below it a quotient may be infinite; and no estimate has a digit there."""
 _DOWN = frozenset({"grf_at_least_n"})
 """A bound is rounded down, and remains one."""
 _BY_TILE = frozenset({"gauge_kpa", "force_n", "force_sigma_n"})
@@ -94,9 +96,9 @@ def _rounded(values: npt.NDArray[Any], step: Floats, *, down: bool) -> npt.NDArr
 
 def _steps(least: Sequence[Floats]) -> Floats:
     """The greatest powers of two that are small enough for each; 0 where there is no sigma."""
-    sigma = np.min(np.stack(least), axis=0)
-    usable = np.isfinite(sigma) & (sigma > 0.0)
-    exponent = np.frexp(np.where(usable, sigma / PART, 1.0))[1] - 1
+    most = np.min(np.stack(least), axis=0) / PART
+    usable = np.isfinite(most) & (most >= _STEP_LEAST)
+    exponent = np.frexp(np.where(usable, most, 1.0))[1] - 1
     return np.where(usable, np.ldexp(1.0, exponent), 0.0)
 
 

@@ -218,6 +218,14 @@ def test_without_noise_nothing_is_rounded_but_what_the_servo_says() -> None:
     np.testing.assert_array_equal(kept["force_n"], values)
 
 
+@pytest.mark.parametrize("sigma_n", [5e-324, 1e-323, 1e-310, 1e-200, 1e-140])
+def test_with_next_to_no_noise_nothing_is_moved_that_shows(sigma_n: float) -> None:
+    rounding = Rounding.of([newton_plan(array_at(SQUARE), sigma_n=sigma_n)])
+    values = np.random.default_rng(0).normal(0.0, 100.0, size=(9, 4))
+    columns = {"gauge_kpa": values, "force_n": values, "grf_at_least_n": values[:, 0]}
+    same_bits(rounding.rounded(columns), columns)
+
+
 @pytest.mark.parametrize("positions", [SQUARE[:1], SQUARE[:2], [SQUARE[0], SQUARE[2]]])
 def test_a_line_of_tiles_and_a_single_one_have_steps_across_as_well(
     positions: list[tuple[float, float, float]],
