@@ -164,6 +164,10 @@ class TemperatureEffect(CalibrationPart):
         return self
 
 
+LATE_MOST_S = 60.0
+"""Nor does any frame take longer; and instants, in nanoseconds, have 64 bits."""
+
+
 class Effects(CalibrationPart):
     """All that the recording determined; None otherwise, and `refused` says why."""
 
@@ -181,6 +185,12 @@ class Effects(CalibrationPart):
     at_bound: Annotated[tuple[Text, ...], Some] = ()
     """Parameters that were found at the end of what is possible."""
     refused: dict[EffectName, Text] = Field(default={})
+
+    @model_validator(mode="after")
+    def _is_read_in_its_frame(self) -> Self:
+        if self.late_s is not None and abs(self.late_s.value) > LATE_MOST_S:
+            raise ValueError(f"a tile is sampled {LATE_MOST_S:g} s from its frame at most")
+        return self
 
     @property
     def wall_per_kpa(self) -> float:

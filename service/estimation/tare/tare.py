@@ -19,6 +19,9 @@ from devices.errors import TareError
 TakenFrom = Literal["interval", "lead", "recognised", "unloaded", "flight"]
 Source = TakenFrom | Literal["lost"]
 _LASTING_MAX = {"noise_lasting": 1.0, "noise_lasting_s": 3600.0}
+_KPA_MAX = 1000.0
+"""Nine times as much as a chip tells, and near enough that no square of it overflows."""
+_TADC_MAX = 1023.0
 
 
 @dataclass(frozen=True)
@@ -93,11 +96,13 @@ class Tare:
                 raise ValueError(f"t_ns is {values['t_ns']}")  # noqa: TRY301  # caught with the others
             for name in ("baseline_kpa", "baseline_sigma_kpa", "noise_kpa"):
                 values[name] = np.array(content[name], dtype=np.float64)
-                if values[name].shape != (tiles,) or not np.isfinite(values[name]).all():
+                is_possible = (values[name] >= 0.0) & (values[name] <= _KPA_MAX)
+                if values[name].shape != (tiles,) or not is_possible.all():
                     raise ValueError(f"{name} is not that of {tiles} tiles")  # noqa: TRY301  # caught with the others
             counts = content.get("tadc_counts") or [None] * tiles
             values["tadc_counts"] = np.array(counts, dtype=np.float64)  # None becomes NaN
-            if values["tadc_counts"].shape != (tiles,):
+            is_none = (values["tadc_counts"] < 0.0) | (values["tadc_counts"] > _TADC_MAX)
+            if values["tadc_counts"].shape != (tiles,) or is_none.any():
                 raise ValueError(f"tadc_counts are not those of {tiles} tiles")  # noqa: TRY301  # caught with the others
             for name in ("noise_lasting", "noise_lasting_s"):
                 if content.get(name) is not None:

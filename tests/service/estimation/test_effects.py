@@ -71,6 +71,8 @@ def test_the_walls_give_is_that_of_the_soak_or_of_the_material() -> None:
         lambda: FlowEffect(part=p(0.1), stress_n=p(0.0), power=p(4.0)),
         lambda: FlowEffect(part=p(0.1), stress_n=p(0.1), power=p(1.0)),
         lambda: temperature(kpa_per_k=0.0),
+        lambda: make_effects(late_s=p(60.1)),
+        lambda: make_effects(late_s=p(-1e12)),
         lambda: Parameter(value=float("nan"), sigma=0.0),
         lambda: Parameter(value=1.0, sigma=float("inf")),
         lambda: Parameter(value=1.0, sigma=-1.0),
@@ -86,6 +88,7 @@ def test_the_limits_themselves_are_accepted() -> None:
     assert rubber((0.0, 0.99), (1e-9, 1e9)).part[1].value == 0.99
     assert HysteresisEffect(part=(p(0.0), p(0.0), p(0.999))).part[2].value == 0.999
     assert FlowEffect(part=p(0.4), stress_n=p(0.01), power=p(4.0)).part.value == 0.4
+    assert make_effects(late_s=p(-60.0)).late_s is not None
 
 
 def test_effects_survive_a_calibration_file_to_the_bit() -> None:

@@ -139,3 +139,22 @@ def test_a_tare_with_an_impossible_noise_is_refused(wrong: Any) -> None:
     content = tare_of(readings_of(300, part=0.9, readings=6.0, seed=5, tiles=2)).as_dict()
     with pytest.raises(TareError, match="not readable"):
         Tare.from_dict({**content, "noise_lasting": wrong}, tiles=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("baseline_kpa", -1.0),
+        ("baseline_kpa", 1e300),
+        ("baseline_sigma_kpa", -1e-3),
+        ("baseline_sigma_kpa", 1e300),
+        ("noise_kpa", -0.1),
+        ("noise_kpa", 1e200),
+        ("tadc_counts", 1e300),
+        ("tadc_counts", -1.0),
+    ],
+)
+def test_a_tare_that_no_chip_gives_is_refused(name: str, wrong: float) -> None:
+    content = tare_of(readings_of(300, part=0.9, readings=6.0, seed=5, tiles=2)).as_dict()
+    with pytest.raises(TareError, match="not readable"):
+        Tare.from_dict({**content, name: [content[name][0], wrong]}, tiles=2)
