@@ -117,6 +117,8 @@ def clock_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
 def _step(session: Session, node: ServerNode) -> list[Session]:
     """The session with its open part ended, and what follows; nothing if that is not known yet."""
     boot_id = session.parts[-1].boot_id
+    if boot_id in node.unread:
+        return []
     streams = streams_of(session, node)
     closed = at_stop(session, streams, waiting=True)
     if closed.parts[-1].seq_last is not None:
@@ -237,9 +239,16 @@ def sources_now(session: Session, node: ServerNode, *, exact: bool = False) -> S
     )
 
 
+def is_unread(session: Session, node: ServerNode | None) -> bool:
+    """Is any of its journals here, and cannot be read now? Then what is lost is not known."""
+    if node is None or session.given_up:
+        return False
+    return any(part.boot_id in node.unread for part in session.parts)
+
+
 def is_all_here(session: Session, node: ServerNode | None) -> bool:
     """Have all frames come, and are they on the disk?"""
-    if session.parts[-1].seq_last is None:
+    if session.parts[-1].seq_last is None or is_unread(session, node):
         return False
     for boot_id, numbers in numbers_of(session.parts).items():
         stream = node.streams.get(boot_id) if node is not None else None

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from devices.errors import (
+    DamagedFileError,
     FileFormatError,
     FootTileError,
     LinkError,
@@ -60,6 +61,8 @@ class ServerNode:
         self.tares = TareHistory(folder / "tares.json")
         self.streams: dict[str, ServerStream] = {}
         """By boot_id: those that are kept here, and those that it said it has."""
+        self.unread: set[str] = set()
+        """Kept here, but their journals cannot be read now: nothing is known of their frames."""
         self.has_spoken = False
         """Has it said hello since the server was started?"""
         self.greeted_t_ns: int | None = None
@@ -83,8 +86,11 @@ class ServerNode:
                 try:
                     self.streams[path.name] = stream = ServerStream.open(path)
                     self._found += stream.problems
-                except FootTileError as error:
+                except DamagedFileError as error:
                     self._found.append(f"a journal is left out: {error}")
+                except FootTileError as error:  # a disk that is full, or another version wrote it
+                    self.unread.add(path.name)
+                    self._found.append(f"a journal is left out until it can be read: {error}")
         if self.tares.problem is not None:
             self._found.append(self.tares.problem)
         for text in self._found:
@@ -279,6 +285,25 @@ class ServerNode:
                 f"node {self.name!r} is away", remedy="Tare when it is connected again"
             )
         return self.tare_keeper.by_hand(reason)
+
+    def read_again(self) -> None:
+        """Try the journals again that could not be read."""
+        for name in sorted(self.unread):
+            stream = self.streams.get(name)
+            try:
+                if stream is None or stream.journal is None:
+                    opened = ServerStream.open(self._journals_folder / name)
+                    if stream is not None:  # the node has said something of it
+                        stream.journal = opened.journal
+                    else:
+                        self.streams[name] = opened
+                        if self.has_spoken:
+                            opened.is_gone()
+            except DamagedFileError as error:
+                self._found.append(f"a journal is left out: {error}")
+            except FootTileError:
+                continue
+            self.unread.discard(name)
 
     def server_t_ns(self, t_ns: int) -> int:
         """An instant of the node's UTC in the server's; the same while no offset is measured."""

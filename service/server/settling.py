@@ -15,7 +15,7 @@ from pathlib import Path
 from devices.errors import DamagedFramesError, FootTileError
 from service.server import following
 from service.server.book import SessionBook
-from service.server.following import is_all_here, ledger_now, sources_now
+from service.server.following import is_all_here, is_unread, ledger_now, sources_now
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.sessions.sealing import seal
@@ -27,6 +27,7 @@ from storage.sessions.folder import Session
 log = logging.getLogger("foottile.settling")
 
 _SEAL_AGAIN_S = 10.0
+_UNREAD = "a journal of it cannot be read now, and is tried again: see what the server says of it"
 
 
 class Settling:
@@ -111,6 +112,14 @@ class Settling:
         return self._not_sealed.get(session.id, session.problem)
 
     def _settle(self, session: Session) -> None:
+        node = self._nodes.find(session.node)
+        if node is not None and is_unread(session, node):
+            node.read_again()
+            if is_unread(session, node):
+                self._not_sealed[session.id] = _UNREAD
+                self._again_after[session.id] = time.monotonic() + _SEAL_AGAIN_S
+                return
+            self._not_sealed.pop(session.id, None)
         try:
             if session.state == "pending":
                 session = self._follow(session)

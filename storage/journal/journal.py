@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from devices.errors import FileFormatError, StorageError
+from devices.errors import DamagedFileError, FileFormatError, StorageError
 from devices.frames import ArrayInfo, FrameBatch
 from devices.words import printable
 from storage.durable import make_folder, storage_errors
@@ -96,7 +96,8 @@ class Journal:
         """A journal that is there already; its description is in its notes or its segments.
 
         Raises:
-            FileFormatError: no readable segment in it.
+            DamagedFileError: no readable segment in it.
+            FileFormatError: another version wrote its notes.
             StorageError: it cannot be read.
         """
         problems: list[str] = []
@@ -105,7 +106,7 @@ class Journal:
             info = notes.array_info if notes is not None else _described(folder)
         if info is None:
             said = "; ".join(("no readable journal segment", *problems))
-            raise FileFormatError(said, where=str(folder))
+            raise DamagedFileError(said, where=str(folder))
         journal = cls(folder, info)
         journal.problems[:0] = problems
         if notes is not None:

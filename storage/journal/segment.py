@@ -302,7 +302,7 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
                     end = max(end, int(found["offset"]) + int(found["length"]))
         if end < size:
             file.seek(end)
-            unread_of(path).write_bytes(file.read())
+            _set_aside(unread_of(path), file.read())
     segment = Segment(path)
     if not good:
         segment.delete()
@@ -328,6 +328,15 @@ def write_all(file: BinaryIO, data: bytes) -> None:
         with suppress(OSError):
             file.truncate(begin)
             file.seek(begin)
+        raise
+
+
+def _set_aside(path: Path, content: bytes) -> None:
+    """All of it, or nothing: on a full disk it is tried again and again."""
+    try:
+        path.write_bytes(content)
+    except OSError:
+        path.unlink(missing_ok=True)
         raise
 
 

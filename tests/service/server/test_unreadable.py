@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from devices.errors import StorageError
 from service.api.address import token_for
 from service.offline.calibrations import read_calibration, write_calibration
+from service.server import settling
 from service.server.data_folder import DataFolder
 from service.server.nodes import ServerNodes
 from service.server.server import Server
 from service.sessions.tares import TareHistory
 from storage import durable
+from storage.checked_json import write_checked
+from storage.journal import journal as journal_module
 from storage.journal.node.in_flight import IN_FLIGHT_FILE, InFlight
 from storage.journal.node.journal import NodeJournal
 from storage.journal.node.wanted import ServerWants, Wanted
@@ -26,6 +31,7 @@ from tests.builders.arrays import make_array
 from tests.builders.calibrations import make_calibration, make_tare
 from tests.service.fake_node import FakeNode
 from tests.service.running import Running
+from tests.waiting import until
 
 INFO = make_array()
 NEEDED = ServerWants(streams={"a": ((0, 9),)})
@@ -166,6 +172,60 @@ def test_a_node_whose_files_cannot_be_read_is_left_out_until_it_connects(
     running.start()
     tared.connect()
     assert running.node()["tare"] is not None
+
+
+@pytest.mark.parametrize("is_mentioned", [True, False])
+def test_frames_in_a_journal_that_cannot_be_read_now_are_not_lost(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch, *, is_mentioned: bool
+) -> None:
+    monkeypatch.setattr(settling, "_SEAL_AGAIN_S", 0.1)
+    recording = tared.record()
+    tared.deliver(100, 5.0)  # acknowledged: the node has forgotten them
+    running.stop()
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(journal_module, "recover", refuse)
+        running.start()
+        tared.reboot()
+        mentioned = tuple(earlier.said(held=()) for earlier in tared.before)
+        tared.connect(earlier=mentioned if is_mentioned else ())
+        tared.send(50, 5.0)
+        tared.taken_in()
+        recording.stop()
+        tared.send(10, now=True)
+        tared.taken_in()
+        until(lambda: "cannot be read now" in (recording.now()["problem"] or ""))
+        assert recording.now()["state"] == "pending"
+        said = " ".join(running.http.get("/health").json()["problems"])
+        assert "left out until it can be read" in said
+    sealed = recording.sealed()
+    assert (sealed["frames"], sealed["lost"]) == (150, {})
+    assert np.bincount(recording.column("part")).tolist() == [100, 50]
+
+
+def test_frames_of_a_stream_whose_notes_another_version_wrote_are_not_lost(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(settling, "_SEAL_AGAIN_S", 0.1)
+    recording = tared.record()
+    tared.deliver(100, 5.0)
+    running.stop()
+    notes = running.data / "journal" / "bench" / tared.boot_id / "stream.json"
+    ours = notes.read_bytes()
+    theirs = json.loads(ours) | {"of_later": 1}
+    del theirs["check"]
+    write_checked(notes, json.dumps(theirs).encode())
+    running.start()
+    tared.reboot()
+    tared.connect()
+    recording.stop()
+    tared.send(10, now=True)
+    until(lambda: "cannot be read now" in (recording.now()["problem"] or ""))
+    notes.write_bytes(ours)
+    assert recording.sealed()["frames"] == 100
 
 
 def test_a_session_that_cannot_be_read_stays_as_it_is_and_is_named(

@@ -147,3 +147,17 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StorageError):
         begun(tmp_path / "file" / "journal")
+
+
+def test_what_a_full_disk_has_no_room_to_set_aside_leaves_nothing_however_often_it_is_tried(
+    tmp_path: Path,
+) -> None:
+    filled(tmp_path, (0, 9)).close()
+    (path,) = segments(tmp_path)
+    path.write_bytes(path.read_bytes() + bytes(5000))
+    before = sorted(tmp_path.iterdir())
+    for _ in range(3):
+        with pytest.raises(StorageError), disk_with_room_for(1000):
+            reopened(tmp_path)
+        assert sorted(tmp_path.iterdir()) == before
+    assert_holds(reopened(tmp_path), set(range(10)))
