@@ -117,7 +117,7 @@ def clock_at_start(node: ServerNode, part: Part) -> tuple[ClockOffset, ...]:
 def _step(session: Session, node: ServerNode) -> list[Session]:
     """The session with its open part ended, and what follows; nothing if that is not known yet."""
     boot_id = session.parts[-1].boot_id
-    if boot_id in node.unread:
+    if boot_id in node.unread and not session.given_up:
         return []
     streams = streams_of(session, node)
     closed = at_stop(session, streams, waiting=True)

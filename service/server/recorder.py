@@ -141,7 +141,13 @@ class Recorder:
                 expected="a session that is pending",
                 remedy="Stop it first" if session.state == "recording" else "",
             )
-        self._book.keep(following.given_up(session, self._nodes.find(session.node)))
+        node = self._nodes.find(session.node)
+        if node is not None and following.is_unread(session, node):
+            # What a journal holds that cannot be read is given up; what followed it is elsewhere.
+            self._book.keep(session.model_copy(update={"given_up": True}))
+            self._settling.follow(node)
+            session = self._book.get(session_id)
+        self._book.keep(following.given_up(session, node))
         self._settling.forget(session_id)
         self._settling.settle()
         return self._book.get(session_id)

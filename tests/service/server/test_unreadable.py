@@ -174,20 +174,27 @@ def test_a_node_whose_files_cannot_be_read_is_left_out_until_it_connects(
     assert running.node()["tare"] is not None
 
 
-@pytest.mark.parametrize("is_mentioned", [True, False])
-def test_frames_in_a_journal_that_cannot_be_read_now_are_not_lost(
-    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch, *, is_mentioned: bool
-) -> None:
-    monkeypatch.setattr(settling, "_SEAL_AGAIN_S", 0.1)
-    recording = tared.record()
-    tared.deliver(100, 5.0)  # acknowledged: the node has forgotten them
-    running.stop()
+@contextmanager
+def refused_journals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The disk does not give what journals hold."""
 
     def refuse(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
+    monkeypatch.setattr(settling, "_SEAL_AGAIN_S", 0.1)
     with monkeypatch.context() as disk:
         disk.setattr(journal_module, "recover", refuse)
+        yield
+
+
+@pytest.mark.parametrize("is_mentioned", [True, False])
+def test_frames_in_a_journal_that_cannot_be_read_now_are_not_lost(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch, *, is_mentioned: bool
+) -> None:
+    recording = tared.record()
+    tared.deliver(100, 5.0)  # acknowledged: the node has forgotten them
+    running.stop()
+    with refused_journals(monkeypatch):
         running.start()
         tared.reboot()
         mentioned = tuple(earlier.said(held=()) for earlier in tared.before)
@@ -204,6 +211,27 @@ def test_frames_in_a_journal_that_cannot_be_read_now_are_not_lost(
     sealed = recording.sealed()
     assert (sealed["frames"], sealed["lost"]) == (150, {})
     assert np.bincount(recording.column("part")).tolist() == [100, 50]
+
+
+def test_who_gives_up_what_cannot_be_read_keeps_what_followed_it(
+    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = tared.record()
+    tared.deliver(100, 5.0)
+    running.stop()
+    with refused_journals(monkeypatch):
+        running.start()
+        tared.reboot()
+        tared.connect()
+        tared.send(50, 5.0)
+        tared.taken_in()
+        recording.stop()
+        tared.send(10, now=True)
+        tared.taken_in()
+        until(lambda: "cannot be read now" in (recording.now()["problem"] or ""))
+        assert running.http.post(f"{recording.url}/seal").status_code == 200
+        sealed = recording.sealed()
+    assert (sealed["complete"], sealed["frames"]) == ("lossy", 50)
 
 
 def test_frames_of_a_stream_whose_notes_another_version_wrote_are_not_lost(
