@@ -1,0 +1,422 @@
+"""Many nodes on one server: what a frame costs, and how old it is on a screen.
+
+    python benchmarks/many_nodes.py [--nodes 1 8 24] [--tiles 4] [--rate-hz 541] [--seconds 20]
+                                    [--viewers 1] [--no-record]
+    python benchmarks/many_nodes.py --soak [--seconds 1800] [--download-mb 2000]
+
+A real server (`foottile serve`) in a process of its own; one load process with all nodes, which
+replay real messages at their pace through the node's own link (`replayed_nodes.py`); screens at
+60 Hz in this process. The scene is `rolling`: its whole ladder is estimated, live, and every node
+is recorded. CPU is the server's, of all its threads. Age is that of the newest estimate in a
+message when it is here, less the look-ahead: the wait for the batch, the link, the step and the
+screen's tick are in it. A frame is lost if the server has not acknowledged it five seconds after
+the last one was taken.
+
+`--soak` is a long run of four nodes, with 20 screens and one who downloads a big sealed session
+meanwhile, at so many megabytes a second as `--download-mb-s` says; 0: as fast as it goes. What is
+downloaded has the size of a session, and is noise. At the end every session is stopped and sealed,
+and its ledger counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import websockets.asyncio.client
+from replayed_nodes import DRAIN_S, Played, Sent, played, run_load
+
+from service.link import SUBPROTOCOL
+from service.server.live_estimates import LIVE_LAG_MS
+
+COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
+RATE_HZ = {4: 541.0, 64: 64.0}
+SCREEN_HZ = 60
+SETTLE_S = 2.0
+READY_S, SEALED_S, PATIENCE_S = 120.0, 300.0, 30.0
+SOAK_NODES, SOAK_SCREENS, SOAK_S, LOOK_S = 4, 20, 1800.0, 60.0
+_CHUNK_BYTES = 1 << 20
+_TICKS = os.sysconf("SC_CLK_TCK")
+_CREATED = 201
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is asked for."""
+
+    viewers: int = 1
+    seconds: float = 20.0
+    look_s: float = LOOK_S
+    record: bool = True
+    seal: bool = False
+    download_mb: float = 0.0
+    download_mb_s: float = 0.0
+
+
+@dataclass
+class Screen:
+    """What one screen was told."""
+
+    messages: int = 0
+    dropped: int = 0
+    unknown: int = 0
+    """Messages without a force: nothing was estimated."""
+    ages_ms: list[float] = field(default_factory=list)
+
+    def take(self, text: str, *, looks: bool) -> None:
+        """One message; only who `looks` reads it."""
+        if text.startswith('{"type":"dropped"'):
+            self.dropped += 1
+        if not text.startswith('{"type":"frame"'):
+            return
+        self.messages += 1
+        if looks:
+            now_ns, message = time.time_ns(), json.loads(text)
+            self.ages_ms.append((now_ns - message["t_ns"]) * 1e-6 - LIVE_LAG_MS)
+            self.unknown += message["grf_at_least_n"] is None
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the server had done at an instant."""
+
+    wall_s: float
+    cpu_s: float
+    frames: int
+    rss_mb: float
+
+    @classmethod
+    def at(cls, server: Server) -> Look:
+        """Now; what was overtaken, and is still to come, does not count."""
+        frames = sum(
+            (node["last_seq"] or 0) + 1 - node["backlog_frames"] - node["lost_frames"]
+            for node in server.nodes()
+        )
+        return cls(time.monotonic(), server.cpu_s, frames, server.rss_mb)
+
+
+class Server:
+    """`foottile serve` as a process."""
+
+    def __init__(self, data: Path) -> None:
+        self.process = subprocess.Popen(
+            [*COMMAND, "serve", "--port=0", f"--data={data}"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.url = self.process.stdout.readline().split()[-1].rstrip("/")
+        self.http = httpx.Client(base_url=f"{self.url}/api/v1", trust_env=False, timeout=60.0)
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU time of all its threads so far."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(") ", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / _TICKS
+
+    @property
+    def rss_mb(self) -> float:
+        """Memory that it holds."""
+        fields = Path(f"/proc/{self.process.pid}/statm").read_text().split()
+        return int(fields[1]) * os.sysconf("SC_PAGE_SIZE") * 1e-6
+
+    def nodes(self) -> list[dict[str, Any]]:
+        """As its API has them."""
+        items: list[dict[str, Any]] = self.http.get("/nodes").json()["items"]
+        return items
+
+    def record(self) -> list[str]:
+        """Record every node; the sessions' ids."""
+        found = []
+        for node in self.nodes():
+            answer = self.http.post("/sessions", json={"node": node["node"], "name": "many"})
+            assert answer.status_code == _CREATED, answer.text
+            found.append(answer.json()["id"])
+        return found
+
+    def sealed(self, sessions: list[str]) -> list[dict[str, Any]]:
+        """The sessions, once they are sealed."""
+        end_s = time.monotonic() + SEALED_S
+        while time.monotonic() < end_s:
+            found = [self.http.get(f"/sessions/{session}").json() for session in sessions]
+            if all(each["state"] == "sealed" for each in found):
+                return found
+            time.sleep(0.5)
+        raise TimeoutError("not sealed")
+
+    def close(self) -> None:
+        """End it."""
+        self.http.close()
+        self.process.terminate()
+        try:
+            self.process.wait(30.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@contextlib.contextmanager
+def served(data: Path) -> Iterator[Server]:
+    """A server, and its end."""
+    server = Server(data)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+class Load:
+    """The process with all nodes."""
+
+    def __init__(self, what: Played, count: int, url: str) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._control, theirs = context.Pipe()
+        self._process = context.Process(
+            target=run_load, args=(what, count, url, theirs), daemon=True
+        )
+        self._process.start()
+
+    def stop(self) -> Sent:
+        """End it, once everything was acknowledged or five seconds have passed."""
+        self._control.send(None)
+        sent: Sent = self._control.recv()
+        self._process.join()
+        return sent
+
+
+@contextlib.asynccontextmanager
+async def watched(url: str, viewers: int) -> AsyncIterator[list[Screen]]:
+    """So many screens; the first one looks at what it is told."""
+    screens = [Screen() for _ in range(viewers)]
+
+    async def look(socket: Any, screen: Screen) -> None:
+        async for text in socket:
+            screen.take(text, looks=screen is screens[0])
+
+    async with contextlib.AsyncExitStack() as stack:
+        tasks = []
+        for screen in screens:
+            socket = await stack.enter_async_context(
+                websockets.asyncio.client.connect(
+                    f"{url.replace('http', 'ws')}/api/v1/live?rate_hz={SCREEN_HZ}",
+                    proxy=None,
+                    compression=None,
+                    max_queue=None,
+                    subprotocols=[websockets.Subprotocol(SUBPROTOCOL)],
+                )
+            )
+            tasks.append(asyncio.create_task(look(socket, screen)))
+        try:
+            yield screens
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What came of one number of nodes; the rows are one for each look."""
+
+    rows: list[str]
+    screens: list[Screen]
+    sent: Sent
+    lost: int
+    sessions: list[dict[str, Any]]
+    downloaded: str
+
+
+def measure(what: Played, count: int, options: Options) -> Found:
+    """So many nodes on a server of their own."""
+    with tempfile.TemporaryDirectory(prefix="foottile-many-") as folder:
+        big = _big(Path(folder), options.download_mb) if options.download_mb else None
+        with served(Path(folder)) as server:
+            load = Load(what, count, server.url)
+            end_s = time.monotonic() + READY_S
+            while sum(node["tare"] is not None for node in server.nodes()) < count:
+                assert time.monotonic() < end_s, "the nodes are not tared"
+                time.sleep(0.2)
+            sessions = server.record() if options.record else []
+            rows, screens, downloaded = asyncio.run(_watch(server, count, what, options, big))
+            if (
+                options.seal
+            ):  # while frames come: a session ends when its stream has passed its stop
+                for session in sessions:
+                    server.http.post(f"/sessions/{session}/stop")
+                time.sleep(SETTLE_S)
+            sent = load.stop()
+            lost = sum(node["lost_frames"] for node in server.nodes())
+            sealed = server.sealed(sessions) if options.seal else []
+    return Found(rows, screens, sent, lost, sealed, downloaded)
+
+
+async def _watch(
+    server: Server, count: int, what: Played, options: Options, big: str | None
+) -> tuple[list[str], list[Screen], str]:
+    rows, downloading = [], None
+    async with watched(server.url, options.viewers) as screens:
+        await asyncio.sleep(SETTLE_S)
+        for screen in screens:
+            screen.messages = screen.dropped = 0
+        if big is not None:
+            downloading = await asyncio.create_subprocess_exec(
+                *[sys.executable, __file__, "--download", f"{server.url}/api/v1{big}"],
+                f"--download-mb-s={options.download_mb_s:g}",
+                stdout=subprocess.PIPE,
+            )
+        end_s = time.monotonic() + options.seconds
+        before = await asyncio.to_thread(Look.at, server)
+        while time.monotonic() < end_s:
+            screens[0].ages_ms.clear()
+            await asyncio.sleep(min(options.look_s, max(0.0, end_s - time.monotonic())))
+            now = await asyncio.to_thread(Look.at, server)
+            rows.append(row(count, what, before, now, screens[0].ages_ms))
+            print(rows[-1], flush=True)
+            before = now
+        downloaded = await _downloaded(downloading) if downloading is not None else ""
+    return rows, screens, downloaded
+
+
+async def _downloaded(process: asyncio.subprocess.Process) -> str:
+    try:
+        return (await asyncio.wait_for(process.communicate(), PATIENCE_S))[0].decode().strip()
+    except TimeoutError:
+        process.kill()
+        await process.wait()
+        return "the download was not finished"
+
+
+def row(count: int, what: Played, before: Look, now: Look, ages_ms: list[float]) -> str:
+    """One line of the table."""
+    wall_s, cpu_s = now.wall_s - before.wall_s, now.cpu_s - before.cpu_s
+    frames = now.frames - before.frames
+    due = count * what.info.nominal_rate_hz * wall_s
+    p50, p99 = np.percentile(ages_ms, (50, 99)) if ages_ms else (np.nan, np.nan)
+    return (
+        f"| {count} | {100 * cpu_s / wall_s:.1f} | {1e6 * cpu_s / max(1, frames):.1f} | "
+        f"{100 * frames / due:.1f} | {p50:.1f} | {p99:.1f} | {now.rss_mb:.0f} |"
+    )
+
+
+HEAD = (
+    "| nodes | server, % of a core | CPU us a frame | taken in, % of frames due | "
+    "age p50 ms | p99 ms | RSS MB |\n|--:|--:|--:|--:|--:|--:|--:|"
+)
+
+
+def remarks(found: Found) -> str:
+    """What is not in the table."""
+    sent, looked = found.sent, found.screens[0]
+    told = [screen.messages for screen in found.screens]
+    said = [
+        f"of {sent.taken} frames {found.lost} are lost, "
+        f"{sent.taken - sent.acknowledged} not acknowledged {DRAIN_S:g} s after the last",
+        f"screens were told {min(told)} to {max(told)} times, and dropped "
+        f"{sum(screen.dropped for screen in found.screens)} times",
+        f"{looked.unknown} messages without a force" if looked.unknown else "",
+        f"the load gave messages to its links {sent.late_ms:.1f} ms late (p99)",
+        *(f"links said {n} times: {text}" for text, n in Counter(sent.said).items()),
+        found.downloaded,
+    ]
+    for session in found.sessions:
+        said.append(
+            f"session of {session['frames']} frames: "
+            f"{'complete' if session['complete'] is True else 'NOT COMPLETE'}"
+        )
+    return "".join(f"  {text}\n" for text in said if text)
+
+
+# --- the big download -----------------------------------------------------------------------------
+
+
+def _big(data: Path, megabytes: float) -> str:
+    """The path, below the API, of a sealed session's file of so many MB of noise."""
+    from many_sessions import sealed
+
+    from storage.checked_json import write_checked
+    from storage.file_hash import sha256_of
+    from storage.sessions.folder import FRAMES_NAME
+
+    session = sealed(1)
+    path = data / "sessions" / session.id / FRAMES_NAME
+    path.parent.mkdir(parents=True)
+    with path.open("wb") as file:
+        for _ in range(max(1, round(megabytes * 1e6 / _CHUNK_BYTES))):
+            file.write(os.urandom(_CHUNK_BYTES))
+    session = session.model_copy(update={"bytes": path.stat().st_size, "sha256": sha256_of(path)})
+    write_checked(path.parent / "session.json", session.model_dump_json().encode())
+    return f"/sessions/{session.id}/data?format=parquet"
+
+
+def download(url: str, mb_s: float) -> None:
+    """Read all of it, no faster than so many MB a second; 0: as fast as it comes."""
+    began_s, size = time.monotonic(), 0
+    with httpx.stream("GET", url, timeout=60.0, trust_env=False) as answer:
+        answer.raise_for_status()
+        for piece in answer.iter_raw(_CHUNK_BYTES):
+            size += len(piece)
+            if mb_s:
+                time.sleep(max(0.0, began_s + size * 1e-6 / mb_s - time.monotonic()))
+    took_s = time.monotonic() - began_s
+    print(f"downloaded {size * 1e-6:.0f} MB in {took_s:.1f} s", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--nodes", type=int, nargs="+")
+    parser.add_argument("--tiles", type=int, default=4)
+    parser.add_argument("--rate-hz", type=float, help="541 for four tiles, 64 for 64")
+    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--viewers", type=int)
+    parser.add_argument("--record", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument("--soak", action="store_true")
+    parser.add_argument("--download-mb", type=float)
+    parser.add_argument("--download-mb-s", type=float, default=10.0)
+    parser.add_argument("--download", help=argparse.SUPPRESS)
+    a = parser.parse_args()
+    if a.download:
+        download(a.download, a.download_mb_s)
+        return
+    rate_hz = a.rate_hz or RATE_HZ.get(a.tiles) or parser.error("say --rate-hz for so many tiles")
+    seconds = a.seconds or (SOAK_S if a.soak else 20.0)
+    options = Options(
+        viewers=a.viewers or (SOAK_SCREENS if a.soak else 1),
+        seconds=seconds,
+        look_s=LOOK_S if a.soak else seconds,
+        record=a.record,
+        seal=a.soak and a.record,
+        download_mb=(2000.0 if a.soak else 0.0) if a.download_mb is None else a.download_mb,
+        download_mb_s=a.download_mb_s,
+    )
+    what = played(a.tiles, rate_hz)
+    print(
+        f"{a.tiles} tiles at {rate_hz:g} Hz, {what.frames_a_batch:.1f} frames a message, "
+        f"{options.viewers} screens\n\n{HEAD}",
+        flush=True,
+    )
+    found = [measure(what, n, options) for n in a.nodes or ([SOAK_NODES] if a.soak else [1, 8, 24])]
+    print()
+    for n, each in zip(a.nodes or ([SOAK_NODES] if a.soak else [1, 8, 24]), found, strict=True):
+        print(f"{n} nodes:\n{remarks(each)}", end="")
+
+
+if __name__ == "__main__":
+    main()
