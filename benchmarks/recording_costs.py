@@ -158,7 +158,7 @@ def in_flight_costs(recording: Recording, folder: Path) -> dict[str, Cost]:
     keeper = InFlight(folder, recording.info)
     tiles = recording.frames.tile_count
     size = 4 + sum(
-        dtype(0).itemsize * (tiles if per_tile else 1) for dtype, per_tile in FRAME_COLUMNS.values()
+        dtype.itemsize * (tiles if per_tile else 1) for dtype, per_tile in FRAME_COLUMNS.values()
     )
     bare = mmap.mmap(-1, size * 8192)
     row_bytes = bytes(size)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -99,14 +99,14 @@ class FrameBatch(Arrays):
     reference_force_n: npt.NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        n, tiles = self.padc.shape
+        by_tile = self.padc.shape
+        by_frame = by_tile[:1]
         for name, (dtype, per_tile) in FRAME_COLUMNS.items():
             column = getattr(self, name)
-            shape = (n, tiles) if per_tile else (n,)
+            shape = by_tile if per_tile else by_frame
             if column.shape != shape or column.dtype != dtype:
                 raise ValueError(
-                    f"FrameBatch.{name}: expected {np.dtype(dtype)}{shape}, "
-                    f"got {column.dtype}{column.shape}"
+                    f"FrameBatch.{name}: expected {dtype}{shape}, got {column.dtype}{column.shape}"
                 )
 
     def __len__(self) -> int:
@@ -118,18 +118,18 @@ class FrameBatch(Arrays):
         return int(self.padc.shape[1])
 
 
-FRAME_COLUMNS: dict[str, tuple[type[np.generic], bool]] = {
-    "seq": (np.uint64, False),
-    "t_mono_ns": (np.int64, False),
-    "t_ns": (np.int64, False),
-    "padc": (np.uint16, True),
-    "tadc": (np.uint16, True),
-    "sample_offset_us": (np.int32, True),
-    "servo_counts": (np.int32, False),
-    "servo_age_us": (np.int32, False),
-    "status": (np.uint8, True),
-    "frame_status": (np.uint8, False),
-    "reference_force_n": (np.float32, False),
+FRAME_COLUMNS: dict[str, tuple[np.dtype[Any], bool]] = {
+    "seq": (np.dtype(np.uint64), False),
+    "t_mono_ns": (np.dtype(np.int64), False),
+    "t_ns": (np.dtype(np.int64), False),
+    "padc": (np.dtype(np.uint16), True),
+    "tadc": (np.dtype(np.uint16), True),
+    "sample_offset_us": (np.dtype(np.int32), True),
+    "servo_counts": (np.dtype(np.int32), False),
+    "servo_age_us": (np.dtype(np.int32), False),
+    "status": (np.dtype(np.uint8), True),
+    "frame_status": (np.dtype(np.uint8), False),
+    "reference_force_n": (np.dtype(np.float32), False),
 }
 """Type of every column, and whether it has one value per tile."""
 

@@ -39,9 +39,9 @@ def broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
         info: the array of their stream.
     """
     for rule, wrong in _rules(frames, info):
-        rows = np.flatnonzero(wrong if wrong.ndim == 1 else wrong.any(axis=1))
-        if len(rows):
-            return f"{rule} in frame {int(frames.seq[rows[0]])}"
+        if wrong.any():
+            row = int(np.flatnonzero(wrong if wrong.ndim == 1 else wrong.any(axis=1))[0])
+            return f"{rule} in frame {int(frames.seq[row])}"
     return ""
 
 
@@ -72,7 +72,9 @@ def _rules(frames: FrameBatch, info: ArrayInfo) -> Iterator[tuple[str, Wrong]]:
         f"t_ns is not t_mono_ns plus the {info.utc_offset_ns} ns announced with the stream",
         t_ns - t_mono_ns != info.utc_offset_ns,
     )
-    yield "t_mono_ns runs backwards", np.diff(t_mono_ns, prepend=t_mono_ns[:1]) < 0
+    back = np.zeros(len(t_mono_ns), np.bool_)
+    np.less(t_mono_ns[1:], t_mono_ns[:-1], out=back[1:])
+    yield "t_mono_ns runs backwards", back
     for name in ("padc", "tadc"):
         counts = getattr(frames, name)
         yield f"{name} has more than 10 bits", (counts > COUNTS_MAX) & (counts != NOT_READ)

@@ -1,7 +1,7 @@
 """Where the columns of a message of frames lie in its bytes: its header says it, and nothing else.
 
-A header of the same bytes says the same of every message, so it is checked once, and messages by
-the thousand are read as numpy columns without asking Arrow for each.
+A header of the same bytes says the same of every message, so it is checked once, by Arrow and
+here, and then messages by the thousand are read as numpy columns without asking Arrow for each.
 """
 
 from __future__ import annotations
@@ -12,11 +12,19 @@ import pyarrow as pa
 
 from devices.errors import FileFormatError
 from storage.arrow_header import HeaderError, read_header
+from storage.schema import from_record_batch
 
 FRAMES_MAX = 4096
 """Frames in one message; a node sends some ten. More is not what a node sends."""
 PREFIX_BYTES = 8
 """Before the header of a message: a mark, and the header's length."""
+_MARK = b"\xff\xff\xff\xff"
+"""With which a message begins. Arrow also reads older ones without it, in which all that is behind
+stands four bytes earlier: where columns are said to lie there would be other numbers."""
+_KNOWN_MAX = 256
+"""Headers that are remembered; a node's batches have two or three different ones."""
+_HEAD_BYTES_MAX = 4096
+"""Longer ones are not remembered: ours take some 700 bytes, and a stranger's up to a megabyte."""
 
 
 @dataclass(frozen=True)
@@ -77,3 +85,50 @@ def layout_of(message: pa.ipc.Message, schema: pa.Schema) -> Layout:
     body = PREFIX_BYTES + message.metadata.size
     columns = tuple((body + header.buffers[at][0], needed_bytes[at]) for at in values_at)
     return Layout(rows, body + header.body_bytes, columns)
+
+
+class Layouts:
+    """Layouts of one stream's messages by their headers. May be used from several threads.
+
+    Args:
+        schema: of the stream (`storage.schema.wire_schema`).
+    """
+
+    def __init__(self, schema: pa.Schema) -> None:
+        self.schema = schema
+        self._known: dict[bytes, Layout] = {}
+
+    def of(self, message: bytes | memoryview) -> Layout:
+        """Where the columns of a message are; everything that its header says is checked first.
+
+        Raises:
+            FileFormatError: it is no message of the stream, or is cut off.
+        """
+        head = bytes(message[: PREFIX_BYTES + int.from_bytes(message[4:PREFIX_BYTES], "little")])
+        layout = self._known.get(head)
+        try:
+            if layout is None:
+                layout = self._checked(message, head)
+            if layout.message_bytes != len(message):
+                raise HeaderError(f"it is {len(message)} bytes long, and says another length")
+        except (pa.ArrowException, EOFError, OSError, ValueError, IndexError) as error:
+            raise FileFormatError(
+                f"no Arrow message of frames: {error}",
+                expected="a record batch of the schema announced in hello",
+            ) from error
+        return layout
+
+    def _checked(self, message: bytes | memoryview, head: bytes) -> Layout:
+        if not head.startswith(_MARK):
+            raise HeaderError("it does not begin as messages do since Arrow 0.15")
+        found = pa.ipc.read_message(pa.py_buffer(message))
+        layout = layout_of(found, self.schema)
+        if layout.message_bytes == len(message):
+            record = pa.ipc.read_record_batch(found, self.schema)
+            record.validate(full=True)  # whatever the header did not say
+            from_record_batch(record)
+            if len(head) <= _HEAD_BYTES_MAX:
+                if len(self._known) >= _KNOWN_MAX:
+                    self._known.clear()
+                self._known[head] = layout
+        return layout

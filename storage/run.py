@@ -21,13 +21,7 @@ from devices.arrays import Ints
 from devices.errors import FileFormatError
 from devices.facts import SEQ_END
 from devices.frames import FRAME_COLUMNS, FrameBatch
-from storage.layout import PREFIX_BYTES, Layout, layout_of
-from storage.wire import decode
-
-_LAYOUTS_MAX = 256
-"""Headers that are remembered; a node's batches have two or three different ones."""
-_HEAD_BYTES_MAX = 4096
-"""Longer ones are not remembered: ours take some 700 bytes, and a stranger's up to a megabyte."""
+from storage.layout import Layout, Layouts
 
 Numbers = npt.NDArray[np.integer[Any]]
 
@@ -60,7 +54,7 @@ class RunReader:
 
     def __init__(self, schema: pa.Schema) -> None:
         self.schema = schema
-        self._layouts: dict[bytes, Layout] = {}
+        self._layouts = Layouts(schema)
 
     def read(self, run: Run) -> FrameBatch | None:
         """The frames of all messages, copied; None if `decode` or the index says otherwise of one.
@@ -86,26 +80,14 @@ class RunReader:
             message = view[begin:end]
             if zlib.crc32(message) != crc32:
                 return None
-            layout = self._layout(message)
-            if layout is None or (layout.rows, layout.message_bytes) != (count, end - begin):
+            try:
+                layout = self._layouts.of(message)
+            except FileFormatError:
+                return None
+            if layout.rows != count:
                 return None
             found.append(layout)
         return found
-
-    def _layout(self, message: memoryview) -> Layout | None:
-        head = bytes(message[: PREFIX_BYTES + int.from_bytes(message[4:PREFIX_BYTES], "little")])
-        known = self._layouts.get(head)
-        if known is None:
-            try:
-                decode(message, self.schema)
-            except FileFormatError:
-                return None
-            known = layout_of(pa.ipc.read_message(pa.py_buffer(message)), self.schema)
-            if len(head) <= _HEAD_BYTES_MAX:
-                if len(self._layouts) >= _LAYOUTS_MAX:
-                    self._layouts.clear()
-                self._layouts[head] = known
-        return known
 
 
 def _joined(run: Run, begins: Ints, layouts: Sequence[Layout], schema: pa.Schema) -> FrameBatch:

@@ -65,7 +65,7 @@ class Column:
 
 def _frame(name: str, unit: str, description: str, missing: int | None = None) -> Column:
     dtype, per_tile = FRAME_COLUMNS[name]
-    return Column(name, pa.from_numpy_dtype(np.dtype(dtype)), unit, description, per_tile, missing)
+    return Column(name, pa.from_numpy_dtype(dtype), unit, description, per_tile, missing)
 
 
 FRAMES = (

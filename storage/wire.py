@@ -15,15 +15,11 @@ import pyarrow as pa
 
 from devices.errors import FileFormatError
 from devices.facts import SEQ_END
-from devices.frames import ArrayInfo, FrameBatch
-from storage.arrow_header import HeaderError
+from devices.frames import FRAME_COLUMNS, ArrayInfo, FrameBatch
 from storage.intervals import Intervals
-from storage.layout import layout_of
-from storage.schema import from_record_batch, to_record_batch, wire_schema
+from storage.layout import Layouts
+from storage.schema import to_record_batch, wire_schema
 
-_MARK = b"\xff\xff\xff\xff"
-"""With which a message begins. Arrow also reads older ones without it, in which all that is behind
-stands four bytes earlier: where columns are said to lie there would be other numbers."""
 _MESSAGE_FRAMES = 64
 """As many as acquisition puts into a batch at most."""
 
@@ -66,38 +62,56 @@ def messages_of(frames: FrameBatch, info: ArrayInfo) -> Iterator[EncodedBatch]:
         yield EncodedBatch.of(rows, encode(rows, schema))
 
 
+class Decoder:
+    """Decodes messages of one stream. May be used from several threads.
+
+    Args:
+        schema: of the stream (`storage.schema.wire_schema`).
+    """
+
+    def __init__(self, schema: pa.Schema) -> None:
+        self._layouts = Layouts(schema)
+        self._columns = [(name, *FRAME_COLUMNS[name]) for name in schema.names]
+        self._tiles = schema.field("padc").type.list_size
+
+    def decode(self, payload: bytes | memoryview) -> FrameBatch:
+        """Frames of one message, as views of its bytes; everything about it is checked first.
+
+        Raises:
+            FileFormatError: it is no such message, is cut off, or its frames are not in order.
+        """
+        layout = self._layouts.of(payload)
+        by_frame, by_tile = (layout.rows,), (layout.rows, self._tiles)
+        batch = FrameBatch(
+            **{
+                name: np.ndarray(by_tile if per_tile else by_frame, dtype, payload, offset)
+                for (name, dtype, per_tile), (offset, _) in zip(
+                    self._columns, layout.columns, strict=True
+                )
+            }
+        )
+        seq, t_mono_ns = batch.seq, batch.t_mono_ns
+        first, last = int(seq[0]), int(seq[-1])
+        # A difference of unsigned numbers wraps, so both ends are looked at as well.
+        if last - first != len(batch) - 1 or (seq[1:] - seq[:-1] != 1).any():
+            raise FileFormatError(
+                f"frames {first} to {last} do not follow one another",
+                expected="seq rising by one within a message",
+            )
+        if last >= SEQ_END:
+            raise FileFormatError(f"frame number {last}", expected="less than 2^53")
+        if (t_mono_ns[1:] < t_mono_ns[:-1]).any():
+            raise FileFormatError(
+                f"time runs backwards within frames {first} to {last}",
+                expected="t_mono_ns rising",
+            )
+        return batch
+
+
 def decode(payload: bytes | memoryview, schema: pa.Schema) -> FrameBatch:
-    """Frames of one message, as views of its bytes; everything about it is checked first.
+    """One message alone, as by a `Decoder`.
 
     Raises:
-        FileFormatError: it is no such message, is cut off, or its frames are not in order.
+        FileFormatError: as there.
     """
-    try:
-        if bytes(payload[: len(_MARK)]) != _MARK:
-            raise HeaderError("it does not begin as messages do since Arrow 0.15")
-        message = pa.ipc.read_message(pa.py_buffer(payload))
-        if layout_of(message, schema).message_bytes != len(payload):
-            raise HeaderError(f"it is {len(payload)} bytes long, and says another length")
-        record = pa.ipc.read_record_batch(message, schema)
-        record.validate(full=True)  # whatever the header did not say
-    except (pa.ArrowException, EOFError, OSError, ValueError, IndexError) as error:
-        raise FileFormatError(
-            f"no Arrow message of frames: {error}",
-            expected="a record batch of the schema announced in hello",
-        ) from error
-    batch = from_record_batch(record)
-    first, last = int(batch.seq[0]), int(batch.seq[-1])
-    # A difference of unsigned numbers wraps, so both ends are looked at as well.
-    if (np.diff(batch.seq) != 1).any() or last - first != len(batch) - 1:
-        raise FileFormatError(
-            f"frames {first} to {last} do not follow one another",
-            expected="seq rising by one within a message",
-        )
-    if last >= SEQ_END:
-        raise FileFormatError(f"frame number {last}", expected="less than 2^53")
-    if (batch.t_mono_ns[1:] < batch.t_mono_ns[:-1]).any():
-        raise FileFormatError(
-            f"time runs backwards within frames {first} to {last}",
-            expected="t_mono_ns rising",
-        )
-    return batch
+    return Decoder(schema).decode(payload)

@@ -206,12 +206,14 @@ class LiveEstimates:
         return self._calibration
 
     def _note_contact(self, frames: FrameBatch, columns: Columns) -> None:
-        before_t_ns = self._due_t_ns if self._due_t_ns is not None else int(frames.t_ns[0])
+        t_ns = frames.t_ns
+        before_t_ns = self._due_t_ns if self._due_t_ns is not None else int(t_ns[0])
+        taken = columns["contact"] != 0  # or not known
         # A gap that is too short for a step, such as a missed slot, cannot hide a contact.
-        gap = np.diff(frames.t_ns, prepend=before_t_ns) > UNSEEN_NS
-        taken = np.flatnonzero((columns["contact"] != 0) | gap)  # or not known
-        self._due_t_ns = int(frames.t_ns[-1])
-        if len(taken):
-            self.free_since_t_ns = int(frames.t_ns[taken[-1]])
+        taken[0] |= int(t_ns[0]) - before_t_ns > UNSEEN_NS
+        taken[1:] |= t_ns[1:] - t_ns[:-1] > UNSEEN_NS
+        self._due_t_ns = int(t_ns[-1])
+        if taken.any():
+            self.free_since_t_ns = int(t_ns[np.flatnonzero(taken)[-1]])
         elif self.free_since_t_ns is None:
-            self.free_since_t_ns = int(frames.t_ns[0])
+            self.free_since_t_ns = int(t_ns[0])

@@ -33,7 +33,6 @@ from storage.clock.log import ClockOffset
 from storage.durable import make_folder, storage_errors
 from storage.intervals import NO_END, NODE_RESTARTED, Intervals, with_open_ends
 from storage.journal.journal import RING_NS, Journal
-from storage.wire import decode
 
 log = logging.getLogger("foottile.nodes")
 
@@ -250,7 +249,7 @@ class ServerNode:
             LinkError: it is not a message of this stream's frames, or they break a rule of theirs.
         """
         try:
-            frames = decode(payload, stream.schema)
+            frames = stream.decoder.decode(payload)
             stream.check(frames)
             stream.take(frames, payload, now_t_ns)
         except FileFormatError as error:
@@ -365,8 +364,7 @@ class ServerNode:
         if self.storage_problem is not None:  # it could not be kept
             return
         try:
-            to_come = next(iter(self.present.may_come), (0, 0))[0]
-            self.tare_keeper.look(self.journal, to_come)
+            self.tare_keeper.look(self.journal, lambda: self.present.may_come)
         except StorageError as error:  # not in force then; tried again once it can be kept
             self.storage_problem = str(error)
         except Exception as error:

@@ -21,6 +21,7 @@ from storage.intervals import CORRUPT, NO_END, REFUSED, Intervals, Losses
 from storage.journal.journal import Journal
 from storage.journal.stream_notes import StreamNotes
 from storage.schema import wire_schema
+from storage.wire import Decoder
 
 log = logging.getLogger("foottile.streams")
 
@@ -40,7 +41,7 @@ class ServerStream:
     def __init__(self, folder: Path, info: ArrayInfo) -> None:
         self.folder = folder
         self.info = info
-        self.schema = wire_schema(info)
+        self.decoder = Decoder(wire_schema(info))
         self.journal: Journal | None = None
         self.notes = StreamNotes(array_info=info)
         self.node_has: Intervals | None = None

@@ -5,6 +5,7 @@ One for each stream, fed after every message of frames; times are the frames' ow
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import takewhile
 from typing import Literal
 
@@ -18,6 +19,7 @@ from service.estimation.tare.tare import Tare, expected_shift_kpa, has_warmed, w
 from service.server.live_estimates import LiveEstimates
 from service.sessions.tare_file import RecordedTare
 from service.sessions.tares import TareHistory
+from storage.intervals import Intervals
 from storage.journal.journal import Journal
 
 LOOK_EVERY_NS = 5_000_000_000
@@ -122,12 +124,12 @@ class TareKeeper:
         self._doubt = None
         self._live.use(self._history.to_use(self._info))
 
-    def look(self, journal: Journal | None, node_first_seq: int) -> None:
+    def look(self, journal: Journal | None, may_come: Callable[[], Intervals]) -> None:
         """After more frames: tare from a lead that is over, or in flight.
 
         Args:
             journal: of this stream.
-            node_first_seq: the oldest frame that the node can still send.
+            may_come: numbers that the node may still give, which takes a while to say.
 
         Raises:
             StorageError: a tare cannot be kept; it is not in force then, and tried again.
@@ -135,11 +137,11 @@ class TareKeeper:
         if self._live.calibration is None:
             return
         if not self._lead_is_over and journal is not None:
-            self._look_at_lead(journal, node_first_seq)
+            self._look_at_lead(journal, may_come)
         if self._is_time() and self.auto_tare == "on":
             self._look_in_flight()
 
-    def _look_at_lead(self, journal: Journal, node_first_seq: int) -> None:
+    def _look_at_lead(self, journal: Journal, may_come: Callable[[], Intervals]) -> None:
         newest = self._live.newest
         if newest is None or newest.frame_status[-1] & FrameStatus.LEAD:
             self._has_seen_lead |= newest is not None
@@ -147,7 +149,7 @@ class TareKeeper:
         # From the journal, not as frames come: after a break of the link they come in any order.
         seq, t_ns = int(newest.seq[-1]), int(newest.t_ns[-1])
         self._lead_over_t_ns = self._lead_over_t_ns or t_ns
-        lacks = journal.held.missing(min(node_first_seq, seq), seq)
+        lacks = journal.held.missing(min(may_come().first or 0, seq), seq)
         if lacks and t_ns - self._lead_over_t_ns < LEAD_WAIT_NS:
             return
         try:

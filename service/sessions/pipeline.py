@@ -30,6 +30,7 @@ from storage.schema import ROUNDED_TO
 
 Extra = Mapping[str, npt.NDArray[Any]]
 Columns = dict[str, npt.NDArray[Any]]
+_ESTIMATED = tuple(f.name for f in fields(Estimates) if f.name not in ("seq", "t_ns"))
 
 CHUNK = 1024
 """Rows per step: more are no faster, and keep more of a wide array's columns in memory."""
@@ -58,7 +59,10 @@ class EstimateRun:
         self._held: deque[tuple[FrameBatch, Extra]] = deque()
 
     def feed(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Take the next frames; return those whose estimates are due, in order."""
+        """Take the next frames; return those whose estimates are due, in order.
+
+        In one piece for each `CHUNK` of frames: what is done for a piece is done the more rarely.
+        """
         for begin in range(0, len(frames), CHUNK):
             end = min(begin + CHUNK, len(frames))
             rows = frames.rows(begin, end)
@@ -196,27 +200,34 @@ class EstimateStream:
 def _paired(
     held: deque[tuple[FrameBatch, Extra]], estimates: Estimates
 ) -> Iterator[tuple[FrameBatch, Columns]]:
-    """Cut the held frames to where the estimates reach."""
-    at = 0
-    while at < len(estimates):
+    """The oldest of the held frames, as many as there are estimates, in one piece with them."""
+    pieces: list[tuple[FrameBatch, Extra]] = []
+    lack = len(estimates)
+    while lack:
         frames, extra = held.popleft()
-        n = min(len(frames), len(estimates) - at)
-        if n < len(frames):
-            rest = {name: values[n:] for name, values in extra.items()}
-            held.appendleft((frames.rows(n, len(frames)), rest))
-        columns = {name: values[:n] for name, values in extra.items()}
-        columns |= estimate_columns(estimates.rows(at, at + n))
-        yield frames.rows(0, n), columns
-        at += n
+        if lack < len(frames):
+            rest = {name: values[lack:] for name, values in extra.items()}
+            held.appendleft((frames.rows(lack, len(frames)), rest))
+            frames = frames.rows(0, lack)
+            extra = {name: values[:lack] for name, values in extra.items()}
+        pieces.append((frames, extra))
+        lack -= len(frames)
+    if pieces:
+        frames, extra = _joined(pieces)
+        yield frames, {**extra, **estimate_columns(estimates)}
+
+
+def _joined(pieces: list[tuple[FrameBatch, Extra]]) -> tuple[FrameBatch, Extra]:
+    if len(pieces) == 1:
+        return pieces[0]
+    names = pieces[0][1]
+    extra = {name: np.concatenate([extra[name] for _, extra in pieces]) for name in names}
+    return FrameBatch.concatenate([frames for frames, _ in pieces]), extra
 
 
 def estimate_columns(estimates: Estimates) -> dict[str, npt.NDArray[Any]]:
     """Columns of a sealed file; `seq` and `t_ns` are the frames' own."""
-    return {
-        f.name: getattr(estimates, f.name)
-        for f in fields(Estimates)
-        if f.name not in ("seq", "t_ns")
-    }
+    return {name: getattr(estimates, name) for name in _ESTIMATED}
 
 
 def notes_of(

@@ -81,6 +81,15 @@ class Segment:
             self.t_ns_last = end if fresh else max(self.t_ns_last, end)
             self.size_bytes += int(records["length"].sum()) + records.nbytes
 
+    def note(self, message: EncodedBatch) -> None:
+        """Note one batch that was written: the same as `take_in` of its record, for every one."""
+        self.held.add(message.seq_first, message.seq_last)
+        fresh = not self.size_bytes
+        begin, end = message.t_ns_first, message.t_ns_last
+        self.t_ns_first = begin if fresh else min(self.t_ns_first, begin)
+        self.t_ns_last = end if fresh else max(self.t_ns_last, end)
+        self.size_bytes += len(message.payload) + RECORD.itemsize
+
     def records(self) -> Records:
         """Index of the batches that count, in order of their frames.
 
@@ -165,14 +174,14 @@ class SegmentWriter:
         record = record_of(message, offset)
         write_all(self._data, message.payload)
         try:
-            write_all(self._index, record.tobytes())
+            write_all(self._index, record)
         except OSError:
             with suppress(OSError):
                 self._data.truncate(offset)
                 self._data.seek(offset)
             raise
         self.has_news = True
-        self.segment.take_in(record)
+        self.segment.note(message)
 
     def sync(self) -> None:
         """Return when all that was appended before is on the disk.
@@ -204,7 +213,7 @@ class SegmentWriter:
                 self._forget_doubtful()
                 return
             with suppress(OSError):  # without it the batches are checked when it is opened again
-                write_all(self._index, closing_record().tobytes())
+                write_all(self._index, closing_record())
                 os.fsync(self._index.fileno())
         finally:
             self.abandon()
@@ -342,7 +351,7 @@ def _set_aside(path: Path, content: bytes) -> None:
 
 def _write_index(path: Path, records: Records) -> None:
     """Replace a segment's index by one that says that it was closed."""
-    content = records.tobytes() + closing_record().tobytes()
+    content = records.tobytes() + closing_record()
     write_whole(path.with_suffix(INDEX_SUFFIX), content)
 
 
@@ -353,13 +362,13 @@ def _checked(descriptor: int, record: Any, end: int, message: EncodedBatch | Non
         return record if is_right else None
     if message is None or zlib.crc32(message.payload) != record["crc32"]:
         return None
-    return record_of(message, end)[0]
+    return np.frombuffer(record_of(message, end), RECORD)[0]
 
 
 def _rebuilt_index(path: Path, begin: int, schema: pa.Schema) -> Records:
-    records = [np.zeros(0, RECORD)]
+    records = bytearray()
     # Without a whole header nothing after it is known to be a batch.
     for message in messages_from(path, begin, schema) if begin else ():
-        records.append(record_of(message, begin))
+        records += record_of(message, begin)
         begin += len(message.payload)
-    return np.concatenate(records)
+    return np.frombuffer(bytes(records), RECORD)

@@ -7,6 +7,7 @@ without frames ends it: the segment was synced to its end and closed.
 from __future__ import annotations
 
 import os
+import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,25 +39,28 @@ RECORD = np.dtype(
 """One batch in the index: `crc32` is of its bytes, `check` of this record before it."""
 
 _CHECKED = RECORD.itemsize - 4
+_PACKED = struct.Struct("<QqqQIII")
 _OFFSET_END = 1 << 62
 
 Records = npt.NDArray[np.void]
 
 
-def record_of(message: EncodedBatch, offset: int) -> Records:
-    """The index record of a batch: an array of one."""
-    record = np.zeros(1, RECORD)
-    record["seq_first"] = message.seq_first
-    record["t_ns_first"], record["t_ns_last"] = message.t_ns_first, message.t_ns_last
-    record["offset"], record["length"] = offset, len(message.payload)
-    record["count"] = message.seq_last - message.seq_first + 1
-    record["crc32"] = zlib.crc32(message.payload)
-    return _sealed(record)
+def record_of(message: EncodedBatch, offset: int) -> bytes:
+    """The index record of a batch."""
+    return _sealed(
+        message.seq_first,
+        message.t_ns_first,
+        message.t_ns_last,
+        offset,
+        len(message.payload),
+        message.seq_last - message.seq_first + 1,
+        zlib.crc32(message.payload),
+    )
 
 
-def closing_record() -> Records:
-    """The record that ends an index: an array of one."""
-    return _sealed(np.zeros(1, RECORD))
+def closing_record() -> bytes:
+    """The record that ends an index."""
+    return _sealed(0, 0, 0, 0, 0, 0, 0)
 
 
 def numbers(record: Any) -> tuple[int, int]:
@@ -163,6 +167,7 @@ def run_of(records: Records, content: bytes) -> Run:
     return Run(content, *columns)
 
 
-def _sealed(record: Records) -> Records:
-    record["check"] = zlib.crc32(record.tobytes()[:_CHECKED])
-    return record
+def _sealed(*values: int) -> bytes:
+    # Packed, which takes a tenth of the time of filling in an array of one.
+    content = _PACKED.pack(*values)
+    return content + zlib.crc32(content).to_bytes(4, "little")

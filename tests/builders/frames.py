@@ -104,7 +104,7 @@ def any_frames(rows: int, tiles: int = 2, seed: int = 0, **columns: npt.ArrayLik
     values: dict[str, npt.ArrayLike] = {}
     for name, (dtype, per_tile) in FRAME_COLUMNS.items():
         shape = (rows, tiles) if per_tile else (rows,)
-        bits = rng.integers(0, 256, (*shape, np.dtype(dtype).itemsize), dtype=np.uint8)
+        bits = rng.integers(0, 256, (*shape, dtype.itemsize), dtype=np.uint8)
         column = bits.view(dtype)[..., 0]
         if np.issubdtype(dtype, np.floating):
             ends = np.array([np.nan, np.inf, -np.inf, -0.0, 1e-40, 29.97], dtype)

@@ -171,7 +171,7 @@ def test_headers_of_strangers_take_no_memory() -> None:
         read = reader.read(run_of([part], [payload]))
         assert read is not None
         assert_same_bits(read, part)
-    assert sum(len(head) for head in reader._layouts) < 100_000
+    assert sum(len(head) for head in reader._layouts._known) < 100_000
 
 
 def padded(payload: bytes, more: int) -> bytes:

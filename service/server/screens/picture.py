@@ -28,17 +28,19 @@ _NOTICES_MAX = 256
 
 # Digits that are finer than what is measured, and no more.
 _DIGITS = {"kpa": 4, "n": 4, "m": 6, "rad": 5}
-_PER_TILE = ("gauge_kpa", "force_n", "force_sigma_n")
+_PER_TILE = (("gauge_kpa", "kpa"), ("force_n", "n"), ("force_sigma_n", "n"))
 _PER_FRAME = (
-    "grf_n",
-    "grf_sigma_n",
-    "grf_at_least_n",
-    "cop_x_m",
-    "cop_y_m",
-    "cop_sigma_x_m",
-    "cop_sigma_y_m",
-    "angle_rad",
+    ("grf_n", "n"),
+    ("grf_sigma_n", "n"),
+    ("grf_at_least_n", "n"),
+    ("cop_x_m", "m"),
+    ("cop_y_m", "m"),
+    ("cop_sigma_x_m", "m"),
+    ("cop_sigma_y_m", "m"),
+    ("angle_rad", "rad"),
 )
+# Made once: `json.dumps` would make one for each message.
+_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 
 
 @dataclass(frozen=True)
@@ -213,10 +215,10 @@ def sum_up(
         "servo_age_us": int(frames.servo_age_us[-1]) if frames.servo_age_us[-1] >= 0 else None,
     }
     unknown = np.full((1, tiles), np.nan)
-    for name in _PER_TILE:
-        newest[name] = rounded(columns.get(name, unknown)[-1], name.rsplit("_", 1)[1])
-    for name in _PER_FRAME:
-        newest[name] = one(float(columns.get(name, unknown[:, 0])[-1]), name.rsplit("_", 1)[1])
+    for name, unit in _PER_TILE:
+        newest[name] = rounded(columns.get(name, unknown)[-1], unit)
+    for name, unit in _PER_FRAME:
+        newest[name] = one(float(columns.get(name, unknown[:, 0])[-1]), unit)
     contact = int(columns["contact"][-1]) if "contact" in columns else UNKNOWN
     newest["contact"] = None if contact == UNKNOWN else bool(contact)
     newest["estimate_status"] = (
@@ -247,7 +249,9 @@ def sum_up(
 
 def rounded(values: npt.NDArray[Any], unit: str) -> list[float | None]:
     """Numbers for a screen; what is not finite is null."""
-    return [one(value, unit) for value in values.tolist()]
+    return [
+        number if math.isfinite(number) else None for number in values.round(_DIGITS[unit]).tolist()
+    ]
 
 
 def one(value: float, unit: str) -> float | None:
@@ -262,4 +266,4 @@ def min_of(a: float, b: float) -> float:
 
 def dumps(message: Mapping[str, Any]) -> str:
     """Compact JSON; NaN has no place in it."""
-    return json.dumps(message, separators=(",", ":"), allow_nan=False)
+    return _ENCODER.encode(message)

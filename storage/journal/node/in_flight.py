@@ -110,7 +110,7 @@ def read_in_flight(folder: Path) -> tuple[ArrayInfo, FrameBatch | None] | None:
     types: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = []
     for name in _ORDER:
         dtype, per_tile = FRAME_COLUMNS[name]
-        code = np.dtype(dtype).newbyteorder("<").str
+        code = dtype.newbyteorder("<").str
         types.append((name, code, (tiles,)) if per_tile else (name, code))
     rows = np.frombuffer(content, np.dtype([*types, ("crc32", "<u4")]), ROWS, begin)
     body = memoryview(content)
@@ -170,7 +170,7 @@ def _codes(tiles: int) -> str:
     codes = []
     for name in _ORDER:
         dtype, per_tile = FRAME_COLUMNS[name]
-        codes.append((str(tiles) if per_tile else "") + _CODES[np.dtype(dtype).name])
+        codes.append((str(tiles) if per_tile else "") + _CODES[dtype.name])
     return "<" + "".join(codes)
 
 
