@@ -285,10 +285,11 @@ async def _watch(
         end_s = time.monotonic() + options.seconds
         before = await asyncio.to_thread(Look.at, server)
         while time.monotonic() < end_s:
-            screens[0].ages_ms.clear()
+            ages_ms = screens[0].ages_ms if screens else []
+            ages_ms.clear()
             await asyncio.sleep(min(options.look_s, max(0.0, end_s - time.monotonic())))
             now = await asyncio.to_thread(Look.at, server)
-            rows.append(row(count, what, before, now, screens[0].ages_ms))
+            rows.append(row(count, what, before, now, ages_ms))
             print(rows[-1], flush=True)
             before = now
         downloaded = await _downloaded(downloading) if downloading is not None else ""
@@ -324,14 +325,17 @@ HEAD = (
 
 def remarks(found: Found) -> str:
     """What is not in the table."""
-    sent, looked = found.sent, found.screens[0]
+    sent = found.sent
     told = [screen.messages for screen in found.screens]
+    unknown = sum(screen.unknown for screen in found.screens)
     said = [
         f"of {sent.taken} frames {found.lost} are lost, "
         f"{sent.taken - sent.acknowledged} not acknowledged {DRAIN_S:g} s after the last",
         f"screens were told {min(told)} to {max(told)} times, and dropped "
-        f"{sum(screen.dropped for screen in found.screens)} times",
-        f"{looked.unknown} messages without a force" if looked.unknown else "",
+        f"{sum(screen.dropped for screen in found.screens)} times"
+        if told
+        else "",
+        f"{unknown} messages without a force" if unknown else "",
         f"the load gave messages to its links {sent.late_ms:.1f} ms late (p99)",
         *(f"links said {n} times: {text}" for text, n in Counter(sent.said).items()),
         found.downloaded,
@@ -398,7 +402,7 @@ def main() -> None:
     rate_hz = a.rate_hz or RATE_HZ.get(a.tiles) or parser.error("say --rate-hz for so many tiles")
     seconds = a.seconds or (SOAK_S if a.soak else 20.0)
     options = Options(
-        viewers=a.viewers or (SOAK_SCREENS if a.soak else 1),
+        viewers=(SOAK_SCREENS if a.soak else 1) if a.viewers is None else a.viewers,
         seconds=seconds,
         look_s=LOOK_S if a.soak else seconds,
         record=a.record,

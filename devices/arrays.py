@@ -47,5 +47,6 @@ class Arrays:
         Raises:
             ValueError: no part, or arrays of different width.
         """
-        names = [f.name for f in fields(cls)]
-        return cls(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
+        columns = [vars(part) for part in parts]
+        names = columns[0] if columns else [f.name for f in fields(cls)]
+        return cls(**{name: np.concatenate([part[name] for part in columns]) for name in names})

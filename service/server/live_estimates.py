@@ -11,7 +11,7 @@ from devices.arrays import Floats
 from devices.chips.compensation import Compensation
 from devices.errors import FootTileError, TareError
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
-from service.estimation.calibration import Calibration
+from service.estimation.calibration import Calibration, TileCalibration
 from service.estimation.foot.contact import UNSEEN_NS
 from service.estimation.ladder.plan import make_plan
 from service.estimation.models.static import StaticCurves
@@ -45,6 +45,10 @@ class LiveEstimates:
         self._compensation = Compensation(info.tiles)
         self._bears = np.array([not tile.reference for tile in info.tiles])
         self._calibration: Calibration | None = None
+        self.calibration_id: str | None = None
+        """Of the calibration in use: a hash, which takes longer than all else a screen is told."""
+        self.entries: tuple[TileCalibration | None, ...] = (None,) * len(info.tiles)
+        """What the calibration in use knows of each tile; None for bare ones."""
         self.range_kpa: Floats | None = None
         """End of each tile's calibrated range, NaN for bare ones; None without a calibration."""
         self.full_scale_n: Floats | None = None
@@ -61,6 +65,8 @@ class LiveEstimates:
             try:
                 EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
                 self._calibration = calibration
+                self.calibration_id = calibration.id
+                self.entries = tuple(calibration.find(serial) for serial in info.serials)
                 self._know_ranges(calibration)
             except FootTileError as error:  # does not fit these tiles: report it and go without
                 self.calibration_problem = str(error)
@@ -136,10 +142,12 @@ class LiveEstimates:
         if not self._recent:
             return np.full(len(self._info.tiles), np.nan)
         since_t_ns = int(self._recent[-1].t_ns[-1]) - _TADC_OVER_NS
-        frames = FrameBatch.concatenate([f for f in self._recent if f.t_ns[-1] >= since_t_ns])
-        known = (frames.tadc != NOT_READ) & ((frames.status & np.uint8(TileStatus.UNUSABLE)) == 0)
+        recent = [frames for frames in self._recent if frames.t_ns[-1] >= since_t_ns]
+        tadc = np.concatenate([frames.tadc for frames in recent])
+        status = np.concatenate([frames.status for frames in recent])
+        known = (tadc != NOT_READ) & ((status & np.uint8(TileStatus.UNUSABLE)) == 0)
         counts = known.sum(axis=0)
-        total = np.where(known, frames.tadc, 0).sum(axis=0)
+        total = np.where(known, tadc, 0).sum(axis=0)
         return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
     def newtons(self, shift_kpa: Floats) -> float | None:

@@ -263,8 +263,8 @@ class ServerNode:
         if self.last_seq is not None and last <= self.last_seq:
             self._look_for_tare()  # sent again for the journal; the picture is further on
             return first, last, []
-        if self.last_seq is not None:
-            frames = frames.rows(max(0, self.last_seq + 1 - first), len(frames))
+        if self.last_seq is not None and first <= self.last_seq:
+            frames = frames.rows(self.last_seq + 1 - first, len(frames))
         self.last_seq, self.last_t_ns = last, int(frames.t_ns[-1])
         self._pace.append((int(frames.t_mono_ns[-1]), last))
         while self._pace[-1][0] - self._pace[0][0] > _RATE_OVER_NS and len(self._pace) > 2:

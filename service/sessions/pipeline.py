@@ -65,8 +65,11 @@ class EstimateRun:
         """
         for begin in range(0, len(frames), CHUNK):
             end = min(begin + CHUNK, len(frames))
-            rows = frames.rows(begin, end)
-            self._held.append((rows, {name: v[begin:end] for name, v in extra.items()}))
+            rows, rows_of = frames, extra
+            if end - begin < len(frames):  # a message that comes live is not cut
+                rows = frames.rows(begin, end)
+                rows_of = {name: v[begin:end] for name, v in extra.items()}
+            self._held.append((rows, rows_of))
             yield from _paired(self._held, self._estimator.step(rows))
 
     def finish(self) -> Iterator[tuple[FrameBatch, Columns]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Generic, Literal, TypeVar
 
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from devices.frames import ServoInfo
-from service.estimation.calibration import Calibration
+from service.estimation.calibration import TileCalibration
 from service.estimation.tare.tare import TakenFrom, expected_shift_kpa, trend, warmer_k
 from service.server.node import ServerNode
 from service.server.recorder import Recorder
@@ -214,11 +215,11 @@ class NodeView(View):
             schedule=info.schedule,
             nominal_rate_hz=info.nominal_rate_hz,
             calibration=None
-            if calibration is None
+            if calibration is None or live.calibration_id is None
             else CalibrationView(
-                id=calibration.id,
+                id=live.calibration_id,
                 name=calibration.name,
-                absolute_scale=_scale(calibration, info.serials),
+                absolute_scale=_scale(live.entries),
             ),
             calibration_problem=live.calibration_problem or node.hello.calibration_problem,
             tare=TareView.of(tare) if tare is not None else None,
@@ -337,7 +338,7 @@ class EventView(View):
 
 
 def _tiles(node: ServerNode) -> list[TileView]:
-    calibration, full_scale_n = node.live.calibration, node.live.full_scale_n
+    full_scale_n = node.live.full_scale_n
     full_scales = [None] * len(node.info.tiles) if full_scale_n is None else _known(full_scale_n)
     placed = {"serial", "mux", "channel", "x_m", "y_m", "z_m", "reference"}
     return [
@@ -346,16 +347,14 @@ def _tiles(node: ServerNode) -> list[TileView]:
             full_scale_n=full_scales[i],
             **tile.model_dump(include=placed),
         )
-        for i, tile in enumerate(node.info.tiles)
-        for entry in (calibration.find(tile.serial) if calibration is not None else None,)
+        for i, (tile, entry) in enumerate(zip(node.info.tiles, node.live.entries, strict=True))
     ]
 
 
 def _known(values: npt.NDArray[np.float64]) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]
+    return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
-def _scale(calibration: Calibration, serials: Iterable[str]) -> Literal["measured", "assumed"]:
-    entries = [calibration.find(serial) for serial in serials]
+def _scale(entries: Iterable[TileCalibration | None]) -> Literal["measured", "assumed"]:
     assumed = any(entry is not None and entry.absolute_scale == "assumed" for entry in entries)
     return "assumed" if assumed else "measured"
