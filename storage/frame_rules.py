@@ -39,7 +39,7 @@ def broken_rule(frames: FrameBatch, info: ArrayInfo) -> str:
         info: the array of their stream.
     """
     for rule, wrong in _rules(frames, info):
-        if wrong.any():
+        if np.count_nonzero(wrong):  # a third of the time of `any`, and nearly always 0
             row = int(np.flatnonzero(wrong if wrong.ndim == 1 else wrong.any(axis=1))[0])
             return f"{rule} in frame {int(frames.seq[row])}"
     return ""

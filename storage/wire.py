@@ -93,14 +93,14 @@ class Decoder:
         seq, t_mono_ns = batch.seq, batch.t_mono_ns
         first, last = int(seq[0]), int(seq[-1])
         # A difference of unsigned numbers wraps, so both ends are looked at as well.
-        if last - first != len(batch) - 1 or (seq[1:] - seq[:-1] != 1).any():
+        if last - first != len(batch) - 1 or np.count_nonzero(seq[1:] - seq[:-1] != 1):
             raise FileFormatError(
                 f"frames {first} to {last} do not follow one another",
                 expected="seq rising by one within a message",
             )
         if last >= SEQ_END:
             raise FileFormatError(f"frame number {last}", expected="less than 2^53")
-        if (t_mono_ns[1:] < t_mono_ns[:-1]).any():
+        if np.count_nonzero(t_mono_ns[1:] < t_mono_ns[:-1]):
             raise FileFormatError(
                 f"time runs backwards within frames {first} to {last}",
                 expected="t_mono_ns rising",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from itertools import takewhile
 
 import numpy as np
 
@@ -142,7 +143,7 @@ class LiveEstimates:
         if not self._recent:
             return np.full(len(self._info.tiles), np.nan)
         since_t_ns = int(self._recent[-1].t_ns[-1]) - _TADC_OVER_NS
-        recent = [frames for frames in self._recent if frames.t_ns[-1] >= since_t_ns]
+        recent = [*takewhile(lambda each: each.t_ns[-1] >= since_t_ns, reversed(self._recent))]
         tadc = np.concatenate([frames.tadc for frames in recent])
         status = np.concatenate([frames.status for frames in recent])
         known = (tadc != NOT_READ) & ((status & np.uint8(TileStatus.UNUSABLE)) == 0)
@@ -218,10 +219,11 @@ class LiveEstimates:
         before_t_ns = self._due_t_ns if self._due_t_ns is not None else int(t_ns[0])
         taken = columns["contact"] != 0  # or not known
         # A gap that is too short for a step, such as a missed slot, cannot hide a contact.
-        taken[0] |= int(t_ns[0]) - before_t_ns > UNSEEN_NS
-        taken[1:] |= t_ns[1:] - t_ns[:-1] > UNSEEN_NS
+        if int(t_ns[-1]) - before_t_ns > UNSEEN_NS:
+            taken[0] |= int(t_ns[0]) - before_t_ns > UNSEEN_NS
+            taken[1:] |= t_ns[1:] - t_ns[:-1] > UNSEEN_NS
         self._due_t_ns = int(t_ns[-1])
-        if taken.any():
+        if np.count_nonzero(taken):
             self.free_since_t_ns = int(t_ns[np.flatnonzero(taken)[-1]])
         elif self.free_since_t_ns is None:
             self.free_since_t_ns = int(t_ns[0])
