@@ -15,6 +15,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import importlib.util
+import math
 import os
 import statistics
 import subprocess
@@ -274,7 +275,8 @@ def main() -> None:
             row = measured(kind, size, viewers, seconds)
             size = round(row[2]) if kind == "ours" else size
             found[kind].append(row)
-    beside = statistics.median(row[0] for row in found["uvicorn"])
+    # A short run may take no tick of the processor's clock; then there is no ratio.
+    beside = statistics.median(row[0] for row in found["uvicorn"]) or math.nan
     print(f"{viewers} viewers at {RATE_HZ:g} messages/s of {size} bytes,", end=" ")
     print(f"{turns} turns of {seconds:g} s\n")
     print("| server | us CPU a message | of uvicorn's | delivered % |")

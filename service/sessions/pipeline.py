@@ -203,29 +203,37 @@ class EstimateStream:
 def _paired(
     held: deque[tuple[FrameBatch, Extra]], estimates: Estimates
 ) -> Iterator[tuple[FrameBatch, Columns]]:
-    """The oldest of the held frames, as many as there are estimates, in one piece with them."""
+    """The oldest of the held frames, as many as there are estimates, with them.
+
+    In one piece as far as their numbers follow: a screen is told of a gap by what is between two.
+    """
     pieces: list[tuple[FrameBatch, Extra]] = []
-    lack = len(estimates)
-    while lack:
+    given = at = 0
+    while at < len(estimates):
         frames, extra = held.popleft()
+        lack = len(estimates) - at
         if lack < len(frames):
             rest = {name: values[lack:] for name, values in extra.items()}
             held.appendleft((frames.rows(lack, len(frames)), rest))
             frames = frames.rows(0, lack)
             extra = {name: values[:lack] for name, values in extra.items()}
+        if pieces and int(frames.seq[0]) != int(pieces[-1][0].seq[-1]) + 1:
+            yield _joined(pieces, estimates.rows(given, at))
+            pieces, given = [], at
         pieces.append((frames, extra))
-        lack -= len(frames)
+        at += len(frames)
     if pieces:
-        frames, extra = _joined(pieces)
-        yield frames, {**extra, **estimate_columns(estimates)}
+        yield _joined(pieces, estimates.rows(given, at) if given else estimates)
 
 
-def _joined(pieces: list[tuple[FrameBatch, Extra]]) -> tuple[FrameBatch, Extra]:
-    if len(pieces) == 1:
-        return pieces[0]
-    names = pieces[0][1]
-    extra = {name: np.concatenate([extra[name] for _, extra in pieces]) for name in names}
-    return FrameBatch.concatenate([frames for frames, _ in pieces]), extra
+def _joined(
+    pieces: list[tuple[FrameBatch, Extra]], estimates: Estimates
+) -> tuple[FrameBatch, Columns]:
+    frames, extra = pieces[0]
+    if len(pieces) > 1:
+        extra = {name: np.concatenate([extra[name] for _, extra in pieces]) for name in extra}
+        frames = FrameBatch.concatenate([frames for frames, _ in pieces])
+    return frames, {**extra, **estimate_columns(estimates)}
 
 
 def estimate_columns(estimates: Estimates) -> dict[str, npt.NDArray[Any]]:
