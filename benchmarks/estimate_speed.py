@@ -61,7 +61,7 @@ def frames_of(n: int, count: int = 4) -> FrameBatch:
     shape = (n, count)
     turn = 2 * np.pi * 2.5325e-3 * np.arange(n)
     load = 55 - 55 * np.cos(turn[:, None] + np.linspace(0.0, 1.0, count))
-    return make_frames(
+    frames = make_frames(
         n,
         count,
         period_ns=2_532_500,
@@ -69,6 +69,9 @@ def frames_of(n: int, count: int = 4) -> FrameBatch:
         padc=np.round(380 - load + rng.normal(0.0, 0.7, shape)).astype(np.int64),
         tadc=rng.integers(500, 510, shape),
     )
+    for column in vars(frames).values():
+        column.setflags(write=False)  # as those of a message are
+    return frames
 
 
 def estimate(plan: EstimationPlan, frames: FrameBatch, batch: int) -> None:
