@@ -16,7 +16,6 @@ import asyncio
 import contextlib
 import importlib.util
 import math
-import os
 import statistics
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from typing import Any
 
 import websockets.asyncio.client
 import websockets.sync.client
+from served import cpu_s
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -37,7 +37,6 @@ RATE_HZ = 60.0
 FRAMES_PER_MESSAGE = 8  # more messages a second than screens are told of
 TILES = 4
 SETTLE_S = 1.0
-_TICKS = os.sysconf("SC_CLK_TCK")
 _PROTOCOLS = {"ours": "foottile.v1", "foxglove-sdk": "foxglove.sdk.v1"}
 _SUBSCRIBE = '{"op":"subscribe","subscriptions":[{"id":1,"channelId":1}]}'
 
@@ -198,11 +197,6 @@ def a_node(url: str) -> Iterator[None]:
         node.close()
 
 
-def cpu_s(process: subprocess.Popen[str]) -> float:
-    fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(") ", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / _TICKS
-
-
 async def watched(
     kind: str, url: str, process: subprocess.Popen[str], viewers: int, seconds: float
 ) -> tuple[float, int, int]:
@@ -234,9 +228,9 @@ async def watched(
             tasks.append(asyncio.create_task(look(socket)))
         await asyncio.sleep(SETTLE_S)
         came[:] = 0, 0
-        before_s = cpu_s(process)
+        before_s = cpu_s(process.pid)
         await asyncio.sleep(seconds)
-        took_s, found = cpu_s(process) - before_s, tuple(came)
+        took_s, found = cpu_s(process.pid) - before_s, tuple(came)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)

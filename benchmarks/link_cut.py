@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+from served import COMMAND, served
 from websockets.sync.client import connect
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.faults.proxy import Proxy, Quality
 
-COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 RATES = (None, 400_000.0, 100_000.0)
 """Bytes a second of the link: as fast as it goes; Wi-Fi at its edge; twice what the frames need."""
 
@@ -50,32 +50,25 @@ def main() -> None:
 
 def cut(how: str, rate: float | None, seconds: float) -> dict[str, Any]:
     """One cut; what was measured."""
-    with tempfile.TemporaryDirectory() as folder:
-        server = subprocess.Popen(
-            [*COMMAND, "serve", "--port=0", f"--data={folder}/data"],
-            stdout=subprocess.PIPE,
-            text=True,
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        served(Path(folder) / "data") as server,
+        Proxy(int(server.url.rsplit(":", 1)[1])) as proxy,
+    ):
+        proxy.quality = Quality(bytes_per_s=rate)
+        node = subprocess.Popen(
+            [
+                *(*COMMAND, "node", "--scene=standing", "--name=foot"),
+                f"--server=http://127.0.0.1:{proxy.port}",
+                f"--journal={folder}/node",
+            ],
+            stderr=subprocess.DEVNULL,
         )
-        assert server.stdout is not None
-        url = server.stdout.readline().split()[-1].rstrip("/")
-        with Proxy(int(url.rsplit(":", 1)[1])) as proxy:
-            proxy.quality = Quality(bytes_per_s=rate)
-            node = subprocess.Popen(
-                [
-                    *(*COMMAND, "node", "--scene=standing", "--name=foot"),
-                    f"--server=http://127.0.0.1:{proxy.port}",
-                    f"--journal={folder}/node",
-                ],
-                stderr=subprocess.DEVNULL,
-            )
-            try:
-                return measure(url, proxy, how, rate, seconds, Path(folder))
-            finally:
-                node.terminate()
-                node.wait(20)
-                server.terminate()
-                server.wait(20)
-                server.stdout.close()
+        try:
+            return measure(server.url, proxy, how, rate, seconds, Path(folder))
+        finally:
+            node.terminate()
+            node.wait(20)
 
 
 def measure(

@@ -9,79 +9,51 @@ batch (25 ms), the estimator's look-ahead (10 ms) and the pacing of the messages
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-import httpx
 import numpy as np
+from served import COMMAND, Server, children, cpu_s, served
 from websockets.sync.client import connect
-
-COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
-TICKS = os.sysconf("SC_CLK_TCK")
-
-
-def cpu_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(") ", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
-
-
-def children(pid: int) -> list[int]:
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            if int(path.read_text().rsplit(") ", 1)[1].split()[1]) == pid:
-                found.append(int(path.parent.name))
-        except (OSError, IndexError):
-            continue
-    return found
 
 
 def main() -> None:
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 30.0
     scene = sys.argv[2] if len(sys.argv) > 2 else "standing"
-    with tempfile.TemporaryDirectory() as folder:
-        server = subprocess.Popen(
-            [*COMMAND, "serve", "--port=0", f"--data={folder}"], stdout=subprocess.PIPE, text=True
-        )
-        assert server.stdout is not None
-        url = server.stdout.readline().split()[-1].rstrip("/")
-        options = [f"--scene={scene}", f"--server={url}", f"--journal={folder}/node"]
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as server:
+        options = [f"--scene={scene}", f"--server={server.url}", f"--journal={folder}/node"]
         node = subprocess.Popen([*COMMAND, "node", *options])
         try:
-            measure(url, server.pid, node.pid, seconds, Path(folder))
+            measure(server, node.pid, seconds, Path(folder))
         finally:
             node.terminate()
             node.wait(15)
-            server.terminate()
-            server.wait(15)
-            server.stdout.close()
 
 
-def measure(url: str, server: int, node: int, seconds: float, folder: Path) -> None:
-    api = httpx.Client(base_url=f"{url}/api/v1", trust_env=False)
-    while not any(n["tare"] for n in api.get("/nodes").json()["items"]):
+def measure(server: Server, node: int, seconds: float, folder: Path) -> None:
+    api = server.http
+    while not any(each["tare"] for each in server.nodes()):
         time.sleep(0.2)
-    name = api.get("/nodes").json()["items"][0]["node"]
+    name = server.nodes()[0]["node"]
     time.sleep(1.0)
     # First without any screen
     before = api.get(f"/nodes/{name}").json()
-    began_s, busy_s = time.monotonic(), cpu_s(server)
+    began_s, busy_s = time.monotonic(), server.cpu_s
     time.sleep(seconds / 2)
     after = api.get(f"/nodes/{name}").json()
-    unseen_s, unseen = cpu_s(server) - busy_s, after["last_seq"] - before["last_seq"]
+    unseen_s, unseen = server.cpu_s - busy_s, after["last_seq"] - before["last_seq"]
     unseen_wall_s = time.monotonic() - began_s
 
     session = api.post("/sessions", json={"node": name, "name": "benchmark"}).json()
     before = api.get(f"/nodes/{name}").json()
     latencies_ms, ages_ms, sizes, gaps_ms = [], [], [], []
-    busy_s, node_busy_s = cpu_s(server), sum(cpu_s(pid) for pid in [node, *children(node)])
+    busy_s, node_busy_s = server.cpu_s, sum(cpu_s(pid) for pid in [node, *children(node)])
     end_s = time.monotonic() + seconds
     last_ns = 0
-    with connect(url.replace("http", "ws") + "/api/v1/live", compression=None) as socket:
+    with connect(server.url.replace("http", "ws") + "/api/v1/live", compression=None) as socket:
         while time.monotonic() < end_s:
             text = socket.recv(timeout=5)
             now_ns = time.time_ns()
@@ -94,7 +66,7 @@ def measure(url: str, server: int, node: int, seconds: float, folder: Path) -> N
                 last_ns = now_ns
     after = api.get(f"/nodes/{name}").json()
     frames = after["last_seq"] - before["last_seq"]
-    server_s = cpu_s(server) - busy_s
+    server_s = server.cpu_s - busy_s
     node_s = sum(cpu_s(pid) for pid in [node, *children(node)]) - node_busy_s
     sealed = api.post(f"/sessions/{session['id']}/stop", timeout=60).json()
     journal = sum(path.stat().st_size for path in (folder / "journal").rglob("*.arrows"))

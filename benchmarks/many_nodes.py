@@ -25,34 +25,28 @@ import asyncio
 import contextlib
 import json
 import multiprocessing
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import httpx
+import big_download
 import numpy as np
 import websockets.asyncio.client
 from replayed_nodes import DRAIN_S, Played, Sent, played, run_load
+from served import Server, served
 
 from service.link import SUBPROTOCOL
 from service.server.live_estimates import LIVE_LAG_MS
 
-COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 RATE_HZ = {4: 541.0, 64: 64.0}
 SCREEN_HZ = 60
 SETTLE_S = 2.0
-READY_S, SEALED_S, PATIENCE_S = 120.0, 300.0, 30.0
+READY_S = 120.0
 SOAK_NODES, SOAK_SCREENS, SOAK_S, LOOK_S = 4, 20, 1800.0, 60.0
-_CHUNK_BYTES = 1 << 20
-_TICKS = os.sysconf("SC_CLK_TCK")
-_CREATED = 201
 
 
 @dataclass(frozen=True)
@@ -108,79 +102,6 @@ class Look:
             for node in server.nodes()
         )
         return cls(time.monotonic(), server.cpu_s, frames, server.rss_mb)
-
-
-class Server:
-    """`foottile serve` as a process."""
-
-    def __init__(self, data: Path) -> None:
-        self.process = subprocess.Popen(
-            [*COMMAND, "serve", "--port=0", f"--data={data}"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        self.url = self.process.stdout.readline().split()[-1].rstrip("/")
-        self.http = httpx.Client(base_url=f"{self.url}/api/v1", trust_env=False, timeout=60.0)
-
-    @property
-    def cpu_s(self) -> float:
-        """CPU time of all its threads so far."""
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(") ", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / _TICKS
-
-    @property
-    def rss_mb(self) -> float:
-        """Memory that it holds."""
-        fields = Path(f"/proc/{self.process.pid}/statm").read_text().split()
-        return int(fields[1]) * os.sysconf("SC_PAGE_SIZE") * 1e-6
-
-    def nodes(self) -> list[dict[str, Any]]:
-        """As its API has them."""
-        items: list[dict[str, Any]] = self.http.get("/nodes").json()["items"]
-        return items
-
-    def record(self) -> list[str]:
-        """Record every node; the sessions' ids."""
-        found = []
-        for node in self.nodes():
-            answer = self.http.post("/sessions", json={"node": node["node"], "name": "many"})
-            assert answer.status_code == _CREATED, answer.text
-            found.append(answer.json()["id"])
-        return found
-
-    def sealed(self, sessions: list[str]) -> list[dict[str, Any]]:
-        """The sessions, once they are sealed."""
-        end_s = time.monotonic() + SEALED_S
-        while time.monotonic() < end_s:
-            found = [self.http.get(f"/sessions/{session}").json() for session in sessions]
-            if all(each["state"] == "sealed" for each in found):
-                return found
-            time.sleep(0.5)
-        raise TimeoutError("not sealed")
-
-    def close(self) -> None:
-        """End it."""
-        self.http.close()
-        self.process.terminate()
-        try:
-            self.process.wait(30.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
-
-@contextlib.contextmanager
-def served(data: Path) -> Iterator[Server]:
-    """A server, and its end."""
-    server = Server(data)
-    try:
-        yield server
-    finally:
-        server.close()
 
 
 class Load:
@@ -247,7 +168,11 @@ class Found:
 def measure(what: Played, count: int, options: Options) -> Found:
     """So many nodes on a server of their own."""
     with tempfile.TemporaryDirectory(prefix="foottile-many-") as folder:
-        big = _big(Path(folder), options.download_mb) if options.download_mb else None
+        big = (
+            big_download.big_session(Path(folder), options.download_mb)
+            if options.download_mb
+            else None
+        )
         with served(Path(folder)) as server:
             load = Load(what, count, server.url)
             end_s = time.monotonic() + READY_S
@@ -256,9 +181,8 @@ def measure(what: Played, count: int, options: Options) -> Found:
                 time.sleep(0.2)
             sessions = server.record() if options.record else []
             rows, screens, downloaded = asyncio.run(_watch(server, count, what, options, big))
-            if (
-                options.seal
-            ):  # while frames come: a session ends when its stream has passed its stop
+            if options.seal:
+                # While frames come: a session ends when its stream has passed its stop.
                 for session in sessions:
                     server.http.post(f"/sessions/{session}/stop")
                 time.sleep(SETTLE_S)
@@ -277,11 +201,8 @@ async def _watch(
         for screen in screens:
             screen.messages = screen.dropped = 0
         if big is not None:
-            downloading = await asyncio.create_subprocess_exec(
-                *[sys.executable, __file__, "--download", f"{server.url}/api/v1{big}"],
-                f"--download-mb-s={options.download_mb_s:g}",
-                stdout=subprocess.PIPE,
-            )
+            url = f"{server.url}/api/v1{big}"
+            downloading = await big_download.begun(url, options.download_mb_s)
         end_s = time.monotonic() + options.seconds
         before = await asyncio.to_thread(Look.at, server)
         while time.monotonic() < end_s:
@@ -292,17 +213,8 @@ async def _watch(
             rows.append(row(count, what, before, now, ages_ms))
             print(rows[-1], flush=True)
             before = now
-        downloaded = await _downloaded(downloading) if downloading is not None else ""
+        downloaded = await big_download.ended(downloading) if downloading is not None else ""
     return rows, screens, downloaded
-
-
-async def _downloaded(process: asyncio.subprocess.Process) -> str:
-    try:
-        return (await asyncio.wait_for(process.communicate(), PATIENCE_S))[0].decode().strip()
-    except TimeoutError:
-        process.kill()
-        await process.wait()
-        return "the download was not finished"
 
 
 def row(count: int, what: Played, before: Look, now: Look, ages_ms: list[float]) -> str:
@@ -348,41 +260,6 @@ def remarks(found: Found) -> str:
     return "".join(f"  {text}\n" for text in said if text)
 
 
-# --- the big download -----------------------------------------------------------------------------
-
-
-def _big(data: Path, megabytes: float) -> str:
-    """The path, below the API, of a sealed session's file of so many MB of noise."""
-    from many_sessions import sealed
-
-    from storage.checked_json import write_checked
-    from storage.file_hash import sha256_of
-    from storage.sessions.folder import FRAMES_NAME
-
-    session = sealed(1)
-    path = data / "sessions" / session.id / FRAMES_NAME
-    path.parent.mkdir(parents=True)
-    with path.open("wb") as file:
-        for _ in range(max(1, round(megabytes * 1e6 / _CHUNK_BYTES))):
-            file.write(os.urandom(_CHUNK_BYTES))
-    session = session.model_copy(update={"bytes": path.stat().st_size, "sha256": sha256_of(path)})
-    write_checked(path.parent / "session.json", session.model_dump_json().encode())
-    return f"/sessions/{session.id}/data?format=parquet"
-
-
-def download(url: str, mb_s: float) -> None:
-    """Read all of it, no faster than so many MB a second; 0: as fast as it comes."""
-    began_s, size = time.monotonic(), 0
-    with httpx.stream("GET", url, timeout=60.0, trust_env=False) as answer:
-        answer.raise_for_status()
-        for piece in answer.iter_raw(_CHUNK_BYTES):
-            size += len(piece)
-            if mb_s:
-                time.sleep(max(0.0, began_s + size * 1e-6 / mb_s - time.monotonic()))
-    took_s = time.monotonic() - began_s
-    print(f"downloaded {size * 1e-6:.0f} MB in {took_s:.1f} s", flush=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--nodes", type=int, nargs="+")
@@ -394,11 +271,7 @@ def main() -> None:
     parser.add_argument("--soak", action="store_true")
     parser.add_argument("--download-mb", type=float)
     parser.add_argument("--download-mb-s", type=float, default=10.0)
-    parser.add_argument("--download", help=argparse.SUPPRESS)
     a = parser.parse_args()
-    if a.download:
-        download(a.download, a.download_mb_s)
-        return
     rate_hz = a.rate_hz or RATE_HZ.get(a.tiles) or parser.error("say --rate-hz for so many tiles")
     seconds = a.seconds or (SOAK_S if a.soak else 20.0)
     options = Options(

@@ -30,6 +30,7 @@ from storage.journal.stream_notes import StreamNotes
 from tests.builders.arrays import make_array
 from tests.builders.calibrations import make_calibration, make_tare
 from tests.service.fake_node import FakeNode
+from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import until
 
@@ -187,6 +188,16 @@ def refused_journals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
+def stopped_after_fifty(node: FakeNode, recording: Recording) -> None:
+    """The session ends after fifty frames more, and is told to wait for what cannot be read."""
+    node.send(50, 5.0)
+    node.taken_in()
+    recording.stop()
+    node.send(10, now=True)
+    node.taken_in()
+    until(lambda: "cannot be read now" in (recording.now()["problem"] or ""))
+
+
 @pytest.mark.parametrize("is_mentioned", [True, False])
 def test_frames_in_a_journal_that_cannot_be_read_now_are_not_lost(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch, *, is_mentioned: bool
@@ -199,12 +210,7 @@ def test_frames_in_a_journal_that_cannot_be_read_now_are_not_lost(
         tared.reboot()
         mentioned = tuple(earlier.said(held=()) for earlier in tared.before)
         tared.connect(earlier=mentioned if is_mentioned else ())
-        tared.send(50, 5.0)
-        tared.taken_in()
-        recording.stop()
-        tared.send(10, now=True)
-        tared.taken_in()
-        until(lambda: "cannot be read now" in (recording.now()["problem"] or ""))
+        stopped_after_fifty(tared, recording)
         assert recording.now()["state"] == "pending"
         said = " ".join(running.http.get("/health").json()["problems"])
         assert "left out until it can be read" in said
@@ -223,12 +229,7 @@ def test_who_gives_up_what_cannot_be_read_keeps_what_followed_it(
         running.start()
         tared.reboot()
         tared.connect()
-        tared.send(50, 5.0)
-        tared.taken_in()
-        recording.stop()
-        tared.send(10, now=True)
-        tared.taken_in()
-        until(lambda: "cannot be read now" in (recording.now()["problem"] or ""))
+        stopped_after_fifty(tared, recording)
         assert running.http.post(f"{recording.url}/seal").status_code == 200
         sealed = recording.sealed()
     assert (sealed["complete"], sealed["frames"]) == ("lossy", 50)
