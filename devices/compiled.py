@@ -100,9 +100,9 @@ class _Files(IndexDataCacheFile):
 
 def _digest(function: Callable[..., Any]) -> str:
     """Of a function's code, of all compiled functions that it reaches, and of their constants."""
-    digest, seen, todo = hashlib.sha256(repr(_OPTIONS).encode()), set(), [function]
-    while todo:
-        each = todo.pop()
+    digest, seen, left = hashlib.sha256(repr(_OPTIONS).encode()), set(), [function]
+    while left:
+        each = left.pop()
         if each in seen:
             continue
         seen.add(each)
@@ -115,7 +115,7 @@ def _digest(function: Callable[..., Any]) -> str:
                 elif isinstance(value, int | float | str | tuple | np.dtype | np.generic):
                     _add(digest, repr(value).encode())
                 elif hasattr(value, "py_func"):
-                    todo.append(value.py_func)
+                    left.append(value.py_func)
                 else:
                     _add(digest, getattr(value, "__qualname__", "").encode())
     return digest.hexdigest()

@@ -20,6 +20,7 @@ from multiprocessing.connection import Connection
 
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo, FrameBatch
+from devices.realtime import spare_what_is_loaded
 from service.node.notices import Notices
 from service.rig.options import RigOptions
 from service.rig.rig import Rig
@@ -163,6 +164,7 @@ def _streamed(
     """Take frames until told to stop; why it ended before that, if it did."""
     try:
         rig = Rig(options, stack)
+        spare_what_is_loaded()
         while not stop.is_set():  # a replaced part begins a new stream
             _stream(rig, connection, stop)
     except FootTileError as error:

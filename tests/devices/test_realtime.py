@@ -57,6 +57,28 @@ def test_the_clock_is_set_unless_the_kernel_says_otherwise(
 
 
 @pytest.mark.process
+def test_what_is_loaded_is_not_looked_at_again_and_what_comes_later_is() -> None:
+    code = """
+import gc, weakref
+from devices.realtime import spare_what_is_loaded
+
+class Ring:
+    def __init__(self):
+        self.me = self
+
+Ring()
+spare_what_is_loaded()
+assert not any(isinstance(each, Ring) for each in gc.get_objects())
+loaded = gc.get_freeze_count()
+assert loaded > 1000 and len(gc.get_objects()) < 100, (loaded, len(gc.get_objects()))
+later = weakref.ref(Ring())
+gc.collect()
+assert later() is None
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60.0)
+
+
+@pytest.mark.process
 def test_a_process_ends_with_its_parent_even_if_that_is_killed() -> None:
     child = (
         "import sys, time; from devices.realtime import end_with_parent; end_with_parent(); "

@@ -112,6 +112,7 @@ async def _demo(
 @asynccontextmanager
 async def _server(listening: socket.socket, data: Path, token: str | None) -> AsyncIterator[Server]:
     """A server that answers, while the block runs."""
+    from devices.realtime import spare_what_is_loaded
     from service.api.app import make_app
     from service.api.serve import serving
     from service.server.server import Server
@@ -119,6 +120,7 @@ async def _server(listening: socket.socket, data: Path, token: str | None) -> As
     server = Server(data)
     remark(PREPARING)
     async with serving(make_app(server, token=token), listening):
+        spare_what_is_loaded()
         yield server
 
 

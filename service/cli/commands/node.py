@@ -123,8 +123,10 @@ def node_command(
 
 
 async def _run(options: NodeOptions) -> Outcome:
+    from devices.realtime import spare_what_is_loaded
     from service.node.run import run_node
 
+    spare_what_is_loaded()
     return await run_node(options, stop=stop_on_signals(), report=remark)
 
 

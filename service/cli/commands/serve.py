@@ -84,6 +84,7 @@ def serve_command(
 
 
 async def _serve(settings: Settings) -> None:
+    from devices.realtime import spare_what_is_loaded
     from service.api.address import listen, token_for, urls_of
     from service.api.app import make_app
     from service.api.serve import serving
@@ -98,6 +99,7 @@ async def _serve(settings: Settings) -> None:
         app = make_app(server, hosts=settings.allow_host, token=token)
         remark(PREPARING)
         async with serving(app, listening, settings):
+            spare_what_is_loaded()
             announce(
                 urls_of(listening, settings.host),
                 settings.data,
