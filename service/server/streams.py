@@ -76,7 +76,7 @@ class ServerStream:
             FileFormatError: nothing readable is in its folder.
             StorageError: it cannot be read.
         """
-        journal = Journal.open(folder)
+        journal = Journal.open(folder, writes_later=True)
         stream = cls(folder, journal.info)
         stream.journal = journal
         stream.problems = list(journal.problems)
@@ -274,7 +274,7 @@ class ServerStream:
             StorageError: the disk is full or not writable; they are not kept.
         """
         if self.journal is None:
-            self.journal = Journal(self.folder, self.info)
+            self.journal = Journal(self.folder, self.info, writes_later=True)
             for row in self.clock_rows:
                 self._log_clock(row)
         first, last = int(frames.seq[0]), int(frames.seq[-1])

@@ -53,9 +53,11 @@ class Journal:
     Args:
         folder: the stream's own folder; made if absent.
         info: description of the stream's array.
+        writes_later: who appends never waits for the disk. What is appended waits in memory until
+            it is synced or read, and what the disk then refuses is held until it is disowned.
     """
 
-    def __init__(self, folder: Path, info: ArrayInfo) -> None:
+    def __init__(self, folder: Path, info: ArrayInfo, *, writes_later: bool = False) -> None:
         self.folder = folder
         self.info = info
         self.held = Intervals()
@@ -66,7 +68,8 @@ class Journal:
         """What was found damaged when it was opened, and what became of it, in words."""
         self._schema = wire_schema(info)
         self._segments: list[Segment] = []
-        self._open = OpenSegments(folder, self._schema.serialize().to_pybytes())
+        header = self._schema.serialize().to_pybytes()
+        self._open = OpenSegments(folder, header, writes_later=writes_later)
         self._runs = RunReader(self._schema)
         self._instants = Instants(lambda seq, is_upper: self.t_ns_near(seq, newest=is_upper))
         with storage_errors(folder):
@@ -92,7 +95,7 @@ class Journal:
         self.lost.found(self.held)
 
     @classmethod
-    def open(cls, folder: Path) -> Journal:
+    def open(cls, folder: Path, *, writes_later: bool = False) -> Journal:
         """A journal that is there already; its description is in its notes or its segments.
 
         Raises:
@@ -107,7 +110,7 @@ class Journal:
         if info is None:
             said = "; ".join(("no readable journal segment", *problems))
             raise DamagedFileError(said, where=str(folder))
-        journal = cls(folder, info)
+        journal = cls(folder, info, writes_later=writes_later)
         journal.problems[:0] = problems
         if notes is not None:
             journal.lost.add(Intervals(notes.damaged) - journal.held, CORRUPT)
@@ -222,6 +225,7 @@ class Journal:
 
         By whole batches, so up to one batch earlier; None if nothing so young is held.
         """
+        self._open.write()
         return instants.first_seq_since(self._segments, t_ns)
 
     def t_ns_near(self, seq: int, *, newest: bool) -> int | None:
@@ -230,7 +234,10 @@ class Journal:
         By whole batches; None if there is no such frame.
         """
         near = self.held.within(0, seq).last if newest else self.held.within(seq, NO_END).first
-        return None if near is None else instants.t_ns_near(self._segments, near, newest=newest)
+        if near is None:
+            return None
+        self._open.write()
+        return instants.t_ns_near(self._segments, near, newest=newest)
 
     def last_seq_until(self, t_ns: int, *, at_least: int) -> int | None:
         """The last number taken at `t_ns` or before, if frames after `t_ns` are held too.
@@ -238,6 +245,7 @@ class Journal:
         None while the stream has not passed `t_ns`. Batches before `at_least` are not looked at;
         `at_least` - 1 if all of them were taken later.
         """
+        self._open.write()
         return instants.last_seq_until(self._segments, t_ns, at_least=at_least, read=self.read)
 
     def prune(self, before_t_ns: int, keep: Intervals) -> Intervals:
@@ -315,6 +323,7 @@ class Journal:
         while (held := list(self.held.within(at, seq_last))) and held[0][0] <= seq_last:
             at = held[0][0]
             end = min(at + _WINDOW_FRAMES, seq_last + 1)
+            self._open.write()
             found = []
             for segment in list(self._segments):
                 if segment.held and segment.span[0] < end and segment.span[1] >= at:

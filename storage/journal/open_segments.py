@@ -12,7 +12,8 @@ from pathlib import Path
 
 from devices.errors import StorageError
 from storage.durable import check_held, storage_errors, sync_folder
-from storage.journal.segment import SUFFIX, SegmentWriter
+from storage.journal.segment import SUFFIX
+from storage.journal.segment_writer import SegmentWriter
 from storage.wire import EncodedBatch
 
 SEGMENT_NS = 60_000_000_000
@@ -26,11 +27,13 @@ class OpenSegments:
     Args:
         folder: the journal's.
         header: schema message with which a segment begins.
+        writes_later: `append` does not write; `write` and `sync` do, in whatever thread.
     """
 
-    def __init__(self, folder: Path, header: bytes) -> None:
+    def __init__(self, folder: Path, header: bytes, *, writes_later: bool) -> None:
         self._folder = folder
         self._header = header
+        self._writes_later = writes_later
         self._open: list[SegmentWriter] = []
         self._closing: list[SegmentWriter] = []
         self._has_new_names = False
@@ -44,7 +47,7 @@ class OpenSegments:
             return {writer.segment.path for writer in (*self._open, *self._closing)}
 
     def append(self, message: EncodedBatch) -> SegmentWriter:
-        """Write a batch to the segment in which it may follow; all of it, or none.
+        """Add a batch to the segment in which it may follow; all of it, or none.
 
         Raises:
             StorageError: the disk is full or not writable.
@@ -58,6 +61,18 @@ class OpenSegments:
             self._retire(writer)
             raise
         return writer
+
+    def write(self) -> None:
+        """Return when everything appended before is in the files.
+
+        Raises:
+            StorageError: the disk is full or not writable; it goes on waiting.
+        """
+        with self._lock:
+            writers = [*self._open, *self._closing]
+        with storage_errors(self._folder):
+            for writer in writers:
+                writer.write()
 
     def sync(self) -> None:
         """Return when everything appended before is on the disk.
@@ -109,7 +124,7 @@ class OpenSegments:
             taken += 1
         check_held(path)
         with storage_errors(path):
-            writer = SegmentWriter(path, self._header)
+            writer = SegmentWriter(path, self._header, writes_later=self._writes_later)
         with self._lock:
             self._open.append(writer)
             self._has_new_names = True

@@ -7,7 +7,6 @@ the index was never promised to a server or a session. An index that is missing 
 
 from __future__ import annotations
 
-import errno
 import os
 import stat
 import zlib
@@ -15,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import count, islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -135,106 +134,6 @@ class Segment:
         self.path.unlink(missing_ok=True)
 
 
-class SegmentWriter:
-    """Appends to a new segment. Nothing is synced here: what is promised needs `sync` first.
-
-    Args:
-        path: the file, which must not be there.
-        header: its schema message.
-
-    Raises:
-        OSError: it cannot be made; nothing is left behind then.
-    """
-
-    def __init__(self, path: Path, header: bytes) -> None:
-        self.segment = Segment(path)
-        self.has_news = True
-        """Is anything not synced?"""
-        self._data: BinaryIO = path.open("xb", buffering=0)
-        try:
-            self._index: BinaryIO = path.with_suffix(INDEX_SUFFIX).open("wb", buffering=0)
-        except OSError:
-            self._data.close()
-            path.unlink(missing_ok=True)
-            raise
-        try:
-            write_all(self._data, header)
-        except OSError:
-            self.abandon()
-            self.segment.delete()
-            raise
-
-    def append(self, message: EncodedBatch) -> None:
-        """Write a batch and its record; all of it, or none.
-
-        Raises:
-            OSError: the disk is full or does not take it.
-        """
-        offset = self._data.tell()
-        record = record_of(message, offset)
-        write_all(self._data, message.payload)
-        try:
-            write_all(self._index, record)
-        except OSError:
-            with suppress(OSError):
-                self._data.truncate(offset)
-                self._data.seek(offset)
-            raise
-        self.has_news = True
-        self.segment.note(message)
-
-    def sync(self) -> None:
-        """Return when all that was appended before is on the disk.
-
-        Raises:
-            OSError: the disk refused; what it holds of this segment is not known then.
-        """
-        self.has_news = False
-        try:
-            os.fsync(self._data.fileno())
-            os.fsync(self._index.fileno())
-            # A file that was moved or deleted takes what is written, too, and keeps it for nobody.
-            there, ours = os.stat(self.segment.path), os.fstat(self._data.fileno())
-            if (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino):
-                raise FileNotFoundError(errno.ENOENT, "another file is in its place")
-        except OSError:
-            self.has_news = True
-            raise
-
-    def close(self) -> None:
-        """Sync, and note in the index that this segment is whole, so that it need not be checked.
-
-        Raises:
-            OSError: the disk refused.
-        """
-        try:
-            self.sync()
-            if self.segment.is_doubtful:
-                self._forget_doubtful()
-                return
-            with suppress(OSError):  # without it the batches are checked when it is opened again
-                write_all(self._index, closing_record())
-                os.fsync(self._index.fileno())
-        finally:
-            self.abandon()
-
-    def _forget_doubtful(self) -> None:
-        """Keep only the batches that count: those disowned were written again elsewhere."""
-        with suppress(OSError, StorageError):
-            records = self.segment.records()
-            if not len(records):
-                self.segment.delete()
-                return
-            self._data.truncate(end_of(records))
-            os.fsync(self._data.fileno())
-            self.segment.rewrite_index()
-
-    def abandon(self) -> None:
-        """Close the files as they are."""
-        self._data.close()
-        self._index.close()
-
-
 def set_aside_no_files(folder: Path) -> list[str]:
     """Set aside what has the name of a segment or index and is none, or may not be read.
 
@@ -324,20 +223,6 @@ def recover(path: Path, schema: pa.Schema) -> tuple[Segment | None, Intervals]:
         os.fsync(file.fileno())
     _write_index(path, records)
     return segment, damaged
-
-
-def write_all(file: BinaryIO, data: bytes) -> None:
-    """Write all of `data`, or leave the file as long as it was."""
-    begin = file.tell()
-    view = memoryview(data)
-    try:
-        while view:
-            view = view[file.write(view) :]
-    except OSError:
-        with suppress(OSError):
-            file.truncate(begin)
-            file.seek(begin)
-        raise
 
 
 def _set_aside(path: Path, content: bytes) -> None:

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 from devices.errors import StorageError
-from storage.journal import segment as segment_module
+from storage.journal import segment_writer
 from storage.wire import encode
 from tests.storage.faulty_disk import IO_ERROR, NO_SPACE, disk_with_room_for, failing_if, refusing
 from tests.storage.journal.journals import (
@@ -70,14 +70,14 @@ def test_a_disk_that_neither_takes_nor_gives_back_leaves_all_whole_messages(
 ) -> None:
     """A write that stops halfway and cannot be taken back: the next begins another segment."""
     journal = filled(tmp_path, (0, 9))
-    whole = segment_module.write_all
+    whole = segment_writer.write_all
 
     def halfway(file: Any, data: bytes) -> None:
         whole(file, data[: len(data) // 2])
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(segment_module, "write_all", halfway)
+        patch.setattr(segment_writer, "write_all", halfway)
         with pytest.raises(StorageError, match="No space left"):
             journal.append(part(10, 19))
     assert_holds(journal, set(range(10)))
@@ -96,9 +96,9 @@ def test_a_disk_that_fills_between_the_gaps_of_a_batch_holds_what_was_written_an
     """A batch that fills three gaps is three writes."""
     journal, held = filled(tmp_path, (5, 9), (15, 19)), {*range(5, 10), *range(15, 20)}
     writes = itertools.count(1)  # of each gap a header, a batch and a record
-    full = failing_if(lambda *_: next(writes) > 3 * written, segment_module.write_all, *NO_SPACE)
+    full = failing_if(lambda *_: next(writes) > 3 * written, segment_writer.write_all, *NO_SPACE)
     with monkeypatch.context() as patch:
-        patch.setattr(segment_module, "write_all", full)
+        patch.setattr(segment_writer, "write_all", full)
         with pytest.raises(StorageError):
             journal.append(part(0, 29))
     assert_holds(journal, held | set(range(10 * written)))

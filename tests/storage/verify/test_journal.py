@@ -18,8 +18,8 @@ from storage.checked_json import without_check
 from storage.clock.log import ClockLog, ClockOffset
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
-from storage.journal.segment import SegmentWriter
 from storage.journal.segment_format import INDEX_SUFFIX, RECORD, read_header
+from storage.journal.segment_writer import SegmentWriter
 from storage.journal.stream_notes import NOTES_FILE, StreamNotes
 from storage.schema import array_info, older_wire_schema, wire_schema
 from storage.verify.journal import verify_stream

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from storage.intervals import Intervals
-from storage.journal import segment
+from storage.journal import segment_writer
 from storage.journal.journal import Journal
 from storage.journal.node import journal as node_journal
 from storage.journal.node.journal import NodeJournal
@@ -49,7 +49,7 @@ def test_a_disk_that_takes_nothing_costs_what_memory_cannot_hold_and_goes_on_whe
     until(lambda: stream.stored.last == 49 and stream.is_synced)
 
     with monkeypatch.context() as patch:
-        patch.setattr(segment, "write_all", refusing(OSError, number, os.strerror(number)))
+        patch.setattr(segment_writer, "write_all", refusing(OSError, number, os.strerror(number)))
         fill(journal, stream, 50, 69)
         until(lambda: journal.troubles)
         assert words in journal.troubles[0]
@@ -153,7 +153,7 @@ def test_over_the_bound_of_memory_the_oldest_goes_first_of_whichever_stream(
     """A stream that ended while the disk took nothing does not leave the next one without room."""
     monkeypatch.setattr(node_journal, "WAITING_BYTES", 20_000)
 
-    monkeypatch.setattr(segment, "write_all", refusing(*NO_SPACE))
+    monkeypatch.setattr(segment_writer, "write_all", refusing(*NO_SPACE))
     journal = start()
     before = journal.begin(make_array())
     fill(journal, before, 0, 149)
