@@ -50,7 +50,7 @@ def measure(server: Server, node: int, seconds: float, folder: Path) -> None:
     session = api.post("/sessions", json={"node": name, "name": "benchmark"}).json()
     before = api.get(f"/nodes/{name}").json()
     latencies_ms, ages_ms, sizes, gaps_ms = [], [], [], []
-    busy_s, node_busy_s = server.cpu_s, sum(cpu_s(pid) for pid in [node, *children(node)])
+    busy_s, own_s, acquiring_s = server.cpu_s, cpu_s(node), sum(map(cpu_s, children(node)))
     end_s = time.monotonic() + seconds
     last_ns = 0
     with connect(server.url.replace("http", "ws") + "/api/v1/live", compression=None) as socket:
@@ -67,7 +67,7 @@ def measure(server: Server, node: int, seconds: float, folder: Path) -> None:
     after = api.get(f"/nodes/{name}").json()
     frames = after["last_seq"] - before["last_seq"]
     server_s = server.cpu_s - busy_s
-    node_s = sum(cpu_s(pid) for pid in [node, *children(node)]) - node_busy_s
+    own_s, acquiring_s = cpu_s(node) - own_s, sum(map(cpu_s, children(node))) - acquiring_s
     sealed = api.post(f"/sessions/{session['id']}/stop", timeout=60).json()
     journal = sum(path.stat().st_size for path in (folder / "journal").rglob("*.arrows"))
     table = np.percentile(latencies_ms, [50, 99, 100])
@@ -89,7 +89,10 @@ def measure(server: Server, node: int, seconds: float, folder: Path) -> None:
         f"({100 * server_s / seconds:.1f} % of a core); "
         f"{1e6 * unseen_s / unseen:.0f} us without ({100 * unseen_s / unseen_wall_s:.1f} %)"
     )
-    print(f"node, emulated world included: {100 * node_s / seconds:.1f} % of a core")
+    print(
+        f"node: journal and link {100 * own_s / seconds:.1f} % of a core; "
+        f"acquisition, emulated world included, {100 * acquiring_s / seconds:.1f} %"
+    )
     print(
         f"message {np.mean(sizes):.0f} bytes; journal {journal / after['last_seq']:.0f} B a frame; "
         f"sealed {sealed['bytes'] / sealed['frames']:.1f} B a frame of {sealed['frames']}, "
