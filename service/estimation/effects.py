@@ -56,6 +56,10 @@ def values(parameters: Iterable[Parameter]) -> Floats:
     return np.array([parameter.value for parameter in parameters])
 
 
+GAMMA_MOST = 5.0 / 3.0
+"""Of one atom: no gas has a greater ratio of heat capacities."""
+
+
 class GasEffect(CalibrationPart):
     """Of the model `gas`."""
 
@@ -66,8 +70,8 @@ class GasEffect(CalibrationPart):
 
     @model_validator(mode="after")
     def _can_be_undone(self) -> Self:
-        if not (self.gamma.value >= 1.0 and self.tau_s.value > 0.0):
-            raise ValueError("a gas has a gamma of 1 or more and a tau above 0")
+        if not (1.0 <= self.gamma.value <= GAMMA_MOST and self.tau_s.value > 0.0):
+            raise ValueError("a gas has a gamma of 1 to 5/3 and a tau above 0")
         return self
 
 

@@ -59,6 +59,7 @@ def test_the_walls_give_is_that_of_the_soak_or_of_the_material() -> None:
     "make",
     [
         lambda: gas(gamma=0.99),
+        lambda: gas(gamma=1.67),
         lambda: gas(tau_s=0.0),
         lambda: rubber((0.5, 0.5), (1.0, 2.0)),
         lambda: rubber((-0.01,), (1.0,)),
@@ -85,6 +86,7 @@ def test_what_could_not_be_undone_is_refused(make: Callable[[], Any]) -> None:
 
 def test_the_limits_themselves_are_accepted() -> None:
     assert gas(gamma=1.0).gamma.value == 1.0
+    assert gas(gamma=5 / 3).gamma.value == 5 / 3
     assert rubber((0.0, 0.99), (1e-9, 1e9)).part[1].value == 0.99
     assert HysteresisEffect(part=(p(0.0), p(0.0), p(0.999))).part[2].value == 0.999
     assert FlowEffect(part=p(0.4), stress_n=p(0.01), power=p(4.0)).part.value == 0.4
