@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -79,6 +80,16 @@ def limits(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
         By the share of repeats in 0 to `SHARES`, and by that of steps of two.
     """
     chance = 1.0 / (HOURS * 3600.0 * rate_hz * tiles)
+    most = []
+    for at_most in _chances_of_repeats():
+        run = 1.0 + np.ceil(math.log(chance) / np.log(np.minimum(at_most, 1.0 - 1e-15)))
+        most.append(np.minimum(run, UNLIMITED).astype(np.int64))
+    return most[0], most[1]
+
+
+@cache  # a server works them out at every tare, and nobody is told of frames meanwhile
+def _chances_of_repeats() -> tuple[Floats, Floats]:
+    """The greatest chance of a repeat by the share of repeats, and by that of steps of two."""
     shares = np.arange(SHARES + 1) / SHARES
     steps = np.geomspace(_STEP_MAX, _STEP_MIN, 2000)
     by_repeats = np.interp(shares, apart(steps, 0), steps)
@@ -86,12 +97,8 @@ def limits(rate_hz: float, tiles: int) -> tuple[Ints, Ints]:
     rising = slice(int(np.argmax(twos)), None)  # of great noise they are few again
     by_twos = np.interp(shares, twos[rising][::-1], steps[rising][::-1])
     by_twos[0] = _STEP_MIN
-    most = []
-    for step in (by_repeats, by_twos):
-        at_most = np.array([math.erf(0.5 / d) for d in step])
-        run = 1.0 + np.ceil(math.log(chance) / np.log(np.minimum(at_most, 1.0 - 1e-15)))
-        most.append(np.minimum(run, UNLIMITED).astype(np.int64))
-    return most[0], most[1]
+    at_most = [np.array([math.erf(0.5 / d) for d in step]) for step in (by_repeats, by_twos)]
+    return at_most[0], at_most[1]
 
 
 def apart(steps: Floats, counts: int) -> Floats:
