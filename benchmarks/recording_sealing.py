@@ -15,6 +15,7 @@ from service.estimation.calibration import Calibration, paper_eq2_shape
 from service.offline.calibrations import find_calibration
 from service.sessions.frames import SessionFrames
 from service.sessions.sources import Sources
+from service.sessions.stances import StancesBeside
 from storage.file_hash import sha256_of
 from storage.journal.journal import Journal
 from storage.sessions.file import SessionWriter, parquet_options
@@ -51,15 +52,17 @@ def sources_of(
     )
 
 
-def seal(sources: Sources, path: Path) -> int:
-    """Write the file and its hash, as `service.sessions.sealing.seal` does; its frames."""
+def seal(sources: Sources, path: Path, *, with_stances: bool = True) -> int:
+    """Write the file, its hash and stances, as `service.sessions.sealing.seal` does; its frames."""
     count = 0
-    frames = SessionFrames(sources)
+    frames, stances = SessionFrames(sources), StancesBeside()
     with SessionWriter(path, sources.info, sources.notes) as writer:
         for batch, columns in frames:
             writer.append(batch, columns)
+            if with_stances:
+                stances.feed(batch.seq, batch.t_ns, columns)
             count += len(batch)
-    sha256_of(path)
+    stances.write(path.parent, sha256_of(path))
     if sources.calibration is not None:
         assert frames.problem is None, frames.problem
     return count
@@ -77,13 +80,23 @@ def jobs(
         options = parquet_options(table.schema)
         pq.write_table(table, folder / "bare.parquet", row_group_size=rows, **options)
 
-    def sealing(name: str, calibration: Calibration | None, models: tuple[str, ...]) -> None:
-        count = seal(sources_of(journal, calibration, models), folder / f"{name}.parquet")
+    def sealing(
+        name: str,
+        calibration: Calibration | None,
+        models: tuple[str, ...],
+        *,
+        with_stances: bool = True,
+    ) -> None:
+        sources = sources_of(journal, calibration, models)
+        count = seal(sources, folder / f"{name}.parquet", with_stances=with_stances)
         assert count == len(recording.frames)
 
     found: dict[str, Callable[[], object]] = {
         "pyarrow alone, from memory": bare,
         "raw": lambda: sealing("raw", None, ()),
+        "with estimates, `static`, without stances": lambda: sealing(
+            "static", paper_eq2_shape(), STATIC, with_stances=False
+        ),
         "with estimates, `static`": lambda: sealing("static", paper_eq2_shape(), STATIC),
     }
     if with_ladder:

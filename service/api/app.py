@@ -15,7 +15,7 @@ from starlette.websockets import WebSocket
 from devices.errors import FootTileError
 from service.api import problems
 from service.api.guard import Guard
-from service.api.routes import access, clock, data, health, nodes, sessions, trash
+from service.api.routes import access, clock, data, health, nodes, sessions, stances, trash
 from service.api.routes.ingest import ingest
 from service.api.routes.live import live
 from service.link import INGEST_PATH, LIVE_PATH
@@ -77,7 +77,7 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
             _503="There are too many connections, or the data folder is not there.",
         ),
     )
-    for module in (health, nodes, sessions, trash, data, clock):
+    for module in (health, nodes, sessions, trash, data, clock, stances):
         api.include_router(module.router)
     app.include_router(api)
 

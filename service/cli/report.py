@@ -9,7 +9,7 @@ from statistics import median
 from rich.table import Table
 
 from service.cli.options import say, stdout
-from service.estimation.foot.stances import Stance
+from service.estimation.stances import Stance
 from service.offline.accuracy import COP_FROM_N, GRF_FROM_N, Accuracy
 from service.offline.findings import Findings
 
@@ -87,30 +87,24 @@ def findings_json(findings: Findings) -> dict[str, object]:
     scale = {None: None, True: "assumed", False: "measured"}[findings.assumed_scale]
     return {
         "absolute_scale": scale,
-        "stances": [{name: getattr(s, name) for name in _OF_A_STANCE} for s in findings.stances],
+        "stances": [stance.as_dict() for stance in findings.stances],
         "accuracy": findings.accuracy,
     }
 
 
-_OF_A_STANCE = (
-    *("begin_t_ns", "duration_s", "peak_n", "peak_t_ns", "impulse_ns", "unknown_frames"),
-    *("begun", "ended"),
-)
-
-
 def stances_line(stances: Sequence[Stance]) -> str:
     """How often the foot stood, and how hard."""
-    hidden = [s for s in stances if not math.isfinite(s.peak_n)]
-    whole = [s for s in stances if s.begun and s.ended and math.isfinite(s.peak_n)]
+    hidden = [s for s in stances if not math.isfinite(s.peak_grf_n)]
+    whole = [s for s in stances if s.is_whole]
     said = f"{len(stances)} stance{'s' if len(stances) != 1 else ''}"
     if hidden:
         said += f", {len(hidden)} with a peak that is not known"
     if len(whole) + len(hidden) < len(stances):
-        said += f", {len(whole)} of them from beginning to end"
+        said += f", {len(whole)} of them seen from beginning to end"
     if not whole:
         return said
     return (
-        f"{said}: median peak {median(s.peak_n for s in whole):.2f} N, impulse "
-        f"{median(s.impulse_ns for s in whole):.2f} Ns, duration "
+        f"{said}: median peak {median(s.peak_grf_n for s in whole):.2f} N, impulse "
+        f"{median(s.impulse_n_s for s in whole):.2f} N s, duration "
         f"{median(s.duration_s for s in whole):.2f} s"
     )

@@ -18,10 +18,10 @@ from devices.arrays import Floats, Times
 from devices.compiled import compiled, inlined
 from devices.frames import FrameBatch
 from service.estimation.estimates import Estimates, EstimateStatus
+from service.estimation.foot import UNKNOWN
 from service.estimation.foot.contact import has_lasted
 from service.estimation.foot.geometry import to_ground_x_m
 from service.estimation.foot.kinematics import counts_at
-from service.estimation.foot.stances import UNKNOWN
 from service.estimation.ladder import whole
 from service.estimation.ladder.laws import Laws, make_laws
 from service.estimation.ladder.lower import feel

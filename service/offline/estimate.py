@@ -19,9 +19,12 @@ from service.offline.calibrations import BENCH, find_calibration
 from service.offline.findings import Findings, FindingsOf
 from service.offline.stretch import Stretch, since, stretch_of
 from service.sessions.pipeline import EstimateOptions, EstimateStream, notes_of
+from service.sessions.stances import StancesBeside
+from storage.file_hash import sha256_of
 from storage.formats.slice import Slice
 from storage.schema import MILL, PARTS, TRUTH
 from storage.sessions.file import SessionWriter
+from storage.sessions.folder import FRAMES_NAME
 from storage.sessions.frame_order import in_order
 from storage.sessions.reader import SessionReader
 
@@ -96,6 +99,7 @@ def estimate_session(
         stream = EstimateStream(info, options)
         found = FindingsOf(judging=all(c.name in kept for c in TRUTH))
         asking = Asking(info, options.calibration, options.models)
+        stances = StancesBeside()
         frames = 0
         with SessionWriter(out, info, notes) as writer:
             pieces = session.batches(*kept, groups=stretch.groups)
@@ -106,11 +110,16 @@ def estimate_session(
                 writer.append(batch, extra)
                 frames += len(batch)
                 found.feed(batch, extra)
+                stances.feed(batch.seq, batch.t_ns, extra)
                 if stream.tare is not None:
                     asking.feed(stream.tare, batch, extra["contact"] == 1)
             if not frames or stream.plan is None:
                 what = "the session has no frames" + ("" if part.is_all else " in that time")
                 raise FileFormatError(what, where=str(source))
+    if out.name == FRAMES_NAME:  # in a session's folder
+        stances.write(out.parent, sha256_of(out))
+        if stances.problem is not None:
+            remark(stances.problem)
     return Estimated(frames, stream.plan, found.finish(stream.plan), asking.finish())
 
 

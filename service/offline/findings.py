@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from devices.frames import FrameBatch
-from service.estimation.estimates import EstimateStatus
-from service.estimation.foot.stances import Stance, Stances
+from service.estimation.stances import Stance, Stances
 from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 
 if TYPE_CHECKING:
@@ -39,14 +38,14 @@ class FindingsOf:
     """
 
     def __init__(self, *, judging: bool) -> None:
-        self._stances = Stances()
+        self._gathered = Stances()
+        self._stances: list[Stance] = []
         self._judging = judging
         self._judged: list[Columns] = []
 
     def feed(self, batch: FrameBatch, columns: Columns) -> None:
         """Take the next frames."""
-        saturated = (columns["estimate_status"] & EstimateStatus.SATURATED) != 0
-        self._stances.feed(batch.t_ns, columns["grf_n"], columns["contact"], saturated)
+        self._stances += self._gathered.feed(batch.seq, batch.t_ns, columns)
         if self._judging:
             known = {"t_ns": batch.t_ns, **columns}
             self._judged.append({name: known[name] for name in COMPARED})
@@ -56,7 +55,8 @@ class FindingsOf:
         accuracy = None
         if self._judged:
             accuracy = accuracy_of(joined(self._judged), lag_ms=plan.lag_ns * 1e-6)
-        return Findings(self._stances.finish(), accuracy, plan.assumed_scale)
+        stances = *self._stances, *self._gathered.finish()
+        return Findings(stances, accuracy, plan.assumed_scale)
 
 
 def joined(pieces: Sequence[Columns]) -> dict[str, npt.NDArray[Any]]:

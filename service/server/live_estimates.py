@@ -13,7 +13,7 @@ from devices.chips.compensation import Compensation
 from devices.errors import FootTileError, TareError
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
 from service.estimation.calibration import Calibration, TileCalibration
-from service.estimation.foot.contact import UNSEEN_NS
+from service.estimation.foot import UNSEEN_NS
 from service.estimation.ladder.plan import make_plan
 from service.estimation.models.static import StaticCurves
 from service.estimation.tare.automatic import (

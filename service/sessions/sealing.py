@@ -1,4 +1,4 @@
-"""From journals to a sealed session: its frames in one Parquet file, and its ledger."""
+"""From journals to a sealed session: its frames in one Parquet file, stances, and its ledger."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from devices.errors import FileFormatError
 from service.sessions.frames import SessionFrames
 from service.sessions.sources import Sources
+from service.sessions.stances import StancesBeside
 from storage.clock.file import CLOCK_NAME, write_clock
 from storage.file_hash import sha256_of
 from storage.sessions.beside import write_events
@@ -29,7 +30,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
     if not ledger.recorded:
         update = {"state": "sealed", "ledger": ledger, "problem": "not one frame was recorded"}
         return session.model_copy(update=update)
-    frames = SessionFrames(sources)
+    frames, stances = SessionFrames(sources), StancesBeside()
     path = folder / FRAMES_NAME
     count = duration_ns = earlier_ns = part_begin_ns = 0
     notes: dict[str, object] = {
@@ -43,6 +44,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
             if not count:
                 writer.add_notes(frames.notes)
             writer.append(batch, columns)
+            stances.feed(batch.seq, batch.t_ns, columns)
             count += len(batch)
             part = int(columns["part"][0])
             if part != last_part:
@@ -55,15 +57,18 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
         )
     write_events(session, folder)
     write_clock(folder / CLOCK_NAME, session.clock, sources.streams)
+    sha256 = sha256_of(path)
+    stances.write(folder, sha256)
+    problems = session.problem, frames.problem, stances.problem
     return session.model_copy(
         update={
             "state": "sealed",
-            "problem": "; ".join(filter(None, (session.problem, frames.problem))) or None,
+            "problem": "; ".join(filter(None, problems)) or None,
             "ledger": ledger,
             "frames": count,
             "duration_s": duration_ns * 1e-9,
             "bytes": path.stat().st_size,
-            "sha256": sha256_of(path),
+            "sha256": sha256,
             "calibration_id": frames.notes.get("calibration_id"),
             "absolute_scale": frames.notes.get("absolute_scale"),
         }

@@ -19,6 +19,7 @@ from storage.sessions.beside import EVENTS_NAME, StoredEvents, read_events
 from storage.sessions.claims import SESSION_NAME, Claims, bytes_of, claims_in, claims_of
 from storage.sessions.folder import FRAMES_NAME, Event, Ledger, Session
 from storage.sessions.ledger import ledger_of, states_of
+from storage.sessions.stances import STANCES_NAME, read_stances
 from storage.verify.file import FileReport, ledger_problems, verify_file
 from storage.verify.journal import StreamReport, verify_stream
 
@@ -179,6 +180,7 @@ def _check_sealed(report: SessionReport, folder: Path, said: Claims) -> None:
     whole = said.whole
     _check_events(report, folder / EVENTS_NAME, whole.events if whole is not None else None)
     _check_clock(report, folder / CLOCK_NAME, whole)
+    _check_stances(report, folder / STANCES_NAME)
 
 
 def _compare(problems: list[str], content: dict[str, Any], file: FileReport, size: int) -> None:
@@ -244,6 +246,19 @@ def _check_clock(report: SessionReport, path: Path, session: Session | None) -> 
     by_stream = sorted(session.clock, key=lambda row: row.boot_id)
     if by_stream and sorted(stored.offsets, key=lambda row: row.boot_id) != by_stream:
         report.problems.append(f"{path.name} has other rows than {SESSION_NAME}")
+
+
+def _check_stances(report: SessionReport, path: Path) -> None:
+    """Prove the table of stances, which may be missing: it is made again from the frames."""
+    try:
+        stored = read_stances(path)
+    except FileNotFoundError:
+        return
+    except (FileFormatError, StorageError) as error:
+        report.problems.append(f"{path.name}: {error.what}; deleted, it is made again")
+        return
+    if stored.frames_sha256 != report.sha256:
+        report.unproven.append(f"{path.name}: it is of other frames, and nobody reads it")
 
 
 def _stored(

@@ -14,9 +14,6 @@ from devices.arrays import Times
 from devices.compiled import compiled, inlined
 from service.estimation.records import Record, record_type
 
-UNSEEN_NS = 50_000_000
-"""A foot not seen for longer than this may have been lifted and put down again."""
-
 
 @dataclass(frozen=True)
 class ContactRule:

@@ -13,7 +13,7 @@ from devices.chips.mpl115a2 import PRESSURE_MIN_KPA
 from devices.compiled import compiled, inlined
 from devices.frames import NOT_READ, TileStatus
 from devices.temperature import HELD_NS
-from service.estimation.foot.contact import UNSEEN_NS
+from service.estimation.foot import UNSEEN_NS
 from service.estimation.foot.kinematics import carry
 from service.estimation.ladder.laws import Laws
 from service.estimation.ladder.room import Room

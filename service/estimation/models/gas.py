@@ -22,7 +22,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.compiled import compiled
-from service.estimation.foot.contact import UNSEEN_NS
+from service.estimation.foot import UNSEEN_NS
 from service.estimation.records import Record, Records, record_type, records
 
 RESTART = 5.0

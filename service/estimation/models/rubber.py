@@ -19,7 +19,7 @@ import numpy as np
 from devices.arrays import Floats
 from devices.compiled import compiled
 from service.estimation.effects import PARTS_MAX
-from service.estimation.foot.contact import UNSEEN_NS
+from service.estimation.foot import UNSEEN_NS
 from service.estimation.records import Record, Records, record_type, records
 
 LAW = record_type(

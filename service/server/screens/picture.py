@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from devices.arrays import Floats
 from devices.frames import FrameBatch
-from service.estimation.foot.stances import UNKNOWN
+from service.estimation.foot import UNKNOWN
 from storage.intervals import Intervals
 
 SUMMARY_NS = 1_000_000_000

@@ -11,6 +11,7 @@ import pytest
 
 from service.offline.estimate import estimate_session
 from service.sessions.pipeline import EstimateStream
+from service.sessions.stances import stances_of_session
 from storage.formats.export import content_of, export
 from storage.formats.slice import Slice
 from storage.schema import ESTIMATES
@@ -89,6 +90,25 @@ def test_what_is_in_the_file_is_what_was_computed_rounded_to_the_steps_it_states
             whole = np.floor if name == "grf_at_least_n" else np.rint
             expected = whole(one / steps[flat]) * steps[flat] + 0.0 if flat in steps else one
             np.testing.assert_array_equal(other, expected.astype(other.dtype), err_msg=flat)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_session_estimated_in_its_folder_has_its_stances_beside_it(
+    raw: Path, tmp_path: Path, exact: bool
+) -> None:
+    with estimated(raw, tmp_path / "frames.parquet", exact=exact):
+        pass
+    path = tmp_path / "stances.parquet"
+    written = path.read_bytes()
+    hops = stances_of_session(tmp_path).to_pylist()
+    assert len(hops) == 90  # 2700 frames with a hop every 30
+    assert all(hop["peak_grf_n"] > 30.0 for hop in hops)
+    path.unlink()
+    stances_of_session(tmp_path, keep=True)
+    assert path.read_bytes() == written
+    with estimated(raw, tmp_path / "lone.parquet"):
+        pass
+    assert path.read_bytes() == written
 
 
 def test_exports_say_to_what_their_columns_were_rounded(raw: Path, tmp_path: Path) -> None:

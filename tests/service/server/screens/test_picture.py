@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
-from service.estimation.foot.stances import UNKNOWN
+from service.estimation.foot import UNKNOWN
 from service.server.screens.picture import SUMMARY_NS, Piece, Summary, min_of, sum_up
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames

@@ -1,0 +1,297 @@
+"""Stances: contacts of the foot with the ground, gathered from estimates.
+
+This is what a stance is, wherever one is counted. It is a run of frames whose `contact` is 1;
+frames in between in which contact is not known belong to it. A foot that was not seen for longer
+than `UNSEEN_NS`, or whose node was started again, may have been lifted meanwhile: the stance before
+is cut there, and what follows is another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Floats, Times
+from service.estimation.estimates import EstimateStatus
+from service.estimation.foot import UNKNOWN, UNSEEN_NS
+
+GATHERED = ("contact", "grf_n", "grf_sigma_n", "cop_x_m", "estimate_status")
+"""Columns of estimates that stances are made of; of a session of several parts `part` as well."""
+
+STANCE_COLUMNS = (
+    *("number", "part", "begin_t_ns", "end_t_ns", "duration_s"),
+    *("peak_grf_n", "peak_t_ns", "peak_sigma_n", "impulse_n_s"),
+    *("cop_x_first_m", "cop_x_last_m", "cop_x_range_m"),
+    *("frames", "unknown_frames", "missing_frames", "estimate_status"),
+    *("begun", "ended", "is_whole"),
+)
+"""What is said of a stance, wherever one is written."""
+
+Columns = Mapping[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Stance:
+    """One contact of the foot with the ground. What is not known is NaN.
+
+    Attributes:
+        number: of the stance in its recording, from 1; those that are cut count, too.
+        part: of the session, in which it was.
+        begin_t_ns: UTC of its first frame.
+        end_t_ns: UTC of its last.
+        peak_grf_n: greatest GRF of those known; NaN if none is, or if a tile was saturated: the
+            peak was in what is not known then.
+        peak_t_ns: UTC of the first frame of that GRF; None without a peak.
+        peak_sigma_n: standard uncertainty of the GRF in that frame.
+        impulse_n_s: integral of the GRF by the trapezoidal rule, in newton seconds; NaN if a frame
+            is missing or without a GRF, for no line is drawn across it.
+        cop_x_first_m: centre of pressure along x where it is first stated, in the foot frame.
+        cop_x_last_m: where it is last stated.
+        cop_x_range_m: greatest less least.
+        frames: that are there, from the first to the last.
+        unknown_frames: of these, without a GRF.
+        missing_frames: numbers between the first and the last that are not there.
+        estimate_status: bits that any of its frames has.
+        begun: the frame before it is there, and without contact.
+        ended: the frame behind it likewise.
+    """
+
+    number: int
+    part: int
+    begin_t_ns: int
+    end_t_ns: int
+    peak_grf_n: float
+    peak_t_ns: int | None
+    peak_sigma_n: float
+    impulse_n_s: float
+    cop_x_first_m: float
+    cop_x_last_m: float
+    cop_x_range_m: float
+    frames: int
+    unknown_frames: int
+    missing_frames: int
+    estimate_status: int
+    begun: bool
+    ended: bool
+
+    @property
+    def duration_s(self) -> float:
+        """From the first frame to the last."""
+        return (self.end_t_ns - self.begin_t_ns) * 1e-9
+
+    @property
+    def is_whole(self) -> bool:
+        """Was it seen from its beginning to its end, without a gap, and is its GRF always known?"""
+        return self.begun and self.ended and not self.missing_frames and not self.unknown_frames
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it by name, in the order of tables."""
+        return {name: getattr(self, name) for name in STANCE_COLUMNS}
+
+
+def stances_of(seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns) -> list[Stance]:
+    """All stances of a recording that is there as a whole; arguments as of `Stances.feed`."""
+    gathered = Stances()
+    return [*gathered.feed(seq, t_ns, columns), *gathered.finish()]
+
+
+class Stances:
+    """Gathers stances from consecutive frames; any batches give the same, to the bit.
+
+    Sums are kept and no frames: a stance of an hour takes no more memory than one of a step.
+    """
+
+    def __init__(self) -> None:
+        self._seen: _Frame | None = None
+        self._open: _Open | None = None
+        self._unsure = _Unsure()
+        self._number = 0
+
+    def feed(self, seq: npt.NDArray[np.uint64], t_ns: Times, columns: Columns) -> list[Stance]:
+        """Take n more frames; return the stances that are over now.
+
+        Args:
+            seq: (n,), numbers of the frames.
+            t_ns: (n,), UTC.
+            columns: `GATHERED`, (n,) each, contact being 1, 0 or `UNKNOWN`; `part`, 0 if absent.
+        """
+        over: list[Stance] = []
+        sure = np.flatnonzero(columns["contact"] != UNKNOWN)
+        if not len(sure):
+            self._unsure.add(columns["estimate_status"])
+            return over
+        part = columns["part"][sure] if "part" in columns else np.zeros(len(sure), np.uint16)
+        loaded = columns["contact"][sure] == 1
+        frames = _Frames(seq[sure], t_ns[sure], part, loaded)
+        for first, end in frames.runs():
+            begin, last = frames.at(first), frames.at(end - 1)
+            if first or not begin.goes_on_from(self._seen):
+                over += self._close(begin)
+            if begin.loaded:
+                since = int(sure[first])
+                if self._open is None:
+                    self._number += 1
+                    self._open = _Open(self._number, begin, begun=begin.borders(self._seen))
+                else:
+                    self._open.add_unsure(self._unsure)
+                    since = 0
+                self._open.add(slice(since, int(sure[end - 1]) + 1), t_ns, columns)
+                self._open.last = last
+            self._seen, self._unsure = last, _Unsure()
+        self._unsure.add(columns["estimate_status"][int(sure[-1]) + 1 :])
+        return over
+
+    def finish(self) -> list[Stance]:
+        """The stance that has not ended, if there is one: no more frames will come."""
+        return self._close(None)
+
+    def _close(self, behind: _Frame | None) -> list[Stance]:
+        stance, self._open = self._open, None
+        return [] if stance is None else [stance.closed(behind)]
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A frame of which contact is known."""
+
+    seq: int
+    t_ns: int
+    part: int
+    loaded: bool
+
+    def is_seen_from(self, other: _Frame | None) -> bool:
+        """Can the foot not have been lifted, or put down, between two frames and not be seen?"""
+        if other is None:
+            return False
+        return self.part == other.part and abs(self.t_ns - other.t_ns) <= UNSEEN_NS
+
+    def goes_on_from(self, before: _Frame | None) -> bool:
+        """Is it of the same stance, or flight, as the frame before?"""
+        return before is not None and self.is_seen_from(before) and self.loaded == before.loaded
+
+    def borders(self, other: _Frame | None) -> bool:
+        """Is no number between them, and do they differ in contact?"""
+        if other is None or not self.is_seen_from(other) or self.loaded == other.loaded:
+            return False
+        return abs(self.seq - other.seq) == 1
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Those of a batch, (n,) each."""
+
+    seq: npt.NDArray[np.uint64]
+    t_ns: Times
+    part: npt.NDArray[Any]
+    loaded: npt.NDArray[np.bool_]
+
+    def at(self, i: int) -> _Frame:
+        """One of them."""
+        return _Frame(int(self.seq[i]), int(self.t_ns[i]), int(self.part[i]), bool(self.loaded[i]))
+
+    def runs(self) -> Iterator[tuple[int, int]]:
+        """First frame of each stance or flight, and the one behind its last."""
+        differs = (self.loaded[1:] != self.loaded[:-1]) | (self.part[1:] != self.part[:-1])
+        cut = np.flatnonzero(differs | (np.diff(self.t_ns) > UNSEEN_NS)) + 1
+        edges = [0, *cut.tolist(), len(self.loaded)]
+        return pairwise(edges)
+
+
+@dataclass
+class _Unsure:
+    """Frames since the last of which contact is known: of a stance only if it goes on behind."""
+
+    frames: int = 0
+    status: int = 0
+
+    def add(self, status: npt.NDArray[np.uint16]) -> None:
+        self.frames += len(status)
+        self.status |= int(np.bitwise_or.reduce(status))
+
+
+@dataclass
+class _Open:
+    """The present stance: what its frames so far come to."""
+
+    number: int
+    first: _Frame
+    begun: bool
+    last: _Frame = field(init=False)
+    frames: int = 0
+    unknown: int = 0
+    status: int = 0
+    impulse_n_s: float = 0.0
+    peak: tuple[float, int, float] | None = None
+    """GRF, instant and sigma."""
+    end: tuple[Times, Floats] = field(default_factory=lambda: (np.empty(0, np.int64), np.empty(0)))
+    """Instant and GRF of the last frame."""
+    cop_x_m: tuple[float, float, float, float] | None = None
+    """First, last, least and greatest."""
+
+    def add_unsure(self, unsure: _Unsure) -> None:
+        """Take frames in between."""
+        self.frames += unsure.frames
+        self.unknown += unsure.frames
+        self.status |= unsure.status
+
+    def add(self, rows: slice, t_ns: Times, columns: Columns) -> None:
+        """Take the next frames; of the last of them contact is known."""
+        t_ns, status = t_ns[rows], columns["estimate_status"][rows]
+        unsure = columns["contact"][rows] == UNKNOWN
+        grf_n = np.where(unsure, np.nan, columns["grf_n"][rows])
+        there = np.isfinite(grf_n)
+        self.frames += len(grf_n)
+        self.unknown += int(np.count_nonzero(~there))
+        self.status |= int(np.bitwise_or.reduce(status))
+        self._integrate(t_ns, grf_n)
+        if there.any():
+            at = int(np.argmax(np.where(there, grf_n, -np.inf)))
+            if self.peak is None or grf_n[at] > self.peak[0]:
+                sigma_n = float(columns["grf_sigma_n"][rows][at])
+                self.peak = float(grf_n[at]), int(t_ns[at]), sigma_n
+        x_m = columns["cop_x_m"][rows]
+        x_m = x_m[np.isfinite(x_m) & ~unsure]
+        if len(x_m):
+            first, least, greatest = float(x_m[0]), float(x_m.min()), float(x_m.max())
+            if self.cop_x_m is not None:
+                first = self.cop_x_m[0]
+                least, greatest = min(least, self.cop_x_m[2]), max(greatest, self.cop_x_m[3])
+            self.cop_x_m = first, float(x_m[-1]), least, greatest
+
+    def _integrate(self, t_ns: Times, grf_n: Floats) -> None:
+        t_ns, grf_n = np.append(self.end[0], t_ns), np.append(self.end[1], grf_n)
+        trapezoids = (grf_n[1:] + grf_n[:-1]) * 0.5 * (np.diff(t_ns) * 1e-9)
+        # One after the other, so that it does not matter how frames come in batches.
+        self.impulse_n_s = float(np.add.accumulate(np.append(self.impulse_n_s, trapezoids))[-1])
+        self.end = t_ns[-1:], grf_n[-1:]
+
+    def closed(self, behind: _Frame | None) -> Stance:
+        """What it was; `behind` is the next frame of which contact is known."""
+        missing = self.last.seq - self.first.seq + 1 - self.frames
+        hidden = self.peak is None or self.status & EstimateStatus.SATURATED
+        peak_n, peak_t_ns, peak_sigma_n = self.peak or (np.nan, 0, np.nan)
+        x_first_m, x_last_m, least_m, greatest_m = self.cop_x_m or (np.nan,) * 4
+        return Stance(
+            number=self.number,
+            part=self.first.part,
+            begin_t_ns=self.first.t_ns,
+            end_t_ns=self.last.t_ns,
+            peak_grf_n=np.nan if hidden else peak_n,
+            peak_t_ns=None if hidden else peak_t_ns,
+            peak_sigma_n=np.nan if hidden else peak_sigma_n,
+            impulse_n_s=np.nan if missing or self.unknown else self.impulse_n_s,
+            cop_x_first_m=x_first_m,
+            cop_x_last_m=x_last_m,
+            cop_x_range_m=greatest_m - least_m,
+            frames=self.frames,
+            unknown_frames=self.unknown,
+            missing_frames=missing,
+            estimate_status=self.status,
+            begun=self.begun,
+            ended=self.last.borders(behind),
+        )

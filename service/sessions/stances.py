@@ -1,0 +1,149 @@
+"""Stances of sealed sessions: gathered while frames are written, or made again from the file.
+
+They are of the numbers that are in the file, so that both ways come to the same bytes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from devices.errors import FileFormatError, FootTileError, StorageError, UnknownError
+from service.estimation.stances import GATHERED, Stance, Stances
+from storage.file_hash import sha256_of
+from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.reader import SessionReader
+from storage.sessions.stances import STANCES_NAME, read_stances, stances_table, write_stances
+
+log = logging.getLogger("foottile.stances")
+
+_NOT_WRITTEN = f"{STANCES_NAME} was not written, and is made again when it is asked for"
+
+
+class StancesBeside:
+    """Gathers the stances of frames that are being sealed, and writes them beside these.
+
+    Whatever goes wrong with that holds no session up: it is said, and they are made again later.
+
+    Attributes:
+        problem: why they are not there; None: they are, or there are no estimates.
+    """
+
+    def __init__(self) -> None:
+        self.problem: str | None = None
+        self._gathered = Stances()
+        self._over: list[Stance] = []
+        self._has_estimates = False
+
+    def feed(
+        self,
+        seq: npt.NDArray[np.uint64],
+        t_ns: npt.NDArray[np.int64],
+        columns: Mapping[str, npt.NDArray[Any]],
+    ) -> None:
+        """Take the next frames with their columns; without estimates there are no stances."""
+        if self.problem is not None or "contact" not in columns:
+            return
+        self._has_estimates = True
+        try:
+            self._over += self._gathered.feed(seq, t_ns, _as_in_file(columns))
+        except Exception as error:  # a session is worth more than what can be made from it again
+            log.exception("stances: this is a bug")
+            self.problem = f"{_NOT_WRITTEN}: {error}"
+
+    def write(self, folder: Path, frames_sha256: str) -> None:
+        """Write `stances.parquet`; without estimates, take away what an attempt before has left."""
+        path = folder / STANCES_NAME
+        if not self._has_estimates:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        elif self.problem is None:
+            try:
+                write_stances(path, self.table(), frames_sha256=frames_sha256)
+            except Exception as error:
+                if not isinstance(error, FootTileError):
+                    log.exception("stances: this is a bug")
+                self.problem = f"{_NOT_WRITTEN}: {error}"
+
+    def table(self) -> pa.Table:
+        """All stances; no more frames will come."""
+        self._over += self._gathered.finish()
+        return stances_table(stance.as_dict() for stance in self._over)
+
+
+def stances_of_session(
+    folder: Path, *, frames_sha256: str | None = None, keep: bool = False
+) -> pa.Table:
+    """The stances of a sealed session as a table: those beside it, else made from its frames.
+
+    Args:
+        folder: the session's.
+        frames_sha256: file hash of its frames, if it is known; else it is computed.
+        keep: write those that had to be made beside the frames, if the folder can be written to.
+
+    Raises:
+        UnknownError: it has no estimates.
+        FileFormatError: there are no frames, or they are damaged.
+        StorageError: they cannot be read now.
+    """
+    path = folder / STANCES_NAME
+    frames_sha256 = frames_sha256 or _hash_of(folder / FRAMES_NAME)
+    with suppress(FileNotFoundError, FileFormatError):
+        stored = read_stances(path)
+        if stored.frames_sha256 == frames_sha256:
+            return stored.table
+    with SessionReader(folder / FRAMES_NAME, only_slices=True) as session:
+        table = stances_in(session)
+    if keep:
+        with suppress(StorageError):
+            write_stances(path, table, frames_sha256=frames_sha256)
+    return table
+
+
+def stances_in(session: SessionReader) -> pa.Table:
+    """Stances of a sealed file.
+
+    Raises:
+        UnknownError: it has no estimates.
+        FileFormatError: it is damaged.
+    """
+    if not session.has(*GATHERED):
+        reason = session.notes.get("estimates", "no estimates were made")
+        raise UnknownError(
+            f"there are no stances without estimates: {reason}",
+            where=str(session.path),
+            remedy="`foottile estimate` makes them",
+        )
+    names = (*GATHERED, "part") if session.has("part") else GATHERED
+    found = StancesBeside()
+    for columns in session.columns("seq", "t_ns", *names):
+        found.feed(columns["seq"], columns["t_ns"], columns)
+    if found.problem is not None:
+        raise FileFormatError(found.problem, where=str(session.path))
+    return found.table()
+
+
+def _hash_of(path: Path) -> str:
+    try:
+        return sha256_of(path)
+    except OSError as error:
+        raise FileFormatError(f"cannot be read: {error.strerror}", where=str(path)) from error
+
+
+def _as_in_file(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Numbers as single precision keeps them, computed with in double."""
+    names = [*GATHERED, *({"part"} & columns.keys())]
+    return {name: _single(columns[name]) for name in names}
+
+
+def _single(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    if not np.issubdtype(values.dtype, np.floating):
+        return values
+    return values.astype(np.float32).astype(np.float64)

@@ -1,0 +1,119 @@
+"""The table of stances beside a session's frames: a row for each, made from the frames alone.
+
+Nothing is lost with it: whoever lacks it, or finds it damaged or of other frames, makes it again
+(`service.sessions.stances`), to the byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from devices.errors import DamagedFileError
+from storage.checked_table import read_table, write_table
+from storage.schema import Column
+
+STANCES_NAME = "stances.parquet"
+FRAMES_HASH_KEY = b"foottile.frames_sha256"
+"""The file hash of the frames that it was made from."""
+
+_F64 = pa.float64()
+
+STANCES = (
+    Column("number", pa.uint32(), "1", "of the stance in its session, from 1"),
+    Column("part", pa.uint16(), "1", "part of the session in which it was"),
+    Column("begin_t_ns", pa.int64(), "ns", "t_ns of its first frame"),
+    Column("end_t_ns", pa.int64(), "ns", "t_ns of its last frame"),
+    Column("duration_s", _F64, "s", "from the first frame to the last"),
+    Column("peak_grf_n", _F64, "N", "greatest GRF known; null if none is, or a tile was saturated"),
+    Column("peak_t_ns", pa.int64(), "ns", "t_ns of the first frame with that GRF"),
+    Column("peak_sigma_n", _F64, "N", "standard uncertainty of the GRF in that frame"),
+    Column("impulse_n_s", _F64, "N s", "integral of the GRF; null if a frame or a GRF is missing"),
+    Column("cop_x_first_m", _F64, "m", "cop_x_m where it is first stated"),
+    Column("cop_x_last_m", _F64, "m", "cop_x_m where it is last stated"),
+    Column("cop_x_range_m", _F64, "m", "greatest cop_x_m less the least"),
+    Column("frames", pa.uint32(), "1", "frames that are there, first and last included"),
+    Column("unknown_frames", pa.uint32(), "1", "of these, without a GRF"),
+    Column("missing_frames", pa.uint32(), "1", "numbers in between that are not there"),
+    Column("estimate_status", pa.uint16(), "bits", "bits that any of its frames has"),
+    Column("begun", pa.bool_(), "1", "the frame before it is there, and without contact"),
+    Column("ended", pa.bool_(), "1", "the frame behind it is there, and without contact"),
+    Column("is_whole", pa.bool_(), "1", "begun, ended, no frame missing, and a GRF in each"),
+)
+"""What is said of a stance: `service.estimation.stances.Stance`."""
+
+_NULLABLE = frozenset({"peak_t_ns"})
+
+
+def stances_table(rows: Iterable[Mapping[str, Any]]) -> pa.Table:
+    """Stances as a table; what is NaN or None is null.
+
+    Args:
+        rows: by the names of `STANCES`.
+    """
+    content = list(rows)
+    fields, arrays = [], []
+    for column in STANCES:
+        may_miss = column.type == _F64 or column.name in _NULLABLE
+        fields.append(column.field(column.name, column.type, nullable=may_miss))
+        values = [row[column.name] for row in content]
+        if column.type == _F64:
+            values = [None if np.isnan(value) else value for value in values]
+        arrays.append(pa.array(values, column.type))
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+
+
+def write_stances(path: Path, table: pa.Table, *, frames_sha256: str) -> None:
+    """Write `stances.parquet`, in place of the one that is there.
+
+    Args:
+        path: of the file.
+        table: of `stances_table`.
+        frames_sha256: hash of the frames that the stances are of.
+
+    Raises:
+        StorageError: the disk is full or not writable; the old one is still there then.
+    """
+    write_table(path, table.replace_schema_metadata({FRAMES_HASH_KEY: frames_sha256.encode()}))
+
+
+@dataclass(frozen=True)
+class StoredStances:
+    """What `stances.parquet` holds.
+
+    Attributes:
+        table: with the columns of `STANCES`.
+        frames_sha256: hash of the frames that it was made from.
+    """
+
+    table: pa.Table
+    frames_sha256: str
+
+
+def read_stances(path: Path) -> StoredStances:
+    """Read `stances.parquet`.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DamagedFileError: it is not what was written, or no table of stances.
+        StorageError: it cannot be read now.
+    """
+    read = read_table(path)
+    said = read.table.schema.metadata or {}
+    if (
+        not read.is_proven
+        or FRAMES_HASH_KEY not in said
+        or not read.table.schema.equals(stances_table(()).schema)
+    ):
+        raise DamagedFileError(
+            "is no table of stances",
+            where=str(path),
+            expected="columns " + ", ".join(column.name for column in STANCES) + ", with a hash",
+            remedy="Delete it: it is made again from the frames",
+        )
+    return StoredStances(read.table, said[FRAMES_HASH_KEY].decode("ascii", "replace"))

@@ -1,0 +1,157 @@
+"""Stances of sealed sessions: beside the frames, over REST, and made again."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+import service.sessions.stances
+from devices.errors import StorageError
+from service.estimation.stances import GATHERED, Stances, stances_of
+from service.sessions.stances import stances_of_session
+from storage.sessions.stances import read_stances
+from storage.verify.session import verify_session
+from tests.service.fake_node import FakeNode, NodeOf
+from tests.service.recording import Recording
+from tests.service.running import Running, assert_refused
+from tests.storage.faulty_disk import refusing
+
+ARROW = "application/vnd.apache.arrow.stream"
+
+
+def hopped(node: FakeNode) -> Recording:
+    """A sealed session: twice down with 80 N for 80 frames."""
+    session = node.record()
+    for _ in range(2):
+        node.send(100, [0.0, 0.0])
+        node.send(80, [20.0, 60.0])
+    node.deliver(100, [0.0, 0.0])
+    node.finish(session)
+    return session
+
+
+def stances_over_rest(session: Recording, **headers: str) -> Any:
+    return session.running.http.get(f"{session.url}/stances", headers=headers)
+
+
+def from_its_frames(session: Recording) -> list[dict[str, Any]]:
+    """By the definition, from the columns of the sealed file all at once."""
+    names = ("seq", "t_ns", "part", *GATHERED)
+    with session.reader() as file:
+        pieces = list(file.columns(*names))
+    assert len(pieces) == 1
+    columns = {
+        name: values.astype(float) if values.dtype == "f4" else values
+        for name, values in pieces[0].items()
+    }
+    found = stances_of(columns["seq"], columns["t_ns"], columns)
+    return [
+        {name: None if isinstance(v, float) and math.isnan(v) else v for name, v in row.items()}
+        for row in (stance.as_dict() for stance in found)
+    ]
+
+
+def test_a_sealed_session_has_its_stances_beside_its_frames_and_over_rest(
+    tared: FakeNode,
+) -> None:
+    session = hopped(tared)
+    beside = read_stances(session.folder / "stances.parquet")
+    assert beside.frames_sha256 == session.now()["sha256"]
+    rows = stances_over_rest(session).json()
+    assert [row["number"] for row in rows] == [1, 2]
+    assert rows == beside.table.to_pylist() == from_its_frames(session)
+    for row in rows:
+        assert row["peak_grf_n"] == pytest.approx(80.0, abs=0.1)
+        assert row["impulse_n_s"] == pytest.approx(80.0 * row["duration_s"], rel=0.05)
+        assert row["frames"] == pytest.approx(80, abs=4)
+        assert row["is_whole"]
+    arrow = stances_over_rest(session, Accept=ARROW)
+    assert arrow.headers["content-type"] == ARROW
+    assert pa.ipc.open_stream(arrow.content).read_all().to_pylist() == rows
+    assert verify_session(session.folder).problems == []
+    assert verify_session(session.folder).unproven == []
+
+
+def test_stances_that_are_gone_or_damaged_are_made_again_to_the_byte(tared: FakeNode) -> None:
+    session = hopped(tared)
+    path = session.folder / "stances.parquet"
+    whole, rows = path.read_bytes(), stances_over_rest(session).json()
+    path.unlink()
+    assert stances_over_rest(session).json() == rows
+    assert not path.exists()  # no GET writes
+    assert verify_session(session.folder).problems == []
+    stances_of_session(session.folder, keep=True)
+    assert path.read_bytes() == whole
+    damaged = whole[:100] + bytes([whole[100] ^ 1]) + whole[101:]
+    path.write_bytes(damaged)
+    assert stances_over_rest(session).json() == rows
+    (said,) = verify_session(session.folder).problems
+    assert said.startswith("stances.parquet: ")
+    stances_of_session(session.folder, keep=True)
+    assert path.read_bytes() == whole
+
+
+def test_stances_of_other_frames_are_not_read(tared: FakeNode) -> None:
+    one, other = hopped(tared), hopped(tared)
+    path = one.folder / "stances.parquet"
+    whole, rows = path.read_bytes(), stances_over_rest(one).json()
+    path.write_bytes((other.folder / path.name).read_bytes())
+    assert stances_over_rest(one).json() == rows
+    report = verify_session(one.folder)
+    assert report.problems == []
+    assert report.unproven == ["stances.parquet: it is of other frames, and nobody reads it"]
+    stances_of_session(one.folder, keep=True)
+    assert path.read_bytes() == whole
+
+
+def test_a_disk_that_does_not_take_the_stances_holds_no_session_up(
+    tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        full = refusing(StorageError, "cannot be written: No space left on device")
+        patch.setattr(service.sessions.stances, "write_stances", full)
+        session = hopped(tared)
+    sealed = session.now()
+    assert (sealed["state"], sealed["complete"]) == ("sealed", True)
+    assert "stances.parquet was not written, and is made again" in sealed["problem"]
+    assert not (session.folder / "stances.parquet").exists()
+    assert len(stances_over_rest(session).json()) == 2
+
+
+def test_what_fails_while_stances_are_gathered_holds_no_session_up(
+    tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        fails = refusing(ZeroDivisionError, "a bug")
+        patch.setattr(Stances, "feed", fails)
+        session = hopped(tared)
+    assert session.now()["state"] == "sealed"
+    assert "a bug" in session.now()["problem"]
+    assert len(stances_over_rest(session).json()) == 2
+
+
+def test_a_session_without_estimates_has_no_stances_and_says_why(
+    running: Running, node_of: NodeOf
+) -> None:
+    node = node_of(running, calibration=None)
+    node.connect()
+    node.deliver(10)
+    session = node.record()
+    node.deliver(50, [0.0, 0.0])
+    node.finish(session)
+    assert not (session.folder / "stances.parquet").exists()
+    assert_refused(stances_over_rest(session), 404, "no estimates: the node had no calibration")
+
+
+def test_stances_are_counted_when_the_session_is_sealed(tared: FakeNode) -> None:
+    session = tared.record()
+    assert_refused(stances_over_rest(session), 409, "counted when it is sealed")
+    assert_refused(
+        session.running.http.get("/sessions/20200101T000000Z-00000a/stances"), 404, "no session"
+    )
+    tared.deliver(10)
+    tared.finish(session)
+    assert stances_over_rest(session).json() == []

@@ -1,0 +1,81 @@
+"""The table of stances beside a session's frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from devices.errors import DamagedFileError
+from service.estimation.stances import STANCE_COLUMNS, Stance
+from storage.checked_table import write_table
+from storage.sessions.stances import STANCES, read_stances, stances_table, write_stances
+
+NAN = float("nan")
+HOP = Stance(1, 0, 10, 30, 5.0, 20, 0.5, 9e-8, -0.01, 0.02, 0.03, 3, 0, 0, 16, True, True)
+HIDDEN = Stance(2, 1, 50, 90, NAN, None, NAN, NAN, NAN, NAN, NAN, 2, 1, 3, 1, True, False)
+HASH = "0123456789abcdef" * 4
+
+
+def written(path: Path) -> pa.Table:
+    table = stances_table(stance.as_dict() for stance in (HOP, HIDDEN))
+    write_stances(path, table, frames_sha256=HASH)
+    return table
+
+
+def test_the_table_has_what_is_said_of_a_stance_with_units(tmp_path: Path) -> None:
+    assert tuple(column.name for column in STANCES) == STANCE_COLUMNS
+    written(tmp_path / "stances.parquet")
+    schema = pq.read_schema(tmp_path / "stances.parquet")
+    units = {field.name: (field.metadata or {})[b"unit"].decode() for field in schema}
+    assert units["impulse_n_s"] == "N s"
+    assert units["peak_grf_n"] == units["peak_sigma_n"] == "N"
+    assert all(name.rsplit("_", 1)[-1] == "ns" for name, unit in units.items() if unit == "ns")
+
+
+def test_what_was_written_is_read_and_what_is_not_known_is_null(tmp_path: Path) -> None:
+    path = tmp_path / "stances.parquet"
+    table = written(path)
+    stored = read_stances(path)
+    assert stored.frames_sha256 == HASH
+    assert stored.table.equals(table)
+    hop, hidden = stored.table.to_pylist()
+    assert hop == HOP.as_dict()
+    unknown = {name for name, value in hidden.items() if value is None}
+    assert unknown == {
+        name
+        for name, value in HIDDEN.as_dict().items()
+        if value is None or (isinstance(value, float) and np.isnan(value))
+    }
+
+
+def test_a_session_without_a_stance_has_a_table_without_rows(tmp_path: Path) -> None:
+    write_stances(tmp_path / "stances.parquet", stances_table(()), frames_sha256=HASH)
+    assert read_stances(tmp_path / "stances.parquet").table.to_pylist() == []
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(at=st.integers(0, 10**6), bit=st.integers(0, 7))
+def test_any_flipped_bit_is_damage(tmp_path: Path, at: int, bit: int) -> None:
+    path = tmp_path / "stances.parquet"
+    written(path)
+    content = bytearray(path.read_bytes())
+    content[at % len(content)] ^= 1 << bit
+    path.write_bytes(content)
+    with pytest.raises(DamagedFileError):
+        read_stances(path)
+
+
+def test_another_table_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "stances.parquet"
+    write_table(path, pa.table({"number": [1]}))
+    with pytest.raises(DamagedFileError, match="no table of stances"):
+        read_stances(path)
+    pq.write_table(stances_table(()), path)  # without a hash
+    with pytest.raises(DamagedFileError, match="no table of stances"):
+        read_stances(path)
