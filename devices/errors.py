@@ -26,6 +26,7 @@
      |    +-- FolderGoneError                  the folder that it writes to is not there any more
      +-- CalibrationError      (ValueError)    a calibration is absent, unphysical or does not fit
      +-- TareError             (ValueError)    no interval to tare on
+     +-- ComparisonError       (ValueError)    a reference cannot be compared with a session
      +-- LinkError             (ConnectionError) node, server or client cannot talk to each other
      +-- StateError                            not now: recording already, node away, not sealed
      +-- UnknownError          (LookupError)   no such node, session, tare
@@ -242,6 +243,10 @@ class CalibrationError(FootTileError, ValueError):
 
 class TareError(FootTileError, ValueError):
     """No unloaded interval to tare on."""
+
+
+class ComparisonError(FootTileError, ValueError):
+    """A reference cannot be compared with a session: they do not overlap, fit, or bear load."""
 
 
 class LinkError(FootTileError, ConnectionError):

@@ -1,0 +1,303 @@
+"""A reference's clock and scale against our force: lag, drift, offset and scale, with intervals.
+
+The lag is found coarsely by cross-correlation, then all four together by robust least squares under
+narrower and narrower windows. Landings, where plate and foot ring each in its own way, count less:
+the loss is the pseudo-Huber one. Residuals are ours, `ours - scale (reference - offset)`: noise of
+what stands on the right would make the scale too small, and a reference is the better of the two.
+Intervals are those of `jackknife`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+from scipy.special import fdtri
+
+from devices.arrays import Bools, Floats, Ints
+from devices.errors import ComparisonError
+from service.offline.compare.jackknife import Estimate, Spread, block_of, memory_of, spread_of
+from service.offline.compare.lags import Peak, Peaks, likely_lags
+from service.offline.compare.signals import Even, Signal, smooth
+
+ROBUST = 1.345
+"""Beyond so many standard deviations a residual counts less (Huber)."""
+WIDTHS_S = (0.04, 0.01)
+"""Windows before the last one, which is as narrow as samples allow."""
+WIDTH_STEPS = 2.0
+"""The last window, in steps of the slower signal: narrower ones would tell sample from sample."""
+CORRELATION_MIN = 0.5
+"""Signals that resemble each other less at their best lag are not of the same load."""
+RIVAL_FROM = 0.8
+"""Of the best lag's correlation: a rival below that is no rival."""
+CHANCE = 1e-3
+"""A rival is ruled out if what it fits worse would come by chance less often than that."""
+LOADED = 0.1
+"""Of the greatest force: noise of a residual is judged where there is more."""
+
+_LAG, _DRIFT, _OFFSET, _SCALE = range(4)
+
+
+@dataclass(frozen=True)
+class Ambiguity:
+    """The best other lag.
+
+    Attributes:
+        lag_s: it.
+        correlation: at that lag.
+        best_correlation: at the lag that was taken.
+    """
+
+    lag_s: float
+    correlation: float
+    best_correlation: float
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How a reference is to ours: what is at our `t` is in the reference at `reference_s(t)`.
+
+    Attributes:
+        lag_s: reference time less our time of the same event, at `at_s`.
+        drift_ppm: by how much the lag grows, microseconds a second.
+        offset_n: what the reference reads where our force is zero, by the fit.
+        scale: newtons of ours for a newton of the reference.
+        at_s: our instant in the middle of what overlaps.
+        covariance: (2, 2), of lag and drift, in s and 1.
+        residual_n: root mean square of what the fit leaves, under its last window.
+        blocks: of time, from which the uncertainties are.
+        ambiguity: None if no other lag comes near.
+    """
+
+    lag_s: Estimate
+    drift_ppm: Estimate
+    offset_n: Estimate
+    scale: Estimate
+    at_s: float
+    covariance: Floats
+    residual_n: float
+    blocks: int
+    ambiguity: Ambiguity | None
+
+    def reference_s(self, t_s: Floats) -> Floats:
+        """Reference times of our instants (n,)."""
+        drift = self.drift_ppm.value * 1e-6
+        return np.asarray(t_s + self.lag_s.value + drift * (t_s - self.at_s))
+
+    def lag_sigma_s(self, t_s: Floats) -> Floats:
+        """Standard uncertainty of the lag at our instants (n,)."""
+        since = np.stack([np.ones(len(t_s)), t_s - self.at_s])
+        variance = np.einsum("in,ij,jn->n", since, self.covariance, since)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def align(
+    ours: Signal, reference: Signal, *, lag_range_s: tuple[float, float] | None = None
+) -> Alignment:
+    """Align a reference with our force.
+
+    Args:
+        ours: our GRF.
+        reference: the same force by the reference, on a clock of its own.
+        lag_range_s: least and greatest lag that can be, where several would fit; None: any.
+
+    Raises:
+        ComparisonError: one of them is constant, they do not overlap or do not resemble each other,
+            the reference's sign is wrong, or two lags fit equally well.
+    """
+    for signal, whose in ((ours, "our GRF"), (reference, "the reference's force")):
+        _check_varies(signal, whose)
+    peaks = likely_lags(ours, reference, lag_range_s)
+    if peaks is None:
+        raise ComparisonError(
+            "the reference and the session do not overlap",
+            expected="at least half of the shorter one within the other, with a load in it",
+            remedy="Name the lags that can be with --lag-range-s",
+        )
+    _check_alike(peaks, ours, reference, lag_range_s)
+    best = _fit(ours, reference, peaks.best, peaks.step_s)
+    rival = peaks.rival
+    ambiguity = None
+    if rival is not None and rival.correlation > RIVAL_FROM * peaks.best.correlation:
+        other = _fit(ours, reference, rival, peaks.step_s)
+        best, other = sorted((best, other), key=lambda fit: fit.residual_n)
+        if not _is_worse(other, best):
+            raise ComparisonError(
+                f"two lags fit equally well: {best.x[_LAG]:.4f} s and {other.x[_LAG]:.4f} s",
+                expected="a load that does not repeat itself exactly",
+                remedy="Name the lags that can be with --lag-range-s, or begin with a step or a "
+                "tap that comes once",
+            )
+        known = {True: peaks.best.correlation, False: rival.correlation}
+        is_first = abs(best.x[_LAG] - peaks.best.lag_s) < abs(best.x[_LAG] - rival.lag_s)
+        ambiguity = Ambiguity(float(other.x[_LAG]), known[not is_first], known[is_first])
+    spread = best.spread
+    if best.x[_SCALE] <= 0.0:
+        raise _wrong_sign()
+    # The fit's drift is the lag's change over half of what overlaps.
+    covariance = spread.covariance[:2, :2] / np.outer(*2 * (np.array([1.0, best.half_s]),))
+    return Alignment(
+        lag_s=spread.estimate(best.x, _LAG),
+        drift_ppm=spread.estimate(best.x, _DRIFT).times(1e6 / best.half_s),
+        offset_n=spread.estimate(best.x, _OFFSET),
+        scale=spread.estimate(best.x, _SCALE),
+        at_s=best.at_s,
+        covariance=covariance,
+        residual_n=best.residual_n,
+        blocks=spread.blocks,
+        ambiguity=ambiguity,
+    )
+
+
+def _check_varies(signal: Signal, whose: str) -> None:
+    if len(signal.t_s) < 2:
+        raise ComparisonError(f"{whose} has {len(signal.t_s)} samples", expected="at least two")
+    height_n = float(np.ptp(signal.force_n))
+    noise_n = _deviation(np.diff(signal.force_n)) / np.sqrt(2.0)
+    # Of so many samples noise alone reaches some five sigma to either side.
+    if not height_n > 12.0 * noise_n or height_n == 0.0:
+        raise ComparisonError(
+            f"{whose} is constant but for noise: {height_n:.3g} N from least to greatest",
+            expected="a load that comes and goes",
+        )
+
+
+def _check_alike(
+    peaks: Peaks, ours: Signal, reference: Signal, lag_range_s: tuple[float, float] | None
+) -> None:
+    turned = likely_lags(ours, Signal(reference.t_s, -reference.force_n), lag_range_s)
+    if turned is not None and turned.best.correlation > max(
+        CORRELATION_MIN, peaks.best.correlation
+    ):
+        raise _wrong_sign()
+    if peaks.best.correlation >= CORRELATION_MIN:
+        return
+    raise ComparisonError(
+        "the reference and our GRF do not resemble each other: correlation "
+        f"{peaks.best.correlation:.2f} at the best lag",
+        expected=f"at least {CORRELATION_MIN:g}: the same load, of the same foot",
+    )
+
+
+def _wrong_sign() -> ComparisonError:
+    return ComparisonError(
+        "the reference's force falls where ours rises: its sign is turned",
+        expected="the force of the ground on the foot, positive under load",
+        remedy="Give the other --sign",
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Parameters at which the residuals are least, and the residuals, at even steps of our time."""
+
+    x: Floats
+    residual: Floats
+    jacobian: Floats
+    bend_n: float
+    samples: Ints
+    at_s: float
+    half_s: float
+
+    @property
+    def residual_n(self) -> float:
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    @property
+    def spread(self) -> Spread:
+        ratio = 1.0 + (self.residual / self.bend_n) ** 2
+        score, curvature = self.residual / np.sqrt(ratio), ratio**-1.5
+        telling = self.jacobian**2 * curvature[:, None]
+        weight = (telling / telling.sum(axis=0)).sum(axis=1)
+        block = block_of(self.jacobian * score[:, None], self.samples, weight)
+        return spread_of(self.jacobian, score, curvature, block)
+
+
+def _fit(ours: Signal, reference: Signal, peak: Peak, coarse_s: float) -> _Fit:
+    last_s = WIDTH_STEPS * max(ours.step_s, reference.step_s)
+    lag_s, drift = peak.lag_s, 0.0
+    fit: _Fit | None = None
+    for width_s in (*(width for width in WIDTHS_S if width > last_s), last_s, last_s):
+        margin_s = max(width_s, coarse_s)
+        step_s = min(0.5 * width_s, ours.step_s, reference.step_s)
+        own = smooth(ours, width_s, step_s)
+        theirs = smooth(reference, width_s, step_s, margin_s)
+        every = max(1, round(width_s / step_s))
+        t_s, samples = own.t_s[::every], np.arange(len(own.t_s[::every]))
+        to_s = t_s + lag_s + (drift * (t_s - fit.at_s) if fit is not None else 0.0)
+        used = own.known[::every] & _known_at(theirs, to_s)
+        if used.sum() < 10 * (_SCALE + 1):
+            raise ComparisonError(
+                f"reference and session overlap in {used.sum() * width_s:.2f} s without a gap",
+                expected="some stances that both have seen",
+            )
+        fit = _fit_under(
+            own.force_n[::every][used], theirs, t_s[used], samples[used], to_s[used], lag_s
+        )
+        lag_s, drift = float(fit.x[_LAG]), float(fit.x[_DRIFT] / fit.half_s)
+    assert fit is not None  # noqa: S101  # there are two windows at least
+    return fit
+
+
+def _fit_under(
+    own_n: Floats, theirs: Even, t_s: Floats, samples: Ints, to_s: Floats, lag_s: float
+) -> _Fit:
+    at_s, half_s = 0.5 * float(t_s[0] + t_s[-1]), 0.5 * float(t_s[-1] - t_s[0])
+    spline = CubicSpline(theirs.t_s, theirs.force_n)
+    slope = spline.derivative()
+    since = (t_s - at_s) / half_s
+
+    def instants(x: Floats) -> Floats:
+        return np.asarray(t_s + x[_LAG] + x[_DRIFT] * since)
+
+    def residual(x: Floats) -> Floats:
+        return np.asarray(own_n - x[_SCALE] * (spline(instants(x)) - x[_OFFSET]))
+
+    def jacobian(x: Floats) -> Floats:
+        to = instants(x)
+        rate = -x[_SCALE] * slope(to)
+        offset = np.full(len(t_s), x[_SCALE])
+        return np.stack([rate, rate * since, offset, x[_OFFSET] - spline(to)], axis=1)
+
+    # The same drift as before about the new middle of what overlaps.
+    drift = np.polynomial.polynomial.polyfit(since, to_s - t_s, 1)
+    scale, zero_n = np.polyfit(spline(to_s), own_n, 1)
+    begin = np.array([drift[0], drift[1], -zero_n / scale, scale])
+    bend_n = ROBUST * _noise_n(residual(begin), own_n)
+    for _ in range(2):
+        found = least_squares(
+            residual, begin, jacobian, loss="soft_l1", f_scale=bend_n, x_scale="jac", xtol=1e-12
+        )
+        begin = found.x
+        bend_n = ROBUST * _noise_n(residual(begin), own_n)
+    return _Fit(begin, residual(begin), jacobian(begin), bend_n, samples, at_s, half_s)
+
+
+def _noise_n(residual: Floats, own_n: Floats) -> float:
+    """Standard deviation of residuals under load, whatever a few of them are."""
+    loaded = own_n - np.median(own_n[own_n <= np.median(own_n)]) > LOADED * np.ptp(own_n)
+    noise_n = _deviation(residual[loaded] if loaded.sum() > 1 else residual)
+    return max(noise_n, _deviation(residual), 1e-6 * float(np.ptp(own_n)))
+
+
+def _deviation(values: Floats) -> float:
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def _known_at(signal: Even, t_s: Floats) -> Bools:
+    at = np.rint((t_s - signal.begin_s) / signal.step_s).astype(np.int64)
+    inside = (at >= 0) & (at < len(signal.known))
+    return np.asarray(inside & signal.known[np.clip(at, 0, len(signal.known) - 1)])
+
+
+def _is_worse(other: _Fit, best: _Fit) -> bool:
+    """Whether a fit leaves more than another one, beyond chance: an F test of the residuals.
+
+    Its degrees of freedom are stretches of the residuals' memory, not samples.
+    """
+    left, more = best.residual, other.residual
+    free, free_of_best = (max(1.0, len(one) / memory_of(one)) for one in (more, left))
+    limit = float(fdtri(free, free_of_best, 1.0 - CHANCE))
+    return bool(np.mean(more**2) > limit * np.mean(left**2))

@@ -1,0 +1,252 @@
+"""How far ours is from a reference: GRF, stances, COP and coverage, by trial and over trials.
+
+Error is ours minus reference. Frames count in which the reference bears load and our GRF is known;
+what phases are, and coverage, is as in `service.offline.accuracy`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Bools, Floats
+from service.estimation.stances import Stance, stances_of
+from service.offline.accuracy import INTERVAL_95, PHASES, Covered, phases_of
+from service.offline.compare.pairs import Pairs
+from service.offline.compare.trials import OverTrials, Trial, over_trials
+
+MARGIN_NS = 50_000_000
+"""The reference may land so much sooner than ours, or lift off so much later."""
+
+
+@dataclass(frozen=True)
+class StanceError:
+    """One stance that both have seen from beginning to end. Ours minus reference.
+
+    Attributes:
+        number: of the stance in the session.
+        t_ns: UTC of its first frame.
+        peak_n: of the greatest GRF.
+        impulse_n_s: of the impulse.
+        contact_s: of the instant of contact; where both cross the same force upwards.
+        lift_off_s: of lift-off, likewise.
+    """
+
+    number: int
+    t_ns: int
+    peak_n: float
+    impulse_n_s: float
+    contact_s: float
+    lift_off_s: float
+
+
+@dataclass(frozen=True)
+class PhaseError:
+    """Frames of a phase: how many, their mean and mean absolute error, and coverage."""
+
+    frames: int
+    bias_n: float
+    mae_n: float
+    covered: Covered | None
+
+
+@dataclass(frozen=True)
+class TrialErrors:
+    """One trial.
+
+    Attributes:
+        name: of the trial.
+        figures: by name, as in docs/compare.md; NaN where there is nothing to judge.
+        limits_of_agreement_n: bias less and plus 1.96 standard deviations of the error.
+        phases: by name of the phase.
+        stances: those that can be compared.
+        stances_left_out: ours that cannot: cut by the trial's or the recording's end, with unknown
+            frames, or not seen by the reference.
+        cop_frames: with a COP by ours, by the reference, and by both.
+    """
+
+    name: str
+    figures: Mapping[str, float]
+    limits_of_agreement_n: tuple[float, float]
+    phases: Mapping[str, PhaseError]
+    stances: tuple[StanceError, ...]
+    stances_left_out: int
+    cop_frames: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """All trials, and each figure over them."""
+
+    trials: tuple[TrialErrors, ...]
+    figures: Mapping[str, OverTrials] = field(default_factory=dict)
+
+
+def errors_of(
+    pairs: Pairs, trials: Sequence[Trial], *, reference_sigma_n: float | None = None
+) -> Errors:
+    """Judge every trial.
+
+    Args:
+        pairs: frames of ours with the reference.
+        trials: rows of `pairs`.
+        reference_sigma_n: the reference's own standard uncertainty; None: not known, and nothing is
+            said of coverage.
+    """
+    within = None if reference_sigma_n is None else _within(pairs, reference_sigma_n)
+    phases = phases_of(pairs.columns["t_ns"], np.where(pairs.contact, pairs.reference_n, 0.0))
+    stances = stances_of(pairs.columns["seq"], pairs.columns["t_ns"], pairs.columns)
+    judged = tuple(
+        _trial(pairs, trial, phases, within, stances) for trial in trials if trial.rows.any()
+    )
+    names = judged[0].figures if judged else ()
+    figures = {name: over_trials(np.array([one.figures[name] for one in judged])) for name in names}
+    return Errors(judged, figures)
+
+
+def _within(pairs: Pairs, reference_sigma_n: float) -> Bools:
+    """Whether the error is within 1.96 of all that is uncertain: ours, the reference, the lag."""
+    variance = pairs.columns["grf_sigma_n"] ** 2 + reference_sigma_n**2 + pairs.lag_n**2
+    return np.asarray(np.abs(pairs.error_n) <= INTERVAL_95 * np.sqrt(variance))
+
+
+def _trial(
+    pairs: Pairs,
+    trial: Trial,
+    phases: npt.NDArray[np.intp],
+    within: Bools | None,
+    stances: Sequence[Stance],
+) -> TrialErrors:
+    rows = trial.rows & pairs.judged & np.isfinite(pairs.error_n)
+    loaded = rows & pairs.contact
+    error_n, reference_n = pairs.error_n[loaded], pairs.reference_n[loaded]
+    bias_n, spread_n = _mean(error_n), float(np.std(error_n)) if len(error_n) else math.nan
+    compared, left_out = _stances(pairs, trial.rows, stances)
+    cop, cop_frames = _cop(pairs, trial.rows & pairs.judged)
+    scatter = float(((reference_n - reference_n.mean()) ** 2).sum()) if len(error_n) else 0.0
+    figures = {
+        "grf_frames": float(len(error_n)),
+        "grf_bias_n": bias_n,
+        "grf_mae_n": _mean(np.abs(error_n)),
+        "grf_rmse_n": math.sqrt(_mean(error_n**2)),
+        "grf_r2": 1.0 - float((error_n**2).sum()) / scatter if scatter > 0.0 else math.nan,
+        "grf_coverage_95": math.nan if within is None else _mean(within[loaded]),
+        "grf_lag_n": math.sqrt(_mean(pairs.lag_n[loaded] ** 2)),
+        "stances": float(len(compared)),
+        "peak_bias_n": _mean(np.array([one.peak_n for one in compared])),
+        "peak_mae_n": _mean(np.abs([one.peak_n for one in compared])),
+        "impulse_bias_n_s": _mean(np.array([one.impulse_n_s for one in compared])),
+        "impulse_mae_n_s": _mean(np.abs([one.impulse_n_s for one in compared])),
+        "contact_bias_s": _mean(np.array([one.contact_s for one in compared])),
+        "contact_mae_s": _mean(np.abs([one.contact_s for one in compared])),
+        "lift_off_bias_s": _mean(np.array([one.lift_off_s for one in compared])),
+        "lift_off_mae_s": _mean(np.abs([one.lift_off_s for one in compared])),
+        **cop,
+    }
+    by_phase = {}
+    for i, name in enumerate(PHASES):
+        of_phase = rows & (phases == i)
+        # In flight the truth is zero: what the reference still reads there is its own.
+        off_n = pairs.error_n[of_phase]
+        covered = None
+        if within is not None:
+            covered = Covered(int(of_phase.sum()), int((of_phase & within).sum()))
+        by_phase[name] = PhaseError(len(off_n), _mean(off_n), _mean(np.abs(off_n)), covered)
+    half_n = INTERVAL_95 * spread_n
+    return TrialErrors(
+        name=trial.name,
+        figures=figures,
+        limits_of_agreement_n=(bias_n - half_n, bias_n + half_n),
+        phases=by_phase,
+        stances=tuple(compared),
+        stances_left_out=left_out,
+        cop_frames=cop_frames,
+    )
+
+
+def _stances(pairs: Pairs, rows: Bools, stances: Sequence[Stance]) -> tuple[list[StanceError], int]:
+    """Errors of the stances that begin in some rows, and how many of these cannot be compared."""
+    t_ns, error_n = pairs.columns["t_ns"], pairs.error_n
+    compared, left_out = [], 0
+    for i, stance in enumerate(stances):
+        first = int(np.searchsorted(t_ns, stance.begin_t_ns))
+        if not rows[first]:
+            continue
+        # No further than half way to the stances beside it.
+        before_ns = stances[i - 1].end_t_ns if i else stance.begin_t_ns - 2 * MARGIN_NS
+        last = i == len(stances) - 1
+        behind_ns = stance.end_t_ns + 2 * MARGIN_NS if last else stances[i + 1].begin_t_ns
+        begin_ns = stance.begin_t_ns - min(MARGIN_NS, (stance.begin_t_ns - before_ns) // 2)
+        end_ns = stance.end_t_ns + min(MARGIN_NS, (behind_ns - stance.end_t_ns) // 2)
+        window = slice(
+            int(np.searchsorted(t_ns, begin_ns)), int(np.searchsorted(t_ns, end_ns, side="right"))
+        )
+        whole = stance.is_whole and rows[window].all() and np.isfinite(error_n[window]).all()
+        crossed = _crossings(pairs, window) if whole else None
+        if crossed is None:
+            left_out += 1
+            continue
+        t_s = pairs.t_s[window]
+        compared.append(
+            StanceError(
+                number=stance.number,
+                t_ns=stance.begin_t_ns,
+                peak_n=float(
+                    pairs.columns["grf_n"][window].max() - pairs.reference_n[window].max()
+                ),
+                impulse_n_s=float(np.trapezoid(error_n[window], t_s)),
+                contact_s=crossed[0],
+                lift_off_s=crossed[1],
+            )
+        )
+    return compared, left_out
+
+
+def _crossings(pairs: Pairs, window: slice) -> tuple[float, float] | None:
+    """How much later ours crosses the contact force, up and down; None if one does not."""
+    t_s, found = pairs.t_s[window], []
+    for force_n in (
+        pairs.columns["grf_n"][window],
+        pairs.reference_n[window] - pairs.zero_left_n,
+    ):
+        over = force_n - pairs.contact_n
+        above = np.flatnonzero(over > 0.0)
+        if not len(above) or above[0] == 0 or above[-1] == len(over) - 1:
+            return None
+        for i in (int(above[0]) - 1, int(above[-1])):
+            part = over[i] / (over[i] - over[i + 1])
+            found.append(float(t_s[i] + part * (t_s[i + 1] - t_s[i])))
+    return found[0] - found[2], found[1] - found[3]
+
+
+def _cop(pairs: Pairs, rows: Bools) -> tuple[dict[str, float], dict[str, int]]:
+    """Errors of the COP where both are in contact and state it, and the counts."""
+    ours = np.stack([pairs.columns["cop_x_m"], pairs.columns["cop_y_m"]], axis=1)
+    by_ours = rows & (pairs.columns["contact"] == 1) & np.isfinite(ours).all(axis=1)
+    by_reference = rows & pairs.contact & np.isfinite(pairs.reference_cop_m).all(axis=1)
+    both = by_ours & by_reference
+    off_m = ours[both] - pairs.reference_cop_m[both]
+    distance_m = np.hypot(*off_m.T)
+    mean_m = off_m.mean(axis=0) if len(off_m) else np.full(2, np.nan)
+    about_mean_m = np.hypot(*(off_m - mean_m).T)
+    figures = {
+        "cop_mean_m": _mean(distance_m),
+        "cop_p95_m": _p95(distance_m),
+        "cop_bias_x_m": float(mean_m[0]),
+        "cop_bias_y_m": float(mean_m[1]),
+        "cop_p95_about_mean_m": _p95(about_mean_m),
+    }
+    counts = {"ours": by_ours, "reference": by_reference, "both": both}
+    return figures, {name: int(which.sum()) for name, which in counts.items()}
+
+
+def _mean(values: Floats | Bools) -> float:
+    return float(np.mean(values)) if len(values) else math.nan
+
+
+def _p95(values: Floats) -> float:
+    return float(np.percentile(values, 95)) if len(values) else math.nan
