@@ -1,0 +1,191 @@
+"""A reference from a file: what is read, what is refused and how, and what is said of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from devices.errors import FileFormatError, FootTileError, UsageError
+from storage.formats.reference import ReferenceData, Stated, read_reference
+
+LAB = Stated(
+    {"time_s": "Time", "grf_n": "Fz", "cop_x_m": "COPx", "cop_y_m": "COPy"},
+    {"grf": "N", "cop": "mm"},
+    "+",
+)
+GOOD = "Time,Fz,COPx,COPy\n0.00,0,,\n0.01,10.5,10,-20\n0.02,20,20,-30\n0.03,0,,\n"
+
+
+def read(tmp_path: Path, text: str, stated: Stated = LAB, name: str = "plate.csv") -> ReferenceData:
+    path = tmp_path / name
+    path.write_text(text, "utf-8")
+    return read_reference(path, stated)
+
+
+def test_columns_are_mapped_and_units_converted_and_an_empty_cop_is_unknown(tmp_path: Path) -> None:
+    found = read(tmp_path, GOOD)
+    assert found.time_s.tolist() == [0.0, 0.01, 0.02, 0.03]
+    assert found.grf_n.tolist() == [0.0, 10.5, 20.0, 0.0]
+    assert found.cop_m is not None
+    nan = [np.nan, np.nan]
+    np.testing.assert_allclose(found.cop_m, [nan, [0.01, -0.02], [0.02, -0.03], nan])
+    assert (found.epoch_ns, found.notes) == (None, ())
+
+
+def test_our_own_names_say_unit_and_sign(tmp_path: Path) -> None:
+    found = read(tmp_path, "time_s,grf_n\n0,1\n1,5\n", Stated())
+    assert found.grf_n.tolist() == [1.0, 5.0]
+    assert found.cop_m is None
+
+
+def test_a_negative_sign_and_a_turned_coordinate_are_turned(tmp_path: Path) -> None:
+    stated = Stated({**LAB.columns, "cop_y_m": "-COPy"}, {"grf": "kN", "cop": "cm"}, "-")
+    found = read(tmp_path, GOOD.replace("10.5", "-10.5").replace("20,20", "-20,20"), stated)
+    assert found.grf_n.tolist() == [0.0, 10_500.0, 20_000.0, 0.0]
+    assert found.cop_m is not None
+    np.testing.assert_allclose(found.cop_m[1], [0.1, 0.2])
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_semicolons_and_tabs_part_columns_as_well(tmp_path: Path, delimiter: str) -> None:
+    assert len(read(tmp_path, GOOD.replace(",", delimiter)).time_s) == 4
+
+
+def test_parquet_is_read_as_csv_is(tmp_path: Path) -> None:
+    path = tmp_path / "plate.parquet"
+    columns = {"Time": [0.0, 0.5], "Fz": [1, 9], "COPx": [1.0, None], "COPy": [2.0, None]}
+    pq.write_table(pa.table(columns), path)
+    found = read_reference(path, LAB)
+    assert found.grf_n.tolist() == [1.0, 9.0]
+    assert found.cop_m is not None
+    np.testing.assert_allclose(found.cop_m, [[0.001, 0.002], [np.nan, np.nan]])
+
+
+MOT = """ground reactions
+nRows=3
+nColumns=4
+inDegrees=yes
+endheader
+time\tground_force_vy\tground_force_px\tground_force_pz
+0.0\t0.0\t0.0\t0.0
+0.1\t20.0\t0.1\t0.03
+0.2\t10.0\t0.2\t0.02
+"""
+MAPPED = Stated(
+    {
+        "grf_n": "ground_force_vy",
+        "cop_x_m": "ground_force_px",
+        "cop_y_m": "-ground_force_pz",
+    }
+)
+
+
+@pytest.mark.parametrize("ending", ["mot", "sto"])
+def test_ground_reactions_of_opensim_are_read_with_their_own_units(
+    tmp_path: Path, ending: str
+) -> None:
+    found = read(tmp_path, MOT, MAPPED, f"grf.{ending}")
+    assert found.time_s.tolist() == [0.0, 0.1, 0.2]
+    assert found.grf_n.tolist() == [0.0, 20.0, 10.0]
+    assert found.cop_m is not None
+    assert found.cop_m[1].tolist() == [0.1, -0.03]
+
+
+def test_samples_without_a_force_and_gaps_are_left_out_and_said(tmp_path: Path) -> None:
+    rows = [f"{0.01 * i:.2f},{i % 7}" for i in range(20) if not 8 <= i < 12]
+    rows[3] = "0.03,"
+    found = read(tmp_path, "Time,Fz\n" + "\n".join(rows) + "\n", Stated(
+        {"time_s": "Time", "grf_n": "Fz"}, {"grf": "N"}, "+"))  # fmt: skip
+    assert len(found.time_s) == 15
+    assert "1 of 16 samples have no force" in found.notes[0]
+    assert "1 gaps, the longest of 0.050 s" in found.notes[1]
+
+
+HEAD = "Time,Fz,COPx,COPy\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "cannot be read"),
+        (HEAD, "0 samples"),
+        (HEAD + "0,1,1,1\n", "1 samples"),
+        (HEAD + "0,5,1,1\n0,6,1,1\n", "time is repeated"),
+        (HEAD + "0,5,1,1\n2,6,1,1\n1,6,1,1\n", "time runs back: 2 s, then 1 s, at sample 3"),
+        (HEAD + ",5,1,1\n1,6,1,1\n", "no time at sample 1"),
+        (HEAD + "0,,1,1\n1,,1,1\n", "no sample has a force"),
+        (HEAD + "0,0,1,1\n1,0,1,1\n", "0 N throughout"),
+        (HEAD + "0,0,1,1\n1,-30,1,1\n2,-20,1,1\n", "negative under load"),
+        (HEAD + "0,1e12,1,1\n1,5,1,1\n", "1e+12 at sample 1"),
+        (HEAD + "0,inf,1,1\n1,5,1,1\n", "inf at sample 1"),
+        (HEAD + "0,much,1,1\n1,5,1,1\n", "not numeric"),
+        ("t,Fz,COPx,COPy\n0,1,1,1\n1,2,1,1\n", "no column 'Time' for time_s"),
+        ("Time,Fz,Fz,COPx,COPy\n0,1,1,1,1\n1,2,1,1,1\n", "Fz is there twice"),
+    ],
+)
+def test_what_is_no_measurement_is_refused_by_name(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(FileFormatError) as caught:
+        read(tmp_path, text)
+    assert "plate.csv" in str(caught.value)
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("stated", "says"),
+    [
+        (Stated(LAB.columns, {"cop": "mm"}, "+"), "--units grf=N|kN|mN"),
+        (Stated(LAB.columns, {"grf": "N"}, "+"), "--units cop=m|cm|mm"),
+        (Stated(LAB.columns, LAB.units), "--sign +"),
+        (
+            Stated({"time_s": "Time", "grf_n": "Fz", "cop_x_m": "COPx"}, LAB.units, "+"),
+            "one coordinate",
+        ),
+    ],
+)
+def test_units_and_sign_that_are_not_stated_are_not_guessed(
+    tmp_path: Path, stated: Stated, says: str
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        read(tmp_path, GOOD, stated)
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("columns", "units", "sign", "says"),
+    [
+        ({"fz": "Fz"}, {}, None, "--map fz"),
+        ({}, {"force": "N"}, None, "--units force"),
+        ({}, {"grf": "lbf"}, None, "--units grf=lbf"),
+        ({}, {}, "up", "--sign 'up'"),
+    ],
+)
+def test_what_cannot_be_stated_is_refused(
+    columns: dict[str, str], units: dict[str, str], sign: str | None, says: str
+) -> None:
+    with pytest.raises(UsageError, match=says):
+        Stated(columns, units, sign)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("grf.mot", "no header\n1 2 3\n"),
+        ("grf.mot", "endheader\n"),
+        ("grf.mot", "endheader\ntime a b\n0 1\n"),
+        ("grf.sto", "endheader\ntime a\n0 x\n"),
+        ("plate.parquet", "no parquet"),
+        ("plate.xlsx", "table"),
+    ],
+)
+def test_files_of_another_shape_are_refused(tmp_path: Path, name: str, content: str) -> None:
+    with pytest.raises(FootTileError, match=name):
+        read(tmp_path, content, LAB, name)
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"away\.csv"):
+        read_reference(tmp_path / "away.csv", LAB)
