@@ -24,6 +24,7 @@ SUMMARIES = {
     "export": "Write a sealed session, or a slice of it, in another format.",
     "simulate": "Run a scene on emulated hardware in virtual time and write the session.",
     "estimate": "Estimate a recorded session again and write it with the new estimates.",
+    "compare": "Compare a session with a reference: a force plate, an insole, another session.",
     "calibrate": (
         "Fit every tile that was pressed in the recordings, and say how good the fit is."
     ),

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +20,7 @@ from service.cli.options import (
     remark,
     say,
 )
+from service.cli.result_folder import result_folder
 
 SCENES = ("rolling", "poppy", "mud")
 DRAWS, QUICK_DRAWS = 20, 3
@@ -127,7 +126,7 @@ def bench_command(
             "--whole-only": whole_only or None,
         },
     ):
-        with _folder(out) as folder:
+        with result_folder(out) as folder:
             bench_broad(
                 folder,
                 arrays=draws or (QUICK_ARRAYS if quick else ARRAYS),
@@ -165,7 +164,7 @@ def bench_command(
         repeatability=repeatability,
         correlated_ms=correlated_ms,
     )
-    with _folder(out) as folder:
+    with result_folder(out) as folder:
         with progress("starting") as tell:
             bench = run_bench(options, tell)
             text, png = markdown(bench), plot_bench(bench.scenes)
@@ -186,26 +185,3 @@ def bench_command(
             remark(f"goal not met: {name}, {goal.mode}: {goal.figure}: {goal.value:.3g}")
     if bench.failures or (check_goals and missed):
         raise typer.Exit(3)
-
-
-@contextmanager
-def _folder(out: Path) -> Iterator[Path]:
-    """The folder to write in, made if it is missing, and gone again if nothing came of it."""
-    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
-        _make(out)
-        yield out.resolve()
-    except BaseException:
-        for folder in missing:
-            with suppress(OSError):  # not empty, or not made yet
-                folder.rmdir()
-        raise
-
-
-def _make(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"no folder {str(out)!r} can be made: {error}") from error
-    if not os.access(out, os.W_OK):
-        raise UsageError(f"{str(out)!r} cannot be written in")

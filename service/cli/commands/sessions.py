@@ -159,7 +159,7 @@ def export_command(
     chosen = _format(to)
     if clock not in CLOCKS:
         raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
-    source = _sealed_file(session, data)
+    source = sealed_file(session, data)
     path = output_path(out, source)
     part = Slice(start_s, end_s, _names(columns))
     with (
@@ -215,7 +215,12 @@ def _in_folder(data: Path) -> list[dict[str, Any]]:
     return found
 
 
-def _sealed_file(session: str, data: Path | None) -> Path:
+def sealed_file(session: str, data: Path | None) -> Path:
+    """The sealed file that a path, a session's folder, or an id in a data folder means.
+
+    Raises:
+        UsageError: there is none.
+    """
     from storage.sessions.folder import FRAMES_NAME, SessionFolder
 
     path = Path(session)

@@ -18,7 +18,7 @@ from scipy.special import fdtri
 
 from devices.arrays import Bools, Floats, Ints
 from devices.errors import ComparisonError
-from service.offline.compare.jackknife import Estimate, Spread, block_of, memory_of, spread_of
+from service.offline.compare.jackknife import Estimate, Spread, memory_of, spread_of
 from service.offline.compare.lags import Peak, Peaks, likely_lags
 from service.offline.compare.signals import Even, Signal, smooth
 
@@ -209,10 +209,7 @@ class _Fit:
     def spread(self) -> Spread:
         ratio = 1.0 + (self.residual / self.bend_n) ** 2
         score, curvature = self.residual / np.sqrt(ratio), ratio**-1.5
-        telling = self.jacobian**2 * curvature[:, None]
-        weight = (telling / telling.sum(axis=0)).sum(axis=1)
-        block = block_of(self.jacobian * score[:, None], self.samples, weight)
-        return spread_of(self.jacobian, score, curvature, block)
+        return spread_of(self.jacobian, score, curvature, self.samples)
 
 
 def _fit(ours: Signal, reference: Signal, peak: Peak, coarse_s: float) -> _Fit:

@@ -20,6 +20,8 @@ BLOCKS = 20
 BLOCKS_MIN = 8
 MEMORIES = 5.0
 """A block is so many times longer than the residuals' memory."""
+SHARED_MAX = 0.5
+"""No variance is more than doubled for what blocks share."""
 
 _UPPER_95 = 0.975
 
@@ -115,19 +117,21 @@ def memory_of(residual: Floats) -> float:
     return float(1.0 + 2.0 * correlation[1 : gone[0] if len(gone) else len(correlation)].sum())
 
 
-def spread_of(jacobian: Floats, score: Floats, curvature: Floats, block: Ints) -> Spread:
+def spread_of(jacobian: Floats, score: Floats, curvature: Floats, samples: Ints) -> Spread:
     """Uncertainty of a fit at its least.
 
     Args:
         jacobian: (n, p), of the residuals by the parameters.
         score: (n,), derivative of half the loss by the residual: the residual in least squares.
         curvature: (n,), derivative of the score: one in least squares.
-        block: (n,), of each residual.
+        samples: (n,), rising; number of the even time step at which each residual is.
     """
+    scores = jacobian * score[:, None]
+    telling = jacobian**2 * curvature[:, None]
+    block = block_of(scores, samples, (telling / telling.sum(axis=0)).sum(axis=1))
     blocks = int(block.max()) + 1
-    parameters = jacobian.shape[1]
-    slopes = np.zeros((blocks, parameters))
-    np.add.at(slopes, block, jacobian * score[:, None])
+    slopes = np.zeros((blocks, jacobian.shape[1]))
+    np.add.at(slopes, block, scores)
     normals = np.stack(
         [
             (jacobian[block == b] * curvature[block == b, None]).T @ jacobian[block == b]
@@ -144,11 +148,15 @@ def spread_of(jacobian: Floats, score: Floats, curvature: Floats, block: Ints) -
     )
     share = np.einsum("ij,bjk,ki->bi", inverse, normals, inverse)
     with np.errstate(divide="ignore", invalid="ignore"):
-        telling = share.sum(axis=0) ** 2 / (share**2).sum(axis=0)
+        even = share.sum(axis=0) ** 2 / (share**2).sum(axis=0)
     centred = moved - moved.mean(axis=0)
+    # Blocks side by side share what residuals remember across their edge: half a memory of each.
+    length = (samples[-1] - samples[0] + 1) / blocks
+    shared = np.array([memory_of(column) for column in scores.T]) / (2.0 * length)
+    wider = 1.0 / np.sqrt(1.0 - np.minimum(shared, SHARED_MAX))
     return Spread(
-        covariance=(blocks - 1) / blocks * centred.T @ centred,
-        dof=np.clip(np.nan_to_num(telling, nan=1.0), 1.0, blocks - 1.0),
+        covariance=(blocks - 1) / blocks * (centred.T @ centred) * np.outer(wider, wider),
+        dof=np.clip(np.nan_to_num(even, nan=1.0), 1.0, blocks - 1.0),
         blocks=blocks,
     )
 
@@ -157,7 +165,5 @@ def mean_of(values: Floats, samples: Ints) -> Estimate:
     """Mean of values that are correlated in time; `samples` as for `block_of`."""
     mean = float(values.mean())
     ones = np.ones((len(values), 1))
-    spread = spread_of(
-        ones, values - mean, ones[:, 0], block_of(values[:, None], samples, ones[:, 0])
-    )
+    spread = spread_of(ones, values - mean, ones[:, 0], samples)
     return spread.estimate(np.array([mean]), 0)

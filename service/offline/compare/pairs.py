@@ -16,13 +16,15 @@ from service.offline.compare.align import Alignment
 from service.offline.compare.jackknife import Estimate, mean_of
 from service.offline.compare.signals import Signal
 
-COMPARED = ("seq", "t_ns", *GATHERED, "cop_y_m")
+COMPARED = ("seq", "t_ns", *GATHERED, "cop_y_m", "cop_sigma_x_m", "cop_sigma_y_m")
 """Columns of a session that are compared."""
 
 CONTACT_SIGMA = 5.0
 """The reference bears load above so many sigma of its noise without load, as for our contact."""
 SETTLE_S = 0.02
 """A frame in flight is this far from any contact: averaging is over, and ringing nearly."""
+SAME_RATE = 1.05
+"""Steps that differ by less are of one rate."""
 FLIGHT_MIN = 50
 """Frames in flight from which a zero can be told."""
 
@@ -165,7 +167,7 @@ def _flight(
 
 def _nearest(at_s: Floats, samples_s: Floats) -> Bools:
     """Which of n instants count: all if samples are closer than they, else the nearest to each."""
-    if len(at_s) < 2 or np.median(np.diff(samples_s)) <= np.median(np.diff(at_s)):
+    if len(at_s) < 2 or not (np.median(np.diff(samples_s)) > SAME_RATE * np.median(np.diff(at_s))):
         return np.ones(len(at_s), dtype=np.bool_)
     after = np.clip(np.searchsorted(at_s, samples_s), 1, len(at_s) - 1)
     nearer = np.where(samples_s - at_s[after - 1] < at_s[after] - samples_s, after - 1, after)

@@ -35,6 +35,7 @@ SHORT = (
 COMMANDS: dict[str, tuple[object, ...]] = {
     "bench": ("--out", "bench", "--scene", "gone.toml"),
     "calibrate": ("s.parquet", "--out", "cal.json"),
+    "compare": ("s.parquet", "--reference", "s.parquet", "--out", "o"),
     "demo": ("--scene", "gone.toml"),
     "doctor": ("--bus", "emulated"),
     "domes": (),
@@ -165,6 +166,8 @@ FILES = {"missing", "empty", "junk", "hole", "no Parquet"}
 READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("bench", "scene"): ("--out", "bench", "--scene", "{}"),
     ("calibrate", "recordings"): ("{}", "--out", "cal.json"),
+    ("compare", "session"): ("{}", "--reference", "s.parquet", "--out", "o"),
+    ("compare", "reference"): ("s.parquet", "--reference", "{}", "--out", "o"),
     ("demo", "scene"): ("--scene", "{}"),
     ("doctor", "scene"): ("--scene", "{}"),
     ("estimate", "session"): ("{}", "--out", "x.parquet"),
@@ -189,6 +192,11 @@ WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
 }
 IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
     ("bench", "out"): ("--out", "{}", "--scene", "standing", "--seconds", 0.01),
+    ("compare", "out"): ("s.parquet", "--reference", "s.parquet", "--out", "{}"),
+    ("compare", "data"): (
+        *("20200101T000000Z-000000", "--reference", "s.parquet"),
+        *("--out", "o", "--data", "{}"),
+    ),
     ("demo", "data"): ("--port", 0, "--data", "{}"),
     ("export", "data"): ("20200101T000000Z-000000", "--format=csv", "--out=x.csv", "--data", "{}"),
     ("node", "journal"): ("--scene", "standing", "--record", "a", "--journal", "{}"),

@@ -1,0 +1,223 @@
+"""A sealed session against a reference: read, aligned, judged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Floats
+from devices.errors import ComparisonError, FileFormatError
+from service.estimation.estimates import EstimateStatus
+from service.offline.compare.align import Alignment, align
+from service.offline.compare.errors import Errors, errors_of
+from service.offline.compare.pairs import COMPARED, Columns, Pairs, Reference, pair
+from service.offline.compare.plausible import check_force_unit, cop_notes
+from service.offline.compare.signals import Signal
+from service.offline.compare.trials import Mark, trials_of
+from storage.formats.reference import ReferenceData, Stated, read_reference
+from storage.formats.sealed import marks_of
+from storage.formats.slice import Slice
+from storage.sessions.beside import EVENTS_NAME, read_events
+from storage.sessions.reader import SessionReader
+
+ROW = "row"
+"""Beside the columns of a session: in which row of the file a frame is."""
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """How to compare; see `foottile compare --help`."""
+
+    stated: Stated
+    lag_range_s: tuple[float, float] | None = None
+    remove_offset: bool = False
+    contact_n: float | None = None
+    cop_offset_m: tuple[float, float] = (0.0, 0.0)
+    reference_sigma_n: float | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What came of it.
+
+    Attributes:
+        session: which one, as its file says.
+        reference: the file.
+        alignment: of the two.
+        pairs: our frames with the reference.
+        force_n: (n, tiles), forces of the tiles in these frames; of a bare one NaN.
+        serials: of the tiles.
+        errors: by trial and over trials.
+        trials_are: what a trial is.
+        notes: what a user should know.
+        options: as given.
+    """
+
+    session: Mapping[str, object]
+    reference: str
+    alignment: Alignment
+    pairs: Pairs
+    force_n: Floats
+    serials: tuple[str, ...]
+    errors: Errors
+    trials_are: str
+    notes: tuple[str, ...]
+    options: CompareOptions
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        alignment, pairs = self.alignment, self.pairs
+        return {
+            "session": self.session,
+            "reference": self.reference,
+            "notes": self.notes,
+            "alignment": {
+                "lag_s": alignment.lag_s,
+                "at_s": alignment.at_s,
+                "drift_ppm": alignment.drift_ppm,
+                "scale": alignment.scale,
+                "offset_n": alignment.offset_n,
+                "offset_in_flight_n": pairs.zero_n,
+                "offset_removed": pairs.removed,
+                "blocks": alignment.blocks,
+                "ambiguity": alignment.ambiguity,
+            },
+            "contact_n": pairs.contact_n,
+            "reference_sigma_n": self.options.reference_sigma_n,
+            "trials_are": self.trials_are,
+            "figures": self.errors.figures,
+            "trials": self.errors.trials,
+        }
+
+
+def compare_session(path: Path, reference_path: Path, options: CompareOptions) -> Comparison:
+    """Compare a sealed session with a reference.
+
+    Raises:
+        FileFormatError: one of the files cannot be read, or the session has no estimates.
+        UsageError: a unit or sign of the reference is not stated.
+        ComparisonError: the two cannot be compared.
+    """
+    data = read_reference(reference_path, options.stated)
+    with SessionReader(path) as session:
+        columns, force_n = _columns(session)
+        marks, notes = _marks(session, path, columns)
+        tiles, identity = session.info.tiles, session.identity
+    known = np.isfinite(columns["grf_n"])
+    if not known.any():
+        raise ComparisonError("no frame of the session has a GRF", where=str(path))
+    t_ns = columns["t_ns"]
+    reference = _reference(data, int(t_ns[0]), options.cop_offset_m)
+    ours = Signal((t_ns[known] - t_ns[0]) * 1e-9, columns["grf_n"][known])
+    alignment = align(ours, reference.force, lag_range_s=options.lag_range_s)
+    check_force_unit(alignment)
+    pairs = pair(
+        columns,
+        reference,
+        alignment,
+        remove_offset=options.remove_offset,
+        contact_n=options.contact_n,
+    )
+    places_m = np.array([(tile.x_m, tile.y_m) for tile in tiles if not tile.reference])
+    notes += [*data.notes, *cop_notes(pairs, places_m), *_remarks(alignment, pairs, options)]
+    trials, what = trials_of(pairs.columns["t_ns"], pairs.columns["part"], marks)
+    return Comparison(
+        session={"file": str(path), **identity},
+        reference=data.where,
+        alignment=alignment,
+        pairs=pairs,
+        force_n=force_n[pairs.columns[ROW]],
+        serials=tuple(tile.serial for tile in tiles),
+        errors=errors_of(pairs, trials, reference_sigma_n=options.reference_sigma_n),
+        trials_are=what,
+        notes=tuple(notes),
+        options=options,
+    )
+
+
+def _columns(session: SessionReader) -> tuple[Columns, Floats]:
+    """What is compared, in order of time, and the forces of the tiles."""
+    wanted = [*COMPARED, "force_n"]
+    if absent := [name for name in wanted if not session.has(name)]:
+        raise FileFormatError(
+            f"the session has no {', '.join(absent)}",
+            where=str(session.path),
+            remedy="Estimate it first, with `foottile estimate`",
+        )
+    if has_part := session.has("part"):
+        wanted.append("part")
+    pieces = list(session.columns(*wanted))
+    if not pieces:
+        raise FileFormatError("the session has no frames", where=str(session.path))
+    columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in wanted}
+    if (np.diff(columns["t_ns"]) <= 0).any():
+        raise ComparisonError(
+            "the session's clock was set back while it was recorded",
+            where=str(session.path),
+            expected="frames whose t_ns rises",
+            remedy="Compare a part of it: foottile export --start-s --end-s",
+        )
+    force_n = columns.pop("force_n").astype(np.float64)
+    columns["grf_n"] = columns["grf_n"].astype(np.float64)
+    columns["grf_sigma_n"] = columns["grf_sigma_n"].astype(np.float64)
+    if not has_part:
+        columns["part"] = np.zeros(len(force_n), dtype=np.uint16)
+    columns[ROW] = np.arange(len(force_n))
+    return columns, force_n
+
+
+def _marks(session: SessionReader, path: Path, columns: Columns) -> tuple[list[Mark], list[str]]:
+    """Marks that lie beside a session, at their frames, and which could not be placed."""
+    beside = path.with_name(EVENTS_NAME)
+    if not beside.is_file():
+        return [], []
+    placed = marks_of(session, read_events(beside).events, Slice())
+    marks = []
+    for mark in placed.all:
+        if mark.frame is not None:
+            at = (columns["part"] == mark.frame[0]) & (columns["seq"] == mark.frame[1])
+            marks.append(Mark(mark.event.label, int(columns["t_ns"][at][0])))
+    lost = [f"mark {one.event.label!r} begins no trial: {one.left_out}" for one in placed.left_out]
+    return marks, lost
+
+
+def _reference(data: ReferenceData, begin_ns: int, cop_offset_m: tuple[float, float]) -> Reference:
+    since_s = 0.0 if data.epoch_ns is None else (data.epoch_ns - begin_ns) * 1e-9
+    force = Signal(data.time_s + since_s, data.grf_n)
+    return Reference(force, None if data.cop_m is None else data.cop_m + np.array(cop_offset_m))
+
+
+def _remarks(alignment: Alignment, pairs: Pairs, options: CompareOptions) -> Sequence[str]:
+    notes = []
+    if alignment.ambiguity is not None:
+        other = alignment.ambiguity
+        notes.append(
+            f"a lag of {other.lag_s:.3f} s fits nearly as well (correlation "
+            f"{other.correlation:.3f}, {other.best_correlation:.3f} at the one taken): chance "
+            "does not explain the difference"
+        )
+    if options.remove_offset and not pairs.removed:
+        notes.append("no flight is long enough to tell the reference's offset: nothing is removed")
+    elif not pairs.removed and pairs.zero_n is not None:
+        low_n, high_n = pairs.zero_n.interval_95
+        if low_n > 0.0 or high_n < 0.0:
+            notes.append(
+                f"the reference reads {pairs.zero_n.value:.3f} N in flight, which is in every "
+                "error: --remove-offset takes it off"
+            )
+    if not pairs.judged.all():
+        notes.append("the reference is slower than ours: the frame nearest to each sample counts")
+    if _any(pairs, EstimateStatus.ASSUMED_SCALE):
+        notes.append("our newtons rest on an assumed scale: the calibration was not measured")
+    if options.reference_sigma_n is None:
+        notes.append("nothing is said of coverage: --reference-sigma-n was not given")
+    return notes
+
+
+def _any(pairs: Pairs, bit: EstimateStatus) -> bool:
+    status: npt.NDArray[np.uint16] = pairs.columns["estimate_status"]
+    return bool((status & np.uint16(bit)).any())

@@ -1,0 +1,153 @@
+"""`foottile compare` as a user meets it, on an emulated foot whose truth plays the force plate."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+import pytest
+
+from service.version import SOFTWARE
+from tests.service.cli.outcome import Run, scene_text, static_only
+
+pytestmark = pytest.mark.slow
+
+LAG_S = 3.21
+LAB = ("--map", "time_s=Time,grf_n=Fz,cop_x_m=COPx,cop_y_m=COPy", "--units", "grf=N,cop=mm")
+
+
+@pytest.fixture
+def session(run: Run, tmp_path: Path, bench_cache: Path) -> Path:
+    """Ten seconds of `poppy` with the paper's curve and its truth; made once."""
+    kept = bench_cache / f"{SOFTWARE}-compare.parquet"
+    if not kept.exists():
+        scene = 'calibration = "paper-eq2-shape"\n' + static_only(scene_text("poppy"))
+        (tmp_path / "scene.toml").write_text(scene)
+        made = f"{os.getpid()}.parquet"
+        asked = ("--scene", "scene.toml", "--seconds", "10", "--truth", "--out", made)
+        assert run("simulate", *asked).code == 0
+        shutil.move(made, kept)
+    return Path(shutil.copy(kept, tmp_path / "session.parquet"))
+
+
+@pytest.fixture
+def plate(session: Path, tmp_path: Path) -> Path:
+    """What a plate would have written of our own estimate, later, turned, and with an offset."""
+    table = pq.read_table(session)
+    t_s = (table["t_ns"].to_numpy() - table["t_ns"][0].as_py()) * 1e-9
+    known = np.isfinite(table["grf_n"].to_numpy().astype(float))
+    grf_n = table["grf_n"].to_numpy().astype(float)[known]
+    at_s = np.arange(t_s[known][0] + 0.3, t_s[-1] - 0.3, 0.001)
+    noise_n = 0.01 * np.ptp(grf_n) * np.random.default_rng(1).normal(size=len(at_s))
+    columns = {
+        "Time": at_s + LAG_S,
+        "Fz": -np.interp(at_s, t_s[known], grf_n) - 1.2 + noise_n,
+        "COPx": np.full(len(at_s), 12.0),
+        "COPy": np.zeros(len(at_s)),
+    }
+    path = tmp_path / "plate.csv"
+    pyarrow.csv.write_csv(pa.table(columns), path)
+    return path
+
+
+def test_a_plate_is_aligned_and_compared_and_all_three_files_say_so(
+    run: Run, session: Path, plate: Path, tmp_path: Path
+) -> None:
+    asked = (*LAB, "--sign", "-", "--remove-offset", "--reference-sigma-n", "0.5")
+    outcome = run("compare", session, "--reference", plate, *asked, "--out", "new/one", "--json")
+    folder = tmp_path / "new" / "one"
+    content = json.loads((folder / "compare.json").read_text())
+    assert outcome.printed() == content
+    low_s, high_s = content["alignment"]["lag_s"]["interval_95"]
+    assert low_s < LAG_S < high_s
+    assert high_s - low_s < 5e-3
+    assert content["alignment"]["offset_n"]["value"] == pytest.approx(1.2, abs=0.1)
+    # The plate repeats what our estimate still reads in flight: the paper's curve knows no creep.
+    assert content["alignment"]["offset_in_flight_n"]["value"] == pytest.approx(1.2, abs=0.3)
+    assert content["alignment"]["scale"]["value"] == pytest.approx(1.0, abs=0.02)
+    assert content["alignment"]["offset_removed"]
+    assert content["figures"]["grf_r2"]["mean"] > 0.99
+    assert content["trials_are"] == "each contiguous recording"
+    assert "`grf_mae_n`" in (folder / "compare.md").read_text()
+    assert (folder / "compare.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_session_itself_is_a_reference_with_its_truth_and_without_a_lag(
+    run: Run, session: Path
+) -> None:
+    truth = "grf_n=true_grf_n,cop_x_m=true_cop_x_m,cop_y_m=true_cop_y_m"
+    outcome = run(
+        "compare", session, "--reference", session, "--map", truth, "--out", "o", "--json"
+    )
+    content = outcome.printed()
+    assert abs(content["alignment"]["lag_s"]["value"]) < 0.03
+    assert any("assumed scale" in note for note in content["notes"])
+
+
+def test_a_limit_that_is_missed_is_named_and_code_3_and_all_is_written(
+    run: Run, session: Path, plate: Path, tmp_path: Path
+) -> None:
+    asked = (*LAB, "--sign", "-", "--limits", "grf_mae_n=0.001,grf_r2=1")
+    outcome = run("compare", session, "--reference", plate, *asked, "--out", "o")
+    outcome.fails(3, "limit missed: grf_mae_n is ")
+    assert "grf_r2" not in outcome.err
+    assert len(json.loads((tmp_path / "o" / "compare.json").read_text())["missed"]) == 1
+
+
+def test_what_the_reference_has_not_is_a_missed_limit_too(
+    run: Run, session: Path, plate: Path
+) -> None:
+    force = ("--map", "time_s=Time,grf_n=Fz", "--units", "grf=N", "--sign", "-")
+    asked = (*force, "--limits", "cop_p95_m=1", "--out", "o")
+    run("compare", session, "--reference", plate, *asked).fails(3, "cop_p95_m is nan")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        ((*LAB, "--sign", "+"), 1, "negative under load"),
+        ((*LAB,), 2, "sign of column 'Fz' is not stated"),
+        ((*LAB[:2], "--sign", "-"), 2, "unit of column 'Fz' is not stated"),
+        ((*LAB[:2], "--units", "grf=kN,cop=mm", "--sign", "-"), 1, "Its unit may be mN"),
+        ((*LAB[:2], "--units", "grf=mN,cop=mm", "--sign", "-"), 1, "Its unit may be kN"),
+        ((*LAB, "--sign", "-", "--lag-range-s", "100,200"), 1, "do not overlap"),
+        ((*LAB, "--sign", "-", "--limits", "grf=1"), 2, "a limit of grf_frames"),
+        ((*LAB, "--sign", "-", "--limits", "grf_mae_n"), 2, "NAME=VALUE"),
+    ],
+)
+def test_what_cannot_be_compared_is_named_and_leaves_nothing_behind(
+    run: Run,
+    session: Path,
+    plate: Path,
+    tmp_path: Path,
+    arguments: tuple[str, ...],
+    code: int,
+    says: str,
+) -> None:
+    run("compare", session, "--reference", plate, *arguments, "--out", "o").fails(code, says)
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_session_without_estimates_is_refused_with_what_to_do(
+    run: Run, session: Path, plate: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "scene.toml").write_text(scene_text("standing"))
+    raw = ("--scene", "scene.toml", "--seconds", "1", "--no-estimates", "--out", "raw.parquet")
+    assert run("simulate", *raw).code == 0
+    asked = (*LAB, "--sign", "-", "--out", "o")
+    run("compare", "raw.parquet", "--reference", plate, *asked).fails(1, "foottile estimate")
+
+
+def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
+    run: Run, session: Path, plate: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    asked = (*LAB, "--sign", "-", "--out", "o")
+    run("compare", session, "--reference", plate, *asked).fails(2, "pip install 'foottile[plot]'")

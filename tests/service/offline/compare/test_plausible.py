@@ -1,0 +1,52 @@
+"""What a reference cannot be: a wrong unit of force or of place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from devices.errors import ComparisonError
+from service.offline.compare.pairs import Pairs, pair
+from service.offline.compare.plausible import check_force_unit, cop_notes
+from tests.service.offline.compare.sessions import columns, half_sines, reference, same_clock
+
+FOOT_M = np.array([(0.02, 0.015), (0.02, -0.015), (-0.02, 0.015), (-0.02, -0.015)])
+FORCE_N = half_sines([10.0, 12.0])
+
+
+def under(x_m: np.ndarray) -> Pairs:
+    cop_m = np.stack([x_m, np.zeros(len(FORCE_N))], axis=1)
+    return pair(columns(FORCE_N), reference(FORCE_N, cop_m=cop_m), same_clock())
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1000.0, "kN"), (800.0, "kN"), (0.0012, "mN")])
+def test_a_scale_of_a_thousand_is_another_unit(scale: float, unit: str) -> None:
+    aligned = same_clock()
+    wrong = replace(aligned, scale=replace(aligned.scale, value=scale))
+    with pytest.raises(ComparisonError, match=f"may be {unit}"):
+        check_force_unit(wrong)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 9.81])
+def test_other_scales_are_for_the_user_to_judge(scale: float) -> None:
+    aligned = same_clock()
+    check_force_unit(replace(aligned, scale=replace(aligned.scale, value=scale)))
+
+
+TRAVEL = np.linspace(-0.015, 0.015, len(FORCE_N))
+
+
+def test_a_cop_under_the_foot_needs_no_word() -> None:
+    assert cop_notes(under(TRAVEL), FOOT_M) == []
+
+
+def test_a_cop_in_millimetres_read_as_metres_is_refused() -> None:
+    with pytest.raises(ComparisonError, match="may be mm or cm"):
+        cop_notes(under(1e3 * TRAVEL), FOOT_M)
+
+
+def test_a_cop_beside_the_foot_is_said() -> None:
+    (note,) = cop_notes(under(TRAVEL + 0.4), FOOT_M)
+    assert "outside the foot in 100 % of its frames" in note
