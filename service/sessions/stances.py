@@ -24,6 +24,9 @@ from storage.sessions.stances import STANCES_NAME, read_stances, stances_table, 
 
 log = logging.getLogger("foottile.stances")
 
+_NEEDED = (*GATHERED, "part")
+_ROWS = 1 << 14
+"""Frames that wait until they are looked at together: half a megabyte of a minute or less."""
 _NOT_WRITTEN = f"{STANCES_NAME} was not written, and is made again when it is asked for"
 
 
@@ -41,6 +44,8 @@ class StancesBeside:
         self._gathered = Stances()
         self._over: list[Stance] = []
         self._has_estimates = False
+        self._waiting: list[dict[str, npt.NDArray[Any]]] = []
+        self._rows = 0
 
     def feed(
         self,
@@ -52,11 +57,11 @@ class StancesBeside:
         if self.problem is not None or "contact" not in columns:
             return
         self._has_estimates = True
-        try:
-            self._over += self._gathered.feed(seq, t_ns, _as_in_file(columns))
-        except Exception as error:  # a session is worth more than what can be made from it again
-            log.exception("stances: this is a bug")
-            self.problem = f"{_NOT_WRITTEN}: {error}"
+        kept = {name: columns[name] for name in _NEEDED if name in columns}
+        self._waiting.append({"seq": seq, "t_ns": t_ns, **kept})
+        self._rows += len(seq)
+        if self._rows >= _ROWS:
+            self._take_waiting()
 
     def write(self, folder: Path, frames_sha256: str) -> None:
         """Write `stances.parquet`; without estimates, take away what an attempt before has left."""
@@ -64,9 +69,11 @@ class StancesBeside:
         if not self._has_estimates:
             with suppress(OSError):
                 path.unlink(missing_ok=True)
-        elif self.problem is None:
+            return
+        table = self.table()
+        if self.problem is None:
             try:
-                write_stances(path, self.table(), frames_sha256=frames_sha256)
+                write_stances(path, table, frames_sha256=frames_sha256)
             except Exception as error:
                 if not isinstance(error, FootTileError):
                     log.exception("stances: this is a bug")
@@ -74,8 +81,24 @@ class StancesBeside:
 
     def table(self) -> pa.Table:
         """All stances; no more frames will come."""
+        self._take_waiting()
         self._over += self._gathered.finish()
         return stances_table(stance.as_dict() for stance in self._over)
+
+    def _take_waiting(self) -> None:
+        """Many frames at once: what is done for a piece is done the more rarely."""
+        waiting, self._waiting, self._rows = self._waiting, [], 0
+        if not waiting or self.problem is not None:
+            return
+        try:
+            columns = {
+                name: _single(np.concatenate([piece[name] for piece in waiting]))
+                for name in waiting[0]
+            }
+            self._over += self._gathered.feed(columns["seq"], columns["t_ns"], columns)
+        except Exception as error:  # a session is worth more than what can be made from it again
+            log.exception("stances: this is a bug")
+            self.problem = f"{_NOT_WRITTEN}: {error}"
 
 
 def stances_of_session(
@@ -137,13 +160,8 @@ def _hash_of(path: Path) -> str:
         raise FileFormatError(f"cannot be read: {error.strerror}", where=str(path)) from error
 
 
-def _as_in_file(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-    """Numbers as single precision keeps them, computed with in double."""
-    names = [*GATHERED, *({"part"} & columns.keys())]
-    return {name: _single(columns[name]) for name in names}
-
-
 def _single(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Numbers as the file keeps them, in double."""
     if not np.issubdtype(values.dtype, np.floating):
         return values
     return values.astype(np.float32).astype(np.float64)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from devices.errors import DamagedFileError
@@ -47,7 +46,13 @@ STANCES = (
 )
 """What is said of a stance: `service.estimation.stances.Stance`."""
 
-_NULLABLE = frozenset({"peak_t_ns"})
+_MAY_MISS = frozenset({"peak_t_ns", *(column.name for column in STANCES if column.type == _F64)})
+SCHEMA = pa.schema(
+    [
+        column.field(column.name, column.type, nullable=column.name in _MAY_MISS)
+        for column in STANCES
+    ]
+)
 
 
 def stances_table(rows: Iterable[Mapping[str, Any]]) -> pa.Table:
@@ -57,15 +62,12 @@ def stances_table(rows: Iterable[Mapping[str, Any]]) -> pa.Table:
         rows: by the names of `STANCES`.
     """
     content = list(rows)
-    fields, arrays = [], []
-    for column in STANCES:
-        may_miss = column.type == _F64 or column.name in _NULLABLE
-        fields.append(column.field(column.name, column.type, nullable=may_miss))
-        values = [row[column.name] for row in content]
-        if column.type == _F64:
-            values = [None if np.isnan(value) else value for value in values]
-        arrays.append(pa.array(values, column.type))
-    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+    arrays = [
+        # from_pandas: NaN is null
+        pa.array([row[column.name] for row in content], column.type, from_pandas=True)
+        for column in STANCES
+    ]
+    return pa.Table.from_arrays(arrays, schema=SCHEMA)
 
 
 def write_stances(path: Path, table: pa.Table, *, frames_sha256: str) -> None:
@@ -79,7 +81,8 @@ def write_stances(path: Path, table: pa.Table, *, frames_sha256: str) -> None:
     Raises:
         StorageError: the disk is full or not writable; the old one is still there then.
     """
-    write_table(path, table.replace_schema_metadata({FRAMES_HASH_KEY: frames_sha256.encode()}))
+    said = {FRAMES_HASH_KEY: frames_sha256.encode()}
+    write_table(path, table.replace_schema_metadata(said), is_plain=True)
 
 
 @dataclass(frozen=True)
@@ -105,11 +108,7 @@ def read_stances(path: Path) -> StoredStances:
     """
     read = read_table(path)
     said = read.table.schema.metadata or {}
-    if (
-        not read.is_proven
-        or FRAMES_HASH_KEY not in said
-        or not read.table.schema.equals(stances_table(()).schema)
-    ):
+    if not read.is_proven or FRAMES_HASH_KEY not in said or not read.table.schema.equals(SCHEMA):
         raise DamagedFileError(
             "is no table of stances",
             where=str(path),
