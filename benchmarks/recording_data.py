@@ -85,6 +85,11 @@ def emulated(tiles: int, seconds: float) -> Recording:
     return _simulated(f"{tiles} tiles, virtual time", _arc(tiles), seconds, None)
 
 
+def of_scene(name: str, seconds: float) -> Recording:
+    """A built-in scene, in virtual time."""
+    return _simulated(f"scene {name}", load_scene(name), seconds, None)
+
+
 def walked(folder: Path, seconds: float) -> Recording | None:
     """A person's walk, pressed on eight emulated tiles; None if the recording is not there."""
     if not (folder / WALK).is_file():

@@ -22,6 +22,7 @@ SUMMARIES = {
     "sessions": "List recorded sessions, newest first.",
     "pull": "Download a sealed session: data, description, events.",
     "export": "Write a sealed session, or a slice of it, in another format.",
+    "query": "Ask in SQL about all sealed sessions at once.",
     "simulate": "Run a scene on emulated hardware in virtual time and write the session.",
     "estimate": "Estimate a recorded session again and write it with the new estimates.",
     "compare": "Compare a session with a reference: a force plate, an insole, another session.",

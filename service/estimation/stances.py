@@ -125,9 +125,11 @@ class Stances:
         if not len(sure):
             self._unsure.add(columns["estimate_status"])
             return over
-        part = columns["part"][sure] if "part" in columns else np.zeros(len(sure), np.uint16)
-        loaded = columns["contact"][sure] == 1
-        frames = _Frames(seq[sure], t_ns[sure], part, loaded)
+        known: npt.NDArray[Any] | slice = sure
+        if len(sure) == len(columns["contact"]):
+            known = slice(None)  # as nearly always, and nothing is copied
+        part = columns["part"][known] if "part" in columns else np.zeros(len(sure), np.uint16)
+        frames = _Frames(seq[known], t_ns[known], part, columns["contact"][known] == 1)
         for first, end in frames.runs():
             begin, last = frames.at(first), frames.at(end - 1)
             if first or not begin.goes_on_from(self._seen):
@@ -241,13 +243,13 @@ class _Open:
 
     def add(self, rows: slice, t_ns: Times, columns: Columns) -> None:
         """Take the next frames; of the last of them contact is known."""
-        t_ns, status = t_ns[rows], columns["estimate_status"][rows]
-        unsure = columns["contact"][rows] == UNKNOWN
-        grf_n = np.where(unsure, np.nan, columns["grf_n"][rows])
+        t_ns, unsure = t_ns[rows], columns["contact"][rows] == UNKNOWN
+        grf_n = columns["grf_n"][rows].astype(np.float64)  # a copy
+        grf_n[unsure] = np.nan
         there = np.isfinite(grf_n)
         self.frames += len(grf_n)
         self.unknown += int(np.count_nonzero(~there))
-        self.status |= int(np.bitwise_or.reduce(status))
+        self.status |= int(np.bitwise_or.reduce(columns["estimate_status"][rows]))
         self._integrate(t_ns, grf_n)
         if there.any():
             at = int(np.argmax(np.where(there, grf_n, -np.inf)))

@@ -1,6 +1,6 @@
 """Stances of sealed sessions: gathered while frames are written, or made again from the file.
 
-They are of the numbers that are in the file, so that both ways come to the same bytes.
+They are of the numbers that are in the file, in single precision: both ways come to the same bytes.
 """
 
 from __future__ import annotations
@@ -161,7 +161,5 @@ def _hash_of(path: Path) -> str:
 
 
 def _single(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Numbers as the file keeps them, in double."""
-    if not np.issubdtype(values.dtype, np.floating):
-        return values
-    return values.astype(np.float32).astype(np.float64)
+    """Numbers as the file keeps them."""
+    return values.astype(np.float32) if values.dtype == np.float64 else values

@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any, Literal, get_args
+from typing import Any, BinaryIO, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -264,6 +264,12 @@ def _open(sink: _Sink, schema: pa.Schema, to: Format) -> Any:
             return pa.ipc.new_stream(sink, schema)
         case "csv":
             return _CsvWriter(sink, schema)
+
+
+def write_csv(sink: BinaryIO, table: pa.Table) -> None:
+    """A table as CSV, in which no text is a spreadsheet's formula."""
+    with _CsvWriter(sink, table.schema) as writer:
+        writer.write_table(table)
 
 
 _FORMULA = r"^([=+\-@'\t\r\n\x{ff0b}\x{ff0d}\x{ff1d}\x{ff20}])"

@@ -1,0 +1,120 @@
+"""`foottile query`: SQL over many sessions."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from devices.errors import UsageError
+from devices.words import printable
+from service.cli.options import (
+    JsonOption,
+    data_folder,
+    output_path,
+    print_json,
+    progress,
+    remark,
+    say,
+    stdout,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_LEFT_OUT = 3
+
+
+def query_command(
+    sql: Annotated[
+        str, typer.Argument(help="One SELECT over sessions, stances, events and frames.")
+    ],
+    places: Annotated[
+        list[str] | None,
+        typer.Argument(help="Data folders, folders of sessions, sessions, or globs of these."),
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Data folder, if no place is named; default: the user's.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Parquet file to write the answer to.")] = None,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print the answer as CSV.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Ask in SQL about all sealed sessions at once.
+
+    Columns and examples are in docs/query.md. No question changes a session. Sessions that are not
+    sealed yet, or damaged, are left out and named on stderr; the exit code is 3 then.
+    """
+    from service.offline.archive import find_sessions
+    from service.offline.query import ask
+
+    if data is not None and places:
+        raise UsageError("--data and places are two ways to say where", remedy="Name one")
+    if sum((as_csv, as_json, out is not None)) > 1:
+        raise UsageError("--csv, --json and --out are three forms of one answer", remedy="Name one")
+    if out is not None and out.suffix != ".parquet":
+        raise UsageError(f"--out {str(out)!r}", expected="a name that ends with .parquet")
+    path = output_path(out) if out is not None else None
+    with progress("looking for sessions"):
+        archive = find_sessions(places or [str(data_folder(data))])
+        answer = ask(archive, sql)
+    if path is not None:
+        _write(answer, path)
+        say(f"{path}: {len(answer)} rows")
+    elif as_json:
+        print_json({"rows": _rows(answer), "left_out": archive.left_out})
+    elif as_csv:
+        from storage.formats.export import write_csv
+
+        write_csv(sys.stdout.buffer, answer)
+    else:
+        _print(answer)
+    for place, reason in archive.left_out.items():
+        remark(printable(f"{place} is left out: {reason}"))
+    if archive.left_out:
+        raise typer.Exit(_LEFT_OUT)
+
+
+def _rows(answer: pa.Table) -> list[dict[str, Any]]:
+    return [{name: _value(value) for name, value in row.items()} for row in answer.to_pylist()]
+
+
+def _value(value: Any) -> Any:
+    """As JSON can hold it; dates and the like as text."""
+    if isinstance(value, list):
+        return [_value(each) for each in value]
+    if isinstance(value, dict):
+        return {str(name): _value(each) for name, each in value.items()}
+    return value if isinstance(value, str | int | float | None) else str(value)
+
+
+def _print(answer: pa.Table) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    rows = _rows(answer)
+    for name in answer.column_names:
+        is_number = all(isinstance(row[name], int | float | None) for row in rows)
+        justify: Any = "right" if is_number else "left"
+        table.add_column(escape(printable(name)), justify=justify, no_wrap=is_number)
+    for row in rows:
+        table.add_row(*(escape(printable(_text(value))) for value in row.values()))
+    stdout.print(table)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _write(answer: pa.Table, path: Path) -> None:
+    import pyarrow.parquet as pq
+
+    from storage.durable import whole_file
+
+    with whole_file(path) as file:
+        pq.write_table(answer, file, compression="zstd")

@@ -1,0 +1,68 @@
+"""`foottile query`: answers as tables, JSON, CSV and Parquet, and its exit codes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from tests.service.cli.outcome import Run
+from tests.service.offline.archives import IDS, recording, sealed
+
+PEAKS = "SELECT number, peak_grf_n, is_whole FROM stances ORDER BY number"
+MARKS = "SELECT label FROM events"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    data = tmp_path_factory.mktemp("archive")
+    sealed(data, 0, 20.0, 40.0)
+    return data
+
+
+def test_an_answer_is_a_table_json_csv_or_parquet(run: Run, data: Path, tmp_path: Path) -> None:
+    rows = run("query", PEAKS, data, "--json").printed()["rows"]
+    assert [row["number"] for row in rows] == [1, 2]
+    told = run("query", PEAKS, data)
+    assert told.code == 0, told.err
+    head, *lines = told.out.splitlines()
+    assert head.split() == ["number", "peak_grf_n", "is_whole"]
+    assert [line.split()[0] for line in lines] == ["1", "2"]
+    assert run("query", PEAKS, data, "--out", "answer.parquet").code == 0
+    assert pq.read_table(tmp_path / "answer.parquet").to_pylist() == rows
+    assert run("query", PEAKS, "--data", data, "--json").printed()["rows"] == rows
+
+
+def test_no_text_of_a_csv_is_a_formula(run: Run, data: Path) -> None:
+    done = run("query", MARKS, data, "--csv")
+    assert done.code == 0, done.err
+    assert done.out.splitlines() == ['"label"', '"\'=off"']
+
+
+def test_what_is_left_out_is_named_and_the_exit_code_is_3(run: Run, tmp_path: Path) -> None:
+    sealed(tmp_path, 0, 20.0)
+    recording(tmp_path, 1)
+    done = run("query", "SELECT count(*) AS n FROM sessions", tmp_path)
+    done.fails(3, IDS[1], "left out: it is recording")
+    assert done.out.split() == ["n", "1"]
+    said = run("query", "SELECT count(*) AS n FROM sessions", tmp_path, "--json").printed(3)
+    assert said["rows"] == [{"n": 1}]
+    assert list(said["left_out"]) == [str(tmp_path / "sessions" / IDS[1])]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("SELECT nope FROM stances",),
+        ("DELETE FROM stances",),
+        ("SELECT 1 AS a", "nowhere"),
+        ("SELECT 1 AS a", "--json", "--csv"),
+        ("SELECT 1 AS a", "--out", "answer.txt"),
+        ("SELECT 1 AS a", ".", "--data", "."),
+    ],
+)
+def test_what_cannot_be_asked_is_wrong_usage(run: Run, data: Path, words: tuple[str, ...]) -> None:
+    done = run("query", words[0], *([data] if len(words) == 1 else words[1:]))
+    done.fails(2)
+    assert len(done.err.splitlines()) == 1

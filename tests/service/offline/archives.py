@@ -1,0 +1,83 @@
+"""Folders of sealed sessions: a foot that stands and hops, in fractions of a second each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from service.sessions.sealing import seal
+from service.sessions.sources import Sources
+from storage.journal.journal import Journal
+from storage.sessions.folder import Event, Part, Session, SessionFolder
+from storage.sessions.ledger import StreamState, ledger_of
+from tests.builders.arrays import PERIOD_NS, UTC_NS
+from tests.service.sessions.pieces import array, calibration, frames
+
+IDS = tuple(f"20260101T00000{number}Z-00000{number}" for number in range(6))
+HOP = 50
+"""Frames of a hop, and between two."""
+
+
+def hops_n(*peaks_n: float) -> np.ndarray:
+    """Hops with these peaks, half on each of two noisy tiles, after a lead of 200 frames."""
+    still = np.zeros(HOP)
+    half_sine = np.sin(np.pi * np.arange(HOP) / HOP)
+    loads = [np.zeros(200), *(part for peak in peaks_n for part in (half_sine * peak, still))]
+    force_n = np.concatenate(loads)[:, None] / 2
+    return np.asarray(force_n + np.random.default_rng(1).normal(0.0, 1.0, (len(force_n), 2)))
+
+
+def session_of(number: int, scene: str, state: str = "sealing", **facts: object) -> Session:
+    return Session.model_validate(
+        {
+            "id": IDS[number],
+            "name": f"trial {number}",
+            "node": "bench",
+            "state": state,
+            "started_t_ns": UTC_NS,
+            "stopped_t_ns": UTC_NS + 10**9,
+            "parts": (Part(boot_id=str(number) * 32, seq_first=0, seq_last=None),),
+            "scene": scene,
+            **facts,
+        }
+    )
+
+
+def sealed(
+    data: Path, number: int, *peaks_n: float, scene: str = "mud", is_calibrated: bool = True
+) -> Path:
+    """A sealed session of such hops, with a mark at its beginning."""
+    loads_n = hops_n(*peaks_n)
+    batch = frames(loads_n, lead=200)
+    info = array(1e9 / PERIOD_NS).model_copy(
+        update={"boot_id": str(number) * 32, "models": ("static",), "scene": scene}
+    )
+    journal = Journal(data / "journal" / "bench" / info.boot_id, info)
+    journal.append(batch)
+    journal.close()
+    part = Part(boot_id=info.boot_id, seq_first=0, seq_last=len(batch) - 1)
+    event = Event(id=f"e{number}", label="=off", t_ns=UTC_NS)
+    begun = session_of(number, scene, parts=(part,), events=(event,))
+    folder = SessionFolder(data / "sessions")
+    folder.save(begun)
+    sources = Sources(
+        session=begun,
+        info=info,
+        journals={info.boot_id: journal},
+        calibration=calibration(*info.serials) if is_calibrated else None,
+        problem=None if is_calibrated else "the node had no calibration",
+        tares=(),
+        notes={},
+    )
+    held = {info.boot_id: StreamState(held=journal.held)}
+    done = seal(sources, folder.path(begun.id), ledger_of(begun.parts, held, finished=True))
+    folder.save(done)
+    return folder.path(begun.id)
+
+
+def recording(data: Path, number: int) -> Path:
+    """A session that is being recorded."""
+    folder = SessionFolder(data / "sessions")
+    folder.save(session_of(number, "mud", "recording"))
+    return folder.path(IDS[number])

@@ -1,0 +1,221 @@
+"""Questions in SQL about many sessions: what is answered, what is left out, what is locked."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from devices.errors import FileFormatError, UsageError
+from service.offline.archive import EVENTS, SESSIONS, find_sessions
+from service.offline.query import ask
+from storage.sessions.reader import SessionReader
+from tests.service.offline.archives import IDS, recording, sealed
+
+PEAKS_N = {0: (20.0, 30.0, 40.0), 1: (24.0, 34.0, 44.0, 54.0), 2: (50.0, 50.0, 50.0)}
+THIRD_IN_MUD = """
+    SELECT session_id, peak_grf_n, peak_sigma_n, is_whole
+    FROM stances JOIN sessions USING (session_id)
+    WHERE scene = 'mud' AND number = 3 ORDER BY session_id
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sessions in mud, one on a plate, and one in mud without estimates."""
+    data = tmp_path_factory.mktemp("archive")
+    for number, peaks_n in PEAKS_N.items():
+        sealed(data, number, *peaks_n, scene="plate" if number == 2 else "mud")
+    sealed(data, 3, 60.0, is_calibrated=False)
+    return data
+
+
+@pytest.fixture
+def data(made: Path, tmp_path: Path) -> Path:
+    """A copy of these, to be changed."""
+    return Path(shutil.copytree(made, tmp_path / "data"))
+
+
+def answer(sql: str, *places: Path) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = ask(find_sessions([str(p) for p in places]), sql).to_pylist()
+    return rows
+
+
+def test_the_peaks_of_all_third_hops_in_mud(made: Path) -> None:
+    rows = answer(THIRD_IN_MUD, made)
+    assert [row["session_id"] for row in rows] == [IDS[0], IDS[1]]
+    for row, peak_n in zip(rows, (40.0, 44.0), strict=True):
+        assert row["peak_grf_n"] == pytest.approx(peak_n, abs=5.0)  # the greatest of noisy ones
+        assert row["is_whole"]
+
+
+def test_sessions_marks_and_frames_are_views_of_what_is_in_the_folders(made: Path) -> None:
+    sessions = answer("SELECT * FROM sessions ORDER BY session_id", made)
+    assert [row["session_id"] for row in sessions] == list(IDS[:4])
+    assert [row["scene"] for row in sessions] == ["mud", "mud", "plate", "mud"]
+    assert "no estimates" in sessions[3]["problem"]
+    counted = answer("SELECT session_id, count(*) AS n FROM frames GROUP BY 1 ORDER BY 1", made)
+    assert [row["n"] for row in counted] == [row["frames"] for row in sessions]
+    marks = answer("SELECT session_id, label FROM events ORDER BY 1", made)
+    assert marks == [{"session_id": session_id, "label": "=off"} for session_id in IDS[:4]]
+
+
+def test_frames_have_the_numbers_of_the_sealed_file(made: Path) -> None:
+    with SessionReader(made / "sessions" / IDS[1] / "frames.parquet") as session:
+        (columns,) = session.columns("t_ns", "padc", "grf_n")
+    rows = ask(
+        find_sessions([str(made)]),
+        f"SELECT t_ns, padc_1, grf_n FROM frames WHERE session_id = '{IDS[1]}' ORDER BY t_ns",  # noqa: S608
+    )
+    assert rows["t_ns"].to_pylist() == columns["t_ns"].tolist()
+    assert rows["padc_1"].to_pylist() == columns["padc"][:, 1].tolist()
+    assert rows["grf_n"].to_pylist() == columns["grf_n"].tolist()
+
+
+def test_frames_without_estimates_are_null_there(made: Path) -> None:
+    sql = f"SELECT count(*) AS n, count(grf_n) AS known FROM frames WHERE session_id = '{IDS[3]}'"  # noqa: S608
+    (row,) = answer(sql, made)
+    assert row["n"] > 0
+    assert row["known"] == 0
+
+
+def test_places_are_data_folders_folders_of_sessions_single_ones_and_globs(made: Path) -> None:
+    count = "SELECT count(*) AS n FROM sessions"
+    one = made / "sessions" / IDS[0]
+    assert answer(count, made) == answer(count, made / "sessions") == [{"n": 4}]
+    assert answer(count, one) == [{"n": 1}]
+    assert answer(count, made / "sessions" / "*Z-00000[01]") == [{"n": 2}]
+    assert answer(count, one, made) == [{"n": 4}]  # each once
+    with pytest.raises(UsageError, match="no folder"):
+        find_sessions([str(made / "nowhere")])
+
+
+def test_what_is_recorded_or_damaged_is_left_out_and_named(data: Path) -> None:
+    sessions = data / "sessions"
+    recording(data, 4)
+    (sessions / IDS[0] / "frames.parquet").unlink()
+    text = (sessions / IDS[1] / "session.json").read_bytes()
+    (sessions / IDS[1] / "session.json").write_bytes(text.replace(b"trial 1", b"trial 2"))
+    with (sessions / IDS[2] / "frames.parquet").open("ab") as file:
+        file.write(b"more")
+    shutil.copytree(sessions / IDS[3], sessions / IDS[5])
+    archive = find_sessions([str(data)])
+    assert [session.id for session in archive.sessions] == [IDS[3]]
+    left_out = {Path(place).name: reason for place, reason in archive.left_out.items()}
+    assert left_out == {
+        IDS[0]: "damaged: frames.parquet is missing",
+        IDS[1]: "damaged: session.json was changed: its text is not what its hash is of",
+        IDS[2]: "damaged: frames.parquet is not as long as session.json says",
+        IDS[4]: "it is recording, and not sealed yet",
+        IDS[5]: f"it is session {IDS[3]}, in the folder of another",
+    }
+
+
+def test_a_session_that_is_there_twice_counts_once_and_the_other_is_named(
+    made: Path, data: Path
+) -> None:
+    archive = find_sessions([str(made), str(data)])
+    assert len(archive.sessions) == 4
+    assert set(archive.left_out) == {str(data / "sessions" / session_id) for session_id in IDS[:4]}
+
+
+def test_a_damaged_page_is_an_error_and_no_number(data: Path) -> None:
+    path = data / "sessions" / IDS[0] / "frames.parquet"
+    chunk = (
+        pq.ParquetFile(path)
+        .metadata.row_group(0)
+        .column(pq.read_schema(path).get_field_index("grf_n"))
+    )
+    content = bytearray(path.read_bytes())
+    content[chunk.data_page_offset + chunk.total_compressed_size - 5] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match="frames cannot be read"):
+        answer("SELECT sum(grf_n) FROM frames", data)
+
+
+def test_a_damaged_footer_leaves_the_session_out_of_frames_and_sessions(data: Path) -> None:
+    path = data / "sessions" / IDS[0] / "frames.parquet"
+    content = bytearray(path.read_bytes())
+    content[-40] ^= 1
+    path.write_bytes(content)
+    archive = find_sessions([str(data)])
+    sql = "SELECT DISTINCT session_id FROM frames JOIN sessions USING (session_id) ORDER BY 1"
+    assert [row["session_id"] for row in ask(archive, sql).to_pylist()] == list(IDS[1:4])
+    assert list(archive.left_out) == [str(data / "sessions" / IDS[0])]
+
+
+def test_stances_that_an_older_session_lacks_are_made_and_kept(data: Path) -> None:
+    path = data / "sessions" / IDS[0] / "stances.parquet"
+    written, rows = path.read_bytes(), answer(THIRD_IN_MUD, data)
+    path.unlink()
+    assert answer(THIRD_IN_MUD, data) == rows
+    assert path.read_bytes() == written
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT * FROM read_csv('/etc/passwd')",
+        "SELECT * FROM '/etc/passwd'",
+        "SELECT * FROM read_parquet('{one}/frames.parquet')",
+        "SELECT * FROM glob('/*')",
+        "SELECT * FROM read_text('{one}/session.json')",
+        "SELECT * FROM archive",  # a variable of the program
+        "COPY (SELECT 1) TO '{one}/new.csv'",
+        "ATTACH '{one}/new.db'",
+        "INSTALL httpfs",
+        "LOAD httpfs",
+        "SET enable_external_access = true",
+        "CREATE TABLE more AS SELECT 1",
+        "DROP VIEW sessions",
+        "SELECT 1; SELECT 2",
+        "",
+    ],
+)
+def test_nothing_but_a_select_over_the_views_is_answered(made: Path, sql: str) -> None:
+    one = made / "sessions" / IDS[0]
+    before = sorted(one.iterdir())
+    with pytest.raises(UsageError):
+        answer(sql.format(one=one), made)
+    assert sorted(one.iterdir()) == before
+
+
+def test_two_columns_of_one_name_are_refused(made: Path) -> None:
+    with pytest.raises(UsageError, match="two columns are called 'a'"):
+        answer("SELECT 1 AS a, 2 AS a", made)
+
+
+def test_only_what_a_question_is_about_is_read(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    archive = find_sessions([str(made)])
+    # `frames` is a column here, and `stances` a text: neither is opened.
+    monkeypatch.setattr(type(archive), "frames", None)
+    monkeypatch.setattr(type(archive), "stances_table", None)
+    sql = "SELECT sum(frames) AS n, 'stances' AS text FROM sessions"
+    (row,) = ask(archive, sql).to_pylist()
+    assert isinstance(row["n"], int)
+
+
+DOCUMENT = (Path(__file__).resolve().parents[3] / "docs" / "query.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize("sql", re.findall(r"```sql\n(.*?)```", DOCUMENT, re.DOTALL))
+def test_every_example_of_the_document_is_answered(made: Path, sql: str) -> None:
+    answer(sql, made)
+
+
+def test_the_first_example_and_its_variant_find_the_third_hops(made: Path) -> None:
+    first, variant, *_ = re.findall(r"```sql\n(.*?)```", DOCUMENT, re.DOTALL)
+    expected = [(row["session_id"], row["peak_grf_n"]) for row in answer(THIRD_IN_MUD, made)]
+    assert len(expected) == 2
+    found = {(row["session_id"], row["peak_grf_n"]) for row in answer(first, made)}
+    assert found == set(expected)
+    assert {(row["session_id"], row["peak_grf_n"]) for row in answer(variant, made)} >= found
+
+
+def test_every_column_of_sessions_and_events_is_documented() -> None:
+    for name in (*SESSIONS.names, *EVENTS.names):
+        assert f"`{name}`" in DOCUMENT, name
