@@ -105,7 +105,7 @@ class Archive:
 
     def stances_table(self) -> pa.Table:
         """A row for each stance; sessions without estimates have none."""
-        tables = [STANCES.empty_table()]
+        tables, ids = [SCHEMA.empty_table()], [pa.array([], pa.string())]
         for each in list(self.sessions):
             if not each.has_frames:
                 continue
@@ -117,9 +117,10 @@ class Archive:
             except FootTileError as error:
                 self._leave_out(each, error)
                 continue
-            ids = pa.repeat(each.id, len(table))
-            tables.append(pa.Table.from_arrays([ids, *table.columns], schema=STANCES))
-        return pa.concat_tables(tables)
+            tables.append(table)
+            ids.append(pa.repeat(each.id, len(table)))
+        columns = pa.concat_tables(tables).columns
+        return pa.Table.from_arrays([pa.chunked_array(ids), *columns], schema=STANCES)
 
     def frames(self) -> ds.Dataset:
         """All frames, of which no more is read than a question needs; each page is proven."""
