@@ -312,8 +312,12 @@ class ServerNode:
         """An instant of the server's UTC in the node's."""
         return t_ns - (self.clock.server_minus_node_ns if self.clock is not None else 0)
 
-    def prune(self, keep: Mapping[str, Intervals]) -> None:
+    def prune(self, keep: Mapping[str, Intervals]) -> bool:
         """Delete what is older than the ring and not in `keep`, by stream.
+
+        Returns:
+            Was a journal deleted as a whole? Then there may be more: no more than one is at a time,
+            for a node that was switched on a thousand times has as many.
 
         Raises:
             StorageError: a file cannot be deleted.
@@ -324,9 +328,13 @@ class ServerNode:
                 if self.last_t_ns is not None:
                     stream.prune(self.last_t_ns - RING_NS, kept)
             elif not kept:
+                is_there = stream.journal is not None
                 stream.delete()
                 if name not in self.order:
                     del self.streams[name]
+                if is_there:
+                    return True
+        return False
 
     def keep(self) -> None:
         """Write down what the node said, for after a restart.

@@ -32,6 +32,8 @@ TICK_S = 0.2
 """How often frames are synced and acknowledged: a server that is killed has not promised more."""
 _SLOW_TICK_S = 1.0
 _PRUNE_EVERY_S = 30.0
+_PRUNE_MOST_S = 0.1
+"""In one tick: frames are synced and acknowledged again before there is more of it."""
 _SAY_AGAIN_S = 60.0
 
 
@@ -126,11 +128,22 @@ class Server:
                 slow_s = now_s + _SLOW_TICK_S
                 with self._alone("heartbeat"):
                     self._heartbeat()
-            if now_s >= prune_s:
+            if now_s >= prune_s and await self._prune():
                 prune_s = now_s + _PRUNE_EVERY_S
-                for node in list(self.nodes):
-                    with self._alone(f"node {node.name}, deleting what nobody needs"):
-                        node.prune(self.recorder.needed(node.name))
+
+    async def _prune(self) -> bool:
+        """Delete what nobody needs; False: there is more of it, for the next tick.
+
+        One journal after the other, and between two of them everybody else has a turn.
+        """
+        until_s = time.monotonic() + _PRUNE_MOST_S
+        for node in list(self.nodes):
+            with self._alone(f"node {node.name}, deleting what nobody needs"):
+                while node.prune(self.recorder.needed(node.name)):
+                    await asyncio.sleep(0)
+                    if time.monotonic() >= until_s:
+                        return False
+        return True
 
     async def _check_folder(self) -> None:
         """While the folder is away nothing is settled or deleted, and every node says so.

@@ -282,8 +282,7 @@ class Journal:
 
     def delete(self) -> None:
         """Close the journal and delete all of it."""
-        with suppress(StorageError):
-            self.close()
+        self._open.abandon()
         self._segments = []
         self.held = Intervals()
         shutil.rmtree(self.folder, ignore_errors=True)

@@ -106,6 +106,14 @@ class OpenSegments:
             self._closing += self._open
             self._open = []
 
+    def abandon(self) -> None:
+        """Close all files as they are, for they are to be deleted."""
+        with self._lock:
+            writers = [*self._open, *self._closing]
+            self._open, self._closing, self._has_new_names = [], [], False
+        for writer in writers:
+            writer.abandon()
+
     def _writer_for(self, seq_first: int, t_ns: int) -> SegmentWriter:
         """The open segment that these frames may follow in: of several, the one that ends last."""
         fitting = [w for w in self._open if w.segment.span[1] < seq_first]

@@ -111,7 +111,7 @@ async def _hostile(served: Served, random: Random, number: int, outcome: Outcome
             )
         happened = await foreign.tried()
         if happened.startswith("!"):
-            outcome.failed(happened[1:])
+            outcome.failed(f"{happened[1:]}; the log ends with {served.log[-3:]}")
         else:
             outcome.saw(happened)
         if happened != "taken":

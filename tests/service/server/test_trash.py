@@ -351,3 +351,22 @@ def test_frames_of_an_unsealed_session_are_never_pruned(
     node = running.server.nodes.get("bench")
     running.call(lambda: node.prune(running.server.recorder.needed("bench")))
     assert not (Intervals([(70, 119)]) - node.present.held)
+
+
+def test_journals_that_nobody_needs_go_one_at_a_time(running: Running, tared: FakeNode) -> None:
+    # A node that was switched on a thousand times holds nobody up while all of them are deleted.
+    boots = [tared.boot_id]
+    for _ in range(2):
+        tared.close()
+        tared.reboot()
+        until(lambda: not running.node()["connected"])
+        tared.connect()
+        tared.deliver(10)
+        boots.append(tared.boot_id)
+    node = running.server.nodes.get("bench")
+    folder = running.data / "journal" / "bench"
+    left = []
+    while running.call(lambda: node.prune(running.server.recorder.needed("bench"))):
+        left.append(sorted(path.name for path in folder.iterdir()))
+    assert left == [sorted(boots[1:]), boots[2:]]
+    assert node.present.held
