@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
@@ -100,8 +101,8 @@ def _plain(table: pa.Table) -> pa.Table:
         raise UsageError(f"two columns are called {twice!r}", remedy="Name one of them with AS")
     for i, column in enumerate(table.schema):
         if pa.types.is_decimal(column.type) and column.type.scale == 0:
-            values = table.column(i).cast(pa.int64())
-            table = table.set_column(i, column.name, values)
+            with suppress(pa.ArrowInvalid):  # one that is too great stays what it is
+                table = table.set_column(i, column.name, table.column(i).cast(pa.int64()))
     return table
 
 

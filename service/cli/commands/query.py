@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -87,6 +88,8 @@ def _value(value: Any) -> Any:
         return [_value(each) for each in value]
     if isinstance(value, dict):
         return {str(name): _value(each) for name, each in value.items()}
+    if isinstance(value, Decimal):
+        return float(value) if value % 1 else int(value)
     return value if isinstance(value, str | int | float | None) else str(value)
 
 

@@ -189,6 +189,14 @@ def test_two_columns_of_one_name_are_refused(made: Path) -> None:
         answer("SELECT 1 AS a, 2 AS a", made)
 
 
+def test_sums_of_integers_are_integers_however_great(made: Path) -> None:
+    (row,) = answer(
+        "SELECT sum(n) AS n, 4 * max(n)::HUGEINT AS great FROM (SELECT 2::BIGINT**62 AS n)", made
+    )
+    assert row["n"] == 2**62
+    assert row["great"] == 2**64
+
+
 def test_only_what_a_question_is_about_is_read(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archive = find_sessions([str(made)])
     # `frames` is a column here, and `stances` a text: neither is opened.

@@ -34,6 +34,16 @@ def test_an_answer_is_a_table_json_csv_or_parquet(run: Run, data: Path, tmp_path
     assert run("query", PEAKS, "--data", data, "--json").printed()["rows"] == rows
 
 
+def test_numbers_are_numbers_in_json_and_dates_are_texts(run: Run, data: Path) -> None:
+    sql = (
+        "SELECT 1.5 AS part, 4 * (2::HUGEINT ** 62)::HUGEINT AS great, [1, NULL] AS list, "
+        "{'a': 2.5} AS record, DATE '2020-01-01' AS day"
+    )
+    (row,) = run("query", sql, data, "--json").printed()["rows"]
+    expected = {"part": 1.5, "great": 2**64, "list": [1, None], "record": {"a": 2.5}}
+    assert row == {**expected, "day": "2020-01-01"}
+
+
 def test_no_text_of_a_csv_is_a_formula(run: Run, data: Path) -> None:
     done = run("query", MARKS, data, "--csv")
     assert done.code == 0, done.err
