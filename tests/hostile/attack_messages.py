@@ -149,7 +149,7 @@ class _Foreign(ABC):
                         code = 1009  # it did not wait until all of it was sent
                     if code in _CODES:
                         return f"let go with {code}"
-                    return f"!hung up with {code} after {said!r:.300}"
+                    return f"!hung up with {code} ({closed}) after {said!r:.300}"
         except TimeoutError:
             return f"!no answer for {_ANSWER_S:g} s after {said!r:.300}"
         except OSError as error:
