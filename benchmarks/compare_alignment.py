@@ -33,7 +33,7 @@ from storage.formats.load_trace import read_load_trace
 
 MARK = "<!-- tables -->"
 PARAMETERS = ("lag_s", "drift_ppm", "offset_n", "scale")
-UNITS = ((1e3, "ms"), (1.0, "ppm"), (1.0, "N"), (1.0, ""))
+UNITS = ((1e3, " ms"), (1.0, " ppm"), (1.0, " N"), (1.0, ""))
 OURS_HZ = 447.0
 ON_FEET = ("insole, walking, left", "standing, squat jumps")
 
@@ -148,10 +148,11 @@ def drawn_on_feet(name: str, data: Path, draws: int) -> Draws:
 
 
 def row(name: str, draws: Draws) -> str:
-    """A line of the table: coverage and median standard error of each parameter."""
+    """A line of the table: of each parameter coverage, median standard error, and mean error."""
     began_s = time.process_time()
     hits = np.zeros(len(PARAMETERS))
     sigmas: list[list[float]] = []
+    errors: list[Floats] = []
     refused: Counter[str] = Counter()
     for ours, reference, true in draws:
         try:
@@ -160,19 +161,17 @@ def row(name: str, draws: Draws) -> str:
             refused[error.what.partition(":")[0]] += 1
             continue
         estimates = [getattr(found, parameter) for parameter in PARAMETERS]
-        inside = [
-            low <= value <= high
-            for value, (low, high) in zip(
-                true.of(found), (one.interval_95 for one in estimates), strict=True
-            )
-        ]
-        hits += inside
+        for i, (one, value) in enumerate(zip(estimates, true.of(found), strict=True)):
+            low, high = one.interval_95
+            hits[i] += low <= value <= high
+        errors.append(np.array([one.value for one in estimates]) - np.array(true.of(found)))
         sigmas.append([one.sigma for one in estimates])
     count = len(sigmas)
-    median = np.median(sigmas, axis=0)
     cells = [
-        f"{100.0 * hit / count:.1f} % ({factor * sigma:.2g} {unit})".replace(" )", ")")
-        for hit, sigma, (factor, unit) in zip(hits, median, UNITS, strict=True)
+        f"{100.0 * hit / count:.1f} % ({factor * sigma:.2g}, {factor * error:+.2g}{unit})"
+        for hit, sigma, error, (factor, unit) in zip(
+            hits, np.median(sigmas, axis=0), np.mean(errors, axis=0), UNITS, strict=True
+        )
     ]
     why = ", ".join(f"{n} {what}" for what, n in refused.items()) or "none"
     each_s = (time.process_time() - began_s) / (count + refused.total())

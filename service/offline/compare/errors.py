@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Bools, Floats
+from devices.errors import ComparisonError
 from service.estimation.stances import Stance, stances_of
 from service.offline.accuracy import INTERVAL_95, PHASES, Covered, phases_of
 from service.offline.compare.pairs import Pairs
@@ -83,7 +84,7 @@ class Errors:
     """All trials, and each figure over them."""
 
     trials: tuple[TrialErrors, ...]
-    figures: Mapping[str, OverTrials] = field(default_factory=dict)
+    figures: Mapping[str, OverTrials]
 
 
 def errors_of(
@@ -96,6 +97,9 @@ def errors_of(
         trials: rows of `pairs`.
         reference_sigma_n: the reference's own standard uncertainty; None: not known, and nothing is
             said of coverage.
+
+    Raises:
+        ComparisonError: no trial has a frame.
     """
     within = None if reference_sigma_n is None else _within(pairs, reference_sigma_n)
     phases = phases_of(pairs.columns["t_ns"], np.where(pairs.contact, pairs.reference_n, 0.0))
@@ -103,7 +107,12 @@ def errors_of(
     judged = tuple(
         _trial(pairs, trial, phases, within, stances) for trial in trials if trial.rows.any()
     )
-    names = judged[0].figures if judged else ()
+    if not judged:
+        raise ComparisonError(
+            "no trial has a frame at which the reference is known",
+            expected="marks within what reference and session have in common",
+        )
+    names = judged[0].figures
     figures = {name: over_trials(np.array([one.figures[name] for one in judged])) for name in names}
     return Errors(judged, figures)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from devices.arrays import Floats
+from devices.errors import ComparisonError
 from service.offline.compare.errors import Errors, TrialErrors, errors_of
 from service.offline.compare.pairs import Pairs, pair
 from service.offline.compare.trials import Mark, Trial, over_trials, trials_of
@@ -194,6 +195,12 @@ def test_a_mean_over_many_trials_is_resampled_by_trial() -> None:
 def test_a_single_trial_has_no_interval() -> None:
     assert over_trials(np.array([1.0])).interval_95 is None
     assert math.isnan(over_trials(np.array([np.nan])).mean)
+
+
+def test_trials_without_any_frame_of_the_reference_are_refused() -> None:
+    pairs = paired(TRUE_N)
+    with pytest.raises(ComparisonError, match="no trial has a frame"):
+        errors_of(pairs, [Trial("elsewhere", np.zeros(len(pairs.t_s), bool))])
 
 
 def test_figures_are_averaged_over_trials_not_frames() -> None:
