@@ -62,6 +62,8 @@ class ServerNode:
         """By boot_id: those that are kept here, and those that it said it has."""
         self.unread: set[str] = set()
         """Kept here, but their journals cannot be read now: nothing is known of their frames."""
+        self.has_words = False
+        """Has it said what is not written down yet? `keep` does, before its frames are promised."""
         self.has_spoken = False
         """Has it said hello since the server was started?"""
         self.greeted_t_ns: int | None = None
@@ -205,10 +207,7 @@ class ServerNode:
             stream.owed = stream.held & stream.may_come
         if known != (hello.array_info, hello.calibration) or self._has_failed:
             self._estimate_anew()
-        try:
-            self.keep()
-        except StorageError as error:  # the picture goes on; what is sent is not acknowledged
-            self.storage_problem = str(error)
+        self.has_words = True
 
     def lacks(self, needed: Mapping[str, Intervals]) -> tuple[StreamNumbers, ...]:
         """Frames to ask it for: first what sessions need, then the rest of the present stream.
@@ -337,14 +336,17 @@ class ServerNode:
         return False
 
     def keep(self) -> None:
-        """Write down what the node said, for after a restart.
+        """Write down what the node said, for after a restart; may run in another thread.
 
         Raises:
             StorageError: the disk is full or not writable.
         """
+        hello = self.hello
         with storage_errors(self._folder):
             make_folder(self._folder)
-        write_checked(self._folder / HELLO_FILE, self.hello.model_dump_json().encode())
+        write_checked(self._folder / HELLO_FILE, hello.model_dump_json().encode())
+        if hello is self.hello:  # it may have said it anew meanwhile
+            self.has_words = False
 
     def _stream_of(self, info: ArrayInfo) -> ServerStream:
         if info.boot_id not in self.streams:

@@ -171,9 +171,10 @@ class Server:
             link.end(Close.RESTART, "the server is going down; connect again")
         await self.settling.close()
         for node in self.nodes:
-            for stream in node.streams.values():
+            keep = [node.keep] if node.has_words else []
+            for write in (*keep, *(stream.close for stream in node.streams.values())):
                 try:
-                    stream.close()
+                    write()
                 except StorageError as error:
                     log.warning("%s", error)
         self.folder.close()
@@ -285,6 +286,13 @@ class Server:
             if node.storage_problem is not None:  # perhaps not even a journal could be begun
                 await self._try_again(node)
                 return
+            if node.has_words:
+                try:
+                    self.folder.check()
+                    await asyncio.to_thread(node.keep)
+                except StorageError as error:
+                    self._cannot_keep(node, error)
+                    return
             streams = [stream for stream in node.streams.values() if stream.has_news]
             await asyncio.gather(*(self._sync_stream(node, stream) for stream in streams))
 

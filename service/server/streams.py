@@ -233,11 +233,10 @@ class ServerStream:
         self._said(said.lost, next_seq=said.next_seq + beyond, unsynced_tail_max=tail)
 
     def is_gone(self) -> None:
-        """The node has not mentioned it: nothing more will come of it, and no file stays open."""
+        """The node has not mentioned it: nothing more will come, and the next sync closes it."""
         self.node_has = Intervals()
-        with suppress(StorageError):  # said when it is synced
-            if self.journal is not None:
-                self.journal.close()
+        if self.journal is not None:
+            self.journal.retire()
 
     def note_losses(self, lost: PairsByReason) -> None:
         """Note all frames of this stream that the node has lost so far."""
@@ -304,7 +303,8 @@ class ServerStream:
     def has_news(self) -> bool:
         """Is there anything to be synced or acknowledged?"""
         unsaved = self._notes_to_keep != self._notes_on_disk and self.journal is not None
-        return bool(self.unsynced or self.owed or unsaved or self._clock_unsynced)
+        closing = self.journal is not None and self.journal.is_closing
+        return bool(self.unsynced or self.owed or unsaved or self._clock_unsynced or closing)
 
     @property
     def is_open(self) -> bool:

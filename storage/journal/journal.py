@@ -126,6 +126,11 @@ class Journal:
         """Is a segment open, or not closed yet?"""
         return bool(self._open.paths)
 
+    @property
+    def is_closing(self) -> bool:
+        """Is a segment to be closed by the next sync?"""
+        return self._open.is_closing
+
     def misplaced(self, frames: FrameBatch) -> str:
         """Why frames cannot stand among those that are held, in words; empty if they can.
 
@@ -287,13 +292,17 @@ class Journal:
         self.held = Intervals()
         shutil.rmtree(self.folder, ignore_errors=True)
 
+    def retire(self) -> None:
+        """Take nothing more into what is open: the next sync closes it, an append begins anew."""
+        self._open.retire_all()
+
     def close(self) -> None:
         """Sync what is open and close it; a later append opens a new segment.
 
         Raises:
             StorageError: the disk refused.
         """
-        self._open.retire_all()
+        self.retire()
         self.sync()
 
     def _take_in(self, segment: Segment) -> None:

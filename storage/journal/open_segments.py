@@ -46,6 +46,11 @@ class OpenSegments:
         with self._lock:
             return {writer.segment.path for writer in (*self._open, *self._closing)}
 
+    @property
+    def is_closing(self) -> bool:
+        """Is there a file that the next sync closes?"""
+        return bool(self._closing)
+
     def append(self, message: EncodedBatch) -> SegmentWriter:
         """Add a batch to the segment in which it may follow; all of it, or none.
 

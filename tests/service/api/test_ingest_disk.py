@@ -13,6 +13,7 @@ import service.server.node
 import service.server.streams
 import storage.journal.segment_writer
 from devices.errors import StorageError
+from service.server.node import ServerNode
 from storage.intervals import Intervals
 from storage.journal.journal import Journal
 from tests.builders.frames import assert_same_bits
@@ -132,6 +133,30 @@ def test_a_disk_that_is_full_between_two_syncs_has_refused_nothing(
     full.clear()
     node.acknowledged(39)
     assert running.node()["storage_problem"] is None
+
+
+def test_what_a_node_says_is_written_down_in_another_thread_before_its_frames_are_promised(
+    running: Running, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, may_go_on, keep = threading.Event(), threading.Event(), ServerNode.keep
+
+    def slow(self: ServerNode) -> None:
+        begun.set()
+        assert may_go_on.wait(PATIENCE_S)
+        keep(self)
+
+    monkeypatch.setattr(ServerNode, "keep", slow)
+    try:
+        node.connect()
+        node.send(10)
+        assert begun.wait(PATIENCE_S)
+        until(lambda: running.node()["last_seq"] == 9)  # the picture goes on meanwhile
+        assert not node.acked
+        assert not (running.data / "nodes" / "bench" / "hello.json").exists()
+    finally:
+        may_go_on.set()
+    node.acknowledged(9)
+    assert (running.data / "nodes" / "bench" / "hello.json").exists()
 
 
 def test_a_disk_that_refuses_to_sync_acknowledges_nothing(
