@@ -24,6 +24,7 @@ import pyarrow as pa
 from recording_costs import appending
 from recording_data import QUICK, Extent
 from recording_hours import hours
+from recording_reading import read_back
 from recording_sealing import sealed
 from recording_sizes import sizes
 from recording_turns import slices, writing
@@ -38,6 +39,7 @@ SECTIONS: dict[str, tuple[str, Callable[[Extent, Path], Lines]]] = {
     "writing": ("Writing a whole recording", writing),
     "appending": ("Keeping frames while they are taken", appending),
     "sealing": ("Sealing an hour", sealed),
+    "reading": ("Reading an hour back", read_back),
     "slices": ("Two seconds of one tile from the middle", slices),
     "hours": ("A journal of many hours", hours),
 }

@@ -46,6 +46,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "export": ("s.parquet", "--format", "csv", "--out", "x.csv"),
     "node": ("--scene", "gone.toml"),
     "pull": ("20200101T000000Z-000000", "--out", "x", "--server", "http://127.0.0.1:1"),
+    "query": ("SELECT 1", "--data", "."),
     "recover": (".",),
     "serve": ("--host", "192.0.2.1"),  # no address of this machine: it ends at once
     "sessions": ("--data", "."),
@@ -188,6 +189,7 @@ WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
         *("--calibration", "paper-eq2-shape", "--models", "static"),
     ),
     ("export", "out"): ("s.parquet", "--format", "csv", "--out", "{}"),
+    ("query", "out"): ("SELECT 1", "--data", ".", "--out", "{}"),
     ("simulate", "out"): (*SHORT[1:-1], "{}"),
 }
 IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
@@ -201,6 +203,7 @@ IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
     ("export", "data"): ("20200101T000000Z-000000", "--format=csv", "--out=x.csv", "--data", "{}"),
     ("node", "journal"): ("--scene", "standing", "--record", "a", "--journal", "{}"),
     ("pull", "out"): ("20200101T000000Z-000000", "--server=http://127.0.0.1:1", "--out", "{}"),
+    ("query", "data"): ("SELECT 1", "--data", "{}"),
     ("recover", "folder"): ("{}",),
     ("serve", "data"): ("--port", 0, "--data", "{}"),
     ("sessions", "data"): ("--data", "{}"),
