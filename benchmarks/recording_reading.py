@@ -47,7 +47,7 @@ def read_back(extent: Extent, folder: Path) -> list[str]:
     """A journal of `sliced_s`, as a table scaled to an hour."""
     once = emulated(4, min(LEARNT_S, extent.sliced_s))
     recording = lengthened(once, extent.sliced_s, FULL_RATE_HZ)
-    stream = folder / recording.info.boot_id
+    stream = folder / recording.info.node / recording.info.boot_id
     write_journal(stream, recording)
     ways = jobs(stream, len(recording.frames))
     note("reading")

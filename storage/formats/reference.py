@@ -15,6 +15,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
+from storage.formats.pressure_plate import read_pressure_plate
 from storage.formats.reference_tables import (
     Table,
     read_csv,
@@ -148,10 +149,12 @@ def _table(path: Path, stated: Stated) -> Table:
             return read_opensim(path, named)
         case ".csv" | ".txt" | ".tsv":
             return read_csv(path, named)
+        case ".npz":
+            return read_pressure_plate(path)
     raise FileFormatError(
         f"a reference with the ending {path.suffix!r} cannot be read",
         where=str(path),
-        expected=".csv, .parquet (also a session), .mot or .sto",
+        expected=".csv, .parquet (also a session), .mot, .sto, or .npz of a pressure plate",
     )
 
 

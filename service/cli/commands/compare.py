@@ -21,7 +21,10 @@ def compare_command(
         str, typer.Argument(help="A sealed file, a session's folder, or an id in --data.")
     ],
     reference: Annotated[
-        Path, typer.Option(help="What to compare with: .csv, .parquet (or a session), .mot, .sto.")
+        Path,
+        typer.Option(
+            help="What to compare with: .csv, .parquet (or a session), .mot, .sto, .npz (plate)."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for compare.json, compare.md and compare.png.")],
     columns: Annotated[

@@ -1,0 +1,94 @@
+"""A pressure plate's frames over time, reduced to force and centre of pressure.
+
+Numpy's `.npz`, whose arrays say what they are by their names: `time_s` (n,); `force_n` or
+`pressure_kpa` (n, cells along x, cells along y); `pitch_m` (2,), from cell to cell along x and y;
+and `origin_m` (2,), where the middle of the first cell is, zero if absent. x is forward and y to
+the left, as of the foot.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from devices.arrays import Floats
+from devices.errors import FileFormatError
+from devices.inputs import check_file
+from storage.formats.reference_tables import NUMBERS_MAX, Table
+
+_CELLS = {"force_n": 1.0, "pressure_kpa": 1e3}
+"""What a cell reads, in newtons or in pascals."""
+_BYTES_MAX = 8 * NUMBERS_MAX
+
+
+def read_pressure_plate(path: Path) -> Table:
+    """Force and centre of pressure of every frame; NaN where a cell is, or nothing bears.
+
+    Raises:
+        FileFormatError: unreadable, too large, or arrays are missing or do not fit one another.
+    """
+    where = str(path)
+    arrays = _arrays(path)
+    named = [name for name in _CELLS if name in arrays]
+    if len(named) != 1:
+        raise FileFormatError(
+            f"{' and '.join(named) or 'neither'} of {' and '.join(_CELLS)} is there",
+            where=where,
+            expected="one of them, (frames, cells along x, cells along y)",
+        )
+    cells = arrays[named[0]]
+    pitch_m, origin_m = arrays.get("pitch_m"), arrays.get("origin_m", np.zeros(2))
+    time_s = arrays.get("time_s", np.empty(0))
+    if cells.ndim != 3 or time_s.shape != cells.shape[:1]:
+        raise FileFormatError(
+            f"{named[0]} is {cells.shape} and time_s {time_s.shape}",
+            where=where,
+            expected="(n, cells along x, cells along y) and (n,)",
+        )
+    is_placed = pitch_m is not None and pitch_m.shape == origin_m.shape == (2,)
+    if pitch_m is None or not is_placed or not (np.isfinite(pitch_m) & (pitch_m > 0.0)).all():
+        raise FileFormatError(
+            "nothing says where its cells are",
+            where=where,
+            expected="pitch_m with two numbers above 0, and origin_m with two or not at all",
+        )
+    area_m2 = float(pitch_m.prod()) if named[0] == "pressure_kpa" else 1.0
+    force_n = cells * (_CELLS[named[0]] * area_m2)
+    grf_n = force_n.sum(axis=(1, 2))
+    along_x = force_n.sum(axis=2) @ (origin_m[0] + pitch_m[0] * np.arange(cells.shape[1]))
+    along_y = force_n.sum(axis=1) @ (origin_m[1] + pitch_m[1] * np.arange(cells.shape[2]))
+    bears = grf_n > 0.0
+    divisor_n = np.where(bears, grf_n, np.nan)
+    columns = {
+        "time_s": time_s,
+        "grf_n": grf_n,
+        "cop_x_m": along_x / divisor_n,
+        "cop_y_m": along_y / divisor_n,
+    }
+    notes = (f"a plate of {cells.shape[1]} by {cells.shape[2]} cells, added up",)
+    return Table(where, tuple(columns), columns, frozenset(columns), notes=notes)
+
+
+def _arrays(path: Path) -> dict[str, Floats]:
+    where = str(path)
+    try:
+        check_file(path)
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > _BYTES_MAX:
+            raise FileFormatError(
+                f"{size} bytes are too many to be held in memory",
+                where=where,
+                expected=f"up to {_BYTES_MAX}",
+            )
+        with np.load(path, allow_pickle=False) as file:
+            return {name: np.asarray(file[name], dtype=np.float64) for name in file.files}
+    except (
+        *(OSError, ValueError, EOFError, KeyError, TypeError),
+        *(zipfile.BadZipFile, MemoryError),  # of a header that says more than is there
+    ) as error:
+        raise FileFormatError(
+            f"no arrays of numpy: {error}", where=where, expected="a file that numpy.savez wrote"
+        ) from error
