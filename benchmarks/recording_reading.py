@@ -24,7 +24,7 @@ def jobs(folder: Path, frames: int) -> dict[str, Callable[[], object]]:
     def arrow_alone() -> None:
         count = 0
         for path in sorted(folder.glob("*.arrows")):
-            with pa.OSFile(str(path)) as file, pa.ipc.open_stream(file) as stream:
+            with pa.OSFile(str(path), "rb") as file, pa.ipc.open_stream(file) as stream:
                 count += sum(len(batch) for batch in stream)
         assert count == frames
 
