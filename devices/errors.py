@@ -46,7 +46,7 @@ from typing import ClassVar, Literal, TypedDict, Unpack
 
 from devices.words import printable
 
-Extra = Literal["server", "emulation", "plot", "gpio", "rig", "archive"]
+Extra = Literal["server", "emulation", "plot", "gpio", "rig", "archive", "mocap"]
 
 _OURS = ("devices", "storage", "service")
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import FileFormatError, UsageError
+from storage.formats.force_platform import read_force_platforms
 from storage.formats.pressure_plate import read_pressure_plate
 from storage.formats.reference_tables import (
     Table,
@@ -96,6 +97,7 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
         FileFormatError: unreadable, empty, a column is missing, times do not rise, or no sample has
             a force.
         UsageError: a unit or the sign is neither stated nor said by the file.
+        MissingExtraError: it is a C3D file, and what reads it is not installed.
     """
     table = _table(path, stated)
     where = table.where
@@ -151,10 +153,12 @@ def _table(path: Path, stated: Stated) -> Table:
             return read_csv(path, named)
         case ".npz":
             return read_pressure_plate(path)
+        case ".c3d":
+            return read_force_platforms(path)
     raise FileFormatError(
         f"a reference with the ending {path.suffix!r} cannot be read",
         where=str(path),
-        expected=".csv, .parquet (also a session), .mot, .sto, or .npz of a pressure plate",
+        expected=".csv, .parquet (also a session), .c3d, .mot, .sto, or .npz of a pressure plate",
     )
 
 

@@ -23,7 +23,8 @@ def compare_command(
     reference: Annotated[
         Path,
         typer.Option(
-            help="What to compare with: .csv, .parquet (or a session), .mot, .sto, .npz (plate)."
+            help="What to compare with: .c3d, .csv, .parquet (or a session), .mot, .sto, or .npz "
+            "of a pressure plate."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for compare.json, compare.md and compare.png.")],
