@@ -5,16 +5,18 @@
 Recorded loads of DIR are what the foot and the reference both see. Each draw gives the reference
 another clock, offset, scale and noise, aligns the two, and asks whether each 95 % interval has what
 was injected. Ours is the load with noise that remembers, in part growing with the force; with
-`--feet` it is what the estimator makes of the load on emulated domes, with errors of its own.
+`--feet` it is what the estimator makes of the load on emulated domes, with errors of its own: every
+draw has other domes, each pressed on the emulated bench first (some 5 s of CPU each).
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -131,18 +133,19 @@ def drawn_alone(load: Load, data: Path, draws: int) -> Draws:
 
 
 def drawn_on_feet(name: str, data: Path, draws: int) -> Draws:
-    """Ours by the estimator on emulated domes; one foot, many references."""
+    """Ours by the estimator on emulated domes: each draw has another foot with its own bench."""
     (case,) = (case for case in CASES if case.name == name)
     scene = load_scene(case.scene)
     serials = [tile.serial for tile in scene.tile if not tile.reference]
-    calibration = find_calibration(scene.calibration, serials, parts_seed=0)
-    recording, _ = recorded(scene, case.seconds, 0, calibration, case.foot(data))
-    wanted = ("t_ns", "grf_n", "true_grf_n")
-    columns = estimates_of(recording, tuple(scene.models), 100.0, wanted)
-    known = np.isfinite(columns["grf_n"])
-    t_s = ((columns["t_ns"] - columns["t_ns"][0]) * 1e-9)[known]
-    ours = Signal(t_s, columns["grf_n"][known])
+    wanted = ("t_ns", "grf_n", "grf_sigma_n", "true_grf_n")
     for draw in range(draws):
+        calibration = find_calibration(scene.calibration, serials, parts_seed=draw)
+        foot = replace(case.foot(data), parts_seed=draw)
+        recording, _ = recorded(scene, case.seconds, draw, calibration, foot)
+        columns = estimates_of(recording, tuple(scene.models), 100.0, wanted)
+        known = np.isfinite(columns["grf_n"])
+        t_s = ((columns["t_ns"] - columns["t_ns"][0]) * 1e-9)[known]
+        ours = Signal(t_s, columns["grf_n"][known], columns["grf_sigma_n"][known])
         rng = np.random.default_rng(draw)
         yield ours, *referred(rng, t_s, columns["true_grf_n"][known])
 
@@ -165,7 +168,7 @@ def row(name: str, draws: Draws) -> str:
             low, high = one.interval_95
             hits[i] += low <= value <= high
         errors.append(np.array([one.value for one in estimates]) - np.array(true.of(found)))
-        sigmas.append([one.sigma for one in estimates])
+        sigmas.append([math.hypot(one.sigma, one.own) for one in estimates])
     count = len(sigmas)
     cells = [
         f"{100.0 * hit / count:.1f} % ({factor * sigma:.2g}, {factor * error:+.2g}{unit})"

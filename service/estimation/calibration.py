@@ -9,15 +9,22 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from devices.arrays import Floats
 from devices.errors import CalibrationError
 from devices.facts import Count, Label, Text, Word
-from service.estimation.effects import CalibrationPart, Effects, NotNegative, Number
+from service.estimation.effects import CalibrationPart, Effects, NotNegative, Number, Parameter
+from service.estimation.mounted import Mounted
 
 ANY_SERIAL = "*"
 UNPROVEN = ", unproven"
@@ -122,6 +129,16 @@ class Calibration(CalibrationPart):
     tiles: Annotated[tuple[TileCalibration, ...], Field(max_length=_TILES_MAX)]
     refused: Annotated[dict[Label, Text], Field(max_length=_TILES_MAX)] = Field(default={})
     """Serials that were pressed as well, and why they have no curve."""
+    mounted: Mounted | None = None
+    """What a plate has shown of the foot that these tiles are mounted on; None: nothing has."""
+
+    @model_serializer(mode="wrap")
+    def _unmounted_as_before(self, written: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """What no plate has seen is not written: the ids of older calibrations stay theirs."""
+        content: dict[str, Any] = written(self)
+        if self.mounted is None:
+            content.pop("mounted", None)
+        return content
 
     @property
     def id(self) -> str:
@@ -152,6 +169,10 @@ class Calibration(CalibrationPart):
             remedy="Press the tile on the bench and run `foottile calibrate`, or name another "
             "calibration with --calibration",
         )
+
+    def gain(self, serial: str) -> Parameter | None:
+        """Of a tile as it is mounted, to its bench; None: no plate has told."""
+        return None if self.mounted is None else self.mounted.gains.get(serial)
 
     def to_json(self) -> str:
         """Text of a calibration file; the id is in it for people, and checked when read."""

@@ -213,16 +213,17 @@ def _released(laws: Laws, scene: Record, tiles: Records, room: Room, until: int)
         if law.denoise == 1:
             rows = denoise.in_sight(room.t_mono_ns, i, 0, scene.read, rows, look_ns)
         unsettled = bear(laws, tiles, room, i, rows, windows, borne)
+        if law.servo == 1:
+            counts = counts_at(room.readings, i, scene.read, law.look_ns)
+            out[whole.ANGLE] = (counts - law.zero_counts) * law.rad_per_count
+        whole.push(laws, borne, out[whole.ANGLE])
         whole.stand(laws, borne, out)
         if has_lasted(room.since_ns, room.t_mono_ns, i, scene.read, law.min_ns, law.look_ns):
             scene.is_contact = row.loaded
         masked = whole.is_masked(laws, out) or scene.is_contact == 0
         # A bound tells that there is contact, and never that there is none.
         known = not math.isnan(out[whole.GRF])
-        decided = known or (scene.is_contact == 1 and out[whole.AT_LEAST] >= law.on_n)
-        if law.servo == 1:
-            counts = counts_at(room.readings, i, scene.read, law.look_ns)
-            out[whole.ANGLE] = (counts - law.zero_counts) * law.rad_per_count
+        decided = known or (scene.is_contact == 1 and out[whole.AT_LEAST] >= law.bound_on_n)
         if masked:
             out[whole.X : whole.ANGLE] = math.nan
         else:

@@ -111,7 +111,8 @@ def _least_sigmas(plan: EstimationPlan) -> dict[str, Floats]:
     force_n[plan.bearing] = of_tile_n
     grf_n = np.array([math.sqrt(float((of_tile_n**2).sum()))])
     most_kpa = float(plan.ladder.curves.high_kpa.sum())
-    most_n = float(plan.ladder.curves.force(plan.ladder.curves.high_kpa[None]).force_n.sum())
+    end_n = plan.ladder.curves.force(plan.ladder.curves.high_kpa[None]).force_n
+    most_n = float((plan.gain * end_n).sum())
     x, y = (of_tile_n.min() * _extent(plan.bearing_m[:, axis]) / most_n for axis in (0, 1))
     cop = {"x": x or y, "y": y or x}  # across a line of tiles there is nothing to be rounded
     least = {"gauge_kpa": reading_kpa, "force_n": force_n, "force_sigma_n": force_n}
@@ -140,7 +141,7 @@ def _least_tile_n(plan: EstimationPlan) -> Floats:
     of_pressure_kpa = np.sqrt(left * plan.noise_kpa**2 + plan.baseline_sigma_kpa**2)
     static = curves.force(np.linspace(0.0, 1.0, _PLACES)[:, None] * curves.high_kpa)
     own_n = np.hypot(static.slope_n_per_kpa * of_pressure_kpa, static.fit_sigma_n)
-    return np.asarray(own_n.min(axis=0))
+    return np.asarray(plan.gain * own_n.min(axis=0))
 
 
 def _extent(places: Floats) -> float:

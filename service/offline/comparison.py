@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from devices.arrays import Floats
-from devices.errors import ComparisonError, FileFormatError
+from devices.errors import ComparisonError, FileFormatError, UsageError
 from service.estimation.estimates import EstimateStatus
 from service.offline.compare.align import Alignment, align
+from service.offline.compare.clocks import ClockLag, clock_notes
 from service.offline.compare.errors import Errors, errors_of
 from service.offline.compare.pairs import COMPARED, Columns, Pairs, Reference, pair
 from service.offline.compare.plausible import check_force_unit, cop_notes
@@ -21,11 +23,14 @@ from service.offline.compare.trials import Mark, trials_of
 from storage.formats.reference import ReferenceData, Stated, read_reference
 from storage.formats.sealed import marks_of
 from storage.formats.slice import Slice
-from storage.sessions.beside import EVENTS_NAME, read_events
+from storage.schema import NO_INSTANT
+from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
 from storage.sessions.reader import SessionReader
 
 ROW = "row"
 """Beside the columns of a session: in which row of the file a frame is."""
+ANGLE = "angle_rad"
+"""Beside what is compared, of a foot with a servo."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,7 @@ class CompareOptions:
     contact_n: float | None = None
     cop_offset_m: tuple[float, float] = (0.0, 0.0)
     reference_sigma_n: float | None = None
+    reference_cop_sigma_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,7 @@ class Comparison:
         session: which one, as its file says.
         reference: the file.
         alignment: of the two.
+        clock_lag: what the lag has to be by the clocks, where both are sessions of one server.
         pairs: our frames with the reference.
         force_n: (n, tiles), forces of the tiles in these frames; of a bare one NaN.
         serials: of the tiles.
@@ -60,6 +67,7 @@ class Comparison:
     session: Mapping[str, object]
     reference: str
     alignment: Alignment
+    clock_lag: ClockLag | None
     pairs: Pairs
     force_n: Floats
     serials: tuple[str, ...]
@@ -77,6 +85,7 @@ class Comparison:
             "notes": self.notes,
             "alignment": {
                 "lag_s": alignment.lag_s,
+                "clock_lag_s": self.clock_lag,
                 "at_s": alignment.at_s,
                 "drift_ppm": alignment.drift_ppm,
                 "scale": alignment.scale,
@@ -88,6 +97,7 @@ class Comparison:
             },
             "contact_n": pairs.contact_n,
             "reference_sigma_n": self.options.reference_sigma_n,
+            "reference_cop_sigma_m": self.options.reference_cop_sigma_m,
             "trials_are": self.trials_are,
             "figures": self.errors.figures,
             "trials": self.errors.trials,
@@ -112,7 +122,9 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
         raise ComparisonError("no frame of the session has a GRF", where=str(path))
     t_ns = columns["t_ns"]
     reference = _reference(data, int(t_ns[0]), options.cop_offset_m)
-    ours = Signal((t_ns[known] - t_ns[0]) * 1e-9, columns["grf_n"][known])
+    ours = Signal(
+        (t_ns[known] - t_ns[0]) * 1e-9, columns["grf_n"][known], columns["grf_sigma_n"][known]
+    )
     alignment = align(ours, reference.force, lag_range_s=options.lag_range_s)
     check_force_unit(alignment)
     pairs = pair(
@@ -124,15 +136,24 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     )
     places_m = np.array([(tile.x_m, tile.y_m) for tile in tiles if not tile.reference])
     notes += [*data.notes, *cop_notes(pairs, places_m), *_remarks(alignment, pairs, options)]
+    at_ns = int(t_ns[0]) + round(1e9 * alignment.at_s)
+    by_clocks = None if data.epoch_ns is None else _clock_lag(path, reference_path, at_ns)
+    notes += clock_notes(alignment, by_clocks)
     trials, what = trials_of(pairs.columns["t_ns"], pairs.columns["part"], marks)
     return Comparison(
         session={"file": str(path), **identity},
         reference=data.where,
         alignment=alignment,
+        clock_lag=by_clocks,
         pairs=pairs,
         force_n=force_n[pairs.columns[ROW]],
         serials=tuple(tile.serial for tile in tiles),
-        errors=errors_of(pairs, trials, reference_sigma_n=options.reference_sigma_n),
+        errors=errors_of(
+            pairs,
+            trials,
+            reference_sigma_n=options.reference_sigma_n,
+            reference_cop_sigma_m=options.reference_cop_sigma_m,
+        ),
         trials_are=what,
         notes=tuple(notes),
         options=options,
@@ -150,6 +171,8 @@ def _columns(session: SessionReader) -> tuple[Columns, Floats]:
         )
     if has_part := session.has("part"):
         wanted.append("part")
+    if session.has(ANGLE):
+        wanted.append(ANGLE)
     pieces = list(session.columns(*wanted))
     if not pieces:
         raise FileFormatError("the session has no frames", where=str(session.path))
@@ -183,6 +206,37 @@ def _marks(session: SessionReader, path: Path, columns: Columns) -> tuple[list[M
             marks.append(Mark(mark.event.label, int(columns["t_ns"][at][0])))
     lost = [f"mark {one.event.label!r} begins no trial: {one.left_out}" for one in placed.left_out]
     return marks, lost
+
+
+def _clock_lag(path: Path, reference_path: Path, at_ns: int) -> ClockLag | None:
+    """By the clock tables beside two sessions; None: one has none, or it says nothing of then."""
+    found = [_server_offset(one, at_ns) for one in (path, reference_path)]
+    if found[0] is None or found[1] is None:
+        return None
+    (own_ns, own_within_ns), (their_ns, their_within_ns) = found[0], found[1]
+    return ClockLag(1e-9 * (own_ns - their_ns), 1e-9 * (own_within_ns + their_within_ns))
+
+
+def _server_offset(path: Path, at_ns: int) -> tuple[int, int] | None:
+    """The server's time less the node's in ns, and its bound, at the frame nearest to then."""
+    with SessionReader(path) as session:
+        try:
+            clock = clock_beside(session)
+        except (UsageError, FileFormatError):
+            return None
+        wanted = ("t_mono_ns", "t_ns", *(("part",) if session.has("part") else ()))
+        nearest: dict[str, npt.NDArray[Any]] | None = None
+        for piece in session.columns(*wanted):
+            row = int(np.argmin(np.abs(piece["t_ns"] - at_ns)))
+            one = {name: values[row : row + 1] for name, values in piece.items()}
+            if nearest is None or abs(one["t_ns"][0] - at_ns) < abs(nearest["t_ns"][0] - at_ns):
+                nearest = one
+    assert nearest is not None  # noqa: S101  # both have been compared
+    said = clock.columns(nearest["t_mono_ns"], nearest["t_ns"], nearest.get("part"))
+    server_ns = int(said["t_server_ns"][0])
+    if server_ns == NO_INSTANT:
+        return None
+    return server_ns - int(nearest["t_ns"][0]), int(said["t_server_uncertainty_ns"][0])
 
 
 def _reference(data: ReferenceData, begin_ns: int, cop_offset_m: tuple[float, float]) -> Reference:

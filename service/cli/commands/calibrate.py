@@ -1,4 +1,4 @@
-"""`foottile calibrate`: curves of tiles from indentation recordings."""
+"""`foottile calibrate`: curves of tiles from a bench, gains of a mounted foot from a plate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,22 @@ from typing import Annotated
 import typer
 
 from devices.errors import UsageError, needs_extra
-from service.cli.options import JsonOption, output_path, print_json, progress, remark, stdout
+from service.cli.options import (
+    JsonOption,
+    output_path,
+    pair,
+    print_json,
+    progress,
+    remark,
+    stdout,
+)
+from service.cli.reference_options import (
+    ColumnsOfReference,
+    LagRange,
+    SignOfReference,
+    UnitsOfReference,
+    named_values,
+)
 
 DELAY_MAX_MS = 1000.0
 """No reference of use here is later."""
@@ -38,15 +53,65 @@ def calibrate_command(
     reference_delay_sigma_ms: Annotated[
         float, typer.Option(min=0.0, max=1000.0, help="Standard uncertainty of that.")
     ] = 0.1,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            help="What a force plate has recorded under the foot of IN, a session: fits how it is "
+            "mounted, and keeps the curves."
+        ),
+    ] = None,
+    per_tile: Annotated[
+        bool, typer.Option("--per-tile", help="With --against: a gain for each tile.")
+    ] = False,
+    shear: Annotated[
+        bool,
+        typer.Option("--shear", help="With --against: which way the ground pushes tilted tiles."),
+    ] = False,
+    reference_gain_sigma: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, help="With --against: uncertainty of the plate's gain."),
+    ] = 0.0,
+    columns: ColumnsOfReference = None,
+    units: UnitsOfReference = None,
+    sign: SignOfReference = None,
+    lag_range_s: LagRange = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fit every tile that was pressed in the recordings, and say how good the fit is.
 
     A recording is a session with reference_force_n, pressed_tile and phase, as the mill or
     `foottile simulate --scene indentation` makes it. A tile whose recording gives no believable
-    curve is refused with the reason. Exit codes: 0 good, 1 failed, no tile has a curve, 2 wrong
+    curve is refused with the reason. With --against it is a session of the mounted foot on a force
+    plate: its calibration is written with the foot's gains, and its shear if asked for; what the
+    load does not determine is refused. Exit codes: 0 good, 1 failed, no tile has a curve, 2 wrong
     usage, 3 written, but a tile was refused.
     """
+    if against is not None:
+        if len(recordings) > 1 or plot is not None or reference_delay_ms is not None:
+            raise UsageError(
+                "--against goes with one session, and without --plot and --reference-delay-ms"
+            )
+        from service.cli.commands.calibrate_against import calibrate_mounted
+        from service.offline.against import AgainstOptions
+        from storage.formats.reference import Stated
+
+        options = AgainstOptions(
+            stated=Stated(named_values(columns, "--map"), named_values(units, "--units"), sign),
+            lag_range_s=pair(lag_range_s, "--lag-range-s"),
+            per_tile=per_tile,
+            shear=shear,
+            reference_gain_sigma=reference_gain_sigma,
+            reference=reference,
+        )
+        calibrate_mounted(recordings[0], against, out, options, as_json=as_json)
+        return
+    if (
+        per_tile
+        or shear
+        or reference_gain_sigma
+        or any(one is not None for one in (columns, units, sign, lag_range_s))
+    ):
+        raise UsageError("that is said of a plate, and none is named", remedy="Add --against FILE")
     from service.cli.calibration_report import calibration_json, calibration_tables
     from service.estimation.effects import Parameter
     from service.estimation.fitting.timing import UNKNOWN_DELAY

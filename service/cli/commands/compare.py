@@ -11,53 +11,56 @@ import typer
 
 from devices.errors import UsageError, needs_extra
 from service.cli.commands.sessions import sealed_file
-from service.cli.options import JsonOption, json_text, pair, print_json, progress, remark, say
+from service.cli.compare_many import MISSED, compare_many, options_of
+from service.cli.many import NOT_ALL, JobsOption, ManifestOption, SchedulerOption
+from service.cli.options import JsonOption, print_json, progress, remark, say
+from service.cli.reference_options import (
+    ColumnsOfReference,
+    LagRange,
+    SignOfReference,
+    UnitsOfReference,
+    named_values,
+)
 from service.cli.result_folder import result_folder
+
+COMPARISONS = "comparisons"
+"""In a session's folder: what it was compared with, a folder for each reference."""
 
 
 @needs_extra("server", "`foottile compare`")
 def compare_command(
     session: Annotated[
-        str, typer.Argument(help="A sealed file, a session's folder, or an id in --data.")
-    ],
+        str | None, typer.Argument(help="A sealed file, a session's folder, or an id in --data.")
+    ] = None,
     reference: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             help="What to compare with: .c3d, .csv, .parquet (or a session), .mot, .sto, or .npz "
             "of a pressure plate."
         ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder for compare.json, compare.md and compare.png.")],
-    columns: Annotated[
+    ] = None,
+    out: Annotated[
         str | None,
         typer.Option(
-            "--map",
-            metavar="NAME=COLUMN,...",
-            help="Which columns are time_s, grf_n, cop_x_m, cop_y_m; - before a column turns it.",
+            help="Folder for compare.json, compare.md and compare.png; default: with the session, "
+            "in comparisons/ and the reference's name. Of many sessions each has a folder in it."
         ),
     ] = None,
-    units: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME=UNIT,...",
-            help="Of grf (N, kN, mN), cop (m, cm, mm) and time (s, ms, us, ns), unless columns "
-            "have our names.",
-        ),
-    ] = None,
-    sign: Annotated[
-        str | None, typer.Option(help="Of the reference's force under load: + or -.")
-    ] = None,
+    columns: ColumnsOfReference = None,
+    units: UnitsOfReference = None,
+    sign: SignOfReference = None,
     reference_sigma_n: Annotated[
         float | None,
         typer.Option(min=0.0, help="Standard uncertainty of the reference; tells coverage."),
     ] = None,
+    reference_cop_sigma_m: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="The same of each coordinate of its centre of pressure."),
+    ] = None,
     remove_offset: Annotated[
         bool, typer.Option("--remove-offset", help="Take off what the reference reads in flight.")
     ] = False,
-    lag_range_s: Annotated[
-        str | None,
-        typer.Option(metavar="A,B", help="Least and greatest lag, where several would fit."),
-    ] = None,
+    lag_range_s: LagRange = None,
     contact_n: Annotated[
         float | None,
         typer.Option(
@@ -78,74 +81,91 @@ def compare_command(
     data: Annotated[
         Path | None, typer.Option(help="Data folder of the server; default: the user's.")
     ] = None,
+    manifest: ManifestOption = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare a session with a reference: a force plate, an insole, another session.
 
     Clocks are aligned first: lag and drift, offset and scale come with intervals, and none of them
-    but lag and drift is applied unless asked for. Exit codes: 0 good, 1 failed, 2 wrong usage, 3
-    written, but a limit is missed.
-    """
-    from service.offline.compare.plot import plot_comparison
-    from service.offline.compare.report import FIGURES, markdown
-    from service.offline.comparison import CompareOptions, compare_session
-    from service.offline.plots import new_figure
-    from storage.durable import write_whole
-    from storage.formats.reference import Stated
+    but lag and drift is applied unless asked for. Without --out all is kept with the session, in
+    its folder. Many sessions are named by --manifest, with columns session and reference; what
+    differs by row is a column, too: map, units, sign, name of the result and the like.
 
-    asked = {name: _limit(name, text, FIGURES) for name, text in _pairs(limits, "--limits").items()}
-    options = CompareOptions(
-        stated=Stated(_pairs(columns, "--map"), _pairs(units, "--units"), sign),
-        lag_range_s=pair(lag_range_s, "--lag-range-s"),
-        remove_offset=remove_offset,
-        contact_n=contact_n,
-        cop_offset_m=pair(cop_offset_m, "--cop-offset-m") or (0.0, 0.0),
-        reference_sigma_n=reference_sigma_n,
-    )
+    Exit codes: 0 good, 1 failed, 2 wrong usage, 3 written, but a limit is missed, or some of many
+    sessions failed.
+    """
+    from service.offline.compare.report import FIGURES
+    from service.offline.comparison_files import write_comparison
+    from service.offline.plots import new_figure
+
+    asked = {
+        name: _limit(name, text, FIGURES) for name, text in named_values(limits, "--limits").items()
+    }
+    said: dict[str, str | float | None] = {
+        "map": columns,
+        "units": units,
+        "sign": sign,
+        "lag_range_s": lag_range_s,
+        "contact_n": contact_n,
+        "cop_offset_m": cop_offset_m,
+        "reference_sigma_n": reference_sigma_n,
+        "reference_cop_sigma_m": reference_cop_sigma_m,
+    }
     new_figure(1.0, 1.0)  # says what is missing before anything takes time
+    if manifest is not None or session is None or reference is None:
+        if manifest is None or session is not None or reference is not None or out is None:
+            raise UsageError(
+                "which session is compared with what is not said, or twice",
+                expected="SESSION and --reference; or for many --manifest and --out",
+            )
+        summary = compare_many(
+            manifest,
+            said,
+            asked,
+            remove_offset=remove_offset,
+            out=out,
+            jobs=jobs,
+            scheduler=scheduler,
+            as_json=as_json,
+        )
+        if summary.states["failed"] or summary.verdicts[MISSED]:
+            raise typer.Exit(NOT_ALL)
+        return
+    options = options_of(said, remove_offset=remove_offset)
     source = sealed_file(session, data)
     title = f"{Path(session).name} against {reference.name}"
-    with result_folder(out) as folder, progress(f"comparing {title}"):
-        found = compare_session(source, reference, options)
-        missed = [
-            f"{name} is {found.errors.figures[name].mean:.4g}, and was to be within {limit:g}"
-            for name, limit in asked.items()
-            if not abs(found.errors.figures[name].mean) <= limit
-        ]
-        text = markdown(
-            title, found.alignment, found.pairs, found.errors, found.trials_are, found.notes
-        )
-        png = plot_comparison(title, found.pairs, found.force_n, found.serials, found.errors)
-        content = {**found.as_dict(), "limits": asked, "missed": missed}
-        write_whole(folder / "compare.json", json_text(content).encode())
-        write_whole(folder / "compare.md", text.encode())
-        write_whole(folder / "compare.png", png)
+    with (
+        result_folder(Path(out) if out is not None else kept_with(source, reference)) as folder,
+        progress(f"comparing {title}"),
+    ):
+        done = write_comparison(source, reference, options, asked, folder, title)
     if as_json:
-        print_json(content)
+        print_json(done.content)
     else:
-        say(text)
+        say(done.text)
         say(f"{folder}: compare.json, compare.md, compare.png")
-    for line in missed:
+    for line in done.missed:
         remark(f"limit missed: {line}")
-    if missed:
+    if done.missed:
         raise typer.Exit(3)
 
 
-def _pairs(text: str | None, option: str) -> dict[str, str]:
-    """Names with what is said of them.
+def kept_with(source: Path, reference: Path) -> Path:
+    """Where a comparison lies with its session.
 
     Raises:
-        UsageError: no name, nothing said, or a name twice.
+        UsageError: the session is a file by itself.
     """
-    found: dict[str, str] = {}
-    for part in (text or "").split(","):
-        name, equals, value = part.strip().partition("=")
-        if not part.strip() and text is None:
-            continue
-        if not (name and equals and value) or name in found:
-            raise UsageError(f"{option} {text!r}", expected="NAME=VALUE,..., each name once")
-        found[name] = value
-    return found
+    from storage.sessions.claims import SESSION_NAME
+
+    if not (source.parent / SESSION_NAME).is_file():
+        raise UsageError(
+            f"{source.name} is a file by itself, with which nothing is kept",
+            remedy="Add --out FOLDER, or name a session's folder or id",
+        )
+    return source.parent / COMPARISONS / reference.stem
 
 
 def _limit(name: str, text: str, known: Collection[str]) -> float:

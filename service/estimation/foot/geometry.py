@@ -56,18 +56,23 @@ def grid_indices(
     return x.astype(np.float64) + 1.0, y.astype(np.float64) + 1.0
 
 
-def lost_by_tilt(positions_m: Floats) -> Floats:
-    """Part of a force along each tile's axis that is not along the segment, (tiles,).
+def axes_rad(positions_m: Floats) -> Floats:
+    """Angle of each tile's axis to the segment, (tiles,): as the segment rolls, upright in turn.
 
-    1 - cos of the angle between them: tiles stand upright on their sole, whose shape along x is a
-    parabola through their places (tiles, 3). Nothing, if these do not show how it is curved.
+    Tiles stand upright on their sole, whose shape along x is a parabola through their places
+    (tiles, 3). Zero, if these do not show how it is curved.
     """
     x_m, z_m = positions_m[:, 0], positions_m[:, 2]
     if len(np.unique(np.round(x_m / _SAME_PLACE_M))) < _CURVED_TILES:
         return np.zeros(len(positions_m))
     design = np.stack([np.ones(len(x_m)), x_m, x_m**2], axis=1)
     (_, slope, bend), *_ = np.linalg.lstsq(design, z_m, rcond=None)
-    return np.asarray(1.0 - np.cos(np.arctan(slope + 2.0 * bend * x_m)))
+    return np.asarray(np.arctan(slope + 2.0 * bend * x_m))
+
+
+def lost_by_tilt(axes: Floats) -> Floats:
+    """Part of a force along each tile's axis that is not along the segment: 1 - cos."""
+    return np.asarray(1.0 - np.cos(axes))
 
 
 def rad_per_count(servo: ServoInfo) -> float:

@@ -52,6 +52,11 @@ SCENE = record_type(
         ("rad_per_count", np.float64),
         ("travel_m_per_rad", np.float64),
         ("bearing", np.int64),  # number of tiles that bear load
+        ("bound_on_n", np.float64),  # a bound that tells contact: `on_n` as the foot bears it
+        # Is it known which way the ground pushes tiles that are not upright, and which?
+        ("sheared", np.int64),
+        ("shear", np.float64),
+        ("shear_sigma", np.float64),
         # Of `repeats.Limits`, and of the sum of all tiles as of each of them.
         ("by_repeats", np.int64, (SHARES + 1,)),
         ("by_twos", np.int64, (SHARES + 1,)),
@@ -84,6 +89,9 @@ TILE = record_type(
         ("gas_misfit", np.float64),
         ("rubber_misfit", np.float64),
         ("place_m", np.float64, (3,)),
+        ("gain", np.float64),
+        ("gain_sigma", np.float64),
+        ("axis_rad", np.float64),
         ("tilted", np.float64),
         ("noise_left", np.float64, (AVERAGED_MAX + 1,)),
         ("grid", np.float64, (2,)),
@@ -143,6 +151,7 @@ def _scene(plan: EstimationPlan) -> Records:
         assumed_scale=plan.assumed_scale,
         on_n=plan.contact.on_n,
         off_n=plan.contact.off_n,
+        bound_on_n=plan.contact.on_n * plan.gain.max(),
         min_ns=plan.contact.min_ns,
         cop_sigma_max_m=plan.cop_sigma_max_m,
         grid=plan.grid is not None,
@@ -154,6 +163,9 @@ def _scene(plan: EstimationPlan) -> Records:
         scene["by_repeats"], scene["by_twos"] = limits.by_repeats, limits.by_twos
     for name in ("temperature", "ambient", "gas", "hysteresis", "flow", "rubber"):
         scene[name] = getattr(ladder, name) is not None
+    if plan.shear is not None:
+        scene["sheared"] = 1
+        scene["shear"], scene["shear_sigma"] = plan.shear.value, plan.shear.sigma
     if servo is not None:
         travel = servo.ankle_travel_m_per_rad
         scene["servo"] = 1
@@ -191,6 +203,9 @@ def _tiles(plan: EstimationPlan) -> Records:
         "gas_misfit": ladder.gas_misfit,
         "rubber_misfit": ladder.rubber_misfit,
         "place_m": plan.bearing_m,
+        "gain": plan.gain,
+        "gain_sigma": plan.gain_sigma,
+        "axis_rad": plan.axis_rad,
         "tilted": plan.tilted,
         "noise_left": plan.noise_left,
         "static": ladder.curves.laws(),

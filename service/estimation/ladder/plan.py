@@ -17,8 +17,9 @@ from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
 from devices.errors import CalibrationError, UsageError
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.effects import Parameter
 from service.estimation.foot.contact import ContactRule
-from service.estimation.foot.geometry import grid_indices, hull, lost_by_tilt
+from service.estimation.foot.geometry import axes_rad, grid_indices, hull, lost_by_tilt
 from service.estimation.ladder.chosen import MODELS, Ladder, make_ladder
 from service.estimation.ladder.unseen import Unseen, make_unseen
 from service.estimation.models import denoise
@@ -79,8 +80,15 @@ class EstimationPlan:
     """Standard deviation of a single unloaded reading about the true baseline."""
     bearing_m: Floats
     """(bearing tiles, 3)."""
+    gain: Floats
+    """What the ground puts on a tile's part of the foot for a newton of the dome's."""
+    gain_sigma: Floats
+    axis_rad: Floats
+    """Angle of a tile's axis to the segment."""
     tilted: Floats
     """Part of a tile's force that may not be along the segment, for its axis is not."""
+    shear: Parameter | None
+    """Which way the ground pushes tiles that are not upright; None: not known."""
     hull: tuple[Floats, Floats]
     grid: tuple[Floats, Floats] | None
     contact: ContactRule
@@ -147,6 +155,8 @@ def make_plan(
     )
     still_kpa = np.hypot(tare.noise_kpa, tare.baseline_sigma_kpa)[bearing]
     unloaded_n = float(np.sqrt(((ladder.curves.slope_at_zero_n_per_kpa * still_kpa) ** 2).sum()))
+    gains = [calibration.gain(info.tiles[i].serial) for i in bearing]
+    axis_rad = axes_rad(positions_m[bearing])
     return EstimationPlan(
         info=info,
         calibration=calibration,
@@ -184,7 +194,11 @@ def make_plan(
         ),
         still_kpa=still_kpa,
         bearing_m=positions_m[bearing],
-        tilted=lost_by_tilt(positions_m[bearing]),
+        gain=np.array([1.0 if gain is None else gain.value for gain in gains]),
+        gain_sigma=np.array([0.0 if gain is None else gain.sigma for gain in gains]),
+        axis_rad=axis_rad,
+        tilted=lost_by_tilt(axis_rad),
+        shear=None if calibration.mounted is None else calibration.mounted.shear,
         hull=hull(positions_m[bearing, :2]),
         grid=grid_indices(positions_m[bearing, :2]),
         contact=ContactRule(
@@ -192,7 +206,10 @@ def make_plan(
             off_n=CONTACT_OFF_SIGMA * unloaded_n,
             min_ns=CONTACT_MIN_NS,
         ),
-        assumed_scale=any(entry.absolute_scale == "assumed" for entry in entries),
+        assumed_scale=any(
+            entry.absolute_scale == "assumed" and gain is None
+            for entry, gain in zip(entries, gains, strict=True)
+        ),
         gap_ns=round(GAP * 1e9 / info.nominal_rate_hz),
     )
 

@@ -37,6 +37,7 @@ BORNE = record_type(
         ("bend_n", np.float64),  # how far an average is from that of a window of half the length
         ("of_bend_n", np.float64),  # standard deviation that noise gives that
         ("smoothed_n", np.float64),  # what averages smooth away, as far as the sum of tiles shows
+        ("upright", np.float64),  # part of the force that is vertical
         ("weight", np.float64),  # in a sum over tiles
     ]
 )
@@ -115,7 +116,21 @@ def _bear_tile(
         math.sqrt(variance),
         cell.beyond,
     )
+    _as_mounted(law, now)
     return math.sqrt(cell.unseen_gas_n**2 + unseen_n**2)
+
+
+@compiled
+def _as_mounted(law: Record, now: Record) -> None:
+    """From newtons of the dome to those of the ground on the tile's part of the foot."""
+    if law.gain == 1.0 and law.gain_sigma == 0.0:
+        return
+    of_gain_n = law.gain_sigma * now.force_n
+    now.force_n *= law.gain
+    now.own_n = math.hypot(law.gain * now.own_n, of_gain_n)
+    now.sigma_n = math.hypot(law.gain * now.sigma_n, of_gain_n)
+    for part in range(PARTS):
+        now.common_n[part] *= law.gain
 
 
 @inlined

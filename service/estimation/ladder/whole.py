@@ -8,15 +8,44 @@ from devices.arrays import Floats
 from devices.compiled import inlined
 from service.estimation.ladder.laws import Laws
 from service.estimation.ladder.plan import SIGMAS
-from service.estimation.ladder.upper import BOUND_SIGMAS, sigma_of_sum
+from service.estimation.ladder.upper import BOUND_SIGMAS, PARTS, sigma_of_sum
 from service.estimation.records import Records
 
+UPRIGHT_LEAST = 0.1  # below it what a plate has told of tiles nearly upright says nothing
 HULL_SIGMAS = 3.0  # noise about the edge of the tiles is no reason to mask
 GRF, GRF_SIGMA, AT_LEAST, X, Y, SIGMA_X, SIGMA_Y, INDEX_X, INDEX_Y, GROUND_X, GROUND_Y, ANGLE, Z = (
     range(13)
 )
 """Places of the answers in a row of `stand`; the last is needed for the ground only."""
 COLUMNS = 13
+
+
+@inlined
+def push(laws: Laws, borne: Records, angle_rad: float) -> None:
+    """How much of each tile's force is vertical, as `upright`: all, unless a plate has told.
+
+    Where it has, that is `1 + shear (1 - cos a)` with `a` between the tile's axis and the vertical,
+    and what is left of that doubt is all tiles' alike. Where the segment's angle is not known, it
+    is as if no plate had; of a tile that hardly faces the ground nothing is told.
+
+    Args:
+        laws: constants of the estimate.
+        borne: what the tiles bear.
+        angle_rad: of the segment.
+    """
+    scene, tiles = laws.scene[0], laws.tiles
+    known = scene.sheared == 1 and not (scene.servo == 1 and math.isnan(angle_rad))
+    turned_rad = angle_rad if scene.servo == 1 else 0.0
+    for j in range(len(tiles)):
+        now = borne[j]
+        now.upright = 1.0
+        if known and tiles[j].bears == 1:
+            tilted = 1.0 - math.cos(tiles[j].axis_rad - turned_rad)
+            now.upright = 1.0 + scene.shear * tilted
+            if now.upright < UPRIGHT_LEAST:
+                now.upright = 0.0
+                continue
+            now.common_n[PARTS - 1] = scene.shear_sigma * tilted * now.force_n / now.upright
 
 
 @inlined
@@ -28,17 +57,17 @@ def stand(laws: Laws, borne: Records, out: Floats) -> None:
 
     Args:
         laws: constants of the estimate.
-        borne: what the tiles bear.
-        out: (`COLUMNS`,), NaN throughout; its first seven columns, and `Z`.
+        borne: what the tiles bear, and how much of it is upright.
+        out: (`COLUMNS`,); its first seven columns, and `Z`, NaN where they stay.
     """
     tiles = laws.tiles
     total, stating, telling = 0.0, 0, 0
     for j in range(len(tiles)):
         now = borne[j]
         now.weight = 0.0
-        if tiles[j].bears == 1 and not math.isnan(now.force_n):
-            total += now.force_n
-            now.weight = 1.0
+        if tiles[j].bears == 1 and not math.isnan(now.force_n) and now.upright > 0.0:
+            total += now.upright * now.force_n
+            now.weight = now.upright
             stating += 1
             telling += 1 - now.beyond
     sigma_n = sigma_of_sum(borne)
@@ -53,12 +82,13 @@ def stand(laws: Laws, borne: Records, out: Floats) -> None:
         moment = 0.0
         for j in range(len(tiles)):
             if tiles[j].bears == 1:
-                moment += borne[j].force_n * tiles[j].place_m[axis]
+                moment += borne[j].upright * borne[j].force_n * tiles[j].place_m[axis]
         out[column] = moment / total
     for axis, column in ((0, X), (1, Y)):
         for j in range(len(tiles)):
             if tiles[j].bears == 1:
-                borne[j].weight = tiles[j].place_m[axis] - out[column]
+                arm_m = tiles[j].place_m[axis] - out[column]
+                borne[j].weight = borne[j].upright * arm_m
         out[column + SIGMA_X - X] = sigma_of_sum(borne) / abs(total)
 
 

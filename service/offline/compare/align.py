@@ -4,12 +4,14 @@ The lag is found coarsely by cross-correlation, then all four together by robust
 narrower and narrower windows. Landings, where plate and foot ring each in its own way, count less:
 the loss is the pseudo-Huber one. Residuals are ours, `ours - scale (reference - offset)`: noise of
 what stands on the right would make the scale too small, and a reference is the better of the two.
-Intervals are those of `jackknife`.
+Intervals are those of `jackknife`. In them is what our foot may get wrong in the same way in every
+stance, if it states its uncertainty: as if all of that went one way, and as phases of the load
+contradict one another.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -18,7 +20,13 @@ from scipy.special import fdtri
 
 from devices.arrays import Bools, Floats, Ints
 from devices.errors import ComparisonError
-from service.offline.compare.jackknife import Estimate, Spread, memory_of, spread_of
+from service.offline.compare.jackknife import (
+    Estimate,
+    Spread,
+    memory_of,
+    over_phases,
+    spread_of,
+)
 from service.offline.compare.lags import Peak, Peaks, likely_lags
 from service.offline.compare.signals import Even, Signal, smooth
 
@@ -65,7 +73,8 @@ class Alignment:
         offset_n: what the reference reads where our force is zero, by the fit.
         scale: newtons of ours for a newton of the reference.
         at_s: our instant in the middle of what overlaps.
-        covariance: (2, 2), of lag and drift, in s and 1.
+        covariance: (2, 2), of lag and drift, in s and 1; without what our foot gets wrong, which is
+            in the sigma of our force already.
         residual_n: root mean square of what the fit leaves, under its last window.
         blocks: of time, from which the uncertainties are.
         ambiguity: None if no other lag comes near.
@@ -87,7 +96,7 @@ class Alignment:
         return np.asarray(t_s + self.lag_s.value + drift * (t_s - self.at_s))
 
     def lag_sigma_s(self, t_s: Floats) -> Floats:
-        """Standard uncertainty of the lag at our instants (n,)."""
+        """Standard error of the lag at our instants (n,)."""
         since = np.stack([np.ones(len(t_s)), t_s - self.at_s])
         variance = np.einsum("in,ij,jn->n", since, self.covariance, since)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -133,7 +142,7 @@ def align(
         known = {True: peaks.best.correlation, False: rival.correlation}
         is_first = abs(best.x[_LAG] - peaks.best.lag_s) < abs(best.x[_LAG] - rival.lag_s)
         ambiguity = Ambiguity(float(other.x[_LAG]), known[not is_first], known[is_first])
-    spread = best.spread
+    spread = best.spread(ours)
     if best.x[_SCALE] <= 0.0:
         raise _wrong_sign()
     # The fit's drift is the lag's change over half of what overlaps.
@@ -185,7 +194,7 @@ def _wrong_sign() -> ComparisonError:
     return ComparisonError(
         "the reference's force falls where ours rises: its sign is turned",
         expected="the force of the ground on the foot, positive under load",
-        remedy="Give the other --sign",
+        remedy="Give the other --sign; or it is the other foot's",
     )
 
 
@@ -197,6 +206,7 @@ class _Fit:
     residual: Floats
     jacobian: Floats
     bend_n: float
+    t_s: Floats
     samples: Ints
     at_s: float
     half_s: float
@@ -205,11 +215,18 @@ class _Fit:
     def residual_n(self) -> float:
         return float(np.sqrt(np.mean(self.residual**2)))
 
-    @property
-    def spread(self) -> Spread:
+    def spread(self, ours: Signal) -> Spread:
+        """How uncertain they are, and by what our foot states to be uncertain of."""
         ratio = 1.0 + (self.residual / self.bend_n) ** 2
         score, curvature = self.residual / np.sqrt(ratio), ratio**-1.5
-        return spread_of(self.jacobian, score, curvature, self.samples)
+        spread = spread_of(self.jacobian, score, curvature, self.samples)
+        if ours.sigma_n is None:
+            return spread
+        pulled = (self.jacobian * curvature[:, None]).T
+        sigma_n = np.interp(self.t_s, ours.t_s, ours.sigma_n)
+        one_way = np.linalg.pinv(pulled @ self.jacobian, hermitian=True) @ (pulled @ sigma_n)
+        by_phase = over_phases(self.jacobian, score, curvature, -self.jacobian[:, _SCALE])
+        return replace(spread, own=by_phase + np.outer(one_way, one_way))
 
 
 def _fit(ours: Signal, reference: Signal, peak: Peak, coarse_s: float) -> _Fit:
@@ -269,7 +286,7 @@ def _fit_under(
         )
         begin = found.x
         bend_n = ROBUST * _noise_n(residual(begin), own_n)
-    return _Fit(begin, residual(begin), jacobian(begin), bend_n, samples, at_s, half_s)
+    return _Fit(begin, residual(begin), jacobian(begin), bend_n, t_s, samples, at_s, half_s)
 
 
 def _noise_n(residual: Floats, own_n: Floats) -> float:

@@ -88,7 +88,11 @@ class Errors:
 
 
 def errors_of(
-    pairs: Pairs, trials: Sequence[Trial], *, reference_sigma_n: float | None = None
+    pairs: Pairs,
+    trials: Sequence[Trial],
+    *,
+    reference_sigma_n: float | None = None,
+    reference_cop_sigma_m: float | None = None,
 ) -> Errors:
     """Judge every trial.
 
@@ -97,6 +101,7 @@ def errors_of(
         trials: rows of `pairs`.
         reference_sigma_n: the reference's own standard uncertainty; None: not known, and nothing is
             said of coverage.
+        reference_cop_sigma_m: likewise of each coordinate of its centre of pressure.
 
     Raises:
         ComparisonError: no trial has a frame.
@@ -105,7 +110,9 @@ def errors_of(
     phases = phases_of(pairs.columns["t_ns"], np.where(pairs.contact, pairs.reference_n, 0.0))
     stances = stances_of(pairs.columns["seq"], pairs.columns["t_ns"], pairs.columns)
     judged = tuple(
-        _trial(pairs, trial, phases, within, stances) for trial in trials if trial.rows.any()
+        _trial(pairs, trial, phases, within, stances, reference_cop_sigma_m)
+        for trial in trials
+        if trial.rows.any()
     )
     if not judged:
         raise ComparisonError(
@@ -129,13 +136,14 @@ def _trial(
     phases: npt.NDArray[np.intp],
     within: Bools | None,
     stances: Sequence[Stance],
+    reference_cop_sigma_m: float | None,
 ) -> TrialErrors:
     rows = trial.rows & pairs.judged & np.isfinite(pairs.error_n)
     loaded = rows & pairs.contact
     error_n, reference_n = pairs.error_n[loaded], pairs.reference_n[loaded]
     bias_n, spread_n = _mean(error_n), float(np.std(error_n)) if len(error_n) else math.nan
     compared, left_out = _stances(pairs, trial.rows, stances)
-    cop, cop_frames = _cop(pairs, trial.rows & pairs.judged)
+    cop, cop_frames = _cop(pairs, trial.rows & pairs.judged, reference_cop_sigma_m)
     scatter = float(((reference_n - reference_n.mean()) ** 2).sum()) if len(error_n) else 0.0
     figures = {
         "grf_frames": float(len(error_n)),
@@ -232,7 +240,9 @@ def _crossings(pairs: Pairs, window: slice) -> tuple[float, float] | None:
     return found[0] - found[2], found[1] - found[3]
 
 
-def _cop(pairs: Pairs, rows: Bools) -> tuple[dict[str, float], dict[str, int]]:
+def _cop(
+    pairs: Pairs, rows: Bools, reference_sigma_m: float | None
+) -> tuple[dict[str, float], dict[str, int]]:
     """Errors of the COP where both are in contact and state it, and the counts."""
     ours = np.stack([pairs.columns["cop_x_m"], pairs.columns["cop_y_m"]], axis=1)
     by_ours = rows & (pairs.columns["contact"] == 1) & np.isfinite(ours).all(axis=1)
@@ -249,6 +259,12 @@ def _cop(pairs: Pairs, rows: Bools) -> tuple[dict[str, float], dict[str, int]]:
         "cop_bias_y_m": float(mean_m[1]),
         "cop_p95_about_mean_m": _p95(about_mean_m),
     }
+    for axis, off in zip("xy", off_m.T, strict=True):
+        sigma_m = pairs.columns[f"cop_sigma_{axis}_m"][both].astype(np.float64)
+        # Across a line of tiles nothing is measured, and nothing is uncertain.
+        told = reference_sigma_m is not None and (sigma_m > 0.0).any()
+        most_m = INTERVAL_95 * np.hypot(sigma_m, reference_sigma_m or 0.0)
+        figures[f"cop_coverage_{axis}_95"] = _mean(np.abs(off) <= most_m) if told else math.nan
     counts = {"ours": by_ours, "reference": by_reference, "both": both}
     return figures, {name: int(which.sum()) for name, which in counts.items()}
 

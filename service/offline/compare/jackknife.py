@@ -5,10 +5,15 @@ rings by. Counting each as new would give intervals several times too narrow. Bl
 are much longer than this memory are as good as independent, and how far an answer moves when one of
 them is left out says how uncertain it is, whatever is in it (delete-a-group jackknife; of a robust
 fit to first order, from its scores and its curvature).
+
+What a model of rubber gets wrong in the same way in every stance, no block of time can show. It
+shows where phases of the load contradict one another: the same is done with them, the rise and the
+fall of a load, each low and high, of all stances together (`over_phases`).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +28,7 @@ MEMORIES = 5.0
 SHARED_MAX = 0.5
 """No variance is more than doubled for what blocks share."""
 
+NORMAL_95 = 1.96
 _UPPER_95 = 0.975
 
 
@@ -34,25 +40,33 @@ class Estimate:
         value: it.
         sigma: standard error.
         dof: degrees of freedom of that, not whole: blocks tell unequally much.
+        own: standard uncertainty from what our foot gets wrong in the same way all the time.
     """
 
     value: float
     sigma: float
     dof: float
+    own: float = 0.0
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """By Student's t."""
-        half = float(stdtrit(self.dof, _UPPER_95)) * self.sigma
+        """By Student's t; for what our foot gets wrong, of which blocks do not tell, normal."""
+        half = math.hypot(float(stdtrit(self.dof, _UPPER_95)) * self.sigma, NORMAL_95 * self.own)
         return self.value - half, self.value + half
 
     def times(self, factor: float) -> Estimate:
         """The same in another unit."""
-        return Estimate(factor * self.value, abs(factor) * self.sigma, self.dof)
+        more = abs(factor)
+        return Estimate(factor * self.value, more * self.sigma, self.dof, more * self.own)
 
     def as_dict(self) -> dict[str, object]:
         """For JSON."""
-        return {"value": self.value, "sigma": self.sigma, "interval_95": self.interval_95}
+        return {
+            "value": self.value,
+            "sigma": self.sigma,
+            "own_sigma": self.own,
+            "interval_95": self.interval_95,
+        }
 
 
 @dataclass(frozen=True)
@@ -63,15 +77,18 @@ class Spread:
         covariance: (p, p).
         dof: (p,).
         blocks: how many there were.
+        own: (p, p), covariance of what our foot gets wrong all the time.
     """
 
     covariance: Floats
     dof: Floats
     blocks: int
+    own: Floats
 
     def estimate(self, values: Floats, i: int) -> Estimate:
         """Of parameter number i."""
-        return Estimate(float(values[i]), float(np.sqrt(self.covariance[i, i])), float(self.dof[i]))
+        sigma, own = (math.sqrt(matrix[i, i]) for matrix in (self.covariance, self.own))
+        return Estimate(float(values[i]), sigma, float(self.dof[i]), own)
 
 
 def block_of(scores: Floats, samples: Ints, weight: Floats) -> Ints:
@@ -130,22 +147,10 @@ def spread_of(jacobian: Floats, score: Floats, curvature: Floats, samples: Ints)
     telling = jacobian**2 * curvature[:, None]
     block = block_of(scores, samples, (telling / telling.sum(axis=0)).sum(axis=1))
     blocks = int(block.max()) + 1
-    slopes = np.zeros((blocks, jacobian.shape[1]))
-    np.add.at(slopes, block, scores)
-    normals = np.stack(
-        [
-            (jacobian[block == b] * curvature[block == b, None]).T @ jacobian[block == b]
-            for b in range(blocks)
-        ]
-    )
+    normals, slopes = _by_group(jacobian, score, curvature, block)
     whole = normals.sum(axis=0)
     inverse = np.linalg.pinv(whole, hermitian=True)
-    moved = np.stack(
-        [
-            np.linalg.pinv(whole - normal, hermitian=True) @ slope
-            for normal, slope in zip(normals, slopes, strict=True)
-        ]
-    )
+    moved = _moved(normals, slopes)
     share = np.einsum("ij,bjk,ki->bi", inverse, normals, inverse)
     with np.errstate(divide="ignore", invalid="ignore"):
         even = share.sum(axis=0) ** 2 / (share**2).sum(axis=0)
@@ -158,6 +163,58 @@ def spread_of(jacobian: Floats, score: Floats, curvature: Floats, samples: Ints)
         covariance=(blocks - 1) / blocks * (centred.T @ centred) * np.outer(wider, wider),
         dof=np.clip(np.nan_to_num(even, nan=1.0), 1.0, blocks - 1.0),
         blocks=blocks,
+        own=np.zeros_like(whole),
+    )
+
+
+def over_phases(jacobian: Floats, score: Floats, curvature: Floats, force_n: Floats) -> Floats:
+    """Covariance of a fit from its phases: how far it moves without one of them, in all stances.
+
+    Four phases tell little of how much they differ: it is so much wider that 1.96 of its square
+    root is Student's interval with three degrees of freedom.
+
+    Args:
+        jacobian: (n, p), of the residuals by the parameters; the first is a time.
+        score: as for `spread_of`.
+        curvature: likewise.
+        force_n: (n,), how high the load is.
+    """
+    rises, telling = jacobian[:, 0] < 0.0, jacobian[:, 0] ** 2 * curvature
+    phase = np.zeros(len(force_n), dtype=np.intp)
+    for side, of_side in enumerate((~rises, rises)):
+        rows = np.flatnonzero(of_side)[np.argsort(force_n[of_side], kind="stable")]
+        told = np.cumsum(telling[rows])
+        half = int(np.searchsorted(told, 0.5 * told[-1])) if len(told) else 0
+        phase[rows] = 2 * side + (np.arange(len(rows)) > half)
+    moved = _moved(*_by_group(jacobian, score, curvature, phase))
+    centred = moved - moved.mean(axis=0)
+    free = len(moved) - 1
+    wider = float(stdtrit(free, _UPPER_95)) / NORMAL_95
+    return np.asarray(wider**2 * free / len(moved) * (centred.T @ centred))
+
+
+def _by_group(
+    jacobian: Floats, score: Floats, curvature: Floats, group: Ints
+) -> tuple[Floats, Floats]:
+    """Normal matrices (g, p, p) and slopes of the loss (g, p) of groups from 0."""
+    groups = int(group.max()) + 1
+    slopes = np.zeros((groups, jacobian.shape[1]))
+    np.add.at(slopes, group, jacobian * score[:, None])
+    normals = [
+        (jacobian[group == g] * curvature[group == g, None]).T @ jacobian[group == g]
+        for g in range(groups)
+    ]
+    return np.stack(normals), slopes
+
+
+def _moved(normals: Floats, slopes: Floats) -> Floats:
+    """By how much a fit moves without each group, (g, p)."""
+    whole = normals.sum(axis=0)
+    return np.stack(
+        [
+            np.linalg.pinv(whole - normal, hermitian=True) @ slope
+            for normal, slope in zip(normals, slopes, strict=True)
+        ]
     )
 
 

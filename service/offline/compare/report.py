@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from service.offline.accuracy import PHASES
 from service.offline.compare.align import Alignment
+from service.offline.compare.clocks import ClockLag
 from service.offline.compare.errors import Errors
 from service.offline.compare.jackknife import Estimate
 from service.offline.compare.pairs import Pairs
@@ -34,6 +35,8 @@ FIGURES: Mapping[str, str] = {
     "cop_bias_x_m": "COP, mean error along x, m",
     "cop_bias_y_m": "COP, mean error along y, m",
     "cop_p95_about_mean_m": "COP, 95th percentile of the distance about the mean error, m",
+    "cop_coverage_x_95": "COP, part within the 95 % interval along x",
+    "cop_coverage_y_95": "COP, part within the 95 % interval along y",
 }
 """Every figure, and what it is."""
 
@@ -41,6 +44,7 @@ FIGURES: Mapping[str, str] = {
 def markdown(
     title: str,
     alignment: Alignment,
+    by_clocks: ClockLag | None,
     pairs: Pairs,
     errors: Errors,
     trials_are: str,
@@ -48,14 +52,14 @@ def markdown(
 ) -> str:
     """All of a comparison that people read."""
     lines = [f"# {title}", "", *(f"- {note}" for note in notes), ""]
-    lines += _alignment(alignment, pairs)
+    lines += _alignment(alignment, by_clocks, pairs)
     lines += _figures(errors, trials_are)
     lines += _trials(errors)
     lines += _phases(errors)
     return "\n".join(lines) + "\n"
 
 
-def _alignment(alignment: Alignment, pairs: Pairs) -> Iterator[str]:
+def _alignment(alignment: Alignment, by_clocks: ClockLag | None, pairs: Pairs) -> Iterator[str]:
     removed = ", removed" if pairs.removed else ", not removed"
     rows: list[tuple[str, Estimate | None, str]] = [
         (f"lag behind our clock at {alignment.at_s:.2f} s, ms", alignment.lag_s.times(1e3), ""),
@@ -67,16 +71,23 @@ def _alignment(alignment: Alignment, pairs: Pairs) -> Iterator[str]:
     yield from (
         "## Alignment",
         "",
-        "| | value | standard error | 95 % interval |",
-        "|---|--:|--:|--:|",
+        "| | value | standard error | of our foot | 95 % interval |",
+        "|---|--:|--:|--:|--:|",
     )
     for name, found, remark in rows:
         if found is None:
-            yield f"| {name} | not known: no flight | - | - |"
+            yield f"| {name} | not known: no flight | - | - | - |"
             continue
         low, high = found.interval_95
         yield (
-            f"| {name}{remark} | {found.value:.4f} | {found.sigma:.4f} | {low:.4f} to {high:.4f} |"
+            f"| {name}{remark} | {found.value:.4f} | {found.sigma:.4f} | {found.own:.4f} | "
+            f"{low:.4f} to {high:.4f} |"
+        )
+    if by_clocks is not None:
+        low_s, high_s = (by_clocks.lag_s + side * by_clocks.within_s for side in (-1.0, 1.0))
+        yield (
+            f"| the same lag by the clock tables, and its bounds, ms | {1e3 * by_clocks.lag_s:.4f} "
+            f"| - | - | {1e3 * low_s:.4f} to {1e3 * high_s:.4f} |"
         )
     yield ""
     yield f"From {alignment.blocks} blocks of time. The reference bears load from"

@@ -20,10 +20,13 @@ class Signal:
     Attributes:
         t_s: (n,), rising.
         force_n: (n,), finite: samples without a force are left out, and are gaps then.
+        sigma_n: (n,), its stated standard uncertainty, which may be the same from stance to stance;
+            None: nothing is stated.
     """
 
     t_s: Floats
     force_n: Floats
+    sigma_n: Floats | None = None
 
     @property
     def step_s(self) -> float:

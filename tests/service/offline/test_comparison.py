@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError
+from service.offline.compare.report import markdown
 from service.offline.comparison import CompareOptions, compare_session
 from storage.clock.file import write_clock
 from storage.clock.log import ClockOffset
@@ -24,7 +25,14 @@ SECONDS = 20.0
 OWN = CompareOptions(Stated())
 
 
-def seal(folder: Path, *, boot_id: str = "one", later_s: float = 0.0, bias_n: float = 0.0) -> Path:
+def seal(
+    folder: Path,
+    *,
+    boot_id: str = "one",
+    later_s: float = 0.0,
+    bias_n: float = 0.0,
+    server_minus_node_s: float = 0.0,
+) -> Path:
     """A session of an irregular gait, `later_s` behind another's clock."""
     n = round(SECONDS * 1e9 / PERIOD_NS)
     info = make_array(2, boot_id=boot_id)
@@ -49,7 +57,12 @@ def seal(folder: Path, *, boot_id: str = "one", later_s: float = 0.0, bias_n: fl
     with SessionWriter(path, info, {}) as writer:
         writer.append(frames, columns)
     clock = [
-        ClockOffset(boot_id=boot_id, t_mono_ns=t_ns, server_minus_node_ns=0, uncertainty_ns=50)
+        ClockOffset(
+            boot_id=boot_id,
+            t_mono_ns=t_ns,
+            server_minus_node_ns=round(server_minus_node_s * 1e9),
+            uncertainty_ns=500_000,
+        )
         for t_ns in range(0, round(SECONDS * 1e9), 10 * 10**9)
     ]
     write_clock(folder / "clock.parquet", clock, [])
@@ -95,6 +108,43 @@ def test_another_session_is_compared_by_its_own_clock(tmp_path: Path) -> None:
     assert found.alignment.lag_s.value == pytest.approx(0.25, abs=2e-3)
     assert found.trials_are == "each contiguous recording"
     assert found.errors.figures["grf_mae_n"].mean < 0.1
+
+
+def test_the_lag_by_forces_stands_beside_that_by_the_clock_tables_of_one_server(
+    tmp_path: Path,
+) -> None:
+    # The other node's clock is a quarter of a second ahead of the server's.
+    path = seal(tmp_path / "ours")
+    other = seal(tmp_path / "theirs", later_s=0.25, server_minus_node_s=-0.25)
+    found = compare_session(path, other, OWN)
+    assert found.clock_lag is not None
+    assert found.clock_lag.lag_s == pytest.approx(0.25, abs=1e-6)
+    assert found.clock_lag.within_s == pytest.approx(0.001, abs=2e-4)
+    assert found.alignment.lag_s.value == pytest.approx(found.clock_lag.lag_s, abs=2e-3)
+    assert not any("the clocks say" in note for note in found.notes)
+    said = markdown(
+        "ours",
+        found.alignment,
+        found.clock_lag,
+        found.pairs,
+        found.errors,
+        found.trials_are,
+        found.notes,
+    )
+    assert "| the same lag by the clock tables, and its bounds, ms | 250.0" in said
+
+
+def test_forces_and_clocks_that_contradict_each_other_are_said(tmp_path: Path) -> None:
+    path = seal(tmp_path / "ours")
+    other = seal(tmp_path / "theirs", later_s=0.25, server_minus_node_s=0.5)
+    found = compare_session(path, other, OWN)
+    assert any("the clocks say a lag of -500.000 ms" in note for note in found.notes)
+
+
+def test_without_a_clock_table_beside_one_of_them_no_lag_is_known_by_clocks(tmp_path: Path) -> None:
+    path, other = seal(tmp_path / "ours"), seal(tmp_path / "theirs")
+    (tmp_path / "theirs" / "clock.parquet").unlink()
+    assert compare_session(path, other, OWN).clock_lag is None
 
 
 def test_forces_of_the_tiles_stand_beside_the_frames_that_are_compared(tmp_path: Path) -> None:

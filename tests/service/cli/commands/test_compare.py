@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import sys
 from pathlib import Path
@@ -14,27 +13,13 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 
-from service.version import SOFTWARE
-from tests.service.cli.outcome import Run, scene_text, static_only
+from storage.checked_json import read_checked
+from tests.service.cli.outcome import Run, scene_text
 
 pytestmark = pytest.mark.slow
 
 LAG_S = 3.21
 LAB = ("--map", "time_s=Time,grf_n=Fz,cop_x_m=COPx,cop_y_m=COPy", "--units", "grf=N,cop=mm")
-
-
-@pytest.fixture
-def session(run: Run, tmp_path: Path, bench_cache: Path) -> Path:
-    """Ten seconds of `poppy` with the paper's curve and its truth; made once."""
-    kept = bench_cache / f"{SOFTWARE}-compare.parquet"
-    if not kept.exists():
-        scene = 'calibration = "paper-eq2-shape"\n' + static_only(scene_text("poppy"))
-        (tmp_path / "scene.toml").write_text(scene)
-        made = f"{os.getpid()}.parquet"
-        asked = ("--scene", "scene.toml", "--seconds", "10", "--truth", "--out", made)
-        assert run("simulate", *asked).code == 0
-        shutil.move(made, kept)
-    return Path(shutil.copy(kept, tmp_path / "session.parquet"))
 
 
 @pytest.fixture
@@ -64,6 +49,7 @@ def test_a_plate_is_aligned_and_compared_and_all_three_files_say_so(
     outcome = run("compare", session, "--reference", plate, *asked, "--out", "new/one", "--json")
     folder = tmp_path / "new" / "one"
     content = json.loads((folder / "compare.json").read_text())
+    del content["check"]
     assert outcome.printed() == content
     low_s, high_s = content["alignment"]["lag_s"]["interval_95"]
     assert low_s < LAG_S < high_s
@@ -89,6 +75,21 @@ def test_the_session_itself_is_a_reference_with_its_truth_and_without_a_lag(
     content = outcome.printed()
     assert abs(content["alignment"]["lag_s"]["value"]) < 0.03
     assert any("assumed scale" in note for note in content["notes"])
+
+
+def test_without_a_folder_it_is_kept_with_the_session(
+    run: Run, session: Path, plate: Path, tmp_path: Path
+) -> None:
+    asked = ("--reference", plate, *LAB, "--sign", "-", "--lag-range-s", "3,4")
+    run("compare", session, *asked).fails(2, "is a file by itself")
+    folder = tmp_path / "20200101T000000Z-000000"
+    folder.mkdir()
+    shutil.copy(session, folder / "frames.parquet")
+    (folder / "session.json").write_text("{}")
+    assert run("compare", folder, *asked).code == 0
+    kept = folder / "comparisons" / "plate"
+    assert {path.name for path in kept.iterdir()} == {"compare.json", "compare.md", "compare.png"}
+    assert read_checked(kept / "compare.json").is_proven
 
 
 def test_a_limit_that_is_missed_is_named_and_code_3_and_all_is_written(

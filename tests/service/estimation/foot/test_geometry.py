@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from devices.frames import ServoInfo
 from service.estimation.foot.geometry import (
+    axes_rad,
     grid_indices,
     hull,
     lost_by_tilt,
@@ -185,12 +186,12 @@ def test_where_the_ankle_goes_unknown_the_ground_frame_is_unknown() -> None:
 def test_tiles_on_an_arc_push_along_its_radii_and_on_a_plane_along_the_segment() -> None:
     arc_rad = np.array([-0.14, -0.047, 0.047, 0.14])
     arc_m = 0.15 * np.stack([np.sin(arc_rad), 0 * arc_rad, -np.cos(arc_rad)], axis=1)
-    assert lost_by_tilt(arc_m) == pytest.approx(1.0 - np.cos(arc_rad), rel=0.05, abs=1e-5)
+    assert lost_by_tilt(axes_rad(arc_m)) == pytest.approx(1.0 - np.cos(arc_rad), rel=0.05, abs=1e-5)
     flat_m = arc_m * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.15]
-    assert lost_by_tilt(flat_m) == pytest.approx(np.zeros(4), abs=1e-12)
+    assert lost_by_tilt(axes_rad(flat_m)) == pytest.approx(np.zeros(4), abs=1e-12)
 
 
 @pytest.mark.parametrize("x_m", [[0.0], [0.0, 0.02], [0.0, 0.0, 0.02, 0.02]])
 def test_too_few_places_do_not_show_how_a_sole_is_curved(x_m: list[float]) -> None:
     positions_m = np.array([[x, 0.01 * i, -0.15 + x] for i, x in enumerate(x_m)])
-    assert (lost_by_tilt(positions_m) == 0.0).all()
+    assert (axes_rad(positions_m) == 0.0).all()

@@ -27,6 +27,8 @@ def columns(force_n: Floats, hz: float = HZ, **given: Any) -> dict[str, Any]:
         "grf_sigma_n": np.full(n, 0.1),
         "cop_x_m": np.where(force_n > 3.0, 0.01, np.nan),
         "cop_y_m": np.where(force_n > 3.0, -0.02, np.nan),
+        "cop_sigma_x_m": np.full(n, 0.001),
+        "cop_sigma_y_m": np.full(n, 0.001),
         "estimate_status": np.zeros(n, dtype=np.uint16),
     }
     return made | given

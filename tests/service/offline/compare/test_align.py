@@ -109,6 +109,50 @@ def test_uncertainty_grows_away_from_the_middle_of_what_overlaps() -> None:
     assert end > 3.0 * middle
 
 
+# --- what a foot gets wrong all the time ----------------------------------------------------------
+
+
+def test_without_a_stated_uncertainty_of_ours_nothing_is_added() -> None:
+    found = align(*walk(6, 12.0))
+    assert (found.lag_s.own, found.drift_ppm.own, found.offset_n.own, found.scale.own) == (0,) * 4
+
+
+def test_a_gain_that_our_sigma_has_room_for_is_within_the_interval_of_the_scale() -> None:
+    ours, reference = walk(10, 12.0, noise=0.3)
+    gained = Signal(ours.t_s, 1.03 * ours.force_n)
+    said = Signal(ours.t_s, gained.force_n, 0.1 + 0.02 * np.abs(ours.force_n))
+    low, high = align(gained, reference).scale.interval_95
+    assert low > 1.0
+    found = align(said, reference)
+    low, high = found.scale.interval_95
+    assert low < 1.0 < found.scale.value < high
+    assert found.scale.own == pytest.approx(0.02, rel=0.5)
+
+
+def late_when_falling(late_s: float) -> tuple[Signal, Signal]:
+    """Ours follows the same load, the falls of it later: as a dome whose creep is not undone."""
+    ours, reference = walk(11, 20.0, noise=0.1)
+    rate = np.gradient(ours.force_n, ours.t_s)
+    falling = ours.force_n - late_s * np.where(rate < 0.0, rate, 0.0)
+    return Signal(ours.t_s, falling, np.full(len(rate), 0.1)), reference
+
+
+def test_phases_that_contradict_one_another_in_every_stance_make_the_lag_uncertain() -> None:
+    ours, reference = late_when_falling(0.004)
+    found = align(ours, reference)
+    low, high = found.lag_s.interval_95
+    assert found.lag_s.own > 3.0 * found.lag_s.sigma  # no block shows what all have
+    assert low <= 0.0 <= high
+    only_blocks = align(Signal(ours.t_s, ours.force_n), reference).lag_s.interval_95
+    assert not only_blocks[0] <= 0.0 <= only_blocks[1]
+
+
+def test_what_our_foot_gets_wrong_is_in_its_force_and_not_again_in_what_the_lag_makes() -> None:
+    ours, reference = late_when_falling(0.004)
+    found = align(ours, reference)
+    assert float(found.lag_sigma_s(np.array([found.at_s]))[0]) == pytest.approx(found.lag_s.sigma)
+
+
 # --- what is refused ------------------------------------------------------------------------------
 
 

@@ -141,6 +141,32 @@ def test_cop_counts_only_where_both_are_in_contact_and_both_counts_are_said() ->
     assert found.cop_frames["both"] == found.cop_frames["reference"] < found.cop_frames["ours"]
 
 
+def test_coverage_of_the_cop_is_said_by_axis_if_the_reference_says_how_good_it_is() -> None:
+    force_n = half_sines([20.0, 25.0, 22.0])
+    off_m = np.random.default_rng(3).normal(0.0, 0.001, (len(force_n), 2))
+    there_m = np.array([0.01, -0.02]) + off_m
+    for sigma_m, least, most in ((0.0005, 0.6, 0.75), (0.001, 0.93, 0.97)):
+        sigmas: dict[str, Any] = {
+            f"cop_sigma_{axis}_m": np.full(len(force_n), sigma_m) for axis in "xy"
+        }
+        pairs = pair(columns(force_n, **sigmas), reference(force_n, cop_m=there_m), same_clock())
+        trial = judged(pairs, reference_cop_sigma_m=0.0)
+        for axis in "xy":
+            assert least < trial.figures[f"cop_coverage_{axis}_95"] < most
+    assert np.isnan(judged(pairs).figures["cop_coverage_x_95"])
+
+
+def test_across_a_line_of_tiles_nothing_is_said_of_coverage() -> None:
+    force_n = half_sines([20.0, 25.0])
+    n = len(force_n)
+    sigmas: dict[str, Any] = {"cop_sigma_x_m": np.full(n, 0.001), "cop_sigma_y_m": np.zeros(n)}
+    there_m = np.tile([0.01, -0.02], (n, 1))
+    pairs = pair(columns(force_n, **sigmas), reference(force_n, cop_m=there_m), same_clock())
+    trial = judged(pairs, reference_cop_sigma_m=0.001)
+    assert trial.figures["cop_coverage_x_95"] == 1.0
+    assert np.isnan(trial.figures["cop_coverage_y_95"])
+
+
 def test_a_reference_of_50_hz_counts_once_for_each_of_its_samples() -> None:
     slow = reference(TRUE_N[::10], hz=HZ / 10)
     pairs = pair(columns(TRUE_N), slow, same_clock())

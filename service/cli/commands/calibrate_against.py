@@ -1,0 +1,80 @@
+"""`foottile calibrate --against`: a mounted foot against a force plate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from service.cli.commands.sessions import sealed_file
+from service.cli.options import output_path, print_json, progress, remark, stdout
+from service.estimation.effects import Parameter
+from service.offline.against import Against, AgainstOptions, calibrate_against
+from service.offline.calibrations import write_calibration
+
+
+def calibrate_mounted(
+    session: Path, against: Path, out: Path, options: AgainstOptions, *, as_json: bool
+) -> None:
+    """See `foottile calibrate --help`."""
+    source = sealed_file(str(session), None)
+    path = output_path(out, source, against)
+    with progress(f"calibrating {session.name} against {against.name}"):
+        found = calibrate_against(source, against, options, name=path.stem)
+    write_calibration(path, found.calibration)
+    if as_json:
+        print_json(_content(found))
+    else:
+        stdout.print(_table(found))
+    if options.reference_gain_sigma == 0.0:
+        remark("the plate's own gain is taken as exact: --reference-gain-sigma says how well it is")
+    for note in found.comparison.notes:
+        remark(note)
+
+
+def _content(found: Against) -> dict[str, object]:
+    mounted, mount = found.calibration.mounted, found.mount
+    return {
+        "id": found.calibration.id,
+        "against": None if mounted is None else mounted.against,
+        "gains": {}
+        if mounted is None
+        else {serial: _parameter(gain) for serial, gain in mounted.gains.items()},
+        "shear": None if mount.shear is None else _parameter(mount.shear),
+        "mae_before_n": mount.before_n,
+        "mae_after_n": mount.after_n,
+        "frames": mount.frames,
+        "blocks": mount.blocks,
+        "late_s": _parameter(mount.late_s),
+    }
+
+
+def _parameter(found: Parameter) -> dict[str, object]:
+    return {"value": found.value, "sigma": found.sigma, "interval_95": found.interval_95}
+
+
+def _table(found: Against) -> Table:
+    mounted, mount = found.calibration.mounted, found.mount
+    table = Table(
+        title=f"Calibration {found.calibration.name} ({found.calibration.id}), as mounted",
+        caption=(
+            f"GRF under load, mean absolute error: {mount.before_n:.3f} N before, "
+            f"{mount.after_n:.3f} N after,\neach stretch by a fit to the others; "
+            f"{mount.frames} frames"
+        ),
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    for heading in ("", "value", "95 % interval"):
+        table.add_column(heading, justify="left" if not heading else "right", no_wrap=True)
+    rows = [] if mounted is None else [(f"gain {name}", one) for name, one in mounted.gains.items()]
+    if mount.shear is not None:
+        rows.append(("shear", mount.shear))
+    for name, found_one in rows:
+        low, high = found_one.interval_95
+        table.add_row(name, f"{found_one.value:.4f}", f"{low:.4f} to {high:.4f}")
+    return table

@@ -1,0 +1,131 @@
+"""From a session over a plate to a better calibration of the foot as it is mounted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from devices.arrays import Floats
+from devices.errors import CalibrationError, FileFormatError
+from devices.frames import ArrayInfo
+from service.estimation.calibration import Calibration
+from service.estimation.effects import Parameter
+from service.estimation.foot.geometry import axes_rad
+from service.estimation.mounted import Mounted
+from service.offline.compare.mounted import Mount, fit_mount
+from service.offline.compare.pairs import Pairs
+from service.offline.comparison import ANGLE, CompareOptions, Comparison, compare_session
+from storage.formats.reference import Stated
+from storage.sessions.reader import SessionReader
+
+
+@dataclass(frozen=True)
+class AgainstOptions:
+    """How to calibrate against a plate; see `foottile calibrate --help`."""
+
+    stated: Stated
+    lag_range_s: tuple[float, float] | None = None
+    per_tile: bool = False
+    shear: bool = False
+    reference_gain_sigma: float = 0.0
+    reference: str = "not stated"
+
+
+@dataclass(frozen=True)
+class Against:
+    """What came of it."""
+
+    calibration: Calibration
+    mount: Mount
+    comparison: Comparison
+
+
+def calibrate_against(
+    path: Path, reference_path: Path, options: AgainstOptions, *, name: str
+) -> Against:
+    """The calibration of a session's foot, with what a plate shows of how it is mounted.
+
+    Args:
+        path: a sealed session with estimates and calibration.
+        reference_path: what the plate has recorded.
+        options: as asked.
+        name: of the calibration.
+
+    Raises:
+        FileFormatError: one of the files cannot be read, or the session brings no calibration.
+        UsageError: a unit or sign of the reference is not stated.
+        ComparisonError: the two cannot be compared.
+        CalibrationError: the load does not determine what was asked for.
+    """
+    asked = CompareOptions(
+        stated=options.stated, lag_range_s=options.lag_range_s, remove_offset=True
+    )
+    with SessionReader(path) as session:
+        info, calibration = session.info, _calibration(session)
+    comparison = compare_session(path, reference_path, asked)
+    pairs = comparison.pairs
+    if not pairs.removed:
+        raise CalibrationError(
+            "the foot is never in flight for long enough to tell the plate's zero",
+            where=str(path),
+            remedy="Lift the foot off the plate for a second before or after",
+        )
+    bearing = np.flatnonzero([not tile.reference for tile in info.tiles])
+    serials = [info.tiles[i].serial for i in bearing]
+    mount = fit_mount(
+        pairs,
+        comparison.force_n[:, bearing],
+        _tilted(info, pairs)[:, bearing],
+        serials,
+        per_tile=options.per_tile,
+        shear=options.shear,
+        reference_gain_sigma=options.reference_gain_sigma,
+    )
+    before = calibration.mounted.gains if calibration.mounted is not None else {}
+    gains = {
+        serial: _times(gain, before[serial].value if serial in before else 1.0)
+        for serial, gain in zip(serials, mount.gains, strict=True)
+    }
+    which = comparison.session.get("id") or path.name
+    mounted = Mounted(
+        against=f"session {which} on {options.reference}, {reference_path.name}",
+        gains=gains,
+        shear=mount.shear,
+    )
+    made = calibration.model_copy(update={"name": name, "mounted": mounted})
+    return Against(made, mount, comparison)
+
+
+def _calibration(session: SessionReader) -> Calibration:
+    if "calibration" not in session.notes:
+        raise FileFormatError(
+            "the session brings no calibration",
+            where=str(session.path),
+            remedy="Estimate it with one first: foottile estimate --calibration",
+        )
+    try:
+        return Calibration.model_validate(session.notes["calibration"])
+    except ValueError as error:
+        raise FileFormatError(
+            f"its calibration is not readable: {error}", where=str(session.path)
+        ) from error
+
+
+def _tilted(info: ArrayInfo, pairs: Pairs) -> Floats:
+    """1 - cos of the angle between each tile's axis and the vertical, (n, tiles)."""
+    positions_m = np.array([(tile.x_m, tile.y_m, tile.z_m) for tile in info.tiles])
+    bearing = np.array([not tile.reference for tile in info.tiles])
+    axes = np.zeros(len(positions_m))
+    axes[bearing] = axes_rad(positions_m[bearing])
+    turned_rad = np.zeros(len(pairs.t_s))
+    if info.servo is not None:
+        known = pairs.columns.get(ANGLE)
+        turned_rad = np.full(len(pairs.t_s), np.nan) if known is None else known.astype(float)
+    return np.asarray(1.0 - np.cos(axes - turned_rad[:, None]))
+
+
+def _times(gain: Parameter, before: float) -> Parameter:
+    """With the gain that the session was estimated with; its doubt is replaced by the new one."""
+    return Parameter(value=gain.value * before, sigma=gain.sigma * before)

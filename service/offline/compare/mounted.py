@@ -1,0 +1,264 @@
+"""What a plate shows of a mounted foot: the gain of its tiles, and which way the ground pushes.
+
+    reference = zero + sum of gain F (1 + shear (1 - cos a)) + late dF/dt
+
+by robust least squares, with F what our tiles say they bear, `a` the angle between a tile's axis
+and the vertical, and `late` what is left of the lag, which would else go into the gains. All of it
+is refused that the load does not determine: gains of tiles that always bear their loads together,
+or the shear of a foot whose tiles are never far from upright.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from devices.arrays import Bools, Floats
+from devices.errors import CalibrationError
+from service.estimation.effects import Parameter
+from service.offline.compare.align import ROBUST
+from service.offline.compare.jackknife import NORMAL_95, Estimate, over_phases, spread_of
+from service.offline.compare.pairs import Pairs
+
+GAIN_SIGMA_MAX = 0.05
+"""Of a gain: a bench is as good as that without any plate."""
+SHEAR_SIGMA_MAX = 0.3
+"""Half of what is known beforehand: all from -1 to 1 alike has 0.58."""
+SINGULAR = 1e-10
+"""Part of the greatest eigenvalue of the columns' correlations at which they are the same."""
+FRAMES_MIN = 200
+"""Under load: fewer tell nothing of phases and blocks."""
+FOLDS = 10
+"""Blocks of time, every other one judged by what the rest has told."""
+
+_LATE, _ZERO, _GAINS = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Mount:
+    """What was found.
+
+    Attributes:
+        gains: of each tile, the same for all if one was asked for.
+        shear: None if it was not asked for.
+        late_s: what was left of the lag.
+        before_n: mean absolute error of the GRF under load, as it was, zero of the reference off.
+        after_n: the same with gains and shear, in stretches that they were not fitted to.
+        frames: under load.
+        blocks: of time, from which the uncertainties are.
+    """
+
+    gains: tuple[Parameter, ...]
+    shear: Parameter | None
+    late_s: Parameter
+    before_n: float
+    after_n: float
+    frames: int
+    blocks: int
+
+
+@dataclass(frozen=True)
+class _Load:
+    """Frames that tell, n of them, and to which gain (g of them) each tile belongs."""
+
+    reference_n: Floats
+    force_n: Floats
+    tilted: Floats
+    rate: Floats
+    gain_of: npt.NDArray[np.intp]
+    gains: int
+    with_shear: bool
+
+    def model_n(self, x: Floats) -> Floats:
+        """What the reference should read, (n,)."""
+        upright = 1.0 + (x[-1] if self.with_shear else 0.0) * self.tilted
+        gained = (self.force_n * upright) @ x[_GAINS + self.gain_of]
+        return np.asarray(gained + x[_ZERO] + x[_LATE] * self.rate)
+
+    def off_n(self, x: Floats) -> Floats:
+        """How far the reference is from that, (n,)."""
+        return np.asarray(self.reference_n - self.model_n(x))
+
+    def jacobian(self, x: Floats) -> Floats:
+        """Of `off_n`, (n, p)."""
+        upright = 1.0 + (x[-1] if self.with_shear else 0.0) * self.tilted
+        columns = [self.rate, np.ones(len(self.rate))]
+        for g in range(self.gains):
+            columns.append((self.force_n * upright)[:, self.gain_of == g].sum(axis=1))
+        if self.with_shear:
+            columns.append((self.force_n * self.tilted) @ x[_GAINS + self.gain_of])
+        return -np.stack(columns, axis=1)
+
+    def grf_n(self, x: Floats) -> Floats:
+        """The GRF with gains and shear, (n,)."""
+        return np.asarray(self.model_n(x) - x[_ZERO] - x[_LATE] * self.rate)
+
+    def of(self, rows: Bools) -> _Load:
+        """Some of the frames."""
+        return _Load(
+            self.reference_n[rows],
+            self.force_n[rows],
+            self.tilted[rows],
+            self.rate[rows],
+            self.gain_of,
+            self.gains,
+            self.with_shear,
+        )
+
+    def fit(self) -> tuple[Floats, float]:
+        """Parameters (p,), late, zero, gains, shear; and from where on residuals count less."""
+        x = np.concatenate([[0.0, 0.0], np.ones(self.gains), np.zeros(int(self.with_shear))])
+        start = self.jacobian(x)[:, : _GAINS + self.gains]
+        x[: _GAINS + self.gains] = -np.linalg.lstsq(start, self.reference_n, rcond=None)[0]
+        bend_n = ROBUST * self._noise_n(x)
+        for _ in range(2):
+            found = least_squares(
+                self.off_n,
+                x,
+                self.jacobian,
+                loss="soft_l1",
+                f_scale=bend_n,
+                x_scale="jac",
+            )
+            x = found.x
+            bend_n = ROBUST * self._noise_n(x)
+        return x, bend_n
+
+    def _noise_n(self, x: Floats) -> float:
+        off_n = self.off_n(x)
+        noise_n = 1.4826 * float(np.median(np.abs(off_n - np.median(off_n))))
+        return max(noise_n, 1e-6 * float(np.ptp(self.reference_n)))
+
+
+def fit_mount(
+    pairs: Pairs,
+    force_n: Floats,
+    tilted: Floats,
+    serials: Sequence[str],
+    *,
+    per_tile: bool = False,
+    shear: bool = False,
+    reference_gain_sigma: float = 0.0,
+) -> Mount:
+    """Fit gains, and shear if asked for.
+
+    Args:
+        pairs: our frames with the reference, its zero taken off.
+        force_n: (n, tiles), what each bearing tile says it bears.
+        tilted: (n, tiles), 1 - cos of the angle between its axis and the vertical; NaN: not known.
+        serials: of the tiles.
+        per_tile: a gain for each tile, and not one for all.
+        shear: which way the ground pushes, too.
+        reference_gain_sigma: standard uncertainty of the reference's own gain.
+
+    Raises:
+        CalibrationError: the load does not determine what was asked for.
+    """
+    known = pairs.judged & np.isfinite(pairs.error_n) & np.isfinite(force_n).all(axis=1)
+    known &= np.isfinite(tilted).all(axis=1) | (not shear)
+    loaded = int((known & pairs.contact).sum())
+    if loaded < FRAMES_MIN:
+        raise CalibrationError(
+            f"{loaded} frames under load tell of the mounted foot",
+            expected=f"at least {FRAMES_MIN} with a GRF, a reference"
+            + (" and an angle" if shear else ""),
+        )
+    grf_n, t_s = pairs.columns["grf_n"], pairs.t_s
+    tiles = force_n.shape[1]
+    load = _Load(
+        reference_n=pairs.reference_n[known],
+        force_n=force_n[known],
+        tilted=np.nan_to_num(tilted[known]) if shear else np.zeros_like(force_n[known]),
+        rate=np.gradient(grf_n, t_s)[known],
+        gain_of=np.arange(tiles) if per_tile else np.zeros(tiles, dtype=np.intp),
+        gains=tiles if per_tile else 1,
+        with_shear=shear,
+    )
+    names = [*(serials if per_tile else ("the foot",)), *(("the shear",) if shear else ())]
+    x, bend_n = load.fit()
+    jacobian = load.jacobian(x)
+    _refuse_alike(jacobian, names)
+    off_n = load.off_n(x)
+    ratio = 1.0 + (off_n / bend_n) ** 2
+    score, curvature = off_n / np.sqrt(ratio), ratio**-1.5
+    step_s = float(np.median(np.diff(t_s)))
+    samples = np.rint((t_s[known] - t_s[known][0]) / step_s).astype(np.int64)
+    spread = spread_of(jacobian, score, curvature, samples)
+    own = over_phases(jacobian, score, curvature, load.force_n.sum(axis=1))
+    found = [_parameter(replace(spread, own=own).estimate(x, i)) for i in range(len(x))]
+    gains = [
+        Parameter(value=gain.value, sigma=math.hypot(gain.sigma, reference_gain_sigma * gain.value))
+        for gain in found[_GAINS : _GAINS + load.gains]
+    ]
+    _refuse_doubtful(gains, found[-1] if shear else None, names)
+    before_n, after_n = _judged(load, pairs, known)
+    return Mount(
+        gains=tuple(gains[g] for g in load.gain_of.tolist()),
+        shear=found[-1] if shear else None,
+        late_s=found[_LATE],
+        before_n=before_n,
+        after_n=after_n,
+        frames=loaded,
+        blocks=spread.blocks,
+    )
+
+
+def _parameter(found: Estimate) -> Parameter:
+    """With a sigma whose 1.96 are the interval, few as the blocks may be."""
+    return Parameter(value=found.value, sigma=(found.interval_95[1] - found.value) / NORMAL_95)
+
+
+def _refuse_alike(jacobian: Floats, names: Sequence[str]) -> None:
+    """Refuse what the load does not tell apart at all: columns that are the same, or nothing."""
+    size = np.linalg.norm(jacobian, axis=0)
+    alike = size <= SINGULAR * size.max()
+    if not alike.any():
+        values, vectors = np.linalg.eigh((jacobian / size).T @ (jacobian / size))
+        if values[0] > SINGULAR * values[-1]:
+            return
+        alike = np.abs(vectors[:, 0]) > 0.1 * np.abs(vectors[:, 0]).max()
+    raise _undetermined([name for name, one in zip(names, alike[_GAINS:], strict=True) if one])
+
+
+def _refuse_doubtful(
+    gains: Sequence[Parameter], shear: Parameter | None, names: Sequence[str]
+) -> None:
+    """Refuse what is known less well than a bench, or friction, would tell."""
+    doubtful = [
+        f"{name} ({gain.value:.3f} with a sigma of {gain.sigma:.3f})"
+        for name, gain in zip(names, gains, strict=False)
+        if not gain.sigma <= GAIN_SIGMA_MAX * abs(gain.value)
+    ]
+    if shear is not None and not shear.sigma <= SHEAR_SIGMA_MAX:
+        doubtful.append(f"the shear ({shear.value:.2f} with a sigma of {shear.sigma:.2f})")
+    if doubtful:
+        raise _undetermined(doubtful)
+
+
+def _undetermined(what: Sequence[str]) -> CalibrationError:
+    return CalibrationError(
+        f"the load does not determine {', '.join(what)}",
+        expected="for a gain of each tile loads that go from tile to tile; for the shear tiles "
+        "that are far from upright, at angles that change",
+        remedy="Roll or tilt the foot over the plate, for longer; or ask for less: one gain for "
+        "the foot, no shear",
+    )
+
+
+def _judged(load: _Load, pairs: Pairs, known: Bools) -> tuple[float, float]:
+    """Mean absolute error under load before and after, each stretch by a fit to the others."""
+    contact = pairs.contact[known]
+    # Stretches with equally much load: a few stances may be all there is.
+    fold = (np.cumsum(contact) - contact) * FOLDS // contact.sum() % 2
+    before_n = np.abs(pairs.error_n[known])
+    after_n = np.empty(len(contact))
+    for judged in (0, 1):
+        x, _ = load.of(fold != judged).fit()
+        some = load.of(fold == judged)
+        after_n[fold == judged] = np.abs(some.grf_n(x) - some.reference_n)
+    return float(before_n[contact].mean()), float(after_n[contact].mean())
