@@ -29,6 +29,7 @@
      +-- ComparisonError       (ValueError)    a reference cannot be compared with a session
      +-- LinkError             (ConnectionError) node, server or client cannot talk to each other
      +-- StateError                            not now: recording already, node away, not sealed
+     |    +-- WorkerLostError                  processes that worked on a task were killed
      +-- UnknownError          (LookupError)   no such node, session, tare
 
 Every error keeps its facts: `what` happened, `where`, what was `expected`, and the `remedy`. Those
@@ -255,6 +256,10 @@ class LinkError(FootTileError, ConnectionError):
 
 class StateError(FootTileError):
     """What is asked for does not fit the present state: recording already, node away."""
+
+
+class WorkerLostError(StateError):
+    """Processes that worked on a task were killed, again and again."""
 
 
 class UnknownError(FootTileError, LookupError):

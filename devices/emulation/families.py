@@ -1,4 +1,4 @@
-"""Families of parts: the usual one, and a broad one that contains what a real batch may be.
+"""Families of parts: the usual one, the paper's six domes, and a broad one of what may come.
 
 The usual family (`devices.emulation.parts`) is what calibrations and results are kept for, and
 never changes. The broad one is there to try an estimator on domes that nobody has seen: its ranges
@@ -7,12 +7,14 @@ are wider wherever hardware.md says "not known", or gives a number of one part o
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 
 from devices.chips.mpl115a2 import PRESSURE_MAX_KPA
 from devices.emulation.parts import ChipPart, DomePart, draw_chip, draw_dome, random_of
+from devices.errors import SceneError
 from devices.scene.emulated import Family
 
 _LATE_NS = 300_000
@@ -24,7 +26,7 @@ _LACKING = 0.05
 def chip_of(family: Family, serial: str, parts_seed: int) -> ChipPart:
     """The chip of a serial in a family."""
     chip = draw_chip(serial, parts_seed)
-    if family == "default":
+    if family != "broad":
         return chip
     rng = random_of(f"broad chip/{parts_seed}/{serial}")
     return replace(chip, late_ns=round(rng.uniform(-_LATE_NS, _LATE_NS)))
@@ -34,7 +36,52 @@ def dome_of(family: Family, serial: str, parts_seed: int) -> DomePart:
     """The dome of a serial in a family."""
     if family == "default":
         return draw_dome(serial, parts_seed)
+    if family == "table-1":
+        return _table_dome(serial, draw_dome("table-1", parts_seed))
     return _broad_dome(random_of(f"broad dome/{parts_seed}/{serial}"))
+
+
+_TABLE_1 = re.compile(r"v(?P<material>40|60)-(?P<mm>10|11|12)")
+_MODULUS_MPA = {"40": 0.69, "60": 2.17}
+_BUBBLE_MM = 3.0
+
+
+def _table_dome(serial: str, usual: DomePart) -> DomePart:
+    """One of the paper's domes, Table I, whose serial is its name: v60-11 is 11 mm of Vytaflex 60.
+
+    Of the others the paper states no force. All six are of one casting, a usual dome's, with its
+    forces scaled by modulus and area, which is the same strain at the same part of full scale, and
+    with the give of a thick sphere's wall (hardware.md 9).
+
+    Raises:
+        SceneError: the serial is no name of a dome.
+    """
+    named = _TABLE_1.fullmatch(serial)
+    if named is None:
+        raise SceneError(
+            f"tile {serial} is of the family table-1, and no dome of the paper's Table I",
+            expected="v40-10, v40-11, v40-12, v60-10, v60-11 or v60-12",
+        )
+    modulus_mpa, diameter_mm = _MODULUS_MPA[named["material"]], float(named["mm"])
+    stiffer = modulus_mpa / _MODULUS_MPA["60"] * (diameter_mm / 11.0) ** 2
+    given = _give(modulus_mpa, diameter_mm) / _give(_MODULUS_MPA["60"], 11.0)
+    full_scale_n = float(usual.felt_n(np.array([PRESSURE_MAX_KPA]))[0])
+    part = replace(
+        usual,
+        knee_n=stiffer * usual.knee_n,
+        wall_per_kpa=given * usual.wall_per_kpa,
+        loop_n=stiffer * usual.loop_n,
+    )
+    # A wall that gives way more would shift the end of the range: the rubber's forces are to.
+    shifted = float(part.felt_n(np.array([PRESSURE_MAX_KPA]))[0])
+    lost = part.stiffening * np.log1p(shifted / part.knee_n)
+    return replace(part, stiffening=float(lost / np.log1p(stiffer * full_scale_n / part.knee_n)))
+
+
+def _give(modulus_mpa: float, diameter_mm: float) -> float:
+    """Of a thick sphere's wall for a pressure, up to a factor that all domes have in common."""
+    outer3 = (diameter_mm / 2.0) ** 3
+    return outer3 / (modulus_mpa * (outer3 - _BUBBLE_MM**3))
 
 
 def _broad_dome(rng: np.random.Generator) -> DomePart:

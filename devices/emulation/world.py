@@ -31,6 +31,7 @@ from devices.emulation.ground.hopping import Hopping
 from devices.emulation.ground.load_trace import PressedTrace
 from devices.emulation.ground.mill import Indentation, Mill
 from devices.emulation.parts import random_of
+from devices.emulation.plates.underfoot import Underfoot
 from devices.emulation.puncture import Puncture
 from devices.emulation.surroundings import Surroundings
 from devices.scene.emulated import BUS, LEAK_S, FaultKind, MudGround, PartFault
@@ -99,6 +100,8 @@ class World:
         """Instant of the clock at which the scene's time began."""
         self.ground = make_ground(scene, seed=seed, lead_s=lead_s, pressed=pressed, looped=looped)
         self._positions_m = tile_positions_m(scene.tile)
+        self.underfoot = Underfoot(self.ground, self._positions_m)
+        """What a plate under the foot sees."""
         serials = [tile.serial for tile in scene.tile]
         family = scene.emulation.family
         domes = [dome_of(family, serial, parts_seed) for serial in serials]
@@ -202,13 +205,11 @@ class World:
 
     def truth(self, t_mono_ns: Times) -> Truth:
         """Ground truth at instants of the node's monotonic clock."""
-        t_s = self._seconds(t_mono_ns)
+        t_s = self.seconds(t_mono_ns)
         forces_n = self.ground.forces_n(t_s)
         angle = self.ground.angle_rad(t_s)
         angle_rad = np.full(len(t_s), np.nan) if angle is None else angle
-        vertical_n = forces_n
-        if self.ground.arc_rad is not None:
-            vertical_n = forces_n * np.cos(self.ground.arc_rad - angle_rad[:, None])
+        vertical_n = forces_n * np.cos(self.ground.tilt_rad(t_s))
         grf_n = vertical_n.sum(axis=1)
         weight = vertical_n / np.where(grf_n > 0.0, grf_n, np.nan)[:, None]
         return Truth(
@@ -238,7 +239,7 @@ class World:
         domes = self._domes.again(emulation, around)
         pressed = [
             [domes.pressure_kpa(dome, t_s) for dome in range(len(self.domes))]
-            for t_s in self._seconds(t_mono_ns).tolist()
+            for t_s in self.seconds(t_mono_ns).tolist()
         ]
         return np.array(pressed).reshape(len(t_mono_ns), len(self.domes))
 
@@ -246,7 +247,7 @@ class World:
     def mill(self) -> Mill | None:
         """The reference force sensor beside the spindle, if the ground is the mill."""
         if isinstance(self.ground, Indentation):
-            return Mill(self.ground, self._seconds, self._mill_rng)
+            return Mill(self.ground, self.seconds, self._mill_rng)
         return None
 
     def _puncture(self, serial: str, surroundings: Surroundings) -> Puncture:
@@ -271,13 +272,14 @@ class World:
             )
         return Surroundings(emulation, ground if isinstance(ground, Hopping) else None, draw)
 
-    def _seconds(self, t_ns: Times) -> Floats:
+    def seconds(self, t_ns: Times) -> Floats:
+        """Time of the scene at instants of the clock; zero until it begins."""
         if not self._begun:
             return np.zeros(len(t_ns))
         return np.asarray(np.maximum(t_ns - self.epoch_ns, 0) * 1e-9)
 
     def _servo_counts(self, servo: ServoScene, t_ns: int) -> int:
-        angle = self.ground.angle_rad(self._seconds(np.array([t_ns])))
+        angle = self.ground.angle_rad(self.seconds(np.array([t_ns])))
         angle_rad = 0.0 if angle is None else float(angle[0])
         turns = angle_rad / (2 * math.pi) / (servo.sign * servo.ratio)
         return servo.zero_counts + math.floor(turns * COUNTS_PER_TURN + 0.5)

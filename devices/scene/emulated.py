@@ -111,7 +111,7 @@ GroundScene = Annotated[
 
 
 ReadDuringConversion = Literal["stale", "abort", "torn"]
-Family = Literal["default", "broad"]
+Family = Literal["default", "broad", "table-1"]
 """Of emulated parts; drawn in `devices.emulation.families`."""
 
 
@@ -119,7 +119,8 @@ class EmulationScene(Section):
     """`[emulation]`: which effects the emulated domes and chips show. A real node ignores it."""
 
     family: Family = "default"
-    """Which domes and chips are drawn: the usual ones, or whatever a real batch may be."""
+    """Which domes and chips are drawn: the usual ones, whatever a real batch may be, or the paper's
+    six domes, each by its name as serial."""
     noise_kpa: Annotated[float, Field(ge=0, le=100)] = 0.165
     """Standard deviation of a single reading in all: core, outliers and rounding."""
     correlated_ms: NotNegative = 0.0

@@ -10,6 +10,7 @@ from devices.emulation.ground.grounds import press_on
 from devices.emulation.ground.load_trace import CopTransform, LoadTrace, PressedTrace
 from devices.errors import needs_extra
 from devices.scene.file import Scene
+from service.rig.plates import PlateFiles, write_plates
 
 if TYPE_CHECKING:
     from devices.emulation.world import World
@@ -25,6 +26,7 @@ class EmulatedFoot:
     lead_s: float = 1.0
     seed: int = 0
     parts_seed: int = 0
+    plates: PlateFiles = PlateFiles()  # noqa: RUF009  # frozen, so one for all is safe
 
     def pressed_on(self, scene: Scene) -> PressedTrace | None:
         """The recorded load on the tiles of a scene; None if there is none.
@@ -67,3 +69,11 @@ class EmulatedFoot:
             begun=False,
             in_real_time=in_real_time,
         )
+
+    def write_plates(self, world: World, end_ns: int) -> None:
+        """Write what the plates under it have seen until an instant of the node's clock.
+
+        Raises:
+            StorageError: a file cannot be written.
+        """
+        write_plates(self.plates, world, end_ns, seed=self.seed, parts_seed=self.parts_seed)

@@ -19,7 +19,7 @@ from devices.chips.dynamixel.reader import open_servo
 from devices.chips.dynamixel.servo import ServoReader
 from devices.chips.mcp3208 import Mcp3208
 from devices.clock import Clock, SpinningClock, SystemClock, UtcAnchor
-from devices.errors import I2cError, TileSetupError, UsageError
+from devices.errors import FootTileError, I2cError, TileSetupError, UsageError
 from devices.frames import ArrayInfo, FrameBatch, FrameStatus
 from devices.realtime import clock_is_set, run_before_others, sharpen_timers
 from devices.recovery.recovery import BusRecovery, GpioRecovery, open_recovery
@@ -131,6 +131,7 @@ class Rig:
         # Only now: on a busy machine all that was before would use up the lead.
         if world is not None and options.emulated:
             self._lead = Lead(world, options.foot.lead_s)
+            stack.callback(self._write_plates, world)
         elif world is not None:
             world.begin()
         self._begin_stream(bus_hz, is_new=False)
@@ -238,6 +239,13 @@ class Rig:
             self._clock = driver = HostedClock(self._clock)
             clock = WireClock(driver, self._line_clock)
         return options.foot.world(scene, clock, pressed, looped=True, in_real_time=True)
+
+    def _write_plates(self, world: World) -> None:
+        """What plates have seen, when all is closed: nobody is there any more to be told."""
+        try:
+            self._options.foot.write_plates(world, self._clock.now_ns())
+        except FootTileError as error:
+            sys.stderr.write(f"foottile: {error}\n")
 
     def _servo(self, scene: ServoScene, world: World | None, stack: ExitStack) -> ServoReader:
         port = scene.port

@@ -37,6 +37,13 @@ class Ground(ABC):
         """Angle of the foot segment; None for a foot without a moving segment."""
         return None
 
+    def tilt_rad(self, t_s: Floats) -> Floats:
+        """Angle of each dome's axis ahead of the vertical, (n, tiles); (n, 1) if all stand."""
+        angle_rad = self.angle_rad(t_s)
+        if self.arc_rad is None or angle_rad is None:
+            return np.zeros((len(t_s), 1))
+        return np.asarray(self.arc_rad - angle_rad[:, None])
+
 
 def in_round(t_s: Floats, lead_s: float, round_s: float) -> Floats:
     """Times within the first of many rounds of `round_s` after the lead; infinite: there is one."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
@@ -12,7 +13,9 @@ from devices.frames import FrameStatus
 from devices.scene.file import load_scene
 from service.rig.emulated import EmulatedFoot
 from service.rig.options import RigOptions
+from service.rig.plates import PlateFiles
 from service.rig.rig import Rig
+from storage.formats.reference import Stated, read_reference
 
 
 @pytest.mark.slow
@@ -47,3 +50,20 @@ def test_a_stream_that_is_faster_than_its_bus_was_measured_to_be_goes_on_as_one_
     assert rig.info.boot_id == boot_id
     assert second.seq[0] == 0
     assert second.t_mono_ns[0] > first[-1].t_mono_ns[-1]
+
+
+@pytest.mark.slow
+def test_plates_under_a_foot_in_real_time_write_when_it_is_closed_and_say_what_they_cannot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plates = PlateFiles(tmp_path / "plate.csv", tmp_path / "gone" / "plate.npz")
+    foot = EmulatedFoot(lead_s=0.2, plates=plates)
+    with ExitStack() as stack:
+        rig = Rig(RigOptions(load_scene("standing"), "stands", foot), stack)
+        end_ns = time.monotonic_ns() + 1_500_000_000
+        for _ in rig.batches(lambda: time.monotonic_ns() > end_ns):
+            pass
+        assert not (tmp_path / "plate.csv").exists()
+    force_n = read_reference(tmp_path / "plate.csv", Stated({"grf_n": "fz_n"})).grf_n
+    assert force_n[-1] == pytest.approx(40.0, abs=2.0), "it stands on the plate"
+    assert str(tmp_path / "gone" / "plate.npz") in capsys.readouterr().err

@@ -1,0 +1,144 @@
+"""A small force plate with six channels, as it is on paper and a little beside that.
+
+A plate is a spring with a mass on it; its amplifier has a low-pass filter. Channels mix, have a
+gain of their own, an offset that creeps, noise, and steps of a converter. Where the numbers are
+from, and how sure they are, is in hardware.md 11.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Floats
+from devices.emulation.plates.clock import PlateClock
+from devices.emulation.plates.underfoot import FORCES, MOMENTS, VERTICAL
+
+CHANNELS = ("fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")
+RATE_HZ = 1000.0
+RANGE = np.array([125.0, 125.0, 250.0, 12.0, 12.0, 6.0])
+"""Of the channels, either way, in N and N m."""
+BITS = 16
+NATURAL_HZ, DAMPING = 400.0, 0.05
+FILTER_HZ = 300.0
+"""Butterworth, second order."""
+GAIN = 0.005
+"""Of a channel's own gain, at the most."""
+CROSSTALK, CROSSTALK_OF_VERTICAL = 0.02, 0.005
+"""Part of a load that another force, or another moment, shows of it, at the most."""
+LEVER_M = 0.0005
+"""Moment that a newton shows, at the most."""
+WHITE, SLOW = 4e-4, 2e-4
+"""Standard deviations of the noise, in parts of the range."""
+SLOW_S = 3.0
+OFFSET = 4e-3
+"""After it was set to zero by hand, in parts of the range."""
+CREEP_PER_S = 4e-5
+"""Of that offset, in parts of the range."""
+STATED_SIGMA_N = 0.25
+"""Standard uncertainty of a vertical force of some 20 N once the zero is off, as a user would put
+together from the above: noise, a uniform gain within half a per cent, crosstalk of 2 N."""
+DRIFT_PPM = 50.0
+LATEST_S = 0.4
+
+Complexes = npt.NDArray[np.complex128]
+
+_FINER = 4  # the filters are computed on samples so much closer
+_PAD_S = 0.1  # in which what they remember from before has died away
+
+
+@dataclass(frozen=True)
+class ForcePlate:
+    """One plate in one trial.
+
+    Attributes:
+        clock: its own.
+        mixing: (6, 6), what each channel shows of each load.
+        offset: (6,), at the first sample.
+        creep_per_s: (6,), of the offset.
+    """
+
+    clock: PlateClock
+    mixing: Floats
+    offset: Floats
+    creep_per_s: Floats
+
+    @classmethod
+    def drawn(cls, plate: np.random.Generator, trial: np.random.Generator) -> ForcePlate:
+        """A plate, and how it was set up for a trial; each is drawn by its own generator."""
+        mixing = np.eye(6) * (1.0 + GAIN * plate.uniform(-1.0, 1.0, 6))
+        part = CROSSTALK * plate.uniform(-1.0, 1.0, (6, 6))
+        part[:, VERTICAL] *= CROSSTALK_OF_VERTICAL / CROSSTALK
+        for kind in (FORCES, MOMENTS):
+            own = np.ix_(kind, kind)
+            mixing[own] += part[own] * (1.0 - np.eye(3))
+        mixing[np.ix_(MOMENTS, FORCES)] += LEVER_M * plate.uniform(-1.0, 1.0, (3, 3))
+        return cls(
+            clock=PlateClock(
+                RATE_HZ,
+                start_s=trial.uniform(0.05, LATEST_S),
+                drift_ppm=plate.uniform(-DRIFT_PPM, DRIFT_PPM),
+            ),
+            mixing=mixing,
+            offset=RANGE * OFFSET * trial.uniform(-1.0, 1.0, 6),
+            creep_per_s=RANGE * CREEP_PER_S * trial.uniform(-1.0, 1.0, 6),
+        )
+
+    @property
+    def delay_s(self) -> float:
+        """How late slow loads are shown: the spring's delay and the filter's."""
+        return DAMPING / (math.pi * NATURAL_HZ) + math.sqrt(0.5) / (math.pi * FILTER_HZ)
+
+    def record(
+        self, wrench: Callable[[Floats], Floats], end_s: float, noise: np.random.Generator
+    ) -> tuple[Floats, Floats]:
+        """What it writes down of a load until `end_s` of the scene.
+
+        Args:
+            wrench: forces and moments at instants of the scene, (n, 6).
+            end_s: when it is stopped.
+            noise: draws it.
+
+        Returns:
+            Times by its own clock (n,), and its channels (n, 6).
+        """
+        time_s, t_s = self.clock.samples(end_s)
+        shown = self._filtered(wrench, t_s) @ self.mixing.T
+        shown += self.offset + time_s[:, None] * self.creep_per_s
+        shown += RANGE * WHITE * noise.standard_normal(shown.shape)
+        shown += RANGE * SLOW * self._slow(len(time_s), noise)
+        step = RANGE / 2 ** (BITS - 1)
+        return time_s, np.asarray(np.clip(np.rint(shown / step) * step, -RANGE, RANGE - step))
+
+    def _filtered(self, wrench: Callable[[Floats], Floats], t_s: Floats) -> Floats:
+        """The load through spring and filter, exactly, as both are linear."""
+        if not len(t_s):
+            return np.zeros((0, 6))
+        step_s = 1.0 / (_FINER * self.clock.rate_hz * (1.0 + 1e-6 * self.clock.drift_ppm))
+        before = math.ceil(_PAD_S / step_s)
+        fine_s = t_s[0] + step_s * np.arange(-before, _FINER * len(t_s))
+        load = wrench(np.maximum(fine_s, 0.0))
+        i_hz: Complexes = np.asarray(1j * np.fft.rfftfreq(len(fine_s), step_s), np.complex128)
+        passed = 1.0 / _second_order(i_hz / NATURAL_HZ, DAMPING)
+        passed /= _second_order(i_hz / FILTER_HZ, math.sqrt(0.5))
+        spectrum = np.fft.rfft(load, axis=0) * passed[:, None]
+        return np.asarray(np.fft.irfft(spectrum, len(fine_s), axis=0)[before::_FINER])
+
+    def _slow(self, n: int, noise: np.random.Generator) -> Floats:
+        """Noise of unit variance that lasts `SLOW_S`: straight lines between knots."""
+        decay = math.exp(-0.1)
+        knot_s = 0.1 * SLOW_S
+        knots = noise.standard_normal((2 + int(n / (self.clock.rate_hz * knot_s)), 6))
+        for i in range(1, len(knots)):
+            knots[i] = decay * knots[i - 1] + math.sqrt(1.0 - decay**2) * knots[i]
+        at = np.arange(n) / (self.clock.rate_hz * knot_s)
+        known = np.arange(len(knots))
+        return np.stack([np.interp(at, known, column) for column in knots.T], axis=1)
+
+
+def _second_order(i: Complexes, damping: float) -> Complexes:
+    return np.asarray(i**2 + 2.0 * damping * i + 1.0)

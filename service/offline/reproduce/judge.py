@@ -1,0 +1,187 @@
+"""A trial judged: compared with its reference, and the comparison with what was injected.
+
+The comparison has two files and what a user would state of them. Only then, and for the report
+alone, it is held against what the emulated instrument's clock, gain and offset really were.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from devices.emulation.plates import force_plate, pressure_plate
+from devices.emulation.plates.underfoot import VERTICAL
+from service.offline.compare.jackknife import Estimate
+from service.offline.compare.trials import OverTrials, over_trials
+from service.offline.comparison import CompareOptions, Comparison, compare_session
+from service.offline.reproduce.setups import FORCE_PLATE, Setup
+from service.rig.plates import injected_beside
+from storage.formats.reference import Stated
+from storage.sessions.reader import SessionReader
+
+SHOWN = (
+    "grf_mae_n",
+    "grf_bias_n",
+    "grf_rmse_n",
+    "grf_coverage_95",
+    "peak_mae_n",
+    "impulse_mae_n_s",
+    "cop_mean_m",
+    "cop_p95_m",
+    "cop_p95_about_mean_m",
+    "cop_coverage_x_95",
+)
+"""Figures of a comparison that the report has."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One property of the reference, as the comparison found it and as it was.
+
+    Attributes:
+        found: by the comparison; None if it could not tell.
+        injected: as it was.
+        beside: standard deviation of what the instrument's slow noise adds to that.
+    """
+
+    found: Estimate | None
+    injected: float
+    beside: float = 0.0
+
+    @property
+    def off(self) -> float:
+        """Found less injected, in halves of the 95 % interval; NaN if nothing was found."""
+        if self.found is None:
+            return math.nan
+        sigma = float(np.hypot(self.found.sigma, self.beside))
+        low, high = replace(self.found, sigma=sigma).interval_95
+        return (self.found.value - self.injected) / (0.5 * (high - low))
+
+    @property
+    def inside(self) -> bool:
+        """Is what was injected within that interval?"""
+        return abs(self.off) <= 1.0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One trial.
+
+    Attributes:
+        name: of it.
+        comparison: with its reference.
+        checks: lag (s), drift (ppm), offset (N) and scale.
+        frames: of the session.
+        rate_hz: of them.
+        lost_frames: that no file has.
+        missed_slots: in which none was taken.
+    """
+
+    name: str
+    comparison: Comparison
+    checks: Mapping[str, Check]
+    frames: int
+    rate_hz: float
+    lost_frames: int = 0
+    missed_slots: int = 0
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Of the comparison, for the one trial that it is."""
+        return {name: over.mean for name, over in self.comparison.errors.figures.items()}
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "name": self.name,
+            "frames": self.frames,
+            "rate_hz": self.rate_hz,
+            "lost_frames": self.lost_frames,
+            "missed_slots": self.missed_slots,
+            "figures": self.figures,
+            "notes": self.comparison.notes,
+            "reference": {
+                name: {
+                    "found": check.found,
+                    "injected": check.injected,
+                    "off_by_half_intervals": check.off,
+                    "inside": check.inside,
+                }
+                for name, check in self.checks.items()
+            },
+        }
+
+
+def judge(
+    setup: Setup,
+    name: str,
+    session: Path,
+    reference: Path,
+    *,
+    lost_frames: int = 0,
+    missed_slots: int = 0,
+) -> Judged:
+    """Compare a trial with its reference.
+
+    Raises:
+        FootTileError: the two cannot be compared.
+    """
+    of_force = setup.instrument == FORCE_PLATE
+    stated = Stated({"grf_n": "fz_n"}) if of_force else Stated()
+    plate = force_plate if of_force else pressure_plate
+    comparison = compare_session(
+        session,
+        reference,
+        CompareOptions(
+            stated=stated,
+            remove_offset=True,
+            reference_sigma_n=plate.STATED_SIGMA_N,
+            reference_cop_sigma_m=None if of_force else pressure_plate.STATED_COP_SIGMA_M,
+        ),
+    )
+    with SessionReader(session) as reader:
+        t_ns = np.concatenate([piece["t_mono_ns"] for piece in reader.columns("t_mono_ns")])
+    injected = json.loads(injected_beside(reference).read_text())
+    return Judged(
+        name=name,
+        comparison=comparison,
+        checks=_checks(comparison, injected, int(t_ns[0]), of_force=of_force),
+        frames=len(t_ns),
+        rate_hz=1e9 * (len(t_ns) - 1) / float(t_ns[-1] - t_ns[0]),
+        lost_frames=lost_frames,
+        missed_slots=missed_slots,
+    )
+
+
+def _checks(
+    comparison: Comparison, injected: Mapping[str, float], begin_ns: int, *, of_force: bool
+) -> dict[str, Check]:
+    alignment, pairs = comparison.alignment, comparison.pairs
+    since_s = (begin_ns - int(injected["zero_t_mono_ns"])) * 1e-9 + alignment.at_s
+    shown_s = since_s * (1.0 + 1e-6 * injected["drift_ppm"]) + injected["delay_s"]
+    in_flight = alignment.reference_s(pairs.t_s[~pairs.contact])
+    at_s = float(in_flight.mean()) if len(in_flight) else 0.0
+    slow_n = float(force_plate.SLOW * force_plate.RANGE[VERTICAL]) if of_force else 0.0
+    return {
+        "lag_s": Check(alignment.lag_s, shown_s - alignment.at_s),
+        "drift_ppm": Check(alignment.drift_ppm, injected["drift_ppm"]),
+        "offset_n": Check(
+            pairs.zero_n,
+            injected["offset_n"] + injected["offset_creep_n_per_s"] * at_s,
+            beside=slow_n,
+        ),
+        "scale": Check(alignment.scale, 1.0 / injected["gain"]),
+    }
+
+
+def over_all(judged: Sequence[Judged]) -> dict[str, OverTrials]:
+    """Every figure over trials, with its interval."""
+    return {
+        name: over_trials(np.array([one.figures[name] for one in judged], dtype=np.float64))
+        for name in (judged[0].figures if judged else ())
+    }

@@ -1,0 +1,86 @@
+"""What a comparison with an emulated plate says is true, as far as the truth is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow.parquet as pq
+import pytest
+
+from devices.scene.file import load_scene
+from service.estimation import OFFLINE_LAG_MS
+from service.offline.calibrations import find_calibration
+from service.offline.compare.jackknife import Estimate
+from service.offline.reproduce.judge import Check, Judged, judge
+from service.offline.reproduce.setups import POPPY, ROLLING, Setup
+from service.offline.simulate import SimulateOptions, simulate
+from service.rig.emulated import EmulatedFoot
+from service.rig.plates import PlateFiles
+from service.sessions.pipeline import EstimateOptions
+
+pytestmark = pytest.mark.slow
+
+
+def recorded(
+    setup: Setup, folder: Path, cache: Path
+) -> tuple[Judged, dict[str, npt.NDArray[np.float64]]]:
+    """A trial in virtual time, judged by its plate, and its columns with the truth."""
+    scene = load_scene(setup.scene)
+    if setup.whole_sole:
+        ground = scene.ground.model_copy(update={"dome_share": 1.0})
+        scene = scene.model_copy(update={"ground": ground})
+    reference, session = folder / f"plate{setup.ending}", folder / "session.parquet"
+    plates = PlateFiles(**{setup.instrument.replace(" ", "_"): reference})
+    serials = [tile.serial for tile in scene.tile]
+
+    def estimate() -> EstimateOptions:
+        calibration = find_calibration("bench", serials, cache=cache / "foottile" / "bench")
+        return EstimateOptions(calibration, scene.models, OFFLINE_LAG_MS)
+
+    foot = EmulatedFoot(seed=5, plates=plates)
+    options = SimulateOptions(scene, seconds=6.0, truth=True, foot=foot)
+    simulate(options, session, estimate)
+    table = pq.read_table(session)
+    names = ("grf_n", "true_plate_n", "cop_x_m", "cop_y_m", "true_cop_x_m", "true_cop_y_m")
+    columns = {name: table[name].to_numpy().astype(np.float64) for name in names}
+    return judge(setup, "trial", session, reference), columns
+
+
+def test_an_error_against_a_force_plate_is_the_true_one_but_for_the_plate_s_own(
+    tmp_path: Path, bench_cache: Path
+) -> None:
+    judged, columns = recorded(POPPY, tmp_path, bench_cache)
+    loaded = columns["true_plate_n"] > 0.5
+    true_n = np.abs(columns["grf_n"] - columns["true_plate_n"])[loaded].mean()
+    # Gain within 0.5 % of some 10 N, 0.1 N of noise on top of ours, and a lag to a tenth of a ms.
+    assert judged.figures["grf_mae_n"] == pytest.approx(true_n, abs=0.08)
+    assert judged.figures["stances"] == 3
+    assert judged.checks["lag_s"].inside
+    assert judged.checks["drift_ppm"].inside
+    assert judged.checks["offset_n"].inside
+    lag = judged.checks["lag_s"]
+    assert lag.found is not None
+    assert lag.found.value == pytest.approx(lag.injected, abs=1.5e-3)
+
+
+def test_a_cop_against_a_pressure_plate_is_the_true_one_but_for_cells_and_placement(
+    tmp_path: Path, bench_cache: Path
+) -> None:
+    judged, columns = recorded(ROLLING, tmp_path, bench_cache)
+    loaded = columns["true_plate_n"] > 3.0
+    off_m = [columns[f"cop_{k}_m"][loaded] - columns[f"true_cop_{k}_m"][loaded] for k in "xy"]
+    true_m = float(np.nanpercentile(np.hypot(*off_m), 95))
+    # Cells of 5 mm under patches of 2 mm, and a degree on 21 mm.
+    assert judged.figures["cop_p95_about_mean_m"] == pytest.approx(true_m, abs=1.2e-3)
+    assert judged.figures["cop_p95_m"] < 0.004
+    assert judged.checks["lag_s"].inside
+
+
+def test_a_wrong_injection_would_be_noticed_and_nothing_found_is_nothing_inside() -> None:
+    found = Estimate(value=0.500, sigma=0.001, dof=10.0)
+    assert Check(found, 0.5021).inside
+    assert not Check(found, 0.505).inside
+    assert Check(found, 0.505, beside=0.003).inside, "within what the plate's own noise adds"
+    assert not Check(None, 0.5).inside
