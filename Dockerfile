@@ -1,4 +1,5 @@
-# One image for both services: `foottile serve` and `foottile node`.
+# One image for both services: `foottile serve` and `foottile node`; with other extras, for a cluster
+# (deploy/docker-compose.yml).
 #
 #   docker build -t foottile .
 #
@@ -14,11 +15,12 @@ COPY devices devices
 COPY storage storage
 COPY service service
 COPY web web
+ARG EXTRAS=server,emulation
 RUN pip install --no-index --find-links /wheels hatchling \
     && pip wheel --no-deps --no-build-isolation -w /dist . \
     && python -m venv /opt/foottile \
     && /opt/foottile/bin/pip install --no-index --find-links /wheels \
-        "$(ls /dist/foottile-*.whl)[server,emulation]"
+        "$(ls /dist/foottile-*.whl)[$EXTRAS]"
 
 FROM python:3.12-slim-bookworm
 COPY --from=build /opt/foottile /opt/foottile

@@ -20,8 +20,8 @@ from recording_sealing import STATIC, sources_of
 from side_by_side import in_turns, note, spread, table
 
 from service.estimation.calibration import paper_eq2_shape
-from service.offline.archive import find_sessions
-from service.offline.query import ask
+from service.offline.archive.finding import find_sessions
+from service.offline.archive.query import ask
 from service.sessions.sealing import seal
 from storage.journal.journal import Journal
 from storage.sessions.folder import FRAMES_NAME, Session, SessionFolder

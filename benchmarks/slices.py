@@ -70,16 +70,18 @@ def session_id(number: int) -> str:
     return f"20200101T000000Z-{number:06x}"
 
 
-def write(data: Path, number: int, minutes: int) -> Path:
+def write(
+    data: Path, number: int, minutes: int, *, tiles: int = TILES, rate_hz: float = RATE_HZ
+) -> Path:
     """Seal a session of so many minutes of noise, as a server has it."""
     sessions = SessionFolder(data / "sessions")
     name = session_id(number)
-    frames, estimates = minute(1, TILES, RATE_HZ), noise(round(60 * RATE_HZ))
+    frames, estimates = minute(1, tiles, rate_hz), noise(round(60 * rate_hz), tiles)
     part = Part(boot_id=BOOT_ID, seq_first=0, seq_last=minutes * len(frames) - 1)
     said = {"id": name, "node": "bench", "parts": [part.model_dump()]}
     path = sessions.path(name) / FRAMES_NAME
     path.parent.mkdir(parents=True)
-    with SessionWriter(path, array(TILES, RATE_HZ), {"session": said}) as writer:
+    with SessionWriter(path, array(tiles, rate_hz), {"session": said}) as writer:
         for at in range(minutes):
             later = {
                 "seq": np.arange(at * len(frames), (at + 1) * len(frames), dtype=np.uint64),
@@ -111,12 +113,12 @@ def write(data: Path, number: int, minutes: int) -> Path:
     return path
 
 
-def noise(rows: int) -> dict[str, Array]:
+def noise(rows: int, tiles: int) -> dict[str, Array]:
     """Estimates that mean nothing and take about as many bytes as those that do."""
     rng = np.random.default_rng(0)
     columns: dict[str, Array] = {"part": np.zeros(rows, dtype=np.uint16)}
     for column in ESTIMATES:
-        values = np.round(rng.normal(0.0, 8.0, (rows, TILES) if column.per_tile else rows) * 8) / 8
+        values = np.round(rng.normal(0.0, 8.0, (rows, tiles) if column.per_tile else rows) * 8) / 8
         is_bits = pa.types.is_integer(column.type)
         columns[column.name] = np.zeros(rows, column.type.to_pandas_dtype()) if is_bits else values
     return columns

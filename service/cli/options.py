@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import json
 import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,9 +24,11 @@ from rich.console import Console
 from devices.errors import UsageError
 from devices.scene.file import Scene, load_scene
 from devices.scene.hardware import EMULATED
+from service.plain_json import json_text
 
 if TYPE_CHECKING:
     from service.rig.emulated import EmulatedFoot
+    from service.rig.plates import PlateFiles
 
 SEED_MAX = 2**63 - 1
 SECONDS_MAX = NUMBER_MAX = 1e9
@@ -111,29 +112,6 @@ def _resolved(path: Path) -> Path:
     return Path(os.path.realpath(path))  # unlike Path.resolve, whatever links there are
 
 
-def plain(value: Any) -> Any:
-    """A result as JSON can hold it: what is not finite is null, a dataclass an object.
-
-    A dataclass with a method `as_dict` is what that says.
-    """
-    if hasattr(value, "as_dict"):
-        return plain(value.as_dict())
-    if is_dataclass(value):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Mapping):
-        return {name: plain(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def json_text(value: object) -> str:
-    """A JSON document of any result."""
-    return json.dumps(plain(value), indent=2, allow_nan=False) + "\n"
-
-
 def print_json(value: object) -> None:
     """One JSON document on stdout."""
     sys.stdout.write(json_text(value))
@@ -182,6 +160,14 @@ class FootOptions:
         int, typer.Option(min=0, max=SEED_MAX, help="Draws noise and ground, not the parts.")
     ] = 0
     parts_seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Draws other parts.")] = 0
+    force_plate: Annotated[
+        Path | None,
+        typer.Option(help="CSV of an emulated force plate under the foot, written at the end."),
+    ] = None
+    pressure_plate: Annotated[
+        Path | None,
+        typer.Option(help="Frames (.npz) of an emulated pressure plate, written at the end."),
+    ] = None
 
     def foot(self, scene: Scene) -> EmulatedFoot:
         """What they ask for, in a scene.
@@ -203,6 +189,7 @@ class FootOptions:
                 raise UsageError(f"{option} {value:g}", expected="a sensible positive number")
         if self.load is not None and scene.array.bus != EMULATED:
             raise UsageError("--load presses emulated tiles only", remedy="Add --bus emulated")
+        plates = self._plates(scene)
         if scene.array.bus == EMULATED and scene.ground.kind == "trace" and self.load is None:
             raise UsageError(
                 f"scene {scene.name!r} presses a recorded load, and none was given",
@@ -216,7 +203,29 @@ class FootOptions:
             lead_s=self.lead_s,
             seed=self.seed,
             parts_seed=self.parts_seed,
+            plates=plates,
         )
+
+    def _plates(self, scene: Scene) -> PlateFiles:
+        from devices.emulation.plates.underfoot import check_seen
+        from service.rig.plates import PlateFiles
+
+        for name, path, ending in (
+            ("force plate", self.force_plate, ".csv"),
+            ("pressure plate", self.pressure_plate, ".npz"),
+        ):
+            if path is None:
+                continue
+            option = f"--{name.replace(' ', '-')}"
+            if scene.array.bus != EMULATED:
+                raise UsageError(f"{option} is emulated, and the tiles are not")
+            if path.suffix != ending:
+                raise UsageError(
+                    f"{option} {str(path)!r}", expected=f"a file that ends in {ending}"
+                )
+            output_path(path)
+            check_seen(name, scene)
+        return PlateFiles(self.force_plate, self.pressure_plate)
 
     def as_arguments(self) -> list[str]:
         """The same options for another command."""

@@ -40,6 +40,9 @@ SUMMARIES = {
     "doctor": (
         "Find the tiles of a bus, measure it, and say what rate it will hold and what to change."
     ),
+    "reproduce": (
+        "Repeat the paper's experiments on emulated hardware, from the mill to the comparison."
+    ),
     "bench": "Measure time per frame and error of every rung of the model ladder.",
 }
 """What each command does, as the first sentence of its function says; in the order of `--help`."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from devices.errors import CalibrationError, FileFormatError, TareError, UsageError
 from devices.frames import ArrayInfo
 from devices.scene.emulated import Family
-from devices.scene.file import Scene, load_scene
+from devices.scene.file import Scene
 from service.estimation.asked import Asking
 from service.estimation.calibration import Calibration
 from service.estimation.ladder.plan import EstimationPlan
@@ -48,10 +48,10 @@ def estimate_session(
     source: Path,
     out: Path,
     *,
-    calibration: str | None,
+    calibration: str | Calibration | None,
     models: tuple[str, ...] | None,
     lag_ms: float,
-    scene: str | None,
+    scene: Scene | None,
     tare_s: tuple[float, float] | None,
     part: Slice = _ALL,
     exact: bool = False,
@@ -62,7 +62,7 @@ def estimate_session(
     Args:
         source: the session.
         out: the session to write; may be the same file if all of it is estimated.
-        calibration: file, preset or id; None: the session's own.
+        calibration: one, or its file, preset or id; None: the session's own.
         models: None: the scene's.
         lag_ms: look-ahead.
         scene: whose models, calibration and places are used; None: the session's.
@@ -75,17 +75,16 @@ def estimate_session(
         FootTileError: the session, scene, calibration or tare is not usable, or no frame is in
             the part; `out` is untouched.
     """
-    the_scene = load_scene(scene) if scene is not None else None
     if not part.is_all and out.exists() and out.samefile(source):
         raise UsageError(
             f"--out {str(out)!r} is the session itself, of which a part would be left",
             expected="another file",
         )
     with SessionReader(source, only_slices=not part.is_all) as session:
-        info = _placed(session.info, the_scene)
+        info = _placed(session.info, scene)
         options = EstimateOptions(
-            calibration=_calibration(session, the_scene, calibration, remark),
-            models=models or (the_scene.models if the_scene else info.models),
+            calibration=_calibration(session, scene, calibration, remark),
+            models=models or (scene.models if scene else info.models),
             lag_ms=lag_ms,
             tare_s=tare_s,
             tares=_recorded_tares(session) if tare_s is None else (),
@@ -182,11 +181,16 @@ def _placed(info: ArrayInfo, scene: Scene | None) -> ArrayInfo:
 def _calibration(
     session: SessionReader,
     scene: Scene | None,
-    wanted: str | None,
+    wanted: str | Calibration | None,
     remark: Callable[[str], None],
 ) -> Calibration:
     notes = session.notes
     where = str(session.path)
+    serials = [tile.serial for tile in session.info.tiles if not tile.reference]
+    if isinstance(wanted, Calibration):
+        for serial in serials:
+            wanted.of(serial)
+        return wanted
     inside = None
     if "calibration" in notes:
         try:
@@ -214,7 +218,7 @@ def _calibration(
         )
     return find_calibration(
         name,
-        [tile.serial for tile in session.info.tiles if not tile.reference],
+        serials,
         parts_seed=int(notes.get("parts_seed", 0)),
         family=_family(notes),
         progress=remark,
@@ -225,5 +229,6 @@ def _family(notes: Mapping[str, Any]) -> Family:
     """Of the emulated parts of a session; those of before there was another are the usual ones."""
     scene = notes.get("scene")
     emulation = scene.get("emulation") if isinstance(scene, dict) else None
-    is_broad = isinstance(emulation, dict) and emulation.get("family") == "broad"
-    return "broad" if is_broad else "default"
+    named = emulation.get("family") if isinstance(emulation, dict) else None
+    families: tuple[Family, ...] = get_args(Family)
+    return next((family for family in families if family == named), "default")

@@ -16,6 +16,9 @@ from service.offline.accuracy import COMPARED, Accuracy, accuracy_of
 if TYPE_CHECKING:
     from service.estimation.ladder.plan import EstimationPlan
 
+PLATE = "true_plate_n"
+"""What a plate sees, which is what gains of a mounted foot are to; the domes' own sum else."""
+
 Columns = Mapping[str, npt.NDArray[Any]]
 
 
@@ -34,7 +37,7 @@ class FindingsOf:
     """Gathers them from consecutive frames with estimates.
 
     Args:
-        judging: the columns bring the truth.
+        judging: the columns bring the truth, and may bring `PLATE`.
     """
 
     def __init__(self, *, judging: bool) -> None:
@@ -48,13 +51,17 @@ class FindingsOf:
         self._stances += self._gathered.feed(batch.seq, batch.t_ns, columns)
         if self._judging:
             known = {"t_ns": batch.t_ns, **columns}
-            self._judged.append({name: known[name] for name in COMPARED})
+            names = [name for name in (*COMPARED, PLATE) if name != PLATE or name in known]
+            self._judged.append({name: known[name] for name in names})
 
     def finish(self, plan: EstimationPlan) -> Findings:
         """All of it; `plan` is what the estimates were made with."""
         accuracy = None
         if self._judged:
-            accuracy = accuracy_of(joined(self._judged), lag_ms=plan.lag_ns * 1e-6)
+            judged = joined(self._judged)
+            if plan.calibration.mounted is not None and PLATE in judged:
+                judged["true_grf_n"] = judged[PLATE]
+            accuracy = accuracy_of(judged, lag_ms=plan.lag_ns * 1e-6)
         stances = *self._stances, *self._gathered.finish()
         return Findings(stances, accuracy, plan.assumed_scale)
 

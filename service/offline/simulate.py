@@ -106,7 +106,8 @@ class Simulation:
         # The machine was switched on earlier, the session and its scene begin now.
         self.world.begin()
         begin_ns = self._clock.now_ns()
-        self._end_ns = begin_ns + duration_ns
+        self.end_ns = begin_ns + duration_ns
+        """Of the scene, by its own clock."""
         anchor = UtcAnchor.of(begin_ns, START_NS, clock_set=True)
         servo = None
         if scene.servo is not None:
@@ -134,7 +135,7 @@ class Simulation:
     def pieces(self) -> Iterator[tuple[FrameBatch, Extra]]:
         """Frames with what the emulation adds: truth if asked for, the mill's notes."""
         mill = self.world.mill
-        batches = self.acquisition.run(lambda: self._clock.now_ns() >= self._end_ns)
+        batches = self.acquisition.run(lambda: self._clock.now_ns() >= self.end_ns)
         # Nothing is shown live, so frames may gather: batching does not change a bit of the result.
         while gathered := list(islice(batches, _GATHER)):
             batch = FrameBatch.concatenate(gathered)
@@ -190,6 +191,7 @@ def simulate(
             if stream is not None:
                 found.feed(batch, extra)
     seconds = (last_ns - first_ns) * 1e-9
+    options.foot.write_plates(simulation.world, simulation.end_ns)
     return Simulated(
         frames=frames,
         seconds=seconds,

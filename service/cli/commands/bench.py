@@ -14,13 +14,13 @@ from service.cli.commands.bench_broad import ARRAYS, QUICK_ARRAYS, bench_broad, 
 from service.cli.options import (
     JsonOption,
     check_emulated,
-    json_text,
     print_json,
     progress,
     remark,
     say,
 )
 from service.cli.result_folder import result_folder
+from service.plain_json import json_text
 
 SCENES = ("rolling", "poppy", "mud")
 DRAWS, QUICK_DRAWS = 20, 3

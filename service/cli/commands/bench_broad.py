@@ -10,7 +10,8 @@ import typer
 
 from devices.errors import UsageError
 from devices.scene.emulated import Family
-from service.cli.options import json_text, print_json, remark, say
+from service.cli.options import print_json, remark, say
+from service.plain_json import json_text
 
 ARRAYS, QUICK_ARRAYS = 200, 3
 

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from devices.errors import needs_extra
+from service.cli.many import (
+    NOT_ALL,
+    JobsOption,
+    ManifestOption,
+    SchedulerOption,
+    is_one,
+    run_many,
+)
 from service.cli.options import (
     EndOption,
     ExactOption,
@@ -21,12 +30,24 @@ from service.cli.options import (
     say,
 )
 from service.estimation import OFFLINE_LAG_MS
+from storage.sessions.folder import FRAMES_NAME
+
+if TYPE_CHECKING:
+    from service.estimation.calibration import Calibration
 
 
 @needs_extra("server", "`foottile estimate`")
 def estimate_command(
-    session: Annotated[Path, typer.Argument(metavar="IN.parquet", help="Session to estimate.")],
-    out: Annotated[Path, typer.Option(help="Session to write, with the new estimates.")],
+    out: Annotated[
+        str,
+        typer.Option(help="Session to write, with the new estimates; for many, a folder or URI."),
+    ],
+    sessions: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="IN.parquet ...", help="Session to estimate; or many: folders, globs, URIs."
+        ),
+    ] = None,
     calibration: Annotated[
         str | None,
         typer.Option(
@@ -51,6 +72,9 @@ def estimate_command(
     start_s: StartOption = None,
     end_s: EndOption = None,
     exact: ExactOption = False,
+    manifest: ManifestOption = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate a recorded session again and write it with the new estimates.
@@ -59,26 +83,46 @@ def estimate_command(
     that can be recognised as unloaded. Of some seconds no more is read than they need: models begin
     some time before them, and do not remember what was before that.
 
-    Exit codes: 0 good, 1 failed, 2 wrong usage.
+    Many sessions are estimated in processes of their own, each into a folder of its id in --out;
+    given again, the command goes on where it was broken off.
+
+    Exit codes: 0 good, 1 failed, 2 wrong usage, 3 some of many sessions failed.
     """
+    from devices.scene.file import load_scene
     from service.cli.report import findings_json, tell_findings
     from service.estimation.asked import SEEN
+    from service.offline.archive.places import is_remote
+    from service.offline.archive.tasks import EstimateTask
     from service.offline.estimate import estimate_session
     from storage.formats.slice import Slice
 
+    task = EstimateTask(
+        calibration=calibration,
+        models=None if models is None else tuple(models.split(",")),
+        lag_ms=lag_ms,
+        scene=None if scene is None else load_scene(scene),
+        tare_s=pair(tare_s, "--tare-s"),
+        part=Slice(start_s, end_s),
+        exact=exact,
+    )
+    if not is_one(sessions, manifest) or is_remote(out):
+        task = replace(task, calibration=_for_workers(calibration))
+        summary = run_many(
+            task, sessions, manifest, out=out, jobs=jobs, scheduler=scheduler, as_json=as_json
+        )
+        if summary.states["failed"]:
+            raise typer.Exit(NOT_ALL)
+        return
+    (session,) = map(Path, sessions or ())
     # The session itself may be the output: it is replaced whole, and nothing raw is lost.
-    path = output_path(out, *(Path(name) for name in (calibration, scene) if name is not None))
+    path = output_path(
+        Path(out), *(Path(name) for name in (calibration, scene) if name is not None)
+    )
     with progress(f"estimating {session}"):
         result = estimate_session(
-            session,
+            session / FRAMES_NAME if session.is_dir() else session,
             path,
-            calibration=calibration,
-            models=None if models is None else tuple(models.split(",")),
-            lag_ms=lag_ms,
-            scene=scene,
-            tare_s=pair(tare_s, "--tare-s"),
-            part=Slice(start_s, end_s),
-            exact=exact,
+            **vars(task),
             remark=remark,
         )
     plan = result.plan
@@ -111,3 +155,12 @@ def estimate_command(
             f"{SEEN[name]}: model {name!r} is not named, and is good for {newtons:.2f} N of the "
             "GRF here; the calibration offers it"
         )
+
+
+def _for_workers(named: str | None) -> Calibration | str | None:
+    """A calibration's content, where a file is named: a worker elsewhere does not have it."""
+    from service.offline.calibrations import read_calibration
+
+    if named is None or not Path(named).is_file():
+        return named
+    return read_calibration(Path(named))

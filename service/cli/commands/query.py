@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,7 +35,9 @@ def query_command(
     ],
     places: Annotated[
         list[str] | None,
-        typer.Argument(help="Data folders, folders of sessions, sessions, or globs of these."),
+        typer.Argument(
+            help="Data folders, folders of sessions, sessions, globs of these, or URIs as s3://."
+        ),
     ] = None,
     data: Annotated[
         Path | None, typer.Option(help="Data folder, if no place is named; default: the user's.")
@@ -48,8 +51,10 @@ def query_command(
     Columns and examples are in docs/query.md. No question changes a session. Sessions that are not
     sealed yet, or damaged, are left out and named on stderr; the exit code is 3 then.
     """
-    from service.offline.archive import find_sessions
-    from service.offline.query import ask
+    from service.offline.archive.finding import find_sessions
+    from service.offline.archive.places import is_remote
+    from service.offline.archive.query import ask
+    from service.offline.archive.workspace import SYSTEM, workspace
 
     if data is not None and places:
         raise UsageError("--data and places are two ways to say where", remedy="Name one")
@@ -58,8 +63,11 @@ def query_command(
     if out is not None and out.suffix != ".parquet":
         raise UsageError(f"--out {str(out)!r}", expected="a name that ends with .parquet")
     path = output_path(out) if out is not None else None
-    with progress("looking for sessions"):
-        archive = find_sessions(places or [str(data_folder(data))])
+    asked = places or [str(data_folder(data))]
+    with progress("looking for sessions"), ExitStack() as stack:
+        needs_mirror = any(is_remote(place) for place in asked)
+        mirror = stack.enter_context(workspace(SYSTEM)) if needs_mirror else None
+        archive = find_sessions(asked, mirror)
         answer = ask(archive, sql)
     if path is not None:
         _write(answer, path)

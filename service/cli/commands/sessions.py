@@ -9,6 +9,14 @@ import typer
 
 from devices.errors import UsageError, needs_extra
 from devices.words import printable
+from service.cli.many import (
+    NOT_ALL,
+    JobsOption,
+    ManifestOption,
+    SchedulerOption,
+    is_one,
+    run_many,
+)
 from service.cli.options import (
     EndOption,
     JsonOption,
@@ -21,6 +29,7 @@ from service.cli.options import (
     say,
     stdout,
 )
+from storage.sessions.beside import EVENTS_NAME
 
 if TYPE_CHECKING:
     from storage.formats.export import Format
@@ -125,11 +134,16 @@ def pull_command(
 
 
 def export_command(
-    session: Annotated[
-        str, typer.Argument(help="A sealed file, a session's folder, or an id in --data.")
-    ],
-    out: Annotated[Path, typer.Option(help="File to write.")],
+    out: Annotated[str, typer.Option(help="File to write; for many sessions, a folder or URI.")],
     to: Annotated[str, typer.Option("--format", help="parquet, arrow or csv.")],
+    sessions: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="SESSION ...",
+            help="A sealed file, a session's folder, or an id in --data; or many: folders, globs, "
+            "URIs.",
+        ),
+    ] = None,
     data: Annotated[
         Path | None, typer.Option(help="Data folder of the server; default: the user's.")
     ] = None,
@@ -147,41 +161,49 @@ def export_command(
             "if there are events beside the frames.",
         ),
     ] = None,
+    manifest: ManifestOption = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Of many sessions print each as a line of JSON.")
+    ] = False,
 ) -> None:
-    """Write a sealed session, or a slice of it, in another format."""
-    from storage.durable import whole_file
-    from storage.formats.export import CLOCKS
-    from storage.formats.sealed import export_file, marks_of
-    from storage.formats.slice import Slice
-    from storage.sessions.beside import EVENTS_NAME, read_events
-    from storage.sessions.reader import SessionReader
+    """Write a sealed session, or a slice of it, in another format.
 
-    chosen = _format(to)
+    Many sessions are written each into a folder of its id in --out; given again, the command goes
+    on where it was broken off. Exit code 3: some of them failed.
+    """
+    from service.offline.archive.places import is_remote
+    from service.offline.export import ExportOptions, export_session
+    from storage.formats.export import CLOCKS
+    from storage.formats.slice import Slice
+
     if clock not in CLOCKS:
         raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
-    source = sealed_file(session, data)
-    path = output_path(out, source)
-    part = Slice(start_s, end_s, _names(columns))
-    with (
-        SessionReader(source, only_slices=not part.is_all) as reader,
-        progress(f"writing {path.name}"),
-    ):
-        beside = source.with_name(EVENTS_NAME)
-        stored = read_events(beside) if marks is not False and beside.is_file() else None
-        if marks and stored is None:
-            raise UsageError(
-                f"there is no {EVENTS_NAME} beside {source.name}, so nothing is known of marks",
-                where=str(source.parent),
-                expected="a session's folder as a server sealed it or `foottile pull` fetched it",
-            )
-        placed = None if stored is None else marks_of(reader, stored.events, part)
-        with whole_file(path) as file:
-            for chunk in export_file(reader, chosen, part, clock=clock, marks=placed):
-                file.write(chunk)
-    say(f"{path}: {path.stat().st_size} bytes")
-    for mark in placed.left_out if placed is not None else ():
+    options = ExportOptions(_format(to), Slice(start_s, end_s, _names(columns)), clock, marks)
+    if not is_one(sessions, manifest) or is_remote(out):
+        from service.offline.archive.tasks import ExportTask
+
+        summary = run_many(
+            ExportTask(options),
+            sessions,
+            manifest,
+            out=out,
+            jobs=jobs,
+            scheduler=scheduler,
+            as_json=as_json,
+        )
+        if summary.states["failed"]:
+            raise typer.Exit(NOT_ALL)
+        return
+    source = sealed_file((sessions or [""])[0], data)
+    path = output_path(Path(out), source)
+    with progress(f"writing {path.name}"):
+        done = export_session(source, path, options)
+    say(f"{path}: {done.size_bytes} bytes")
+    for mark in done.left_out:
         remark(f"mark {mark.event.label!r} is not in it: {mark.left_out}")
-    if marks is None and stored is None and "session" in reader.notes:
+    if done.lacks_marks:
         remark(f"without marks: there is no {EVENTS_NAME} beside {source.name}")
 
 

@@ -8,6 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from devices.errors import UsageError
+from service.cli.many import (
+    NOT_ALL,
+    JobsOption,
+    ManifestOption,
+    SchedulerOption,
+    is_one,
+    run_many,
+)
 from service.cli.options import JsonOption, data_folder, print_json, progress, remark, say
 
 if TYPE_CHECKING:
@@ -28,27 +36,40 @@ _SENTENCE = {
 
 
 def verify_command(
-    target: Annotated[
-        str,
+    targets: Annotated[
+        list[str] | None,
         typer.Argument(
-            help="Session (folder, or id in --data), data folder, a file of them, calibration."
+            metavar="TARGET ...",
+            help="Session (folder, or id in --data), data folder, a file of them, calibration; or "
+            "many sessions: folders, globs, URIs.",
         ),
-    ],
+    ] = None,
     data: Annotated[
         Path | None,
         typer.Option(help="Data folder of the server or node; default: the user's."),
     ] = None,
+    out: Annotated[
+        str | None,
+        typer.Option(help="Folder or URI for the proofs of many sessions; those there are kept."),
+    ] = None,
+    manifest: ManifestOption = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Prove sessions and journals from their files alone: checksums, hashes, order and ledger.
 
     Nothing is written, and a server may run meanwhile. Exit codes: 0 everything is whole and
     complete, 1 something is damaged, 2 wrong usage, 3 whole, but lossy or not yet sealed, 4 an
-    export, which proves nothing: verify the session that it says it was made from.
+    export, which proves nothing: verify the session that it says it was made from. Of many sessions
+    it is 1 if one is damaged, and 3 if one could not be read, too.
     """
     from storage.verify.data import verdict_of, verify
 
-    path = _path_of(target, data)
+    if out is not None or _are_many(targets, manifest):
+        _verify_many(targets, manifest, out, jobs, scheduler, as_json=as_json)
+        return
+    path = _path_of((targets or [""])[0], data)
     with progress(f"reading {path}"):
         report = verify(path, data=data)
     verdict = verdict_of(report)
@@ -59,6 +80,33 @@ def verify_command(
         say(_SENTENCE[verdict])
     if code := _EXIT[verdict]:
         raise typer.Exit(code)
+
+
+def _are_many(targets: list[str] | None, manifest: Path | None) -> bool:
+    """A single folder is one target, whatever is in it: it may be a data folder with journals."""
+    if manifest is None and targets is not None and len(targets) == 1 and Path(targets[0]).exists():
+        return False
+    return not is_one(targets, manifest)
+
+
+def _verify_many(
+    targets: list[str] | None,
+    manifest: Path | None,
+    out: str | None,
+    jobs: int | None,
+    scheduler: str | None,
+    *,
+    as_json: bool,
+) -> None:
+    from service.offline.archive.tasks import VerifyTask
+
+    summary = run_many(
+        VerifyTask(), targets, manifest, out=out, jobs=jobs, scheduler=scheduler, as_json=as_json
+    )
+    codes = {_EXIT[verdict] for verdict in summary.verdicts if _EXIT[verdict]}
+    codes |= {NOT_ALL} if summary.states["failed"] else set()
+    if codes:
+        raise typer.Exit(min(codes))
 
 
 def _path_of(target: str, data: Path | None) -> Path:

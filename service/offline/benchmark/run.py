@@ -29,8 +29,8 @@ from service.offline.benchmark.draws import (
     time_rungs,
 )
 from service.offline.benchmark.figures import Goal, SceneFigures, Spread, goals_of, measured_of
-from service.offline.benchmark.processes import spread
 from service.offline.benchmark.rungs import Rung, absent, rungs
+from service.offline.processes import spread
 from service.version import SOFTWARE
 
 

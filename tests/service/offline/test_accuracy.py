@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.cli.options import plain
 from service.estimation.estimates import EstimateStatus
 from service.offline.accuracy import COMPARED, PHASES, Accuracy, Covered, accuracy_of, phases_of
+from service.plain_json import plain
 
 PERIOD_NS = 10_000_000
 

@@ -18,8 +18,8 @@ from service.offline.benchmark.broad.results import (
     write_result,
 )
 from service.offline.benchmark.draws import reason
-from service.offline.benchmark.processes import spread
 from service.offline.benchmark.run import machine
+from service.offline.processes import spread
 from service.version import SOFTWARE
 from storage.durable import make_folder
 

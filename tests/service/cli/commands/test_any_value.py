@@ -48,6 +48,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "pull": ("20200101T000000Z-000000", "--out", "x", "--server", "http://127.0.0.1:1"),
     "query": ("SELECT 1", "--data", "."),
     "recover": (".",),
+    "reproduce": ("--out", "s.parquet"),  # no folder: it ends at once
     "serve": ("--host", "192.0.2.1"),  # no address of this machine: it ends at once
     "sessions": ("--data", "."),
     "simulate": SHORT[1:],
@@ -167,19 +168,24 @@ FILES = {"missing", "empty", "junk", "hole", "no Parquet"}
 READ: dict[tuple[str, str], tuple[object, ...]] = {
     ("bench", "scene"): ("--out", "bench", "--scene", "{}"),
     ("calibrate", "recordings"): ("{}", "--out", "cal.json"),
+    ("calibrate", "against"): ("s.parquet", "--out", "cal.json", "--against", "{}"),
     ("compare", "session"): ("{}", "--reference", "s.parquet", "--out", "o"),
+    ("compare", "manifest"): ("--manifest", "{}", "--out", "o"),
     ("compare", "reference"): ("s.parquet", "--reference", "{}", "--out", "o"),
     ("demo", "scene"): ("--scene", "{}"),
     ("doctor", "scene"): ("--scene", "{}"),
-    ("estimate", "session"): ("{}", "--out", "x.parquet"),
+    ("estimate", "sessions"): ("{}", "--out", "x.parquet"),
+    ("estimate", "manifest"): ("--manifest", "{}", "--out", "o"),
     ("estimate", "calibration"): ("s.parquet", "--out", "x.parquet", "--calibration", "{}"),
     ("estimate", "scene"): (*COMMANDS["estimate"], "--scene", "{}"),
-    ("export", "session"): ("{}", "--format", "csv", "--out", "x.csv"),
+    ("export", "sessions"): ("{}", "--format", "csv", "--out", "x.csv"),
+    ("export", "manifest"): ("--manifest", "{}", "--format", "csv", "--out", "o"),
     ("node", "scene"): ("--scene", "{}"),
     ("serve", "config"): ("--host", "192.0.2.1", "--config", "{}"),
     ("simulate", "scene"): ("--scene", "{}", "--seconds", 1),
     ("simulate", "load"): ("--scene", "standing", "--load", "{}"),
-    ("verify", "target"): ("{}",),
+    ("verify", "targets"): ("{}",),
+    ("verify", "manifest"): ("--manifest", "{}"),
 }
 WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
     ("calibrate", "out"): ("s.parquet", "--out", "{}"),
@@ -190,7 +196,9 @@ WRITTEN: dict[tuple[str, str], tuple[object, ...]] = {
     ),
     ("export", "out"): ("s.parquet", "--format", "csv", "--out", "{}"),
     ("query", "out"): ("SELECT 1", "--data", ".", "--out", "{}"),
+    ("simulate", "force_plate"): (*SHORT[1:], "--force-plate", "{}"),
     ("simulate", "out"): (*SHORT[1:-1], "{}"),
+    ("simulate", "pressure_plate"): (*SHORT[1:], "--pressure-plate", "{}"),
 }
 IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
     ("bench", "out"): ("--out", "{}", "--scene", "standing", "--seconds", 0.01),
@@ -205,6 +213,7 @@ IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
     ("pull", "out"): ("20200101T000000Z-000000", "--server=http://127.0.0.1:1", "--out", "{}"),
     ("query", "data"): ("SELECT 1", "--data", "{}"),
     ("recover", "folder"): ("{}",),
+    ("reproduce", "out"): ("--out", "{}"),
     ("serve", "data"): ("--port", 0, "--data", "{}"),
     ("sessions", "data"): ("--data", "{}"),
     ("verify", "data"): ("20200101T000000Z-000000", "--data", "{}"),

@@ -298,7 +298,7 @@ def test_verify_names_whatever_stands_in_the_place_of_a_file(
     write_checked(data / "nodes" / "bench" / "hello.json", b'{"older": 1}')
     write_server_id(data / SERVER_ID_NAME, "5" * 32)
     paths = [path for path in data.rglob("*") if path.is_file() and path.name != ".lock"]
-    assert len(paths) == 9
+    assert len(paths) == 10
     for path in paths:
         aside = path.rename(data.parent / "aside")
         replaced_by(path)

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.cli.options import plain
 from service.offline.accuracy import Accuracy, accuracy_of
 from service.offline.benchmark.draws import Drawn
 from service.offline.benchmark.figures import Spread, coverage_of, figures_of, measured_of, pareto
 from service.offline.benchmark.rungs import rungs
+from service.plain_json import plain
 
 
 def accuracy(error_n: float, frames: int = 20) -> Accuracy:

@@ -19,7 +19,7 @@ from devices.errors import FileFormatError, UsageError, needs_extra
 if TYPE_CHECKING:
     import duckdb
 
-    from service.offline.archive import Archive
+    from service.offline.archive.sealed import Archive
 
 VIEWS = ("sessions", "stances", "events", "frames")
 LOCKED: dict[str, Any] = {
@@ -29,6 +29,7 @@ LOCKED: dict[str, Any] = {
     "allow_community_extensions": False,
     "python_enable_replacements": False,  # a name is a view, and no variable of this program
     "temp_directory": "",
+    "memory_limit": "50%",  # of the machine's: a question that needs more is refused
     "lock_configuration": True,
 }
 

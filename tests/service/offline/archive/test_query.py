@@ -11,8 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from devices.errors import FileFormatError, UsageError
-from service.offline.archive import EVENTS, SESSIONS, find_sessions
-from service.offline.query import ask
+from service.offline.archive.finding import find_sessions
+from service.offline.archive.query import ask
+from service.offline.archive.sealed import EVENTS, SESSIONS
 from storage.sessions.reader import SessionReader
 from tests.service.offline.archives import IDS, recording, sealed
 
@@ -90,7 +91,7 @@ def test_places_are_data_folders_folders_of_sessions_single_ones_and_globs(made:
     assert answer(count, one) == [{"n": 1}]
     assert answer(count, made / "sessions" / "*Z-00000[01]") == [{"n": 2}]
     assert answer(count, one, made) == [{"n": 4}]  # each once
-    with pytest.raises(UsageError, match="no folder"):
+    with pytest.raises(UsageError, match="no session or folder"):
         find_sessions([str(made / "nowhere")])
 
 
@@ -207,7 +208,7 @@ def test_only_what_a_question_is_about_is_read(made: Path, monkeypatch: pytest.M
     assert isinstance(row["n"], int)
 
 
-DOCUMENT = (Path(__file__).resolve().parents[3] / "docs" / "query.md").read_text("utf-8")
+DOCUMENT = (Path(__file__).resolve().parents[4] / "docs" / "query.md").read_text("utf-8")
 
 
 @pytest.mark.parametrize("sql", re.findall(r"```sql\n(.*?)```", DOCUMENT, re.DOTALL))

@@ -1,0 +1,221 @@
+"""Commands over many sessions: which are meant, how the work is spread, and what is said of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from devices.errors import UsageError
+from devices.words import printable
+from service.cli.options import remark, say, stderr
+
+if TYPE_CHECKING:
+    from service.offline.archive.jobs import Job, Outcome
+    from service.offline.archive.places import Place
+    from service.offline.archive.plan import Spread, Summary
+    from service.offline.archive.tasks import Task
+
+NOT_ALL = 3
+"""Exit code: finished, but not with every session."""
+
+ManifestOption = Annotated[
+    Path | None,
+    typer.Option(help="CSV with a row for each session, in column session; see docs/archive.md."),
+]
+JobsOption = Annotated[
+    int | None, typer.Option(min=1, max=1024, help="Processes; default: one for each core.")
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(help="Work on a Dask cluster, at its scheduler's address, not on this machine."),
+]
+
+
+def is_one(places: Sequence[str] | None, manifest: Path | None) -> bool:
+    """Is a single session asked for, as a file, a folder or an id?"""
+    from service.offline.archive.places import is_remote
+    from storage.sessions.claims import SESSION_NAME
+    from storage.sessions.folder import FRAMES_NAME
+
+    if manifest is not None or len(places or ()) != 1:
+        return False
+    (place,) = places or ()
+    if is_remote(place) or not os.path.exists(place):
+        return not is_remote(place) and not any(c in place for c in "*?[")
+    names = (SESSION_NAME, FRAMES_NAME)
+    return not os.path.isdir(place) or any(os.path.exists(f"{place}/{n}") for n in names)
+
+
+def run_many(
+    task: Task,
+    places: Sequence[str] | None,
+    manifest: Path | None,
+    *,
+    out: str | None,
+    jobs: int | None,
+    scheduler: str | None,
+    as_json: bool,
+) -> Summary:
+    """Do a task with many sessions, say what became of each that failed, and count.
+
+    A result that is there, made from the same in the same way, is not made again.
+
+    Raises:
+        UsageError: nothing, or twice the same, says which sessions; or a place is not there.
+    """
+    from service.offline.archive.jobs import Job
+    from service.offline.archive.manifest import rows_in
+    from service.offline.archive.places import absolute, place_of, sessions_in
+
+    if (manifest is None) == (not places):
+        raise UsageError(
+            "no session is named" if manifest is None else "--manifest and sessions are two ways",
+            expected="sessions, folders of them, or --manifest",
+        )
+    if jobs is not None and scheduler is not None:
+        raise UsageError("--jobs and --scheduler are two ways to spread work", remedy="Name one")
+
+    out = None if out is None else absolute(out)
+
+    def found() -> Iterator[Place]:
+        if manifest is None:
+            return sessions_in(places or ())
+        return (place_of(row["session"]) for row in rows_in(manifest, {"session"}))
+
+    return run_plan(
+        (Job(place, task, out) for place in found()),
+        command=task.command,
+        count=found,
+        out=out,
+        spread=spread_over(jobs, scheduler),
+        as_json=as_json,
+    )
+
+
+def run_plan(
+    jobs: Iterable[Job],
+    *,
+    command: str,
+    count: Callable[[], Iterator[Any]],
+    out: str | None,
+    spread: Spread,
+    as_json: bool,
+) -> Summary:
+    """Run jobs, show how far they are, write the report, and say what came of them.
+
+    Args:
+        jobs: one for each session.
+        command: of their tasks.
+        count: finds them once more, to count them where progress is shown.
+        out: of their results; None: nothing is kept.
+        spread: over processes or a cluster.
+        as_json: each outcome is a line of JSON on stdout.
+    """
+    from service.offline.archive.plan import Summary, outcomes
+    from service.offline.archive.results import Results
+
+    jobs = iter(jobs)
+    first = next(jobs, None)
+    if first is None:
+        raise UsageError("there is no session in these places")
+    summary = Summary()
+    results = None if out is None else Results(out)
+    if results is not None:
+        results.begin()
+    with ExitStack() as stack:
+        report = stack.enter_context(_report(results, command))
+        tell = stack.enter_context(_progress(command, count))
+        for outcome in outcomes(chain([first], jobs), spread):
+            summary.add(outcome)
+            line = json.dumps({k: v for k, v in vars(outcome).items() if v not in ("", {})})
+            if report is not None:
+                report.write(line + "\n")
+                report.flush()
+            if as_json:
+                say(line)
+            tell(outcome)
+    if results is not None:
+        results.end()
+    _tell(summary, command, out, as_json=as_json)
+    return summary
+
+
+def spread_over(jobs: int | None, scheduler: str | None) -> Spread:
+    """Processes of this machine, or a cluster."""
+    if scheduler is not None:
+        from service.offline.archive.cluster import spread_over_cluster
+
+        return partial(spread_over_cluster, address=scheduler)
+    from service.offline.archive.jobs import begin_worker
+    from service.offline.processes import cores, spread
+
+    return partial(spread, jobs=jobs or cores(), begin=begin_worker)
+
+
+@contextmanager
+def _report(results: Any, command: str) -> Iterator[IO[str] | None]:
+    """A line for each outcome, beside the results; a store gets it when all is over."""
+    if results is None:
+        yield None
+        return
+    name = f"{command}.report.jsonl"
+    if not results.is_remote:
+        with open(f"{results.out}/{name}", "w", encoding="utf-8") as file:
+            yield file
+        return
+    with tempfile.NamedTemporaryFile("w", encoding="utf-8", suffix=".jsonl") as file:
+        try:
+            yield file
+        finally:
+            file.flush()
+            results.put_file(name, Path(file.name))
+
+
+@contextmanager
+def _progress(command: str, count: Callable[[], Iterator[Any]]) -> Iterator[Callable[..., None]]:
+    """How far it is and how long it will take, on a terminal."""
+    if not stderr.is_terminal:
+        yield lambda outcome: None
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    text = TextColumn("{task.description}")
+    bar = Progress(text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=stderr)
+    with bar:
+        shown = bar.add_task(command, total=sum(1 for _ in count()))
+
+        def tell(outcome: Outcome) -> None:
+            if outcome.state == "failed":
+                remark(printable(f"{outcome.place}: {outcome.reason}"))
+            bar.advance(shown)
+
+        yield tell
+
+
+def _tell(summary: Summary, command: str, out: str | None, *, as_json: bool) -> None:
+    states = summary.states
+    if not as_json:
+        where = f"{out}: " if out is not None else ""
+        counts = [f"{states['made']} made", f"{states['there']} there before"]
+        verdicts = ", ".join(f"{n} {verdict}" for verdict, n in sorted(summary.verdicts.items()))
+        failed = f", {states['failed']} failed" if states["failed"] else ""
+        say(f"{where}{command}: {', '.join(counts)}{failed}{'; ' if verdicts else ''}{verdicts}")
+    for outcome in () if stderr.is_terminal else summary.failures:
+        remark(printable(f"{outcome.place}: {outcome.reason}"))
+    if states["failed"] > len(summary.failures):
+        remark(f"and {states['failed'] - len(summary.failures)} more, which the report lists")

@@ -1,0 +1,231 @@
+"""What a place is: where sessions are, on this machine or in a store that a filesystem opens.
+
+A place is a session (its folder, or a lone file), a folder of sessions, a data folder, a glob of
+these on this machine, or a URI: `s3://bucket/prefix`, which Arrow opens, or of any other filesystem
+of fsspec. Sessions are given one by one as they are found: a folder may hold any number.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, BinaryIO, cast
+from urllib.parse import urlsplit
+
+import pyarrow.fs as fs
+
+from devices.errors import FileFormatError, StorageError, UsageError, needs_extra
+from devices.words import printable
+from storage.sessions.claims import SESSION_NAME
+from storage.sessions.folder import FRAMES_NAME, SESSION_ID
+
+_EXPECTED = "a session, a folder of sessions, a data folder, a glob of these, or a URI of one"
+_S3_ATTEMPTS = 6
+"""Of a request that a store refuses or breaks off; they wait longer and longer, 3 s in all."""
+_S3_CONNECT_S = 10.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where one session is.
+
+    Attributes:
+        where: its folder or its file, as a path or a URI.
+        name: the session's id; of a lone file its name without the ending.
+        is_file: is it a lone file?
+    """
+
+    where: str
+    name: str
+    is_file: bool = False
+
+    @property
+    def frames(self) -> str:
+        """Where its frames are, if it is sealed."""
+        return self.where if self.is_file else f"{self.where}/{FRAMES_NAME}"
+
+
+def is_remote(where: str) -> bool:
+    """Is it a URI, and no path of this machine?"""
+    return "://" in where
+
+
+def absolute(where: str) -> str:
+    """A place as a worker knows it, whatever folder it works in."""
+    return where if is_remote(where) else os.path.abspath(where)
+
+
+def opened(where: str) -> tuple[fs.FileSystem, str]:
+    """The filesystem in which a place is, and its path there.
+
+    Raises:
+        UsageError: nothing is known of such a filesystem.
+    """
+    if not is_remote(where):
+        return _local(), os.path.abspath(where)
+    said = urlsplit(where)
+    if said.scheme == "s3":
+        return _s3(), f"{said.netloc}{said.path}".rstrip("/")
+    return _by_fsspec(where)
+
+
+def sessions_in(places: Iterable[str]) -> Iterator[Place]:
+    """Every session in some places, in no order.
+
+    Raises:
+        UsageError: one of them is not there; said before the first session is given.
+        StorageError: a store does not answer.
+    """
+    roots = [root for place in places for root in _roots(place)]
+    return (session for root in roots for session in _inside(root))
+
+
+def place_of(where: str) -> Place:
+    """The one session that a folder or a file is; nobody looks whether it is there."""
+    where = where.rstrip("/") or "/"
+    folder, _, name = where.rpartition("/")
+    if name == FRAMES_NAME and SESSION_ID.fullmatch(folder.rpartition("/")[2]):
+        return Place(folder, folder.rpartition("/")[2])
+    is_file = name.endswith(".parquet")
+    return Place(where, name.removesuffix(".parquet") if is_file else name, is_file)
+
+
+def read_bytes(where: str) -> bytes:
+    """A file's content, wherever it is.
+
+    Raises:
+        FileFormatError: there is none.
+        StorageError: it cannot be read now.
+    """
+    with reading(where) as file:
+        return file.read()
+
+
+@contextmanager
+def reading(where: str) -> Iterator[BinaryIO]:
+    """A file to read from, wherever it is.
+
+    Raises:
+        FileFormatError: there is none.
+        StorageError: it cannot be read now.
+    """
+    filesystem, path = opened(where)
+    try:
+        with filesystem.open_input_file(path) as file:
+            yield cast("BinaryIO", file)
+    except (FileFormatError, StorageError):
+        raise
+    except OSError as error:
+        raise read_error(where, error) from error
+
+
+def read_error(where: str, error: OSError) -> FileFormatError | StorageError:
+    """What is said of a file or folder that cannot be read."""
+    if isinstance(error, FileNotFoundError):
+        return FileFormatError("there is no such file", where=where)
+    text = printable(" ".join(str(error).split()))[:300]
+    return StorageError(
+        f"cannot be read: {text}", where=where, remedy="Try again", errno=error.errno
+    )
+
+
+def sizes_in(where: str) -> dict[str, int]:
+    """Lengths of the files in a folder by their names, hidden ones left out.
+
+    Raises:
+        StorageError: a store does not answer.
+    """
+    filesystem, path = opened(where)
+    try:
+        found = filesystem.get_file_info(fs.FileSelector(path, allow_not_found=True))
+    except OSError as error:
+        raise read_error(where, error) from error
+    files = (info for info in found if info.type == fs.FileType.File)
+    return {info.base_name: info.size for info in files if not info.base_name.startswith(".")}
+
+
+@cache
+def _local() -> fs.FileSystem:
+    return fs.LocalFileSystem()
+
+
+@cache
+def _s3() -> fs.FileSystem:
+    """Of credentials, region and endpoint that the environment says, as other programs know it."""
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
+    library: Any = fs  # its stubs are of an older one
+    filesystem: fs.FileSystem = library.S3FileSystem(
+        endpoint_override=endpoint,
+        allow_delayed_open=True,  # one request for a small file, not three
+        connect_timeout=_S3_CONNECT_S,
+        retry_strategy=library.AwsStandardS3RetryStrategy(max_attempts=_S3_ATTEMPTS),
+    )
+    return filesystem
+
+
+def _by_fsspec(where: str) -> tuple[fs.FileSystem, str]:
+    with needs_extra("archive", f"a place like {where[:60]!r}"):
+        from fsspec.core import url_to_fs
+    try:
+        filesystem, path = url_to_fs(where)
+    except (ValueError, ImportError) as error:
+        raise UsageError(
+            f"no place {where!r}: {error}",
+            expected=_EXPECTED,
+            remedy="Install the package that opens it, if there is one",
+        ) from error
+    handler: Any = fs.FSSpecHandler  # its stubs call it abstract
+    return fs.PyFileSystem(handler(filesystem)), path.rstrip("/")
+
+
+def _roots(place: str) -> list[str]:
+    """Folders and files that a place names; one at least."""
+    if is_remote(place):
+        if _kind(place) == fs.FileType.NotFound:
+            raise UsageError(f"no place {place!r}", expected=_EXPECTED)
+        return [place.rstrip("/")]
+    paths = [place] if os.path.exists(place) else glob.glob(place)
+    roots = [absolute(path) for path in paths if os.path.isdir(path) or path.endswith(".parquet")]
+    if not roots:
+        raise UsageError(f"no session or folder {place!r}", expected=_EXPECTED)
+    return roots
+
+
+def _inside(root: str) -> Iterator[Place]:
+    if _kind(root) == fs.FileType.File or SESSION_ID.fullmatch(os.path.basename(root)):
+        yield place_of(root)
+    elif _kind(f"{root}/{SESSION_NAME}") == fs.FileType.File:
+        yield Place(root, os.path.basename(root))
+    else:
+        inside = f"{root}/sessions"
+        inside = inside if _kind(inside) == fs.FileType.Directory else root
+        for name in _names(inside):
+            if SESSION_ID.fullmatch(name):
+                yield Place(f"{inside}/{name}", name)
+
+
+def _names(folder: str) -> Iterator[str]:
+    """Names in a folder: one by one on this machine, from a store a list of all."""
+    if not is_remote(folder):
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                yield entry.name
+        return
+    filesystem, path = opened(folder)
+    try:
+        found = filesystem.get_file_info(fs.FileSelector(path))
+    except OSError as error:
+        raise read_error(folder, error) from error
+    yield from (info.base_name for info in found if info.type == fs.FileType.Directory)
+
+
+def _kind(where: str) -> fs.FileType:
+    filesystem, path = opened(where)
+    try:
+        return filesystem.get_file_info(path).type
+    except OSError as error:
+        raise read_error(where, error) from error

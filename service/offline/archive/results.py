@@ -1,0 +1,208 @@
+"""Results of jobs: a folder for each session, and in it a note of what they were made from.
+
+Files come first, each whole, then the note that names them with their hashes: without it they are
+nothing, and a job that was broken off is done again. A store keeps objects whole by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from devices.errors import FileFormatError, StorageError
+from devices.words import printable
+from service.offline.archive.places import is_remote, opened, read_bytes, sizes_in
+from service.offline.archive.workspace import SYSTEM, remove_stale_workspaces, workspace
+from storage.checked_json import checked, with_check
+from storage.durable import (
+    make_folder,
+    remove_stale_temporaries,
+    storage_errors,
+    sync_folder,
+    temporary_of,
+)
+from storage.file_hash import sha256_of
+
+_WORK = ".work"
+
+
+@dataclass(frozen=True)
+class Note:
+    """What a result was made from.
+
+    Attributes:
+        command: that made it.
+        software: version that made it.
+        place: of the session.
+        input_sha256: of what the session is.
+        options: of the command.
+        files: hash and length of every file, by its name.
+        facts: what there is to say of it.
+    """
+
+    command: str
+    software: str
+    place: str
+    input_sha256: str
+    options: Mapping[str, Any]
+    files: Mapping[str, Mapping[str, Any]]
+    facts: Mapping[str, Any]
+
+    def is_of(self, other: Note) -> bool:
+        """Were both made from the same, in the same way?"""
+        return (self.software, self.input_sha256, self.options) == (
+            other.software,
+            other.input_sha256,
+            other.options,
+        )
+
+
+class Results:
+    """A folder of results, on this machine or in a store."""
+
+    def __init__(self, out: str) -> None:
+        self.out = out.rstrip("/")
+        self.is_remote = is_remote(out)
+
+    def note(self, name: str, command: str) -> Note | None:
+        """What was made by a command for a session, and is there with all its files; else None.
+
+        Raises:
+            StorageError: it cannot be read now.
+        """
+        note = self._read(name, command)
+        if note is None:
+            return None
+        filesystem, path = opened(f"{self.out}/{name}")
+        with _storing(self.out):
+            infos = filesystem.get_file_info([f"{path}/{file}" for file in note.files])
+        sizes = [file["bytes"] for file in note.files.values()]
+        return note if [info.size for info in infos] == sizes else None
+
+    @contextmanager
+    def made(self, name: str, command: str) -> Iterator[Path]:
+        """An empty folder to work in; what is in it is put into the results, if all goes well.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        with workspace(SYSTEM if self.is_remote else Path(self.out) / _WORK) as work:
+            yield work
+            self._put(work, name, command)
+
+    def keep(self, name: str, note: Note) -> None:
+        """Write the note, the last of all. It is not waited for: without it all is made again.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        text = with_check(json.dumps(vars(note), indent=1).encode())
+        where = f"{self.out}/{name}/{_note_name(note.command)}"
+        if self.is_remote:
+            self._upload(where, text)
+            return
+        with storage_errors(Path(where)):
+            temporary = temporary_of(Path(where))
+            temporary.write_bytes(text)
+            temporary.replace(where)
+
+    def begin(self) -> None:
+        """Make the folder, and take away what killed workers of this machine have left.
+
+        Raises:
+            StorageError: it cannot be made.
+        """
+        remove_stale_workspaces(SYSTEM)
+        if not self.is_remote:
+            with storage_errors(Path(self.out)):
+                make_folder(Path(self.out).absolute())
+            remove_stale_workspaces(Path(self.out) / _WORK)
+
+    def end(self) -> None:
+        """All workers have ended."""
+        if not self.is_remote:
+            remove_stale_workspaces(Path(self.out) / _WORK)
+            with suppress(OSError):
+                (Path(self.out) / _WORK).rmdir()
+
+    def put_file(self, name: str, path: Path) -> None:
+        """Put a file beside the results."""
+        if self.is_remote:
+            self._upload(f"{self.out}/{name}", path)
+
+    def _read(self, name: str, command: str) -> Note | None:
+        where = f"{self.out}/{name}/{_note_name(command)}"
+        try:
+            return Note(**json.loads(checked(read_bytes(where), where=where).text))
+        except (FileFormatError, TypeError, ValueError):
+            return None
+
+    def _put(self, work: Path, name: str, command: str) -> None:
+        target = f"{self.out}/{name}"
+        self._forget(name, command)
+        files = sorted(path for path in work.iterdir() if path.is_file())
+        if self.is_remote:
+            for path in files:
+                self._upload(f"{target}/{path.name}", path)
+            return
+        with storage_errors(Path(target)):
+            Path(target).mkdir(parents=True, exist_ok=True)
+            remove_stale_temporaries(Path(target))
+            for path in files:
+                with path.open("rb") as file:
+                    os.fsync(file.fileno())
+                path.replace(Path(target) / path.name)
+            sync_folder(Path(target))  # before the note that names them
+
+    def _forget(self, name: str, command: str) -> None:
+        """The note goes first: no reader may take it for that of other files."""
+        there = set(sizes_in(f"{self.out}/{name}"))
+        if _note_name(command) not in there:
+            return
+        old = self._read(name, command)
+        filesystem, path = opened(f"{self.out}/{name}")
+        with _storing(f"{self.out}/{name}"):
+            filesystem.delete_file(f"{path}/{_note_name(command)}")
+            for file in there.intersection(old.files if old is not None else ()):
+                filesystem.delete_file(f"{path}/{file}")
+
+    def _upload(self, where: str, content: bytes | Path) -> None:
+        filesystem, path = opened(where)
+        with _storing(where), filesystem.open_output_stream(path) as sink:
+            if isinstance(content, bytes):
+                sink.write(content)
+            else:
+                with content.open("rb") as source:
+                    shutil.copyfileobj(source, sink, 1 << 20)
+
+
+def files_in(work: Path) -> dict[str, dict[str, Any]]:
+    """Hash and length of every file in a folder, by its name."""
+    return {
+        path.name: {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
+        for path in sorted(work.iterdir())
+        if path.is_file()
+    }
+
+
+def _note_name(command: str) -> str:
+    return f"{command}.made.json"
+
+
+@contextmanager
+def _storing(where: str) -> Iterator[None]:
+    try:
+        yield
+    except StorageError:
+        raise
+    except OSError as error:
+        text = printable(" ".join(str(error).split()))[:300]
+        raise StorageError(
+            f"cannot be written: {text}", where=where, remedy="Try again", errno=error.errno
+        ) from error

@@ -1,0 +1,227 @@
+"""Sealed sessions as tables, for questions about many of them, and what is left out.
+
+What is read of frames is proven when it is read. No session is changed: stances that an older one
+lacks are made beside its frames, where its folder may be written to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.fs as fs
+
+from devices.errors import FileFormatError, FootTileError, UnknownError
+from service.offline.archive.places import Place, is_remote, opened, read_bytes, reading
+from service.offline.archive.staging import side_by_side
+from service.sessions.stances import stances_of_session
+from storage.durable import write_whole
+from storage.sessions.beside import EVENTS_NAME, read_events
+from storage.sessions.claims import Claims
+from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.footer import Footer
+from storage.sessions.stances import SCHEMA, STANCES_NAME
+
+_ID: pa.Field[Any] = pa.field("session_id", pa.string(), nullable=False)
+_SESSION_COLUMNS: list[tuple[str, pa.DataType]] = [
+    ("name", pa.string()),
+    ("node", pa.string()),
+    ("scene", pa.string()),
+    ("subject", pa.string()),
+    ("notes", pa.string()),
+    ("tags", pa.list_(pa.string())),
+    ("started_t_ns", pa.int64()),
+    ("stopped_t_ns", pa.int64()),
+    ("duration_s", pa.float64()),
+    ("frames", pa.int64()),
+    ("lossy", pa.bool_()),
+    ("bytes", pa.int64()),
+    ("calibration_id", pa.string()),
+    ("absolute_scale", pa.string()),
+    ("problem", pa.string()),
+    ("folder", pa.string()),
+]
+SESSIONS = pa.schema([_ID, *(pa.field(name, type_) for name, type_ in _SESSION_COLUMNS)])
+EVENTS = pa.schema(
+    [_ID, pa.field("id", pa.string()), pa.field("label", pa.string()), pa.field("t_ns", pa.int64())]
+)
+STANCES = pa.schema([_ID, *(SCHEMA.field(name) for name in SCHEMA.names)])
+
+
+@dataclass(frozen=True)
+class Archived:
+    """One sealed session.
+
+    Attributes:
+        place: where it is.
+        folder: the same, or what of it was copied here from a store.
+        said: what it says of itself.
+    """
+
+    place: Place
+    folder: Path
+    said: Claims
+
+    @property
+    def id(self) -> str:
+        """Of the session, and its folder's name."""
+        return self.place.name
+
+    @property
+    def has_frames(self) -> bool:
+        """Was a frame recorded?"""
+        return self.said.content.get("sha256") is not None
+
+    @property
+    def is_remote(self) -> bool:
+        """Is it in a store?"""
+        return is_remote(self.place.where)
+
+    def stances(self) -> pa.Table:
+        """As of `service.sessions.stances`; frames of a store are copied if they are needed."""
+        sha256 = str(self.said.content["sha256"])
+        if self.is_remote:
+            with suppress(FileFormatError):
+                return stances_of_session(self.folder, frames_sha256=sha256)
+            self.fetch(FRAMES_NAME)
+        return stances_of_session(self.folder, frames_sha256=sha256, keep=True)
+
+    def fetch(self, name: str) -> None:
+        """Copy a file from the store, if the session is in one, has it, and it was not before."""
+        if self.is_remote and not (self.folder / name).exists():
+            with suppress(FileFormatError):
+                write_whole(self.folder / name, read_bytes(f"{self.place.where}/{name}"))
+
+
+@dataclass
+class Archive:
+    """Sessions, and what was left out of them.
+
+    Attributes:
+        sessions: sealed and whole as far as was looked.
+        left_out: why something is not in the answers, by its place.
+    """
+
+    sessions: list[Archived] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    def sessions_table(self) -> pa.Table:
+        """A row for each session."""
+        rows = []
+        for each in self.sessions:
+            ledger = each.said.ledger
+            lossy = ledger.lossy if ledger is not None else None
+            about = {"session_id": each.id, "lossy": lossy, "folder": each.place.where}
+            rows.append({**each.said.content, **about})
+        return pa.Table.from_pylist(rows, schema=SESSIONS)
+
+    def events_table(self) -> pa.Table:
+        """A row for each mark."""
+        rows: list[dict[str, Any]] = []
+        self._fetch(EVENTS_NAME)
+        for each in list(self.sessions):
+            try:
+                events = _events(each)
+            except FootTileError as error:
+                self._leave_out(each, error)
+                continue
+            rows += [{"session_id": each.id, **event} for event in events]
+        return pa.Table.from_pylist(rows, schema=EVENTS)
+
+    def stances_table(self) -> pa.Table:
+        """A row for each stance; sessions without estimates have none."""
+        tables, ids = [SCHEMA.empty_table()], [pa.array([], pa.string())]
+        self._fetch(STANCES_NAME)
+        for each in list(self.sessions):
+            if not each.has_frames:
+                continue
+            try:
+                table = each.stances()
+            except UnknownError:
+                continue
+            except FootTileError as error:
+                self._leave_out(each, error)
+                continue
+            tables.append(table)
+            ids.append(pa.repeat(each.id, len(table)))
+        columns = pa.concat_tables(tables).columns
+        return pa.Table.from_arrays([pa.chunked_array(ids), *columns], schema=STANCES)
+
+    def frames(self) -> ds.Dataset:
+        """All frames, of which no more is read than a question needs; each page is proven."""
+        schema = pa.schema([_ID])
+        by_filesystem: list[tuple[fs.FileSystem, list[str], list[str]]] = []
+        for each, own in list(self._schemas()):
+            if isinstance(own, Exception):
+                self._leave_out(each, own)
+                continue
+            schema = pa.unify_schemas([schema, pa.schema([(f.name, f.type) for f in own])])
+            filesystem, path = opened(each.place.frames)
+            known = next((k for k in by_filesystem if k[0].equals(filesystem)), None)
+            if known is None:
+                by_filesystem.append(known := (filesystem, [], []))
+            known[1].append(path)
+            known[2].append(each.id)
+        options = ds.ParquetFragmentScanOptions(page_checksum_verification=True)
+        parts: list[ds.Dataset] = [
+            ds.FileSystemDataset.from_paths(
+                paths,
+                schema=schema,
+                format=ds.ParquetFileFormat(default_fragment_scan_options=options),
+                filesystem=filesystem,
+                partitions=[ds.field("session_id") == session_id for session_id in ids],
+            )
+            for filesystem, paths, ids in by_filesystem or [(fs.LocalFileSystem(), [], [])]
+        ]
+        return parts[0] if len(parts) == 1 else ds.dataset(parts, schema=schema)
+
+    def _schemas(self) -> Iterator[tuple[Archived, pa.Schema | Exception]]:
+        """Of the frames of every session that has any, proven; or why they cannot be."""
+        having = [each for each in self.sessions if each.has_frames]
+        waits = any(each.is_remote for each in having)
+        yield from zip(having, side_by_side(_schema_of, having, is_remote=waits), strict=True)
+
+    def _fetch(self, name: str) -> None:
+        """Copy a file of every session of a store; one that cannot be read is left out."""
+
+        def fetch(session: Archived) -> Exception | None:
+            try:
+                session.fetch(name)
+            except FootTileError as error:
+                return error
+            return None
+
+        remote = [each for each in self.sessions if each.is_remote]
+        for each, error in zip(remote, side_by_side(fetch, remote, is_remote=True), strict=True):
+            if error is not None:
+                self._leave_out(each, error)
+
+    def _leave_out(self, session: Archived, reason: Exception) -> None:
+        """Found damaged only when it is read: it is in no table then that is made from now on."""
+        self.sessions.remove(session)
+        what = reason.what if isinstance(reason, FootTileError) else str(reason)
+        self.left_out[session.place.where] = f"damaged: {what}"
+
+
+def _schema_of(session: Archived) -> pa.Schema | Exception:
+    try:
+        with reading(session.place.frames) as file:
+            return Footer(Path(session.place.frames), only_slices=True, file=file).schema
+    except (FootTileError, pa.ArrowException) as error:
+        return error
+
+
+def _events(session: Archived) -> list[dict[str, Any]]:
+    whole = session.said.whole
+    if whole is not None:
+        return [event.model_dump() for event in whole.events]
+    try:  # one that was pulled
+        stored = read_events(session.folder / EVENTS_NAME)
+    except FileNotFoundError:
+        return []
+    return [event.model_dump() for event in stored.events]

@@ -1,0 +1,213 @@
+"""What is done with each of many sessions: a task has options, and makes files of one session.
+
+Options are values, not names of files: a worker on another machine has none of the client's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+from devices.errors import UsageError
+from devices.scene.file import Scene
+from service.estimation.calibration import Calibration
+from service.offline.archive.staging import claims_of, frames_of, identity_of_file, staged_file
+from service.offline.export import ExportOptions, export_session
+from service.plain_json import plain
+from storage.checked_json import with_check
+from storage.clock.file import CLOCK_NAME
+from storage.file_hash import sha256_of
+from storage.formats.slice import Slice
+from storage.sessions.beside import EVENTS_NAME
+from storage.sessions.claims import LEDGER_NAME, PULLED_EVENTS_NAME, SESSION_NAME, bytes_of
+from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.reader import SessionReader
+from storage.verify.data import verdict_of, verify
+
+if TYPE_CHECKING:
+    from service.offline.comparison import CompareOptions
+
+_BESIDE = (EVENTS_NAME, CLOCK_NAME, LEDGER_NAME, PULLED_EVENTS_NAME)
+
+_ALL = Slice()
+
+
+class Task(Protocol):
+    """What a job does."""
+
+    @property
+    def command(self) -> str:
+        """Which command it is, of which notes and reports have their names."""
+
+    def options(self) -> dict[str, Any]:
+        """What it is asked for, as JSON."""
+
+    def run(self, source: Path, work: Path) -> dict[str, Any]:
+        """Do it.
+
+        Args:
+            source: the session's folder, or its file.
+            work: empty folder, for the files of the result; who calls puts them on the disk.
+
+        Returns:
+            What there is to say of it, as JSON.
+
+        Raises:
+            FootTileError: it cannot be done with this session.
+        """
+
+
+@dataclass(frozen=True)
+class EstimateTask:
+    """Estimates a session again; the result is a session's folder as the source was."""
+
+    calibration: str | Calibration | None
+    models: tuple[str, ...] | None
+    lag_ms: float
+    scene: Scene | None
+    tare_s: tuple[float, float] | None
+    part: Slice = _ALL
+    exact: bool = False
+    command: ClassVar[str] = "estimate"
+
+    def options(self) -> dict[str, Any]:
+        """As for any task."""
+        named = self.calibration
+        return {
+            **vars(self),
+            "calibration": named.id if isinstance(named, Calibration) else named,
+            "scene": None if self.scene is None else self.scene.model_dump(mode="json"),
+            "part": vars(self.part),
+        }
+
+    def run(self, source: Path, work: Path) -> dict[str, Any]:
+        """As for any task."""
+        from service.offline.estimate import estimate_session
+
+        frames, remarks = frames_of(source), list[str]()
+        out = work / FRAMES_NAME
+        made = estimate_session(
+            frames,
+            out,
+            calibration=self.calibration,
+            models=self.models,
+            lag_ms=self.lag_ms,
+            scene=self.scene,
+            tare_s=self.tare_s,
+            part=self.part,
+            exact=self.exact,
+            remark=remarks.append,
+        )
+        if source.is_dir() and self.part.is_all:
+            _complete(source, work)
+        return {
+            "frames": made.frames,
+            "calibration_id": made.plan.calibration.id,
+            "models": made.plan.models,
+            "remarks": remarks,
+        }
+
+
+@dataclass(frozen=True)
+class ExportTask:
+    """Writes a session in another format."""
+
+    export: ExportOptions
+    command: ClassVar[str] = "export"
+
+    def options(self) -> dict[str, Any]:
+        """As for any task."""
+        return {**vars(self.export), "part": vars(self.export.part)}
+
+    def run(self, source: Path, work: Path) -> dict[str, Any]:
+        """As for any task."""
+        name = f"{Path(FRAMES_NAME).stem}.{self.export.to}"
+        done = export_session(frames_of(source), work / name, self.export)
+        left_out = {mark.event.label: mark.left_out for mark in done.left_out}
+        return {"bytes": done.size_bytes, "marks_left_out": left_out}
+
+
+@dataclass(frozen=True)
+class VerifyTask:
+    """Proves a session from its files."""
+
+    command: ClassVar[str] = "verify"
+
+    def options(self) -> dict[str, Any]:
+        """As for any task."""
+        return {}
+
+    def run(self, source: Path, work: Path) -> dict[str, Any]:
+        """As for any task."""
+        report = verify(source)
+        text = json.dumps(report.as_dict(), indent=1).encode()
+        (work / "verify.json").write_bytes(text)
+        return {"verdict": verdict_of(report), "problems": report.problems}
+
+
+@dataclass(frozen=True)
+class CompareTask:
+    """Compares a session with a reference."""
+
+    reference: str
+    """A file, or a session's `frames.parquet`; as a path or URI."""
+    compare: CompareOptions
+    limits: Mapping[str, float]
+    command: ClassVar[str] = "compare"
+
+    def options(self) -> dict[str, Any]:
+        """As for any task; the reference is what is in it."""
+        said = identity_of_file(self.reference)
+        options = {**vars(self.compare), "stated": vars(self.compare.stated)}
+        return {"reference_sha256": said, "limits": self.limits, **options}
+
+    def run(self, source: Path, work: Path) -> dict[str, Any]:
+        """As for any task."""
+        from service.offline.comparison_files import write_comparison
+
+        title = f"{source.name} against {self.reference.rpartition('/')[2]}"
+        with staged_file(self.reference) as reference:
+            done = write_comparison(
+                frames_of(source), reference, self.compare, self.limits, work, title
+            )
+        means = {name: figure.mean for name, figure in done.content["figures"].items()}
+        verdict = {"verdict": "limit missed", "missed": list(done.missed)} if done.missed else {}
+        return {"means": plain(means), **verdict}
+
+
+@dataclass(frozen=True)
+class RefusedTask:
+    """What was asked for one session cannot be meant."""
+
+    reason: str
+    command: str
+
+    def options(self) -> dict[str, Any]:
+        """As for any task."""
+        raise UsageError(self.reason)
+
+    def run(self, source: Path, work: Path) -> dict[str, Any]:
+        """As for any task."""
+        raise UsageError(self.reason)
+
+
+def _complete(source: Path, work: Path) -> None:
+    """Make a session's folder of the estimated frames: what lay beside the old ones."""
+    said = claims_of(source)
+    out = work / FRAMES_NAME
+    with SessionReader(out, is_checked=True) as session:
+        about: Mapping[str, Any] = {
+            "bytes": out.stat().st_size,
+            "sha256": sha256_of(out),
+            "calibration_id": session.notes.get("calibration_id"),
+            "absolute_scale": session.notes.get("absolute_scale"),
+            "problem": None,
+        }
+    for name in _BESIDE:
+        if (content := bytes_of(source / name)) is not None:
+            (work / name).write_bytes(content)
+    text = json.dumps({**said.content, **about}, indent=1).encode()
+    (work / SESSION_NAME).write_bytes(with_check(text))

@@ -1,0 +1,72 @@
+"""A sealed session in, a file of another format out, with its marks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from devices.errors import UsageError
+from storage.durable import whole_file
+from storage.formats.export import ClockName, Format
+from storage.formats.marks import Mark
+from storage.formats.sealed import export_file, marks_of
+from storage.formats.slice import Slice
+from storage.sessions.beside import EVENTS_NAME, read_events
+from storage.sessions.reader import SessionReader
+
+_ALL = Slice()
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What to export; see `foottile export --help`."""
+
+    to: Format
+    part: Slice = _ALL
+    clock: ClockName = "node"
+    marks: bool | None = None
+    """None: if there are events beside the frames."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What came of it."""
+
+    size_bytes: int
+    left_out: tuple[Mark, ...]
+    """Marks that are at no frame."""
+    lacks_marks: bool
+    """Nothing lies beside the frames that would say what was marked."""
+
+
+def export_session(source: Path, out: Path, options: ExportOptions) -> Exported:
+    """Write a sealed session, or a slice of it, in another format.
+
+    Args:
+        source: its frames.
+        out: the file.
+        options: what of it.
+
+    Raises:
+        UsageError: marks or a clock are asked for that are not there, or a slice is empty.
+        FileFormatError: a file is damaged.
+        StorageError: `out` cannot be written.
+    """
+    with SessionReader(source, only_slices=not options.part.is_all) as reader:
+        beside = source.with_name(EVENTS_NAME)
+        stored = read_events(beside) if options.marks is not False and beside.is_file() else None
+        if options.marks and stored is None:
+            raise UsageError(
+                f"there is no {EVENTS_NAME} beside {source.name}, so nothing is known of marks",
+                where=str(source.parent),
+                expected="a session's folder as a server sealed it or `foottile pull` fetched it",
+            )
+        placed = None if stored is None else marks_of(reader, stored.events, options.part)
+        with whole_file(out) as file:
+            for chunk in export_file(
+                reader, options.to, options.part, clock=options.clock, marks=placed
+            ):
+                file.write(chunk)
+        lacks_marks = options.marks is None and stored is None and "session" in reader.notes
+    left_out = tuple(placed.left_out) if placed is not None else ()
+    return Exported(out.stat().st_size, left_out, lacks_marks)

@@ -1,0 +1,146 @@
+"""Commands over many sessions: what they say, and what they leave when they are killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.service.cli.outcome import Run
+from tests.service.offline.archives import IDS, recording, sealed
+from tests.service.process import Process
+from tests.waiting import until
+
+COPIES = 24
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    data = tmp_path_factory.mktemp("many")
+    sealed(data, 0, 20.0, 40.0)
+    sealed(data, 1, 30.0)
+    return data
+
+
+@pytest.fixture
+def data(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "data"))
+
+
+@pytest.fixture
+def copies(made: Path, tmp_path: Path) -> list[str]:
+    """Lone files, to be estimated."""
+    names = [f"trial{number}" for number in range(COPIES)]
+    (tmp_path / "trials").mkdir()
+    for name in names:
+        source = made / "sessions" / IDS[0] / "frames.parquet"
+        shutil.copy(source, tmp_path / "trials" / f"{name}.parquet")
+    return names
+
+
+def report(out: Path, command: str) -> list[dict[str, object]]:
+    lines = (out / f"{command}.report.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def test_many_sessions_are_estimated_each_into_its_folder(
+    run: Run, data: Path, tmp_path: Path
+) -> None:
+    done = run("estimate", data, "--out", "out", "--jobs", 2)
+    assert done.code == 0, done.err
+    assert "2 made, 0 there before" in done.out
+    assert {line["name"] for line in report(tmp_path / "out", "estimate")} == set(IDS[:2])
+    again = run("estimate", data, "--out", "out", "--jobs", 1, "--json")
+    assert again.code == 0, again.err
+    said = [json.loads(line) for line in again.out.splitlines()]
+    assert [line["state"] for line in said] == ["there", "there"]
+    proof = run("verify", "out", "data", "--jobs", 1)
+    assert proof.code == 0, proof.err
+    assert "4 complete" in proof.out
+
+
+def test_what_failed_is_listed_with_its_reason_and_the_exit_code_is_3(
+    run: Run, data: Path, tmp_path: Path
+) -> None:
+    recording(data, 2)
+    done = run("export", data, "--format", "csv", "--out", "out", "--jobs", 1)
+    done.fails(3, f"{IDS[2]}: ", "it is recording, and not sealed yet")
+    assert "2 made, 0 there before, 1 failed" in done.out
+    states = {line["name"]: line["state"] for line in report(tmp_path / "out", "export")}
+    assert states == {IDS[0]: "made", IDS[1]: "made", IDS[2]: "failed"}
+
+
+def test_sessions_of_a_manifest_are_worked_through_and_one_that_is_not_there_fails(
+    run: Run, data: Path, tmp_path: Path
+) -> None:
+    text = f"session\ndata/sessions/{IDS[1]}\ndata/sessions/gone\n"
+    (tmp_path / "list.csv").write_text(text)
+    done = run("export", "--manifest", "list.csv", "--format", "csv", "--out", "out", "--jobs", 1)
+    done.fails(3, "gone", "no such file")
+    assert (tmp_path / "out" / IDS[1] / "frames.csv").is_file()
+
+
+def test_a_damaged_session_among_many_is_told_by_the_exit_code(run: Run, data: Path) -> None:
+    (data / "sessions" / IDS[1] / "clock.parquet").unlink()
+    done = run("verify", f"{data}/sessions/*", "--jobs", 1, "--out", "proofs")
+    assert done.code == 1
+    assert "1 complete, 1 damaged" in done.out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("estimate", "--out", "o"),
+        ("estimate", "data", "nowhere", "--out", "o"),
+        ("estimate", "data", "--out", "o", "--manifest", "list.csv"),
+        ("estimate", "--out", "o", "--manifest", "gone.csv"),
+        ("estimate", "data", "--out", "o", "--jobs", 1, "--scheduler", "tcp://127.0.0.1:1"),
+        ("estimate", "data", "--out", "o", "--scene", "gone"),
+        ("estimate", ".", "--out", "o"),
+        ("verify",),
+        ("verify", "data/x*"),
+        ("export", "nosuch://a/b", "--out", "o", "--format", "csv"),
+    ],
+)
+def test_what_cannot_be_meant_is_wrong_usage(run: Run, data: Path, words: tuple[str, ...]) -> None:
+    done = run(*words)
+    done.fails(2)
+    assert len(done.err.splitlines()) == 1
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """All that a run leaves, without its report."""
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in out.rglob("*")
+        if path.is_file() and path.suffix != ".jsonl"
+    }
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_a_client_that_was_killed_goes_on_where_it_was_and_the_end_is_the_same(
+    run: Run, tmp_path: Path, copies: list[str], number: signal.Signals
+) -> None:
+    words = ("estimate", f"{tmp_path}/trials/*.parquet", "--models", "static", "--jobs")
+    out = tmp_path / "out"
+    with closing(Process(*words, 2, "--out", out, folder=tmp_path / "run")) as client:
+        until(lambda: any(out.glob("*/estimate.made.json")))
+        client.process.send_signal(number)
+        code = client.ended(60.0)
+    assert code == (-number if number == signal.SIGKILL else 130)
+    kept = {path: path.stat().st_mtime_ns for path in out.glob("*/estimate.made.json")}
+    done = run(*words, 1, "--out", out)
+    assert done.code == 0, done.err
+    there = {str(line["name"]) for line in report(out, "estimate") if line["state"] == "there"}
+    assert {path.parent.name for path in kept} <= there
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert {str(line["name"]) for line in report(out, "estimate")} == set(copies)
+    assert run(*words, 1, "--out", "whole").code == 0
+    assert contents(out) == contents(tmp_path / "whole")
+    assert set(os.listdir(out)) == {*copies, "estimate.report.jsonl"}

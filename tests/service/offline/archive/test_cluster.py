@@ -1,0 +1,125 @@
+"""The same plan on a real Dask cluster of processes, one of which is killed on the way."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from devices.errors import LinkError, UsageError, WorkerLostError
+from service.offline.archive.cluster import spread_over_cluster
+from service.offline.archive.jobs import Job
+from service.offline.archive.places import sessions_in
+from service.offline.archive.plan import outcomes
+from service.offline.archive.results import Results
+from service.offline.archive.tasks import EstimateTask
+from service.offline.processes import spread
+from tests.service.offline.archive.clusters import Cluster
+from tests.service.offline.archive.workers import killed_at_two, raising, squared
+from tests.service.offline.archives import IDS
+
+pytestmark = [pytest.mark.process, pytest.mark.slow]
+COPIES = 10
+STATIC = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    with Cluster(tmp_path_factory.mktemp("cluster"), workers=2) as started:
+        yield started
+
+
+@pytest.fixture
+def trials(archive: Path, tmp_path: Path) -> Path:
+    (tmp_path / "trials").mkdir()
+    for number in range(COPIES):
+        source = archive / "sessions" / IDS[number % 4] / "frames.parquet"
+        shutil.copy(source, tmp_path / "trials" / f"t{number}.parquet")
+    return tmp_path / "trials"
+
+
+def jobs(trials: Path, out: Path) -> Iterator[Job]:
+    for place in sessions_in([f"{trials}/*.parquet"]):
+        yield Job(place, STATIC, str(out))
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(out)): p.read_bytes() for p in out.glob("*/*") if p.is_file()}
+
+
+def test_a_worker_that_is_killed_costs_nothing_and_results_are_those_of_one_process(
+    cluster: Cluster, trials: Path, tmp_path: Path
+) -> None:
+    out, there = tmp_path / "out", 0
+    cluster.add_worker()
+    for outcome in outcomes(
+        jobs(trials, out), partial(spread_over_cluster, address=cluster.address)
+    ):
+        assert outcome.state == "made", outcome.reason
+        there += 1
+        if there == 3:
+            cluster.workers[0].kill()
+    assert there == COPIES
+    for outcome in outcomes(jobs(trials, tmp_path / "alone"), partial(spread, jobs=1)):
+        assert outcome.state == "made"
+    assert contents(out) == contents(tmp_path / "alone")
+    Results(str(out)).end()
+    assert not (out / ".work").exists()
+
+
+def test_no_more_tasks_are_taken_than_are_under_way(cluster: Cluster) -> None:
+    taken: list[int] = []
+
+    def tasks() -> Iterator[int]:
+        for number in range(50):
+            taken.append(number)
+            yield number
+
+    results = {}
+    for given, (task, result) in enumerate(
+        spread_over_cluster(squared, tasks(), address=cluster.address), start=1
+    ):
+        assert len(taken) <= given + 3
+        results[task] = result
+    assert results == {n: n * n for n in range(50)}
+
+
+def test_an_error_comes_with_its_task(cluster: Cluster) -> None:
+    found = dict(spread_over_cluster(raising, range(4), address=cluster.address))
+    assert isinstance(found.pop(2), ValueError)
+    assert found == {0: 0, 1: 1, 3: 3}
+
+
+def test_a_worker_of_another_version_is_refused(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "service.offline.archive.cluster.exact_software", lambda: "foottile 9 (ffffffffffff)"
+    )
+    with pytest.raises(UsageError, match="another version: foottile foottile"):
+        list(spread_over_cluster(squared, range(3), address=cluster.address))
+
+
+def test_where_no_scheduler_is_that_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.offline.archive.cluster._CONNECT_S", 1.0)
+    with pytest.raises(LinkError, match="no Dask cluster"):
+        list(spread_over_cluster(squared, range(3), address="tcp://127.0.0.1:9"))
+
+
+def test_a_task_that_kills_every_worker_is_given_up_alone_and_a_scheduler_that_goes_ends_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Cluster(tmp_path, workers=5) as own:
+        found = dict(spread_over_cluster(killed_at_two, range(5), address=own.address))
+        assert isinstance(found.pop(2), WorkerLostError)
+        assert found == {n: n for n in (0, 1, 3, 4)}
+        monkeypatch.setattr("service.offline.archive.cluster._CONNECT_S", 1.0)
+        results = spread_over_cluster(squared, iter(range(10**9)), address=own.address)
+        next(results)
+        own.end_scheduler()
+        with pytest.raises(LinkError, match="goes on where it was broken off"):
+            for _ in results:
+                pass

@@ -1,0 +1,102 @@
+"""Where sessions are: folders, files, globs, manifests, and filesystems that are not this one."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from devices.errors import FileFormatError, UsageError
+from service.offline.archive.manifest import rows_in
+from service.offline.archive.places import Place, place_of, read_bytes, sessions_in
+from service.offline.archive.staging import frames_of, identity, staged
+from storage.sessions.reader import SessionReader
+from tests.service.offline.archives import IDS
+
+
+def names(*places: str | Path) -> list[str]:
+    return sorted(place.name for place in sessions_in([str(place) for place in places]))
+
+
+def test_a_place_is_a_data_folder_a_folder_of_sessions_one_of_them_or_a_glob(archive: Path) -> None:
+    four, sessions = list(IDS[:4]), archive / "sessions"
+    (sessions / "notes").mkdir()
+    assert names(archive) == four
+    assert names(sessions) == four
+    assert names(sessions / IDS[1]) == [IDS[1]]
+    assert names(f"{sessions}/*-00000[12]") == [IDS[1], IDS[2]]
+    assert names(sessions / IDS[0], sessions / IDS[3]) == [IDS[0], IDS[3]]
+
+
+def test_a_lone_file_is_a_session_with_its_own_name(archive: Path, tmp_path: Path) -> None:
+    shutil.copy(archive / "sessions" / IDS[0] / "frames.parquet", tmp_path / "hops.parquet")
+    (place,) = sessions_in([str(tmp_path / "hops.parquet")])
+    assert place == Place(str(tmp_path / "hops.parquet"), "hops", is_file=True)
+    assert len(identity(place)) == 64
+    inside = place_of(f"{archive}/sessions/{IDS[0]}/frames.parquet")
+    assert inside == Place(f"{archive}/sessions/{IDS[0]}", IDS[0])
+
+
+def test_a_place_that_is_not_there_is_refused_before_anything_is_given(archive: Path) -> None:
+    for missing in ("nowhere", f"{archive}/*.parquet", "memory://nowhere", "nosuch://bucket/a"):
+        with pytest.raises(UsageError, match=r"no (place|session)"):
+            sessions_in([str(archive), missing])
+
+
+def test_sessions_are_found_and_staged_in_any_filesystem(archive: Path) -> None:
+    memory = fsspec.filesystem("memory")
+    memory.put(f"{archive}/sessions/", "/lab/sessions/", recursive=True)
+    try:
+        assert names("memory://lab") == list(IDS[:4])
+        assert names(f"memory://lab/sessions/{IDS[2]}") == [IDS[2]]
+        place = place_of(f"memory://lab/sessions/{IDS[2]}")
+        here = place_of(f"{archive}/sessions/{IDS[2]}")
+        assert identity(place) == identity(here)
+        with staged(place) as folder, staged(here) as original:
+            assert original == archive / "sessions" / IDS[2]
+            copied = {path.name: path.read_bytes() for path in folder.iterdir()}
+            assert copied == {path.name: path.read_bytes() for path in original.iterdir()}
+            with SessionReader(frames_of(folder)) as session:
+                assert session.frame_count == 400
+        assert not folder.exists()
+        file = f"memory://lab/sessions/{IDS[2]}/frames.parquet"
+        changed = bytearray(read_bytes(file))
+        changed[1000] ^= 1
+        memory.pipe(f"/lab/sessions/{IDS[2]}/frames.parquet", bytes(changed))
+        with pytest.raises(FileFormatError, match="not the one"), staged(place):
+            pass
+        with pytest.raises(FileFormatError, match="no such file"):
+            identity(place_of("memory://lab/sessions/nothing"))
+    finally:
+        memory.rm("/lab", recursive=True)
+
+
+def test_a_manifest_names_sessions_relative_to_itself(tmp_path: Path) -> None:
+    manifest = tmp_path / "list.csv"
+    manifest.write_text("session,reference\na/b,r.csv\n\ns3://bucket/x , r.csv\n")
+    rows = list(rows_in(manifest, {"session", "reference"}))
+    assert [row["session"] for row in rows] == [str(tmp_path / "a" / "b"), "s3://bucket/x"]
+    assert rows[1]["reference"] == "r.csv"
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("", UsageError),
+        ("name\nx\n", UsageError),
+        ("session,session\nx,y\n", UsageError),
+        ("session,other\nx,y\n", UsageError),
+        ("session\n\x00\xff\n", UsageError),
+        ("session,reference\nx\n", FileFormatError),
+        ("session,reference\n,y\n", FileFormatError),
+    ],
+)
+def test_a_manifest_that_is_none_is_refused(
+    tmp_path: Path, text: str, error: type[Exception]
+) -> None:
+    manifest = tmp_path / "list.csv"
+    manifest.write_bytes(text.encode("latin-1"))
+    with pytest.raises(error):
+        list(rows_in(manifest, {"session", "reference"}))

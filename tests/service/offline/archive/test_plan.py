@@ -1,0 +1,200 @@
+"""A plan over sessions: what is made, what is left as it is, and what fails alone."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from devices.errors import UsageError
+from service.offline.archive.finding import find_sessions
+from service.offline.archive.jobs import Job, Outcome, run_job
+from service.offline.archive.places import sessions_in
+from service.offline.archive.plan import LISTED_MAX, Summary, outcomes
+from service.offline.archive.query import ask
+from service.offline.archive.results import Results
+from service.offline.archive.tasks import EstimateTask, ExportTask, Task, VerifyTask
+from service.offline.export import ExportOptions
+from service.offline.processes import spread
+from storage.verify.data import verdict_of, verify
+from tests.service.offline.archives import IDS, recording
+
+ESTIMATE = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
+CSV = ExportTask(ExportOptions("csv"))
+
+
+def ran(task: Task, place: Path | str, out: Path | str | None) -> dict[str, Outcome]:
+    where = None if out is None else str(out)
+    jobs = [Job(found, task, where) for found in sessions_in([str(place)])]
+    return {each.name: each for each in outcomes(jobs, partial(spread, jobs=1))}
+
+
+def states(found: dict[str, Outcome]) -> set[str]:
+    return {outcome.state for outcome in found.values()}
+
+
+def stamps(out: Path) -> dict[str, tuple[int, int]]:
+    files = [path for path in out.rglob("*") if path.is_file()]
+    return {str(path): (path.stat().st_mtime_ns, path.stat().st_ino) for path in files}
+
+
+def test_a_result_that_is_there_is_not_made_again(archive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first = ran(CSV, archive, out)
+    assert set(first) == set(IDS[:4])
+    assert states(first) == {"made"}
+    before = stamps(out)
+    again = ran(CSV, archive, out)
+    assert states(again) == {"there"}
+    assert stamps(out) == before
+    assert {n: o.facts for n, o in again.items()} == {n: o.facts for n, o in first.items()}
+
+
+def test_a_result_of_other_options_or_another_input_is_made_anew(
+    archive: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    ran(CSV, archive, out)
+    arrow = ran(ExportTask(ExportOptions("arrow")), archive, out)
+    assert states(arrow) == {"made"}
+    assert {path.name for path in (out / IDS[0]).iterdir()} == {
+        "frames.arrow",
+        "export.made.json",
+    }
+    changed = archive / "sessions" / IDS[1]
+    shutil.copytree(archive / "sessions" / IDS[2], changed, dirs_exist_ok=True)
+    made = ran(ExportTask(ExportOptions("arrow")), archive, out)
+    assert {name for name, outcome in made.items() if outcome.state == "made"} == {IDS[1]}
+
+
+@pytest.mark.parametrize("lost", ["export.made.json", "frames.csv"])
+def test_a_result_of_which_a_part_is_missing_is_made_again(
+    archive: Path, tmp_path: Path, lost: str
+) -> None:
+    out = tmp_path / "out"
+    ran(CSV, archive, out)
+    whole = (out / IDS[1] / "frames.csv").read_bytes()
+    (out / IDS[1] / lost).unlink()
+    found = ran(CSV, archive, out)
+    assert {name for name, outcome in found.items() if outcome.state == "made"} == {IDS[1]}
+    assert (out / IDS[1] / "frames.csv").read_bytes() == whole
+
+
+def test_one_session_fails_alone_and_says_why(archive: Path, tmp_path: Path) -> None:
+    recording(archive, 4)
+    frames = archive / "sessions" / IDS[1] / "frames.parquet"
+    content = bytearray(frames.read_bytes())
+    content[2000] ^= 1
+    frames.write_bytes(content)
+    (archive / "sessions" / IDS[2] / "session.json").unlink()
+    found = ran(ESTIMATE, archive, tmp_path / "out")
+    reasons = {name: o.reason for name, o in found.items() if o.state == "failed"}
+    assert set(reasons) == {IDS[1], IDS[2], IDS[4]}
+    assert "hash" in reasons[IDS[1]]
+    assert "session.json" in reasons[IDS[2]]
+    assert "recording" in reasons[IDS[4]]
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {".work", IDS[0], IDS[3]}
+    assert list((tmp_path / "out" / ".work").iterdir()) == []
+
+
+def test_an_unforeseen_error_is_one_sessions_failure(
+    archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(self: VerifyTask, source: Path, work: Path) -> dict[str, Any]:
+        raise ZeroDivisionError(source.name)
+
+    monkeypatch.setattr(VerifyTask, "run", broken)
+    found = ran(VerifyTask(), archive, tmp_path / "out")
+    assert states(found) == {"failed"}
+    assert "this is a bug: ZeroDivisionError" in found[IDS[0]].reason
+
+
+def test_two_sessions_of_one_name_do_not_take_each_others_place(
+    archive: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    ran(CSV, archive, out)
+    other = tmp_path / "other" / IDS[0]
+    shutil.copytree(archive / "sessions" / IDS[1], other)
+    before = stamps(out)
+    found = ran(CSV, other, out)
+    assert "another session of this name" in found[IDS[0]].reason
+    assert stamps(out) == before
+
+
+def test_a_result_never_takes_the_place_of_its_session_and_stays_in_its_folder(
+    archive: Path, tmp_path: Path
+) -> None:
+    before = stamps(archive / "sessions")
+    (tmp_path / "link").symlink_to(archive / "sessions")
+    for out in (archive / "sessions", tmp_path / "link"):
+        found = ran(ESTIMATE, archive, out)
+        assert states(found) == {"failed"}
+        assert "the place of the session itself" in found[IDS[0]].reason
+    assert stamps(archive / "sessions") == before
+    frames = archive / "sessions" / IDS[0] / "frames.parquet"
+    for name in ("...parquet", ".parquet", ".work.parquet"):
+        shutil.copy(frames, tmp_path / name)
+        assert states(ran(CSV, tmp_path / name, tmp_path / "out" / "in")) == {"failed"}
+    assert not (tmp_path / "out" / "in" / "export.made.json").exists()
+
+
+def test_an_archive_that_was_moved_has_its_results(archive: Path, tmp_path: Path) -> None:
+    ran(CSV, archive, tmp_path / "out")
+    moved = archive.rename(tmp_path / "elsewhere")
+    assert states(ran(CSV, moved, tmp_path / "out")) == {"there"}
+
+
+def test_estimated_sessions_are_an_archive_that_can_be_proven_and_asked(
+    archive: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    assert states(ran(ESTIMATE, archive, out)) == {"made"}
+    for name in IDS[:4]:
+        report = verify(out / name)
+        assert verdict_of(report) == "complete", report.as_dict()["problems"]
+    asked = "SELECT session_id, number, peak_grf_n FROM stances ORDER BY ALL"
+    ours = ask(find_sessions([str(out)]), asked)
+    theirs = ask(find_sessions([str(archive)]), asked)
+    assert ours.num_rows == 8
+    assert ours.equals(theirs)  # estimated again with what it was sealed with
+    assert states(ran(VerifyTask(), out, None)) == {"made"}
+
+
+def test_a_damaged_session_has_a_proof_that_says_so(archive: Path, tmp_path: Path) -> None:
+    (archive / "sessions" / IDS[1] / "events.parquet").unlink()
+    found = ran(VerifyTask(), archive, tmp_path / "out")
+    verdicts = {name: outcome.facts["verdict"] for name, outcome in found.items()}
+    assert verdicts == {**dict.fromkeys(IDS[:4], "complete"), IDS[1]: "damaged"}
+
+
+def test_a_worker_of_another_version_refuses(archive: Path, tmp_path: Path) -> None:
+    (place, *_) = sessions_in([str(archive)])
+    job = Job(place, CSV, str(tmp_path / "out"))
+    with pytest.raises(UsageError, match="a worker is foottile"):
+        run_job(replace(job, software="foottile 0.0.1 (000000000000)"))
+
+
+def test_what_a_killed_worker_has_left_is_taken_away_and_others_work_is_not(tmp_path: Path) -> None:
+    from service.offline.archive.workspace import _MACHINE, workspace
+
+    work = tmp_path / "out" / ".work"
+    with workspace(work) as ours:
+        gone = work / f".{_MACHINE}.999999999.1.0123abcd.tmp"
+        elsewhere = work / ".another-machine.999999999.1.0123abcd.tmp"
+        gone.mkdir()
+        elsewhere.mkdir()
+        Results(str(tmp_path / "out")).begin()
+        assert sorted(work.iterdir()) == sorted([ours, elsewhere])
+
+
+def test_a_summary_keeps_no_more_failures_than_it_shows() -> None:
+    summary = Summary()
+    for number in range(100):
+        summary.add(Outcome(str(number), "place", "failed", reason="why"))
+    assert summary.states["failed"] == 100
+    assert len(summary.failures) == LISTED_MAX

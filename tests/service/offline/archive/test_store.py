@@ -1,0 +1,158 @@
+"""An archive in an S3-compatible store: found, worked on, put back; also over a bad connection."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from functools import partial
+from itertools import count
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from devices.errors import FileFormatError
+from service.offline.archive import places
+from service.offline.archive.finding import find_sessions
+from service.offline.archive.jobs import Job, Outcome
+from service.offline.archive.places import sessions_in
+from service.offline.archive.plan import outcomes
+from service.offline.archive.query import ask
+from service.offline.archive.tasks import EstimateTask, Task, VerifyTask
+from service.offline.processes import spread
+from tests.service.offline.archive.stores import BUCKET, BadWay, Store
+from tests.service.offline.archives import IDS
+
+pytestmark = pytest.mark.slow
+STATIC = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
+
+
+@pytest.fixture
+def store(archive: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+    with Store(monkeypatch) as started:
+        started.put(archive / "sessions", "2026/sessions")
+        places._s3.cache_clear()
+        yield started
+    places._s3.cache_clear()
+
+
+def ran(task: Task, out: str | None, *wanted: str) -> dict[str, Outcome]:
+    jobs = [Job(place, task, out) for place in sessions_in(wanted)]
+    return {each.name: each for each in outcomes(jobs, partial(spread, jobs=1))}
+
+
+def test_sessions_of_a_store_are_worked_on_and_results_put_back(
+    store: Store, archive: Path, tmp_path: Path
+) -> None:
+    out = f"s3://{BUCKET}/estimated"
+    made = ran(STATIC, out, f"s3://{BUCKET}/2026")
+    assert {name: each.state for name, each in made.items()} == dict.fromkeys(IDS[:4], "made")
+    ran(STATIC, str(tmp_path / "out"), str(archive))
+    for name in IDS[:4]:
+        there = store.content(f"estimated/{name}")
+        here = {path.name: path.read_bytes() for path in (tmp_path / "out" / name).iterdir()}
+        assert there.pop("estimate.made.json") != here.pop("estimate.made.json")  # their places
+        assert there == here
+    again = ran(STATIC, out, f"s3://{BUCKET}/2026")
+    assert {each.state for each in again.values()} == {"there"}
+    one = ran(VerifyTask(), None, f"{out}/{IDS[2]}", f"{out}/{IDS[3]}/frames.parquet")
+    assert [each.facts["verdict"] for each in one.values()] == ["complete", "complete"]
+
+
+def test_a_result_in_a_store_of_which_an_object_is_gone_is_made_again(store: Store) -> None:
+    out = f"s3://{BUCKET}/proofs"
+    ran(VerifyTask(), out, f"s3://{BUCKET}/2026/sessions")
+    store.files.delete_file(f"{BUCKET}/proofs/{IDS[1]}/verify.json")
+    found = ran(VerifyTask(), out, f"s3://{BUCKET}/2026/sessions")
+    assert {name for name, each in found.items() if each.state == "made"} == {IDS[1]}
+
+
+def test_a_store_that_refuses_and_breaks_off_costs_time_and_nothing_else(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames_read = count()
+
+    def trouble(number: int, method: str, path: str) -> str:
+        if number % 13 == 3:
+            return "slow down"
+        is_read = method == "GET" and path.endswith("frames.parquet")
+        return "cut" if is_read and next(frames_read) % 3 == 0 else "pass"
+
+    with BadWay(store, trouble) as way:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", way.endpoint)
+        places._s3.cache_clear()
+        made = ran(STATIC, f"s3://{BUCKET}/badly", f"s3://{BUCKET}/2026")
+        assert {each.state for each in made.values()} == {"made"}, made
+        assert way.refused >= 3
+        assert way.cut >= 1
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{store.host}:{store.port}")
+    places._s3.cache_clear()
+    ran(STATIC, f"s3://{BUCKET}/well", f"s3://{BUCKET}/2026")
+    assert store.content("badly") == store.content("well")
+
+
+def test_a_session_that_a_store_will_not_give_fails_alone_and_the_next_run_makes_it(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, asked = f"s3://{BUCKET}/proofs", f"s3://{BUCKET}/2026"
+    closed: set[str] = set()
+    monkeypatch.setattr(places, "_S3_ATTEMPTS", 2)
+
+    def trouble(number: int, method: str, path: str) -> str:
+        return "slow down" if any(name in path for name in closed) else "pass"
+
+    with BadWay(store, trouble) as way:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", way.endpoint)
+        places._s3.cache_clear()
+        closed.add(f"{IDS[1]}/frames.parquet")
+        found = ran(VerifyTask(), out, asked)
+        assert {name for name, each in found.items() if each.state == "failed"} == {IDS[1]}
+        assert "cannot be read" in found[IDS[1]].reason
+        closed.clear()
+        found = ran(VerifyTask(), out, asked)
+        assert {name: each.state for name, each in found.items()} == {
+            **dict.fromkeys(IDS[:4], "there"),
+            IDS[1]: "made",
+        }
+
+
+def test_questions_to_a_store_read_what_they_are_about_and_answer_as_for_folders(
+    store: Store, archive: Path, tmp_path: Path
+) -> None:
+    store.files.delete_file(f"{BUCKET}/2026/sessions/{IDS[1]}/stances.parquet")
+    store.files.delete_file(f"{BUCKET}/2026/sessions/{IDS[2]}/frames.parquet")
+    shutil.rmtree(archive / "sessions" / IDS[2])
+    for number, sql in enumerate(
+        (
+            "SELECT session_id, scene, frames FROM sessions ORDER BY 1",
+            "SELECT session_id, number, peak_grf_n FROM stances ORDER BY ALL",
+            "SELECT session_id, label FROM events ORDER BY ALL",
+            "SELECT session_id, sum(grf_n) AS n FROM frames GROUP BY 1 ORDER BY 1",
+        )
+    ):
+        (mirror := tmp_path / f"mirror{number}").mkdir()
+        found = find_sessions([f"s3://{BUCKET}/2026"], mirror)
+        assert list(found.left_out.values()) == ["damaged: frames.parquet is missing"]
+        assert ask(found, sql).equals(ask(find_sessions([str(archive)]), sql)), sql
+        copied = list(mirror.rglob("frames.parquet"))
+        assert len(copied) == (1 if "stances" in sql else 0)  # of the one without its own
+    both = find_sessions([f"s3://{BUCKET}/2026", str(archive)], tmp_path / "mirror0")
+    assert len(both.sessions) == 3
+    mixed = [f"s3://{BUCKET}/2026/sessions/{IDS[0]}", f"{archive}/sessions/{IDS[3]}"]
+    of_two = ask(find_sessions(mixed, tmp_path / "mirror1"), "SELECT count(*) AS n FROM frames")
+    assert of_two.to_pylist() == [{"n": 800}]
+
+
+def test_a_damaged_page_in_a_store_is_an_error_and_no_number(
+    store: Store, archive: Path, tmp_path: Path
+) -> None:
+    path = archive / "sessions" / IDS[0] / "frames.parquet"
+    at = pq.read_schema(path).get_field_index("grf_n")
+    chunk = pq.ParquetFile(path).metadata.row_group(0).column(at)
+    content = bytearray(path.read_bytes())
+    content[chunk.data_page_offset + chunk.total_compressed_size - 5] ^= 1
+    with store.files.open_output_stream(f"{BUCKET}/2026/sessions/{IDS[0]}/frames.parquet") as sink:
+        sink.write(bytes(content))
+    found = find_sessions([f"s3://{BUCKET}/2026"], tmp_path)
+    with pytest.raises(FileFormatError, match="frames cannot be read"):
+        ask(found, "SELECT sum(grf_n) FROM frames")

@@ -1,0 +1,31 @@
+"""What workers are given to do in tests: by name, as another process imports it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+
+def squared(number: int) -> int:
+    return number * number
+
+
+def raising(number: int) -> int:
+    if number == 2:
+        raise ValueError("two")
+    return number
+
+
+def killed_once(marker: Path) -> str:
+    """Killed the first time."""
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return marker.name
+
+
+def killed_at_two(number: int) -> int:
+    if number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
