@@ -7,10 +7,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "images"
 SIZES = {"live": (1366, 768, 1), "phone": (390, 844, 2)}
@@ -19,41 +21,98 @@ OPTIONS = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-backgro
 LOOK_S = 11.0  # until the trace is full
 
 
+SESSION_S = 20.0
+"""How long the session lasts of whose page there is a picture."""
+
+
+@contextmanager
+def demo(*options: str) -> Iterator[str]:
+    """A demo, once its foot is tared: the address of its server."""
+    with tempfile.TemporaryDirectory() as data:
+        running = subprocess.Popen(
+            [*COMMAND, "demo", "--port=0", f"--data={data}", *options],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            assert running.stdout is not None
+            url = running.stdout.readline().split()[-1]
+            while not any(node["tare"] for node in httpx.get(f"{url}api/v1/nodes").json()["items"]):
+                time.sleep(0.2)
+            yield url
+        finally:
+            running.terminate()
+            running.wait(30)
+            if running.stdout is not None:
+                running.stdout.close()
+
+
+def live(browser: Browser) -> None:
+    """The live page, on a laptop and on a phone."""
+    with demo(*sys.argv[1:]) as url:
+        for name, (width, height, scale) in SIZES.items():
+            page = browser.new_page(
+                viewport={"width": width, "height": height}, device_scale_factor=scale
+            )
+            page.goto(url)
+            page.wait_for_selector("body[data-live=true]")
+            time.sleep(LOOK_S)
+            page.wait_for_selector("#cop[data-x-m]:not([data-x-m=''])")
+            save(page, name)
+
+
+def session(browser: Browser) -> None:
+    """The page of a session of a walking foot: two of its stances."""
+    with demo("--scene", "poppy") as url, httpx.Client(base_url=f"{url}api/v1") as http:
+        body = {
+            "node": http.get("/nodes").json()["items"][0]["node"],
+            "name": "stones, third trial",
+        }
+        id_ = http.post(
+            "/sessions", json=body | {"subject": "left leg", "tags": ["gravel"]}
+        ).json()["id"]
+        time.sleep(SESSION_S / 2)
+        http.post(f"/sessions/{id_}/events", json={"label": "a stone"})
+        time.sleep(SESSION_S / 2)
+        http.post(f"/sessions/{id_}/stop", timeout=30.0)
+        while http.get(f"/sessions/{id_}").json()["state"] != "sealed":
+            time.sleep(0.2)
+        begin_ns = http.get(f"/sessions/{id_}/overview", params={"points": 1}).json()["begin_t_ns"]
+        stances = http.get(f"/sessions/{id_}/stances").json()
+        middle = max(0, next(i for i, one in enumerate(stances) if one["is_whole"] and i > 3))
+        begin_s, end_s = (
+            (stances[i][at] - begin_ns) * 1e-9
+            for i, at in ((middle, "begin_t_ns"), (middle + 1, "end_t_ns"))
+        )
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.goto(f"{url}sessions/{id_}?from={begin_s - 0.4}&to={end_s + 0.6}")
+        page.wait_for_selector("#plots[data-settled=true]")
+        page.wait_for_selector("#stances-rows tr")
+        box = page.locator("#plots").bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 100)
+        time.sleep(0.5)
+        save(page, "session")
+
+
+def save(page: Page, name: str) -> None:
+    """Write a picture, and say where."""
+    path = FOLDER / f"{name}.png"
+    page.screenshot(path=path)
+    print(path)
+
+
 def main() -> None:
     """Take all pictures."""
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
         sys.exit("no Chromium; on Debian: sudo apt-get install chromium")
     FOLDER.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as data:
-        demo = subprocess.Popen(
-            [*COMMAND, "demo", "--port=0", f"--data={data}", *sys.argv[1:]],
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        try:
-            assert demo.stdout is not None
-            url = demo.stdout.readline().split()[-1]
-            while not any(node["tare"] for node in httpx.get(f"{url}api/v1/nodes").json()["items"]):
-                time.sleep(0.2)
-            with sync_playwright() as playwright:
-                browser = playwright.chromium.launch(executable_path=chromium, args=OPTIONS)
-                for name, (width, height, scale) in SIZES.items():
-                    page = browser.new_page(
-                        viewport={"width": width, "height": height}, device_scale_factor=scale
-                    )
-                    page.goto(url)
-                    page.wait_for_selector("body[data-live=true]")
-                    time.sleep(LOOK_S)
-                    page.wait_for_selector("#cop[data-x-m]:not([data-x-m=''])")
-                    page.screenshot(path=FOLDER / f"{name}.png")
-                    print(FOLDER / f"{name}.png")
-                browser.close()
-        finally:
-            demo.terminate()
-            demo.wait(30)
-            if demo.stdout is not None:
-                demo.stdout.close()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=OPTIONS)
+        live(browser)
+        session(browser)
+        browser.close()
 
 
 if __name__ == "__main__":

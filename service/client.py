@@ -8,6 +8,7 @@ import re
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Self
+from urllib.parse import quote
 
 import httpx
 
@@ -105,6 +106,39 @@ class Client:
             cursor = page["next_cursor"]
             if cursor is None:
                 return found
+
+    def node(self, name: str) -> dict[str, Any]:
+        """One node.
+
+        Raises:
+            LinkError: the server does not answer, or knows no such node.
+        """
+        return self._get(f"/nodes/{quote(name, safe='')}")
+
+    def session(self, session_id: str) -> dict[str, Any]:
+        """One session.
+
+        Raises:
+            LinkError: the server does not answer, or knows no such session.
+            UsageError: that is no id.
+        """
+        return self._session(session_id)
+
+    def start(self, node: str, name: str, *, pre_roll_s: float = 0.0) -> dict[str, Any]:
+        """Begin to record a node, or so much earlier.
+
+        Raises:
+            LinkError: the server does not answer or refuses.
+        """
+        return self._post("/sessions", {"node": node, "name": name, "pre_roll_s": pre_roll_s})
+
+    def stop(self, session_id: str) -> dict[str, Any]:
+        """End a recording.
+
+        Raises:
+            LinkError: the server does not answer or refuses.
+        """
+        return self._post(f"/sessions/{quote(session_id, safe='')}/stop", None)
 
     def pull(self, session_id: str, out: Path) -> dict[str, Any]:
         """Download a sealed session into the folder `out`/`session_id`.
@@ -266,7 +300,16 @@ class Client:
         write_whole(path, answer.content)
 
     def _get(self, path: str, query: dict[str, str] | None = None) -> dict[str, Any]:
-        answer = self._answer(path, query)
+        return self._content(self._answer(path, query))
+
+    def _post(self, path: str, body: dict[str, Any] | None) -> dict[str, Any]:
+        try:
+            answer = self._http.post(path, json=body)
+        except httpx.HTTPError as error:
+            raise self._no_answer(error) from error
+        return self._content(answer)
+
+    def _content(self, answer: httpx.Response) -> dict[str, Any]:
         if answer.is_error:
             raise self._refused(answer)
         try:
@@ -281,11 +324,14 @@ class Client:
         try:
             return self._http.get(path, params=query)
         except httpx.HTTPError as error:
-            raise LinkError(
-                f"no answer: {error}",
-                where=self.server,
-                remedy="Is `foottile serve` running there? Name it with --server",
-            ) from error
+            raise self._no_answer(error) from error
+
+    def _no_answer(self, error: httpx.HTTPError) -> LinkError:
+        return LinkError(
+            f"no answer: {error}",
+            where=self.server,
+            remedy="Is `foottile serve` running there? Name it with --server",
+        )
 
     def _refused(self, answer: httpx.Response) -> LinkError:
         try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import os
 import re
 import secrets
@@ -66,17 +67,28 @@ def read_whole(path: Path, *, bytes_max: int = BYTES_MAX) -> bytes:
         StorageError: it may be whole and cannot be read now: it is another user's, or memory or
             descriptors are used up. Nobody may set it aside, or write another in its place.
     """
-    try:
+    with open_own(path) as file, _read_errors(path):
+        size = os.fstat(file.fileno()).st_size
+        if size > bytes_max:
+            raise DamagedFileError(
+                f"it has {size} bytes", where=str(path), expected=f"up to {bytes_max}"
+            )
+        return file.read()
+
+
+def open_own(path: Path) -> io.BufferedReader:
+    """Open a file of ours for reading, whatever its length; raises as `read_whole`."""
+    with _read_errors(path):
         # A link may lead anywhere, and a pipe would be waited for.
         if not stat.S_ISREG(path.lstat().st_mode):
             raise DamagedFileError("it is not a file", where=str(path))
-        with open(path, "rb", opener=_without_following) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size > bytes_max:
-                raise DamagedFileError(
-                    f"it has {size} bytes", where=str(path), expected=f"up to {bytes_max}"
-                )
-            return file.read()
+        return open(path, "rb", opener=_without_following)
+
+
+@contextmanager
+def _read_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
     except FileNotFoundError:
         raise
     except OSError as error:
@@ -137,7 +149,7 @@ def remove_stale_temporaries(folder: Path) -> list[Path]:
     with storage_errors(folder):
         folder.stat()  # fails if the folder is missing, where rglob just finds no files
         for path in sorted(folder.rglob(".*.tmp")):
-            if _is_stale(path.name) and path.is_file():
+            if is_stale(path.name) and path.is_file():
                 path.unlink(missing_ok=True)
                 removed.append(path)
         for parent in {path.parent for path in removed}:
@@ -145,7 +157,8 @@ def remove_stale_temporaries(folder: Path) -> list[Path]:
     return removed
 
 
-def _is_stale(name: str) -> bool:
+def is_stale(name: str) -> bool:
+    """Is it a temporary name of a process of this machine that has ended?"""
     if match := _TEMPORARY.fullmatch(name):
         return _started(int(match["process"])) != int(match["started"])
     if match := _OLDER_TEMPORARY.fullmatch(name):

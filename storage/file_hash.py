@@ -122,7 +122,16 @@ def read_footer(path: Path) -> bytes:
         OSError: it cannot be read.
     """
     with path.open("rb") as file:
-        return _footer(file)[1]
+        return footer_in(file)
+
+
+def footer_in(file: BinaryIO) -> bytes:
+    """The same for a file that is open, wherever it is; no more is read of it.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    return _footer(file)[1]
 
 
 def footer_hashes(footer: bytes) -> tuple[str, str] | None:

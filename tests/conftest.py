@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # As of what a shell runs behind: processes of the tests would not hear Ctrl-C, either.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What a builder asserts is explained as in a test.
 pytest.register_assert_rewrite("tests.builders")

@@ -26,6 +26,7 @@ from service.estimation.calibration import TileCalibration
 from service.estimation.estimates import EstimateStatus
 from service.link import Close
 from service.server.screens.picture import Summary, sum_up
+from service.server.screens.spans import span_of
 from service.server.server import Server
 from storage.schema import KNOWN
 from tests.builders.frames import make_frames
@@ -189,7 +190,8 @@ def test_every_route_is_documented() -> None:
 
 def test_every_live_message_field_is_documented() -> None:
     summary = Summary()
-    summary.add("node", sum_up("0" * 32, make_frames(1, 1), {}))
+    frames = make_frames(1, 1)
+    summary.add("node", sum_up("0" * 32, span_of(frames, {}), frames, {}))
     (text,) = summary.take().texts({"node": 1.0})
     frame = json.loads(text)
     for name in frame:

@@ -13,9 +13,12 @@ import { byId, el, setText } from "./common/text.js";
 import { Actions } from "./live/actions.js";
 import { Bars } from "./live/bars.js";
 import { Foot } from "./live/foot.js";
+import { helpWithKeys } from "./live/help.js";
 import { drawGrf } from "./live/grf.js";
+import { History } from "./live/history.js";
 import { Marks } from "./live/marks.js";
 import { Notes } from "./live/notes.js";
+import { Pause } from "./live/pause.js";
 import { Status } from "./live/status.js";
 import { Tares } from "./live/tares.js";
 import { Trace } from "./live/trace.js";
@@ -42,7 +45,15 @@ takeTokenFromAddress();
 const bars = new Bars(() => { state.fresh = true; });
 const foot = new Foot();
 foot.resized = () => { state.fresh = true; };
-const trace = new Trace();
+const trace = new Trace(() => past.want());
+const past = new History(trace.points, () => state.node?.boot_id);
+const pause = new Pause(() => {
+  state.fresh = true;
+  if (pause.held) trace.pause(pause.held.nowMs);
+  else trace.goOn();
+});
+pause.newest = () => state.frame;
+helpWithKeys();
 const notes = new Notes();
 const trash = new Trash(takeSession);
 const sessions = new Sessions({ onSession: takeSession, onDeleted: forgetSession });
@@ -55,6 +66,7 @@ const handlers = {
     state.nodes = new Map((message.nodes ?? []).map((node) => [node.node, node]));
     state.problems = message.problems ?? [];
     state.recordings.clear();
+    past.want(); // what came while the link was down
     (message.recording ?? []).forEach(takeSession);
     chooseNode();
     sessions.reload().then((items) => items.forEach(takeSession));
@@ -77,9 +89,6 @@ const handlers = {
   deleted: ({ session_id: id }) => forgetSession(id),
   heartbeat(message) {
     state.heard.beat = message.nodes?.[state.node?.node] ?? null;
-  },
-  dropped(message) {
-    if (message.node === state.node?.node) trace.dropped(message.from_seq, message.to_seq);
   },
   frame(message) {
     if (message.node === state.node?.node) takeFrame(message);
@@ -108,6 +117,7 @@ function takeFrame(frame) {
   status.see(frame);
   notes.see(state.node, frame, nowMs);
   trace.add(frame, state.node.nominal_rate_hz, nowMs);
+  past.see(state.node, frame, trace.windowS, nowMs);
 }
 
 function keepSpan(frame, earlier) {
@@ -143,7 +153,9 @@ function forgetSession(id) {
 function forget() {
   state.frame = null;
   state.heard = { frameMs: null, beat: null, sinceMs: performance.now() };
+  pause.goOn();
   trace.clear();
+  past.want();
   notes.clear();
   status.clear();
 }
@@ -192,6 +204,7 @@ function tick() {
   notes.draw(node, state.frame, nowMs, state.serverNowMs(), state.problems);
   tares.draw(node);
   actions.draw();
+  if (node && !node.connected) past.see(node, null, trace.windowS, nowMs);
 }
 
 function draw() {
@@ -201,9 +214,10 @@ function draw() {
   const nowMs = performance.now();
   if (state.fresh) {
     state.fresh = false;
-    bars.draw(node, state.frame, nowMs);
-    foot.draw(node, state.frame);
-    drawGrf(node, state.frame);
+    const { frame, nowMs: shownMs } = pause.held ?? { frame: state.frame, nowMs };
+    bars.draw(node, frame, shownMs);
+    foot.draw(node, frame);
+    drawGrf(node, frame);
   }
   trace.draw(nowMs, status.live);
 }

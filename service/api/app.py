@@ -15,7 +15,17 @@ from starlette.websockets import WebSocket
 from devices.errors import FootTileError
 from service.api import problems
 from service.api.guard import Guard
-from service.api.routes import access, clock, data, health, nodes, sessions, stances, trash
+from service.api.routes import (
+    access,
+    clock,
+    data,
+    health,
+    nodes,
+    overview,
+    sessions,
+    stances,
+    trash,
+)
 from service.api.routes.ingest import ingest
 from service.api.routes.live import live
 from service.link import INGEST_PATH, LIVE_PATH
@@ -77,7 +87,7 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
             _503="There are too many connections, or the data folder is not there.",
         ),
     )
-    for module in (health, nodes, sessions, trash, data, clock, stances):
+    for module in (health, nodes, sessions, trash, data, clock, stances, overview):
         api.include_router(module.router)
     app.include_router(api)
 
@@ -92,6 +102,10 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
     @app.get("/", include_in_schema=False)
     async def index() -> FileResponse:
         return FileResponse(page / "index.html", headers={"Cache-Control": "no-cache"})
+
+    @app.get("/sessions/{session_id}", include_in_schema=False)
+    async def session_page(session_id: str) -> FileResponse:  # it asks for the session itself
+        return FileResponse(page / "session.html", headers={"Cache-Control": "no-cache"})
 
     app.mount("/static", StaticFiles(directory=page), name="static")
     app.add_middleware(Guard, hosts=tuple(hosts), token=token)

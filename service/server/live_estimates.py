@@ -82,9 +82,11 @@ class LiveEstimates:
             of_all[bearing] = values
             return of_all
 
+        gains = [calibration.gain(self._info.serials[i]) for i in bearing]
+        gain = np.array([1.0 if one is None else one.value for one in gains])
         self.range_kpa = by_tile(curves.high_kpa)
-        self.full_scale_n = by_tile(curves.force(curves.high_kpa[None]).force_n[0])
-        self.slope_n_per_kpa = by_tile(curves.slope_at_zero_n_per_kpa)
+        self.full_scale_n = by_tile(gain * curves.force(curves.high_kpa[None]).force_n[0])
+        self.slope_n_per_kpa = by_tile(gain * curves.slope_at_zero_n_per_kpa)
 
     @property
     def calibration(self) -> Calibration | None:

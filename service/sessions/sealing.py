@@ -1,4 +1,4 @@
-"""From journals to a sealed session: its frames in one Parquet file, stances, and its ledger."""
+"""From journals to a sealed session: frames in one Parquet file, what lies beside, its ledger."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from devices.errors import FileFormatError
 from service.sessions.frames import SessionFrames
+from service.sessions.overview import OverviewBeside
 from service.sessions.sources import Sources
 from service.sessions.stances import StancesBeside
 from storage.clock.file import CLOCK_NAME, write_clock
@@ -31,6 +32,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
         update = {"state": "sealed", "ledger": ledger, "problem": "not one frame was recorded"}
         return session.model_copy(update=update)
     frames, stances = SessionFrames(sources), StancesBeside()
+    overview = OverviewBeside(len(sources.info.tiles))
     path = folder / FRAMES_NAME
     count = duration_ns = earlier_ns = part_begin_ns = 0
     notes: dict[str, object] = {
@@ -45,6 +47,7 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
                 writer.add_notes(frames.notes)
             writer.append(batch, columns)
             stances.feed(batch.seq, batch.t_ns, columns)
+            overview.feed(batch, columns)
             count += len(batch)
             part = int(columns["part"][0])
             if part != last_part:
@@ -59,7 +62,8 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
     write_clock(folder / CLOCK_NAME, session.clock, sources.streams)
     sha256 = sha256_of(path)
     stances.write(folder, sha256)
-    problems = session.problem, frames.problem, stances.problem
+    overview.write(folder, sha256)
+    problems = session.problem, frames.problem, stances.problem, overview.problem
     return session.model_copy(
         update={
             "state": "sealed",

@@ -77,7 +77,10 @@ class OpenSegments:
             writers = [*self._open, *self._closing]
         with storage_errors(self._folder):
             for writer in writers:
-                writer.write()
+                # Of a segment that is closed meanwhile all is written, or its sync has failed: then
+                # what waited was not acknowledged, and is asked for again.
+                with suppress(ValueError):
+                    writer.write()
 
     def sync(self) -> None:
         """Return when everything appended before is on the disk.

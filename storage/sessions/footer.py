@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -25,6 +25,7 @@ from storage.file_hash import (
     check_hash,
     file_hashes,
     footer_hashes,
+    footer_in,
     read_footer,
 )
 from storage.schema import ARRAY_INFO_KEY, array_info
@@ -53,21 +54,30 @@ class Footer:
         span_ns: `t_ns` of the first frame, and the latest of all; None: not looked for yet.
     """
 
-    def __init__(self, path: Path, *, is_checked: bool = False, only_slices: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        is_checked: bool = False,
+        only_slices: bool = False,
+        file: BinaryIO | None = None,
+    ) -> None:
         """Read the footer of a file, and prove what is asked for.
 
         Args:
             path: the file.
             is_checked: nothing is held against any hash: it was already, or shall not be.
             only_slices: as for `prove`.
+            file: the same, open, if it is not on this machine: then its footer has to prove itself.
 
         Raises:
             FileFormatError: no such file, not Parquet, not one of ours, or damaged.
         """
         self._where = where = str(path)
         try:
-            check_file(path)
-            footer = read_footer(path)
+            if file is None:
+                check_file(path)
+            footer = read_footer(path) if file is None else footer_in(file)
             length = len(footer).to_bytes(4, "little")
             # Parsed are the very bytes that are held against the hash.
             self.metadata = pq.read_metadata(
@@ -86,7 +96,13 @@ class Footer:
         self.is_whole = False
         self.said: Mapping[bytes, bytes] = schema.metadata or {}
         self.format = self._format()
-        if not is_checked:
+        if file is not None and not self.is_proven:
+            raise FileFormatError(
+                "its footer states no hash of itself, as of an older version",
+                where=where,
+                remedy="Copy the session to this machine",
+            )
+        if not is_checked and file is None:
             self.prove(path, only_slices=only_slices)
         self.info = array_info(schema, where=where)
         self.notes = _notes(self.said.get(NOTES_KEY), where=where)

@@ -19,6 +19,7 @@ from storage.sessions.beside import EVENTS_NAME, StoredEvents, read_events
 from storage.sessions.claims import SESSION_NAME, Claims, bytes_of, claims_in, claims_of
 from storage.sessions.folder import FRAMES_NAME, Event, Ledger, Session
 from storage.sessions.ledger import ledger_of, states_of
+from storage.sessions.overview import OVERVIEW_NAME, open_overview
 from storage.sessions.stances import STANCES_NAME, read_stances
 from storage.verify.file import FileReport, ledger_problems, verify_file
 from storage.verify.journal import StreamReport, verify_stream
@@ -181,6 +182,7 @@ def _check_sealed(report: SessionReport, folder: Path, said: Claims) -> None:
     _check_events(report, folder / EVENTS_NAME, whole.events if whole is not None else None)
     _check_clock(report, folder / CLOCK_NAME, whole)
     _check_stances(report, folder / STANCES_NAME)
+    _check_overview(report, folder / OVERVIEW_NAME)
 
 
 def _compare(problems: list[str], content: dict[str, Any], file: FileReport, size: int) -> None:
@@ -258,6 +260,22 @@ def _check_stances(report: SessionReport, path: Path) -> None:
         report.problems.append(f"{path.name}: {error.what}; deleted, it is made again")
         return
     if stored.frames_sha256 != report.sha256:
+        report.unproven.append(f"{path.name}: it is of other frames, and nobody reads it")
+
+
+def _check_overview(report: SessionReport, path: Path) -> None:
+    """Prove every piece of the overview, which may be missing, too."""
+    try:
+        with open_overview(path) as overview:
+            for level in range(overview.index.levels):
+                overview.bins(level, None, None)
+            frames_sha256 = overview.index.frames_sha256
+    except FileNotFoundError:
+        return
+    except (FileFormatError, StorageError) as error:
+        report.problems.append(f"{path.name}: {error.what}; deleted, it is made again")
+        return
+    if frames_sha256 != report.sha256:
         report.unproven.append(f"{path.name}: it is of other frames, and nobody reads it")
 
 

@@ -66,6 +66,8 @@ def test_live_recording_and_marked(
         expect(page.locator("#notices")).to_contain_text("Marked")
         for card in ("#tares-card", "#trash-card"):
             page.click(f"{card} summary")
+        page.keyboard.press("p")
+        expect(page.locator("#paused")).to_be_visible()
         expect(page.locator("#tares li")).not_to_have_count(0)
         assert complaints(page) == []
 
@@ -84,7 +86,7 @@ def test_with_the_node_away_and_sessions_that_wait_for_it(
     assert complaints(page) == []
 
 
-@pytest.mark.parametrize("dialog", ["edit", "seal", "token", "refused"])
+@pytest.mark.parametrize("dialog", ["edit", "seal", "token", "refused", "help"])
 def test_dialogs_and_refusals(scripted: Scripted, open_page: OpenPage, dialog: str) -> None:
     scripted.pending("waits")
     page = open_page(scripted.url)
@@ -94,6 +96,8 @@ def test_dialogs_and_refusals(scripted: Scripted, open_page: OpenPage, dialog: s
         row.get_by_role("button", name="Edit").click()
     elif dialog == "seal":
         row.get_by_role("button", name="Seal without them").click()
+    elif dialog == "help":
+        page.keyboard.press("?")
     elif dialog == "token":
         page.evaluate("document.getElementById('token-dialog').showModal()")
     else:

@@ -11,14 +11,14 @@ import pytest
 from devices.frames import FrameStatus, TileStatus
 from service.estimation.estimates import EstimateStatus
 
-TILE_JS = Path(__file__).resolve().parents[2] / "web" / "live" / "tile.js"
+BITS_JS = Path(__file__).resolve().parents[2] / "web" / "common" / "bits.js"
 
 
 @pytest.mark.parametrize(
     ("name", "bits"), [("TILE", TileStatus), ("ESTIMATE", EstimateStatus), ("FRAME", FrameStatus)]
 )
 def test_the_page_names_every_status_bit_as_python_does(name: str, bits: type[IntFlag]) -> None:
-    found = re.search(rf"export const {name} = \{{([^}}]*)\}}", TILE_JS.read_text("utf-8"))
+    found = re.search(rf"export const {name} = \{{([^}}]*)\}}", BITS_JS.read_text("utf-8"))
     assert found is not None
     said = {bit: int(value) for bit, value in re.findall(r"(\w+): (\d+)", found[1])}
     assert said == {bit.name: bit.value for bit in bits}

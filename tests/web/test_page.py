@@ -199,10 +199,14 @@ def test_saturated_and_silent_tiles_cannot_be_mistaken_for_values(
         expect(page.locator("#grf-bound")).to_have_text("at least")
         at_least_n = float(page.inner_text("#grf"))
         assert 20.0 < at_least_n < 110.0
-        expect(page.locator("#grf-sigma")).to_contain_text("T02")
-        expect(page.locator("#grf-sigma")).to_contain_text("T03")
+        expect(page.locator("#grf-sigma")).to_have_text("(T02 missing, T03 beyond its range)")
+        expect(page.locator("#cop")).to_have_text("no COP: T02 missing, T03 beyond its range")
+        for serial in ("T01", "T04"):  # the others go on
+            expect(page.locator(f'#bars [data-serial="{serial}"]')).to_have_attribute(
+                "data-state", "ok"
+            )
         expect(page.locator("#contact")).to_have_attribute("data-contact", "true")
-        expect(page.locator("#trace-legend")).to_contain_text("at least this much")
+        expect(page.locator("#trace-bound-legend")).to_be_visible()
         card, contact = (page.locator(name).bounding_box() for name in ("#grf-card", "#contact"))
         assert card is not None
         assert contact is not None

@@ -59,8 +59,8 @@ function askForToken(why) {
   return asking;
 }
 
-/** Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. */
-export async function call(method, path, body) {
+/** Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. `stop` takes it back. */
+export async function call(method, path, body, stop = null) {
   const headers = { Accept: "application/json" };
   if (body !== undefined) headers["Content-Type"] = "application/json";
   const bearer = token();
@@ -70,7 +70,7 @@ export async function call(method, path, body) {
     response = await fetch(PREFIX + path, {
       method, headers, cache: "no-store",
       body: body === undefined ? undefined : JSON.stringify(body),
-      signal: AbortSignal.timeout(10_000),
+      signal: stop ? AbortSignal.any([stop, AbortSignal.timeout(10_000)]) : AbortSignal.timeout(10_000),
     });
   } catch (error) {
     const slow = error.name === "TimeoutError";
@@ -79,17 +79,25 @@ export async function call(method, path, body) {
   const answer = response.status === 204 ? null : await response.json().catch(() => null);
   if (response.ok) return answer;
   const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
-  if (response.status === 401 && await askForToken(bearer ? WRONG_TOKEN : ASKED)) return call(method, path, body);
+  if (response.status === 401 && await askForToken(bearer ? WRONG_TOKEN : ASKED)) return call(method, path, body, stop);
   throw new Refusal(String(detail), response.status);
 }
 
 const id = encodeURIComponent;
+export const recent = (node, seconds, before) =>
+  call("GET", `/nodes/${id(node)}/recent?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}`);
 export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, {});
 export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
 export const startSession = (node, name) => call("POST", "/sessions", { node, name });
 export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
 export const markEvent = (session, event) => call("POST", `/sessions/${id(session)}/events`, event);
+export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
+export const listEvents = (session) => call("GET", `/sessions/${id(session)}/events`);
+export const listStances = (session) => call("GET", `/sessions/${id(session)}/stances`);
+export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
+export const overview = (session, query, stop) =>
+  call("GET", `/sessions/${id(session)}/overview?${new URLSearchParams(query)}`, undefined, stop);
 export const changeSession = (session, changes) => call("PATCH", `/sessions/${id(session)}`, changes);
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/seal`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);
@@ -99,5 +107,5 @@ export const emptyTrash = () => call("DELETE", "/trash");
 export const listSessions = (cursor) =>
   call("GET", `/sessions?limit=20${cursor ? `&cursor=${id(cursor)}` : ""}`);
 /** Of a download, with marks if there are any; Parquet without them is the sealed file itself. */
-export const dataAddress = (session, format) =>
-  `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marks ? "&marks=true" : ""}`;
+export const dataAddress = (session, format, part = "") =>
+  `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marks ? "&marks=true" : ""}${part}`;

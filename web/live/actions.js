@@ -42,10 +42,11 @@ export class Actions {
   shortcut(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
     if (event.target.closest?.("input, textarea, select, dialog, [contenteditable]")) return;
-    const name = { t: "tare", r: "record", s: "stop", m: "mark" }[event.key];
+    const name = { t: "tare", r: "record", s: "stop", m: "mark", p: "pause", "?": "help" }[event.key];
     if (!name) return;
     event.preventDefault();
-    this.run(name);
+    if (this[name]) this.run(name);
+    else byId(name).click(); // of another panel
   }
 
   /** Run an action once at a time, and say what came of it. */

@@ -1,7 +1,9 @@
 // The foot from the side (line of tiles) or from above (grid), with forces, COP and its uncertainty.
 
+import { whyNot } from "./grf.js";
+import { ESTIMATE, FRAME } from "../common/bits.js";
 import { byId, number, plain, setData, setText } from "../common/text.js";
-import { ESTIMATE, FRAME, FAULT_STATES, readTile } from "./tile.js";
+import { FAULT_STATES, readTile } from "./tile.js";
 
 const Z95 = 1.96;
 const GRID_FROM_M = 0.005; // tiles spread wider than this in y are a grid
@@ -233,8 +235,7 @@ function whyNoCop(node, frame) {
   const bits = frame.estimate_status ?? 0;
   if (!node.tare || node.tare.undone) return "not tared";
   if (!node.calibration) return "no calibration";
-  if (bits & ESTIMATE.TILE_MISSING) return "tile missing";
-  if (bits & ESTIMATE.SATURATED) return "tile saturated";
+  if (bits & (ESTIMATE.TILE_MISSING | ESTIMATE.SATURATED)) return whyNot(node, frame);
   if (frame.contact === false) return "no contact";
   if (bits & ESTIMATE.COP_MASKED) return "too uncertain";
   return "not determined";

@@ -1,19 +1,19 @@
 // The ground reaction force as one big number with its uncertainty, or what it is at least.
 
+import { ESTIMATE } from "../common/bits.js";
 import { byId, number, plain, setData, setText } from "../common/text.js";
-import { ESTIMATE } from "./tile.js";
 
 export function drawGrf(node, frame) {
   const value = Number.isFinite(frame?.grf_n) ? frame.grf_n : null;
-  // A bound below zero says nothing: a foot does not pull.
-  const atLeast = value === null && frame?.grf_at_least_n > 0 ? Math.floor(frame.grf_at_least_n * 10) / 10 : null;
+  // A foot does not pull: a bound below zero is one of zero.
+  const atLeast = value === null && Number.isFinite(frame?.grf_at_least_n) ? Math.max(0, Math.floor(frame.grf_at_least_n * 10) / 10) : null;
   const bits = frame?.estimate_status ?? 0;
   const assumed = node.calibration?.absolute_scale === "assumed" || bits & ESTIMATE.ASSUMED_SCALE;
   setText(byId("grf"), number(value ?? atLeast ?? NaN));
   setData(byId("grf"), "value", plain(value));
   setText(byId("grf-bound"), atLeast === null ? "" : "at least ");
   setData(byId("grf-card"), "bound", String(atLeast !== null));
-  setText(byId("grf-sigma"), value === null ? whyNot(node, frame)
+  setText(byId("grf-sigma"), value === null ? (atLeast === null ? whyNot(node, frame) : `(${whyNot(node, frame)})`)
     : Number.isFinite(frame.grf_sigma_n) ? `±\u00a0${number(1.96 * frame.grf_sigma_n)}\u00a0N (95\u00a0%)${assumed ? " assumed\u00a0scale" : ""}` : "");
 
   const contact = frame?.contact ?? null;
@@ -22,21 +22,22 @@ export function drawGrf(node, frame) {
   setText(element, contact === null ? "contact unknown" : contact ? "contact" : "flight");
 }
 
-function whyNot(node, frame) {
+export function whyNot(node, frame) {
   if (!frame) return "waiting";
   if (!node.tare || node.tare.undone) return "not tared";
   if (!node.calibration) return "no calibration";
   const bearing = node.tiles.map((tile, i) => ({ tile, i })).filter(({ tile }) => !tile.reference);
   const missing = bearing.filter(({ i }) => !Number.isFinite(frame.force_n?.[i]));
   const saturated = bearing.filter(({ i }) => frame.saturated?.[i]);
-  const said = [named(missing, bearing, "missing"), named(saturated, bearing, "saturated")].filter(Boolean);
+  const said = [named(missing, bearing, "missing"), named(saturated, bearing, "beyond its range", "beyond their range")].filter(Boolean);
   return said.length ? said.join(", ") : "no value";
 }
 
 /** "T03 missing"; of many only how many. */
-function named(which, bearing, what) {
+function named(which, bearing, what, whatOfMany = what) {
   if (!which.length) return "";
-  if (which.length === bearing.length) return `all tiles ${what}`;
+  const says = which.length === 1 ? what : whatOfMany;
+  if (which.length === bearing.length) return `all tiles ${says}`;
   const names = which.length < 3 ? which.map(({ tile }) => tile.serial).join(", ") : `${which.length} tiles`;
-  return `${names} ${what}`;
+  return `${names} ${says}`;
 }

@@ -1,10 +1,12 @@
 // Plain notes about what to trust. They change seldom: an estimate's flag is held so it can be read.
 
+import { ESTIMATE, FRAME, TILE } from "../common/bits.js";
 import { lossesInWords } from "../common/losses.js";
-import { byId, el, number, roughly, setText } from "../common/text.js";
-import { ESTIMATE, FRAME, TILE } from "./tile.js";
+import { byId, el, localTime, number, roughly, setText } from "../common/text.js";
+import { whyOf } from "./why.js";
 
 const HOLD_MS = 3000;
+const FIRST_MS = 3000; // what is said so soon after the page was opened may be older
 
 // A chip throws an outlier now and then, which is no suction: this flag has to stay for a while.
 const BELOW_RANGE = "Below the calibrated range: suction, or an old tare.";
@@ -19,20 +21,23 @@ const FROM_ESTIMATE = [
 ];
 const FROM_FRAME = [
   [FRAME.BUS_FAULT, "Bus fault: the node cannot read all tiles. Check its cable and supply."],
-  [FRAME.OVERRUN, "The node is late: frames take longer than their slot."],
+  [FRAME.OVERRUN, "The node is late: some frames are not taken."],
 ];
 
 export class Notes {
   constructor() {
     this.list = byId("notes");
     this.seenMs = new Map(); // text of a flag -> when it was last set
-    this.shown = "";
+    this.items = new Map(); // of what is said -> its element
+    this.beganMs = performance.now(); // what is there at first may have been there before
     this.belowShare = 0; // of the last half second's messages
   }
 
   clear() {
     this.belowShare = 0;
     this.seenMs.clear();
+    this.items.clear();
+    this.beganMs = performance.now();
   }
 
   /** Called per message, so that a flag between two drawings counts. */
@@ -56,13 +61,34 @@ export class Notes {
       if (nowMs - seenMs > HOLD_MS) this.seenMs.delete(text);
       else notes.push(text);
     }
-    const key = notes.join("\n");
-    if (key !== this.shown) {
-      this.shown = key;
-      this.list.replaceChildren(...notes.map((text) => el("li", { text })));
+    const items = new Map();
+    for (const text of notes) {
+      const same = items.has(kindOf(text)) ? text : kindOf(text);
+      const one = this.items.get(same) ?? item(text, nowMs - this.beganMs < FIRST_MS);
+      setText(one.querySelector(".note-text"), text);
+      items.set(same, one);
     }
+    this.items = items;
+    const wanted = [...items.values()];
+    // What stands stays: it may be open, or have the focus.
+    for (const old of [...this.list.children]) if (!wanted.includes(old)) old.remove();
+    wanted.forEach((one, i) => { if (this.list.children[i] !== one) this.list.insertBefore(one, this.list.children[i] ?? null); });
     setText(byId("facts"), node ? facts(node, frame, serverNowMs) : "");
   }
+}
+
+/** What counts up is still the same note. */
+const kindOf = (text) => (/^(Lost|Tare) /.test(text) ? text.replace(/\d[\d,.]*/g, "#") : text);
+
+/** A note with the time since when it stands; "why?" opens two sentences. */
+function item(text, mayBeOlder) {
+  const clock = localTime(new Date()).slice(11);
+  const since = el("time", { text: mayBeOlder ? ` since ${clock} or before` : ` since ${clock}` });
+  const why = whyOf(text);
+  const says = el("span", { cls: "note-text", text });
+  if (!why) return el("li", {}, says, since);
+  return el("li", {}, el("details", {},
+    el("summary", {}, says, since, " ", el("span", { cls: "ask", text: "why?" })), el("p", { text: why })));
 }
 
 function standing(node, frame, serverNowMs) {

@@ -1,12 +1,6 @@
 // What one tile has to say in one unit: a value, a bound, or the plain reason why there is none.
 
-export const TILE = { NO_ANSWER: 1, STALE: 2, RETRIED: 4, IMPLAUSIBLE: 8, OVER_RANGE: 16, NOT_CONVERTED: 32 };
-export const ESTIMATE = {
-  SATURATED: 1, EXTRAPOLATED: 2, OUTLIER_REPLACED: 4, GAP: 8, COP_MASKED: 16,
-  TILE_MISSING: 32, ASSUMED_SCALE: 64, TARE_OLD: 128, OVER_RATED: 256, TARE_LOST: 512, AFTER_SATURATION: 1024,
-  STUCK: 2048, CLIPPED: 4096, BASELINE_LOST: 8192,
-};
-export const FRAME = { OVERRUN: 1, SERVO_STALE: 2, BUS_FAULT: 4, LEAD: 8, NEW_ARRAY_INFO: 16 };
+import { TILE } from "../common/bits.js";
 
 const FALLBACK = { kPa: 15, N: 30 };
 

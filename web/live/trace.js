@@ -1,29 +1,44 @@
-// The ground reaction force of the last ten seconds, drawn at display rate on a canvas.
+// The ground reaction force of the last seconds, on a canvas: drawn anew when it has moved by half a pixel.
 
-import { byId, setText } from "../common/text.js";
+import { byId, setData } from "../common/text.js";
+import { Points, runs } from "./points.js";
 
-const WINDOW_S = 10;
-const MOST_POINTS = 2000; // 10 s at 30 Hz are 300; the rest guards against a server gone wild
+const WINDOWS_S = [5, 10, 30, 60];
+const TICKS_S = { 5: 1, 10: 1, 30: 5, 60: 10 };
+const WINDOW_KEY = "foottile.window";
 const STEPS_N = [1, 2, 3, 4, 5, 10, 15, 20, 30, 50, 100, 200, 500, 1000, 2000, 5000, 10000];
+const [LEFT_PX, RIGHT_PX] = [50, 10]; // of the axes
 const SHRINK_AFTER_MS = 4000; // a scale that follows every step of the robot cannot be read
 
 export class Trace {
-  constructor() {
+  /** `onWindow()` when another length of time was chosen. */
+  constructor(onWindow) {
     this.canvas = byId("trace");
     this.context = this.canvas.getContext("2d");
     this.still = matchMedia("(prefers-reduced-motion: reduce)");
+    this.points = new Points();
+    this.held = null; // while paused: the points as they were then, and when that was
     this.drawnMs = 0;
     this.stepN = 5;
     this.fitsSmallerSinceMs = null;
-    this.clear();
+    this.choice = byId("trace-window");
+    let kept = null;
+    try { kept = localStorage.getItem(WINDOW_KEY); } catch { /* private window */ }
+    this.windowS = WINDOWS_S.includes(Number(kept)) ? Number(kept) : 10;
+    this.choice.value = String(this.windowS);
+    this.choice.addEventListener("change", () => {
+      this.windowS = Number(this.choice.value);
+      try { localStorage.setItem(WINDOW_KEY, this.choice.value); } catch { /* private window */ }
+      this.drawnMs = 0;
+      onWindow();
+    });
     new ResizeObserver(() => this.resize()).observe(this.canvas);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.colours = null; });
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.colours = null; this.drawnMs = 0; });
   }
 
   clear() {
-    this.points = [];
-    this.offsetS = null; // page clock minus sample clock
-    this.droppedTo = null;
+    this.points.clear();
+    this.drawnMs = 0;
   }
 
   resize() {
@@ -34,55 +49,33 @@ export class Trace {
     this.drawnMs = 0;
   }
 
-  /** Frames `from`..`to` were never shown: the line must not run across them. */
-  dropped(fromSeq, toSeq) {
-    const next = this.points.find((point) => point.seq > toSeq);
-    if (next) next.gap = true;
-    else this.droppedTo = toSeq;
+  add(frame, nominalHz, nowMs) {
+    this.points.periodS = 1 / (nominalHz || 400);
+    this.points.add(frame, nowMs);
   }
 
-  add(frame, nominalHz, nowMs) {
-    const timeS = frame.t_ns / 1e9;
-    const last = this.points.at(-1);
-    const periodS = 1 / (nominalHz || 400);
-    if (last && (frame.seq <= last.seq || timeS <= last.timeS)) this.clear(); // the node restarted
-    // The smallest delay seen is the steadiest clock: jitter of the network must not shake the line.
-    const offsetS = nowMs / 1000 - timeS;
-    if (this.offsetS === null || offsetS < this.offsetS || offsetS - this.offsetS > 2) this.offsetS = offsetS;
-    else this.offsetS += 0.01 * (offsetS - this.offsetS);
+  /** Keep the picture as it is; points are still taken. */
+  pause(nowMs) {
+    this.held = { points: [...this.points.all], offsetS: this.points.offsetS, nowMs };
+  }
 
-    const point = {
-      seq: frame.seq, timeS, gap: true, grf: frame.grf_n,
-      low: frame.grf_min_n ?? frame.grf_n, high: frame.grf_max_n ?? frame.grf_n,
-      // Without a force there may be a bound; one below zero says nothing.
-      bound: !Number.isFinite(frame.grf_n) && frame.grf_at_least_n > 0 ? frame.grf_at_least_n : null,
-    };
-    if (last && this.points.length) {
-      const missingS = Math.max(0, frame.seq - frame.n - last.seq) * periodS;
-      const lateS = timeS - last.timeS - 1.5 * frame.n * periodS;
-      point.gap = missingS > 0.05 || lateS > 0.1 || (this.droppedTo !== null && frame.seq > this.droppedTo);
-    }
-    this.droppedTo = null;
-    this.points.push(point);
-    const oldestS = timeS - WINDOW_S - 1;
-    let old = 0;
-    while (old < this.points.length && this.points[old].timeS < oldestS) old++;
-    if (this.points.length - old > MOST_POINTS) old = this.points.length - MOST_POINTS;
-    if (old) this.points.splice(0, old);
+  goOn() {
+    this.held = null;
+    this.drawnMs = 0;
   }
 
   /** Up at once, down only after a while: the scale stands still while the foot walks. */
-  scale(nowMs) {
+  scale(points, nowMs) {
     let high = 0;
     let low = 0;
-    for (const point of this.points) {
+    for (const point of points) {
       if (point.high > high) high = point.high;
       if (point.bound > high) high = point.bound;
       if (point.low < low) low = point.low;
     }
     const need = STEPS_N.find((step) => 5 * step >= 1.03 * high && step >= -1.03 * low) ?? STEPS_N.at(-1);
     if (need > this.stepN) this.stepN = need;
-    if (need < this.stepN && this.points.length) {
+    if (need < this.stepN && points.length) {
       this.fitsSmallerSinceMs ??= nowMs;
       if (nowMs - this.fitsSmallerSinceMs > SHRINK_AFTER_MS) this.stepN = need;
     } else this.fitsSmallerSinceMs = null;
@@ -90,50 +83,62 @@ export class Trace {
   }
 
   draw(nowMs, live) {
-    if (this.still.matches && nowMs - this.drawnMs < 200) return;
-    this.drawnMs = nowMs;
     if (!this.canvas.width || !this.canvas.height) return;
     if (devicePixelRatio !== this.ratio) this.resize(); // moved to another screen
+    const boxPx = this.canvas.width / this.ratio - LEFT_PX - RIGHT_PX;
+    const everyMs = this.held ? Infinity
+      : this.still.matches ? 200 : (500 * this.windowS) / Math.max(boxPx * this.ratio, 1);
+    if (this.drawnMs && this.coloursLive === live && nowMs - this.drawnMs < everyMs) return;
+    this.drawnMs = nowMs;
     if (!this.colours || this.coloursLive !== live) this.readColours(live);
-    const { context, ratio, colours } = this;
+    const { context, ratio, colours, windowS } = this;
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     const width = this.canvas.width / ratio;
     const height = this.canvas.height / ratio;
     context.clearRect(0, 0, width, height);
 
-    const { top, bottom } = this.scale(nowMs);
-    const box = { left: 50, right: width - 10, top: 8, bottom: height - 24 };
-    const endS = this.offsetS === null ? 0 : nowMs / 1000 - this.offsetS;
-    const x = (timeS) => box.right - ((endS - timeS) / WINDOW_S) * (box.right - box.left);
+    const { all, offsetS, atMs } = this.held
+      ? { all: this.held.points, offsetS: this.held.offsetS, atMs: this.held.nowMs }
+      : { all: this.points.all, offsetS: this.points.offsetS, atMs: nowMs };
+    const endS = offsetS === null ? 0 : atMs / 1000 - offsetS;
+    const first = all.findIndex((point) => point.timeS > endS - windowS);
+    const points = first < 0 ? [] : all.slice(Math.max(0, first - 1)); // one more, up to the edge
+    const { top, bottom } = this.scale(points, nowMs);
+    const box = { left: LEFT_PX, right: width - RIGHT_PX, top: 8, bottom: height - 24 };
+    const x = (timeS) => box.right - ((endS - timeS) / windowS) * (box.right - box.left);
     const y = (n) => box.bottom - ((n - bottom) / (top - bottom)) * (box.bottom - box.top);
-    this.axes(box, x, y, top, endS, width < 500 ? 2 : 1);
+    const everyS = TICKS_S[windowS];
+    this.axes(box, x, y, top, endS, width < 500 && windowS === 10 ? 2 : everyS);
 
     context.save();
     context.beginPath();
     context.rect(box.left, box.top - 4, box.right - box.left, box.bottom - box.top + 4);
     context.clip();
-    for (const run of this.runs((point) => point.grf)) {
-      context.fillStyle = colours.band;
+    // By itself: a peak shows, too, where the newest frame of its span has no force.
+    context.fillStyle = colours.band;
+    for (const run of runs(points, (point) => point.high)) {
       context.beginPath();
       run.forEach((point) => context.lineTo(x(point.timeS), y(point.high)));
       run.toReversed().forEach((point) => context.lineTo(x(point.timeS), y(point.low)));
       context.fill();
-      context.strokeStyle = colours.line;
-      context.lineWidth = 2;
-      context.lineJoin = "round";
+      if (run.length === 1) context.fillRect(x(run[0].timeS) - 1, y(run[0].high), 2, Math.max(1, y(run[0].low) - y(run[0].high)));
+    }
+    context.strokeStyle = colours.line;
+    context.lineWidth = 2;
+    context.lineJoin = "round";
+    for (const run of runs(points, (point) => point.grf)) {
       context.beginPath();
       if (run.length === 1) context.arc(x(run[0].timeS), y(run[0].grf), 1, 0, 7); // alone between two gaps
       run.forEach((point) => context.lineTo(x(point.timeS), y(point.grf)));
       context.stroke();
     }
     let someBound = false;
-    for (const run of this.runs((point) => point.bound)) {
+    for (const run of runs(points, (point) => point.bound)) {
       someBound = true;
       this.above(run.map((point) => [x(point.timeS), y(point.bound)]), box.top - 4);
     }
     context.restore();
-    setText(byId("trace-legend"), "line: newest, band: min to max"
-      + (someBound ? ", striped: at least this much" : ""));
+    setData(byId("trace-legend"), "bound", String(someBound));
   }
 
   /** A bound: the force is on its line or anywhere in the stripes above. */
@@ -157,7 +162,7 @@ export class Trace {
       context.moveTo(at, height);
       context.lineTo(at + height, 0);
     }
-    context.globalAlpha = 0.5;
+    context.globalAlpha = 0.4;
     context.stroke();
     context.restore();
     context.strokeStyle = colours.warn;
@@ -169,27 +174,13 @@ export class Trace {
     context.stroke();
   }
 
-  /** Unbroken stretches in which there is a value: a gap in the data is a gap in the line. */
-  *runs(valueOf) {
-    let run = [];
-    for (const point of this.points) {
-      const absent = !Number.isFinite(valueOf(point));
-      if ((point.gap || absent) && run.length) {
-        yield run;
-        run = [];
-      }
-      if (!absent) run.push(point);
-    }
-    if (run.length) yield run;
-  }
-
   axes(box, x, y, top, endS, everyS) {
     const { context, colours } = this;
     const crisp = (value) => Math.round(value) + 0.5;
     context.font = "600 13px system-ui, sans-serif";
     context.textBaseline = "middle";
     context.textAlign = "right";
-        for (let i = 0; i <= 5; i++) {
+    for (let i = 0; i <= 5; i++) {
       const n = (top / 5) * i;
       const row = crisp(y(n));
       context.strokeStyle = i ? colours.grid : colours.text;
@@ -208,7 +199,7 @@ export class Trace {
     context.moveTo(box.left, crisp(box.bottom));
     context.lineTo(box.right, crisp(box.bottom));
     context.stroke();
-    for (let back = 0; back <= WINDOW_S; back += everyS) {
+    for (let back = 0; back <= this.windowS; back += everyS) {
       const column = crisp(x(endS - back));
       context.strokeStyle = colours.text;
       context.beginPath();

@@ -2,36 +2,12 @@
 
 import * as api from "../common/api.js";
 import { ask, edit } from "../common/dialogs.js";
-import { frames, lossesInWords } from "../common/losses.js";
+import { frames } from "../common/losses.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, bytes, duration, el, localTime, setText } from "../common/text.js";
+import { plainState } from "./state.js";
 
 const MOST = 500; // a page left open for weeks must not grow without end
-
-const WAITS = {
-  frames: (session) => `${frames(session.pending_frames)} are still with the node; it completes by itself when they have come.`,
-  end: () => "Only its end is open: what the node took last, until the stop, has not come yet. It completes by itself when it has.",
-};
-
-/** State and completeness in plain words: [short, long, how serious]. */
-export function plainState(session) {
-  const why = session.problem ? ` ${session.problem}` : "";
-  const losses = lossesInWords(session.lost).map((loss) => `${loss}.`);
-  if (session.tail_frames_max) losses.push(`At most ${frames(session.tail_frames_max)} more may be missing where the node could not tell its end.`);
-  const missing = losses.length ? ` Missing: ${losses.join(" ")}` : "";
-  switch (session.state) {
-    case "recording": return ["recording", missing.trim(), "run"];
-    case "pending": {
-      return ["pending", `${WAITS[session.waits_for]?.(session) ?? "All frames are here; it is sealed in a moment."}${missing}${why}`, "warn"];
-    }
-    case "sealing": return ["sealing", `Being written; Parquet follows.${missing}${why}`, "run"];
-    case "sealed":
-      if (session.complete === true) return ["complete", why.trim(), "good"];
-      if (session.complete === "lossy") return ["lossy", `${missing.trim() || "Frames are missing for good."}${why}`, "warn"];
-      return ["incomplete", why.trim() || "Not all frames have arrived.", "warn"];
-    default: return [String(session.state), why.trim(), "warn"];
-  }
-}
 
 export class Sessions {
   /** `onSession(session)` takes what an answer brings, `onDeleted(id)` what was moved to the trash. */
@@ -120,7 +96,9 @@ export class Sessions {
 
   row(session) {
     const [short, long, weight] = plainState(session);
-    const name = el("span", { cls: "session-name", text: session.name || session.id });
+    const name = el("a", {
+      cls: "session-name", text: session.name || session.id, "data-part": "open", href: `/sessions/${encodeURIComponent(session.id)}`,
+    });
     const about = [session.subject, ...(session.tags ?? []).map((tag) => `#${tag}`), session.notes].filter(Boolean).join(" · ");
     const nameCell = el("div", { cls: "c-name", role: "cell" }, name);
     if (about) nameCell.append(el("span", { cls: "why about", text: about }));

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.api.routes.access import ServerState, problems
-from service.server.screens.views import DriftView, NodeView, Page, TaresPage, TareView
+from service.server.screens.picture import rounded
+from service.server.screens.recent import SECONDS_MAX
+from service.server.screens.spans import Span
+from service.server.screens.views import DriftView, NodeView, Page, TaresPage, TareView, View
 from service.sessions.tares import REASON_LENGTH_MAX
 
 router = APIRouter(prefix="/nodes", tags=["nodes"])
@@ -22,6 +25,41 @@ class TareRequest(BaseModel):
 
     reason: str = Field(
         default="", max_length=REASON_LENGTH_MAX, description='For the history; else "by hand".'
+    )
+
+
+class RecentQuery(BaseModel):
+    """How far back, and up to where."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    seconds: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] = Field(
+        default=10.0, description="Back from the newest frame."
+    )
+    before_seq: Annotated[int, Field(ge=0, lt=2**53)] | None = Field(
+        default=None,
+        description="Only what ends before this number: `seq_first` of a live message of the last "
+        "second, which then goes on without a seam.",
+    )
+
+
+class RecentView(View):
+    """Spans of consecutive frames, oldest first; one value a span in each list."""
+
+    node: str
+    boot_id: str = Field(description="The stream that all of it is of: the present one.")
+    age_ms: float | None = Field(
+        description="How old the newest frame is that screens were told; null while unknown."
+    )
+    seq_first: list[int]
+    seq: list[int]
+    n: list[int] = Field(description="Frames in it; fewer than its numbers if some are missing.")
+    t_ns: list[int] = Field(description="Of its newest frame, node's UTC.")
+    grf_n: list[float | None] = Field(description="Of its newest frame.")
+    grf_min_n: list[float | None] = Field(description="Least of its frames.")
+    grf_max_n: list[float | None] = Field(description="Greatest of its frames.")
+    grf_at_least_max_n: list[float | None] = Field(
+        description="Greatest lower bound of its frames whose GRF is not known."
     )
 
 
@@ -46,6 +84,33 @@ async def get_node(node: str, server: ServerState) -> NodeView:
 async def get_scene(node: str, server: ServerState) -> dict[str, Any]:
     """The content of its scene file, defaults filled in."""
     return server.nodes.get(node).hello.scene
+
+
+@router.get(
+    "/{node}/recent",
+    operation_id="getRecent",
+    summary="What screens were told lately",
+    responses=_UNKNOWN,
+)
+async def get_recent(
+    node: str, query: Annotated[RecentQuery, Query()], server: ServerState
+) -> RecentView:
+    """The GRF of the last seconds, up to a minute, from the server's memory.
+
+    No peak hides: each span has least and greatest. Only of the present stream, and of what came
+    since the server was started; where frames are missing, numbers are.
+    """
+    the_node = server.nodes.get(node)
+    rows = server.hub.recent(the_node).rows(query.seconds, query.before_seq)
+    age_ms = server.hub.age_ms(the_node)
+    numbers = {name: rows[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
+    forces = {name: rounded(rows[name], "n") for name in Span._fields if name.startswith("grf_")}
+    return RecentView(
+        node=the_node.name,
+        boot_id=the_node.boot_id,
+        age_ms=None if age_ms is None else round(age_ms, 1),
+        **(numbers | forces),
+    )
 
 
 @router.post(

@@ -16,6 +16,8 @@ from websockets.frames import Frame, Opcode
 from service.link import Close, HangUp
 from service.server.node import Estimated, ServerNode
 from service.server.screens.picture import Summary, dumps, sum_up
+from service.server.screens.recent import Recent
+from service.server.screens.spans import span_of
 from service.server_clock import utc_ns
 
 RATES_HZ = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0)
@@ -126,6 +128,7 @@ class Hub:
         self._feeds: dict[tuple[str | None, float], tuple[Feed, asyncio.Task[None]]] = {}
         self._nodes: dict[str, ServerNode] = {}
         """Those that have sent frames."""
+        self._recent: dict[str, Recent] = {}
 
     @property
     def subscribers(self) -> int:
@@ -173,10 +176,22 @@ class Hub:
         self._nodes[node.name] = node
         for frames, columns in due:
             node.shown_t_ns = int(frames.t_ns[-1])
+            span = span_of(frames, columns)
+            self._recent.setdefault(node.name, Recent()).add(node.boot_id, span)
             if self._feeds:
-                piece = sum_up(node.boot_id, frames, columns)
+                piece = sum_up(node.boot_id, span, frames, columns)
                 for summary in self._changing():
                     summary.add(node.name, piece)
+
+    def recent(self, node: ServerNode) -> Recent:
+        """What was told of its present stream."""
+        recent = self._recent.get(node.name)
+        return recent if recent is not None and recent.boot_id == node.boot_id else Recent()
+
+    def age_ms(self, node: ServerNode) -> float | None:
+        """How old the newest frame of its present stream is; None where that is not known."""
+        known = node.last_seq is not None
+        return _ages_ms([node]).get(node.name) if known else None
 
     def _changing(self) -> list[Summary]:
         return [feed.change() for feed, _ in self._feeds.values()]

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from devices.arrays import Floats
 from devices.frames import FrameBatch
 from service.estimation.foot import UNKNOWN
+from service.server.screens.spans import Span
 from storage.intervals import Intervals
 
 SUMMARY_NS = 1_000_000_000
@@ -51,35 +52,23 @@ class Piece:
     """
 
     boot_id: str
-    seq_first: int
-    seq_last: int
-    n: int
-    t_ns_first: int
-    t_ns: int
+    span: Span
     newest: Mapping[str, Any]
     gauge_min_kpa: Floats
     gauge_max_kpa: Floats
     force_min_n: Floats
     force_max_n: Floats
-    grf_min_n: float
-    grf_max_n: float
 
     def joined(self, later: Piece) -> Piece:
         """This piece and a later one as one."""
         return Piece(
             boot_id=self.boot_id,
-            seq_first=self.seq_first,
-            seq_last=later.seq_last,
-            n=self.n + later.n,
-            t_ns_first=self.t_ns_first,
-            t_ns=later.t_ns,
+            span=self.span.joined(later.span),
             newest=later.newest,
             gauge_min_kpa=np.fmin(self.gauge_min_kpa, later.gauge_min_kpa),
             gauge_max_kpa=np.fmax(self.gauge_max_kpa, later.gauge_max_kpa),
             force_min_n=np.fmin(self.force_min_n, later.force_min_n),
             force_max_n=np.fmax(self.force_max_n, later.force_max_n),
-            grf_min_n=min_of(self.grf_min_n, later.grf_min_n),
-            grf_max_n=-min_of(-self.grf_max_n, -later.grf_max_n),
         )
 
 
@@ -138,17 +127,18 @@ class Summary:
         """More frames of a node."""
         if self._only not in (None, node):
             return
-        boot_id, last_seq = self._last_seq.get(node, (piece.boot_id, piece.seq_first - 1))
-        if boot_id == piece.boot_id and piece.seq_first > last_seq + 1:
-            self._drop(node, last_seq + 1, piece.seq_first - 1)
-        self._last_seq[node] = (piece.boot_id, piece.seq_last)
+        span = piece.span
+        boot_id, last_seq = self._last_seq.get(node, (piece.boot_id, span.seq_first - 1))
+        if boot_id == piece.boot_id and span.seq_first > last_seq + 1:
+            self._drop(node, last_seq + 1, span.seq_first - 1)
+        self._last_seq[node] = (piece.boot_id, span.seq)
         before = self._pieces.get(node)
         if before is not None:
-            short = 0 <= piece.t_ns - before.t_ns_first < SUMMARY_NS
+            short = 0 <= span.t_ns - before.span.t_ns_first < SUMMARY_NS
             if short and before.boot_id == piece.boot_id:
                 piece = before.joined(piece)
             else:
-                self._drop(node, before.seq_first, before.seq_last)
+                self._drop(node, before.span.seq_first, before.span.seq)
         self._pieces[node] = piece
 
     def count(self, node: str, counted: Mapping[str, Mapping[str, Any]]) -> None:
@@ -182,22 +172,25 @@ def _frame(node: str, piece: Piece, age_ms: float | None) -> dict[str, Any]:
     return {
         "type": "frame",
         "node": node,
-        "seq": piece.seq_last,
-        "t_ns": piece.t_ns,
-        "n": piece.n,
+        "seq_first": piece.span.seq_first,
+        "seq": piece.span.seq,
+        "t_ns": piece.span.t_ns,
+        "n": piece.span.n,
         **piece.newest,
         "gauge_min_kpa": rounded(piece.gauge_min_kpa, "kpa"),
         "gauge_max_kpa": rounded(piece.gauge_max_kpa, "kpa"),
         "force_min_n": rounded(piece.force_min_n, "n"),
         "force_max_n": rounded(piece.force_max_n, "n"),
-        "grf_min_n": one(piece.grf_min_n, "n"),
-        "grf_max_n": one(piece.grf_max_n, "n"),
+        "grf_min_n": one(piece.span.grf_min_n, "n"),
+        "grf_max_n": one(piece.span.grf_max_n, "n"),
+        "grf_at_least_max_n": one(piece.span.grf_at_least_max_n, "n"),
         "age_ms": None if age_ms is None else round(age_ms, 1),
     }
 
 
 def sum_up(
     boot_id: str,
+    span: Span,
     frames: FrameBatch,
     columns: Mapping[str, npt.NDArray[Any]],
 ) -> Piece:
@@ -205,6 +198,7 @@ def sum_up(
 
     Args:
         boot_id: the stream that they are of.
+        span: of the same frames.
         frames: n frames.
         columns: their estimates by name.
     """
@@ -229,21 +223,14 @@ def sum_up(
     # A lower bound is a force without an uncertainty.
     sigma_n = columns.get("force_sigma_n", np.zeros((1, tiles)))
     newest["saturated"] = (np.isfinite(force_n[-1]) & np.isnan(sigma_n[-1])).tolist()
-    grf_n = columns.get("grf_n", unknown[:, 0])
     return Piece(
         boot_id=boot_id,
-        seq_first=int(frames.seq[0]),
-        seq_last=int(frames.seq[-1]),
-        n=len(frames),
-        t_ns_first=int(frames.t_ns[0]),
-        t_ns=int(frames.t_ns[-1]),
+        span=span,
         newest=newest,
         gauge_min_kpa=np.fmin.reduce(gauge_kpa, axis=0),
         gauge_max_kpa=np.fmax.reduce(gauge_kpa, axis=0),
         force_min_n=np.fmin.reduce(force_n, axis=0),
         force_max_n=np.fmax.reduce(force_n, axis=0),
-        grf_min_n=float(np.fmin.reduce(grf_n)),
-        grf_max_n=float(np.fmax.reduce(grf_n)),
     )
 
 
@@ -257,11 +244,6 @@ def rounded(values: npt.NDArray[Any], unit: str) -> list[float | None]:
 def one(value: float, unit: str) -> float | None:
     """One number for a screen; what is not finite is null."""
     return round(value, _DIGITS[unit]) if math.isfinite(value) else None
-
-
-def min_of(a: float, b: float) -> float:
-    """The smaller of two numbers; NaN does not count as a number."""
-    return b if math.isnan(a) else a if math.isnan(b) else min(a, b)
 
 
 def dumps(message: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from devices.errors import StorageError
 from storage.intervals import Intervals
 from storage.journal import segment_writer
 from storage.journal.journal import Journal
+from storage.journal.segment_writer import SegmentWriter
 from tests.builders.arrays import make_array
 from tests.storage.faulty_disk import disk_with_room_for
 from tests.storage.journal.journals import (
@@ -151,3 +152,19 @@ def test_more_than_a_bound_does_not_wait_in_memory(
     at_once = filled(tmp_path / "at_once", (0, 9), (10, 19))
     assert path.stat().st_size == segments(tmp_path / "at_once")[0].stat().st_size
     at_once.close()
+
+
+def test_a_segment_that_was_closed_by_another_thread_does_not_stop_who_reads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = later(tmp_path)
+    journal.append(part(0, 29))
+    write = SegmentWriter.write
+
+    def closed_just_before(writer: SegmentWriter) -> None:
+        writer.abandon()  # as after a close that the disk has refused
+        write(writer)
+
+    monkeypatch.setattr(SegmentWriter, "write", closed_just_before)
+    assert journal.t_ns_near(5, newest=False) is None  # not acknowledged, and asked for again
+    OPENED.remove(journal)  # nothing is left to be closed

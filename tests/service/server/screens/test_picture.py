@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from devices.frames import FrameBatch
 from service.estimation.foot import UNKNOWN
-from service.server.screens.picture import SUMMARY_NS, Piece, Summary, min_of, sum_up
+from service.server.screens.picture import SUMMARY_NS, Piece, Summary, sum_up
+from service.server.screens.spans import min_of, span_of
 from tests.builders.arrays import PERIOD_NS
 from tests.builders.frames import make_frames
 
@@ -53,6 +54,10 @@ def estimates(first: int, rows: int, *, silent: float = 0.2) -> Columns:
     }
 
 
+def summed_up(batch: FrameBatch, columns: Columns, boot_id: str = "0" * 32) -> Piece:
+    return sum_up(boot_id, span_of(batch, columns), batch, columns)
+
+
 def piece(
     first: int,
     rows: int,
@@ -62,7 +67,8 @@ def piece(
     silent: float = 0.2,
 ) -> Piece:
     columns = estimates(first, rows, silent=silent)
-    return sum_up(boot_id, frames(first, rows, period_ns=period_ns), columns)
+    batch = frames(first, rows, period_ns=period_ns)
+    return summed_up(batch, columns, boot_id)
 
 
 def taken(summary: Summary, ages_ms: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
@@ -122,13 +128,10 @@ def test_joining_pieces_is_summing_up_their_frames_and_in_any_grouping(sizes: li
     one, two, three = piece(a, b - a), piece(b, c - b), piece(c, end - c)
     whole = piece(0, end)
     for joined in (one.joined(two).joined(three), one.joined(two.joined(three))):
-        for name in ("seq_first", "seq_last", "n", "t_ns", "newest"):
-            assert getattr(joined, name) == getattr(whole, name), name
+        np.testing.assert_array_equal(joined.span, whole.span)
+        assert joined.newest == whole.newest
         for name in ("gauge_min_kpa", "gauge_max_kpa", "force_min_n", "force_max_n"):
             np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
-        np.testing.assert_array_equal(
-            [joined.grf_min_n, joined.grf_max_n], [whole.grf_min_n, whole.grf_max_n]
-        )
 
 
 @pytest.mark.parametrize(
@@ -211,8 +214,8 @@ def test_a_client_that_never_takes_stays_bounded(frames_sent: int) -> None:
     summary, period_ns = Summary(), 10_000_000
     one = vars(piece(0, 1))
     for at in range(0, 3 * frames_sent, 3):
-        t_ns = at * period_ns
-        summary.add("bench", Piece(**one | {"seq_first": at, "seq_last": at, "t_ns": t_ns}))
+        span = piece(0, 1).span._replace(seq_first=at, seq=at, t_ns=at * period_ns)
+        summary.add("bench", Piece(**one | {"span": span}))
         summary.notice('{"type":"node"}')
     messages = taken(summary)
     assert len(of_type(messages, "node")) == 256
@@ -341,7 +344,7 @@ def told_or_dropped(messages: Sequence[dict[str, Any]]) -> int:
 
 def test_without_estimates_everything_estimated_is_null() -> None:
     summary = Summary()
-    summary.add("bench", sum_up("0" * 32, frames(0, 5), {}))
+    summary.add("bench", summed_up(frames(0, 5), {}))
     (message,) = taken(summary)
     for name in ("gauge_kpa", "force_n", "force_sigma_n", "gauge_min_kpa", "force_max_n"):
         assert message[name] == [None, None], name
@@ -360,11 +363,11 @@ def test_contact_and_saturation_are_those_of_the_newest_frame() -> None:
         "force_sigma_n": np.array([[np.nan, np.nan], [0.1, np.nan]]),  # none of a lower bound
         "contact": np.array([UNKNOWN, 1], dtype=np.uint8),
     }
-    newest = sum_up("0" * 32, frames(0, 2), columns).newest
+    newest = summed_up(frames(0, 2), columns).newest
     assert newest["saturated"] == [False, True]
     assert newest["contact"] is True
     for value, told in ((0, False), (UNKNOWN, None)):
         columns["contact"][-1] = value
-        assert sum_up("0" * 32, frames(0, 2), columns).newest["contact"] is told
+        assert summed_up(frames(0, 2), columns).newest["contact"] is told
     columns["force_n"][-1] = np.nan
-    assert sum_up("0" * 32, frames(0, 2), columns).newest["saturated"] == [False, False]
+    assert summed_up(frames(0, 2), columns).newest["saturated"] == [False, False]

@@ -1,0 +1,169 @@
+"""A session at any zoom: what a plot of it needs, whatever its length."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+import pyarrow as pa
+from anyio import CapacityLimiter, to_thread
+from fastapi import APIRouter, Header, Query, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from devices.errors import StateError, UnknownError, UsageError
+from service.api.routes.access import ServerState, problems
+from service.server.server import Server
+from service.sessions.overview import POINTS_MAX, Seen, overview_of_session
+from service.version import SOFTWARE
+from storage.formats.export import MEDIA_TYPES
+from storage.formats.slice import SECONDS_MAX, Slice
+from storage.schema import Array
+from storage.sessions.folder import Session
+
+router = APIRouter(prefix="/sessions", tags=["sessions"])
+
+_ARROW = MEDIA_TYPES["arrow"]
+_ONE_AT_A_TIME = CapacityLimiter(1)
+"""Each thread that makes pictures keeps memory of them; and one picture waits for few others, which
+take milliseconds."""
+
+
+class OverviewQuery(BaseModel):
+    """Which time, and how finely."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    points: Annotated[int, Field(ge=1, le=POINTS_MAX)] = Field(
+        default=1000, description="Bins at least, if there are as many frames; four times at most."
+    )
+    start_s: Annotated[float, Field(ge=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
+        default=None, description="Seconds after the first frame."
+    )
+    end_s: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
+        default=None, description="Up to, not including, so many seconds after the first frame."
+    )
+    columns: str | None = Field(
+        default=None,
+        description="Beginnings of names with commas between; `t_first_s` and `t_last_s` always.",
+        examples=["grf_n,force_n"],
+    )
+
+
+class OverviewView(BaseModel):
+    """Bins of consecutive frames (docs/api.md); what is not known is null."""
+
+    session_id: str
+    begin_t_ns: int = Field(description="t_ns of the first frame of the session.")
+    duration_s: float = Field(description="From the first frame to the last.")
+    frames_in_bin: int = Field(description="1: each bin is a frame.")
+    serials: list[str] = Field(description="Of the tiles, in the order of the columns.")
+    columns: dict[str, list[float | int | None]]
+
+
+@router.get(
+    "/{session_id}/overview",
+    operation_id="getOverview",
+    summary="At any zoom",
+    response_model=OverviewView,
+    responses={
+        200: {"description": "Bins, in the order of the frames.", "content": {_ARROW: {}}},
+        304: {"description": "It is what If-None-Match names."},
+        **problems(
+            _404="No such session, or nothing was recorded.",
+            _409="The overview is made when the session is sealed.",
+            _422="No such column, or a slice that ends before it begins.",
+        ),
+    },
+)
+async def overview(
+    session_id: str,
+    query: Annotated[OverviewQuery, Query()],
+    server: ServerState,
+    accept: Annotated[str, Header(description="The Arrow media type for an Arrow stream.")] = "",
+    if_none_match: Annotated[str, Header()] = "",
+) -> Response:
+    """Least and greatest of every column in each of some bins, so that no peak hides.
+
+    At full zoom each bin is a frame. What it costs does not depend on the session's length.
+    """
+    session = server.sessions.get(session_id)
+    if session.state != "sealed":
+        raise StateError(
+            f"session {session_id} is {session.state}, and its overview is made when it is sealed",
+            remedy="Stop it",
+        )
+    if session.sha256 is None:
+        raise UnknownError(f"session {session_id}: {session.problem}")
+    as_arrow = _ARROW in accept
+    asked = f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{SOFTWARE}"
+    tag = f'"{hashlib.sha256(asked.encode()).hexdigest()}"'
+    headers = {"ETag": tag, "Cache-Control": "private, no-cache", "Vary": "Accept"}
+    if tag in if_none_match:
+        return Response(status_code=304, headers=headers)
+    make = partial(_content, session, query, server, as_arrow=as_arrow)
+    content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
+    media_type = _ARROW if as_arrow else "application/json"
+    return Response(content, headers=headers, media_type=media_type)
+
+
+def _content(session: Session, query: OverviewQuery, server: Server, *, as_arrow: bool) -> bytes:
+    assert session.sha256 is not None  # noqa: S101  # asked before
+    part = Slice(query.start_s, query.end_s)
+    with server.sessions.frames(session.id, only_slices=True) as reader:
+        seen = overview_of_session(reader, part, query.points, frames_sha256=session.sha256)
+        serials = list(reader.info.serials)
+    columns = _chosen(_in_seconds(seen), query.columns)
+    about = {
+        "session_id": session.id,
+        "begin_t_ns": seen.begin_ns,
+        "duration_s": (seen.end_ns - seen.begin_ns) * 1e-9,
+        "frames_in_bin": seen.frames_in_bin,
+        "serials": serials,
+    }
+    if not as_arrow:
+        content = {**about, "columns": {name: _plain(values) for name, values in columns.items()}}
+        return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+    metadata = {"foottile.overview": json.dumps(about)}
+    table = pa.table({name: pa.array(v) for name, v in columns.items()}, metadata=metadata)
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema) as stream:
+        stream.write_table(table)
+    made: bytes = sink.getvalue().to_pybytes()
+    return made
+
+
+def _in_seconds(seen: Seen) -> dict[str, Array]:
+    """Bins with instants as seconds after the first frame: integers of that size JSON has not."""
+    bins = dict(seen.bins)
+    times = {
+        f"t_{which}_s": (bins.pop(f"t_{which}_ns") - seen.begin_ns) * 1e-9
+        for which in ("first", "last")
+    }
+    return times | bins
+
+
+def _chosen(columns: dict[str, Array], wanted: str | None) -> dict[str, Array]:
+    names = [name.strip() for name in (wanted or "").split(",") if name.strip()]
+    for begin in names:
+        if not any(name.startswith(begin) for name in columns):
+            raise UsageError(f"no column begins with {begin!r}", expected=", ".join(columns))
+    always = ("t_first_s", "t_last_s")
+    return {
+        name: values
+        for name, values in columns.items()
+        if not names or name in always or name.startswith(tuple(names))
+    }
+
+
+def _plain(values: Array) -> list[Any]:
+    """As JSON has it, single precision to a millionth: micrometres and micronewtons."""
+    if values.dtype == np.float32:
+        values = np.round(values.astype(np.float64), 6)
+    if values.dtype.kind == "f" and np.isnan(values).any():
+        return [None if math.isnan(value) else value for value in values.tolist()]
+    plain: list[Any] = values.tolist()
+    return plain

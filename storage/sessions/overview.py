@@ -1,0 +1,266 @@
+"""`overview.arrow` beside a session's frames: the session at every zoom, read piece by piece.
+
+An Arrow file of bins (`storage.sessions.pyramid`), level after level from the finest, in pieces of
+some thousand bins. The file's metadata has an index of the pieces with a checksum of each and of
+itself, so that what is read is proven without reading the rest. Nothing is lost with it: whoever
+lacks it, or finds it damaged or of other frames, makes it again (`service.sessions.overview`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+
+from devices.errors import DamagedFileError
+from storage.durable import open_own, whole_file
+from storage.sessions.pyramid import FACTOR, ROWS, Bins, bin_columns, joined
+
+OVERVIEW_NAME = "overview.arrow"
+_KEY, _CHECK_KEY = b"foottile.overview", b"foottile.overview_sha256"
+_VERSION = 1
+_PIECE = 4096
+"""Bins that are read, and proven, at a time."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some bins of a level.
+
+    Attributes:
+        level: 0 is the finest.
+        bins: how many.
+        begin_ns: least `t_first_ns`.
+        end_ns: greatest `t_last_ns`.
+        crc: of their values.
+    """
+
+    level: int
+    bins: int
+    begin_ns: int
+    end_ns: int
+    crc: int
+
+
+@dataclass(frozen=True)
+class Index:
+    """What the file says of itself.
+
+    Attributes:
+        frames_sha256: file hash of the frames that it was made from.
+        tiles: of the array.
+        estimated: do its bins have forces, or raw counts?
+        begin_ns: `t_ns` of the first frame.
+        pieces: in the order of the file.
+    """
+
+    frames_sha256: str
+    tiles: int
+    estimated: bool
+    begin_ns: int
+    pieces: tuple[Piece, ...]
+
+    @property
+    def levels(self) -> int:
+        """How many there are."""
+        return 1 + max((piece.level for piece in self.pieces), default=-1)
+
+    def to_json(self) -> bytes:
+        """For the file's metadata."""
+        content = {
+            "version": _VERSION,
+            "rows": ROWS,
+            "factor": FACTOR,
+            "frames_sha256": self.frames_sha256,
+            "tiles": self.tiles,
+            "estimated": self.estimated,
+            "begin_ns": self.begin_ns,
+            "pieces": [list(vars(piece).values()) for piece in self.pieces],
+        }
+        return json.dumps(content).encode()
+
+    @classmethod
+    def from_json(cls, text: bytes) -> Self:
+        """The same, read.
+
+        Raises:
+            ValueError: it is none, or of another version.
+        """
+        content: dict[str, Any] = json.loads(text)
+        if (content["version"], content["rows"], content["factor"]) != (_VERSION, ROWS, FACTOR):
+            raise ValueError(f"version {content['version']}")
+        pieces = tuple(Piece(*row) for row in content["pieces"])
+        return cls(
+            content["frames_sha256"],
+            content["tiles"],
+            content["estimated"],
+            content["begin_ns"],
+            pieces,
+        )
+
+
+def overview_content(levels: Sequence[Bins], *, tiles: int, frames_sha256: str) -> pa.Buffer:
+    """The bytes of an `overview.arrow`.
+
+    Args:
+        levels: the finest first; none of them is empty.
+        tiles: of the array.
+        frames_sha256: hash of the frames that it is of.
+    """
+    estimated = "grf_n_min" in levels[0]
+    types = bin_columns(tiles, estimated=estimated)
+    batches, pieces = [], []
+    for level, bins in enumerate(levels):
+        ordered = {name: np.ascontiguousarray(bins[name], type_) for name, type_ in types.items()}
+        for at in range(0, len(ordered["part"]), _PIECE):
+            some = {name: values[at : at + _PIECE] for name, values in ordered.items()}
+            batches.append([pa.array(values) for values in some.values()])
+            begin_ns, end_ns = int(some["t_first_ns"].min()), int(some["t_last_ns"].max())
+            pieces.append(Piece(level, len(some["part"]), begin_ns, end_ns, _crc(some)))
+    begin_ns = int(levels[0]["t_first_ns"][0])
+    text = Index(frames_sha256, tiles, estimated, begin_ns, tuple(pieces)).to_json()
+    schema = pa.schema(
+        [pa.field(name, pa.from_numpy_dtype(t), nullable=False) for name, t in types.items()],
+        metadata={_KEY: text, _CHECK_KEY: hashlib.sha256(text).hexdigest().encode()},
+    )
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_file(sink, schema) as file:
+        for arrays in batches:
+            file.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
+    return sink.getvalue()
+
+
+def write_overview(path: Path, content: pa.Buffer) -> None:
+    """Write `overview.arrow`, in place of the one that is there.
+
+    Args:
+        path: of the file.
+        content: of `overview_content`.
+
+    Raises:
+        StorageError: the disk is full or not writable; the old one is still there then.
+    """
+    with whole_file(path) as out:
+        out.write(content)
+
+
+def open_overview(path: Path) -> Overview:
+    """Open an `overview.arrow`.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DamagedFileError: it is not what was written.
+        StorageError: it cannot be read now.
+    """
+    return Overview(pa.PythonFile(open_own(path), "r"), where=str(path))
+
+
+class Overview:
+    """An `overview.arrow`, open for reading.
+
+    Args:
+        source: its bytes; closed with it.
+        where: for errors.
+
+    Raises:
+        DamagedFileError: it is not what was written.
+    """
+
+    def __init__(self, source: pa.NativeFile, *, where: str) -> None:
+        self._source, self._where = source, where
+        try:
+            self._file = pa.ipc.open_file(source)
+            self.index = _index_of(self._file)
+        except Exception as error:  # damaged bytes may cause any error
+            source.close()
+            raise self._damaged(error) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._source.close()
+
+    def count(self, level: int, begin_ns: int | None, end_ns: int | None) -> int:
+        """About how many bins of a level lie in some time: all of the pieces that do."""
+        return sum(self.index.pieces[i].bins for i in self._within(level, begin_ns, end_ns))
+
+    def bins(self, level: int, begin_ns: int | None, end_ns: int | None) -> Bins:
+        """The bins of a level that have frames from one instant on and before another.
+
+        Raises:
+            DamagedFileError: a piece is damaged.
+        """
+        types = bin_columns(self.index.tiles, estimated=self.index.estimated)
+        found = [{name: np.empty(0, type_) for name, type_ in types.items()}]
+        for i in self._within(level, begin_ns, end_ns):
+            piece = self._piece(i, list(types))
+            rows = np.ones(len(piece["part"]), dtype=np.bool_)
+            if begin_ns is not None:
+                rows &= piece["t_last_ns"] >= begin_ns
+            if end_ns is not None:
+                rows &= piece["t_first_ns"] < end_ns
+            found.append({name: values[rows] for name, values in piece.items()})
+        return joined(found)
+
+    def _within(self, level: int, begin_ns: int | None, end_ns: int | None) -> list[int]:
+        return [
+            i
+            for i, piece in enumerate(self.index.pieces)
+            if piece.level == level
+            and (begin_ns is None or piece.end_ns >= begin_ns)
+            and (end_ns is None or piece.begin_ns < end_ns)
+        ]
+
+    def _piece(self, i: int, names: list[str]) -> Bins:
+        try:
+            batch = self._file.get_batch(i)
+            bins = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in names}
+        except Exception as error:  # damaged bytes may cause any error
+            raise self._damaged(f"piece {i}: {error}") from error
+        said = self.index.pieces[i]
+        if len(batch) != said.bins or _crc(bins) != said.crc:
+            raise self._damaged(f"piece {i} is not what its checksum is of")
+        return bins
+
+    def _damaged(self, why: object) -> DamagedFileError:
+        return DamagedFileError(
+            f"is no overview: {' '.join(str(why).split())[:300]}",
+            where=self._where,
+            remedy="Delete it: it is made again from the frames",
+        )
+
+
+def _index_of(file: pa.ipc.RecordBatchFileReader) -> Index:
+    """What a file's metadata says.
+
+    Raises:
+        ValueError: it is not what its hash is of, or of another file.
+        KeyError: it says nothing.
+    """
+    said = file.schema.metadata or {}
+    text = said[_KEY]
+    if hashlib.sha256(text).hexdigest().encode() != said[_CHECK_KEY]:
+        raise ValueError("its index is not what its hash is of")
+    index = Index.from_json(text)
+    if file.num_record_batches != len(index.pieces):
+        raise ValueError("it has not the pieces it says")
+    return index
+
+
+def _crc(bins: Bins) -> int:
+    crc = 0
+    for values in bins.values():
+        crc = zlib.crc32(np.ascontiguousarray(values).data, crc)
+    return crc

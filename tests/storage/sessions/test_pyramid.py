@@ -1,0 +1,187 @@
+"""Bins of frames at every zoom: exact, whatever the pieces, and never over a part's end."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices.frames import NOT_READ
+from storage.sessions.pyramid import (
+    FACTOR,
+    ROWS,
+    TOP,
+    UNKNOWN,
+    WITH,
+    WITHOUT,
+    Bins,
+    Pyramid,
+    bin_columns,
+    frame_columns,
+    levels_over,
+    merged,
+)
+
+TILES = 2
+
+
+def frames(n: int, seed: int = 0, parts: Sequence[int] = ()) -> dict[str, Any]:
+    """Estimated frames with holes, faults and what is not known, in one part or several."""
+    rng = np.random.default_rng(seed)
+    grf_n = rng.normal(20.0, 10.0, n).astype(np.float32)
+    grf_n[rng.random(n) < 0.1] = np.nan
+    some: dict[str, Any] = {
+        "seq": np.cumsum(rng.choice([1, 1, 1, 5], n)).astype(np.uint64),
+        "t_ns": 10**18 + np.cumsum(rng.integers(1, 3_000_000, n)),
+        "status": rng.choice([0, 0, 1, 4], (n, TILES)).astype(np.uint8),
+        "frame_status": rng.choice([0, 0, 8], n).astype(np.uint8),
+        "grf_n": grf_n,
+        "contact": rng.choice([0, 1, 255], n).astype(np.uint8),
+        "estimate_status": (2 ** rng.integers(0, 14, n)).astype(np.uint16),
+        "force_n": rng.normal(5.0, 3.0, (n, TILES)).astype(np.float32),
+    }
+    for name in ("grf_sigma_n", "grf_at_least_n", "cop_x_m", "cop_y_m", "angle_rad"):
+        some[name] = rng.random(n).astype(np.float32)
+    if parts:
+        some["part"] = np.repeat(np.arange(len(parts), dtype=np.uint16), parts)
+        for number in range(len(parts)):
+            of = some["part"] == number
+            some["seq"][of] -= some["seq"][of][0]  # a stream begins again
+    return some
+
+
+def rows(columns: Mapping[str, Any], begin: int, end: int) -> dict[str, Any]:
+    return {name: values[begin:end] for name, values in columns.items()}
+
+
+def gathered(columns: Mapping[str, Any], cuts: Sequence[int] = ()) -> Pyramid:
+    pyramid = Pyramid()
+    edges = [0, *sorted(cuts), len(columns["seq"])]
+    for begin, end in itertools.pairwise(edges):
+        pyramid.feed(rows(columns, begin, end))
+    return pyramid
+
+
+def same(one: Bins, other: Bins) -> None:
+    assert one.keys() == other.keys()
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, other[name], err_msg=name)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    parts=st.lists(st.integers(1, 200), min_size=1, max_size=4),
+    cuts=st.sets(st.integers(0, 300)),
+    seed=st.integers(0, 9),
+)
+def test_however_frames_are_cut_the_bins_are_those_worked_out_one_by_one(
+    parts: list[int], cuts: set[int], seed: int
+) -> None:
+    n = sum(parts)
+    columns = frames(n, seed, parts)
+    found = gathered(columns, [cut for cut in cuts if cut < n]).finest()
+    assert found is not None
+    assert set(found) == set(bin_columns(TILES, estimated=True))
+    at = 0
+    for number, length in enumerate(parts):
+        first = sum(parts[:number])
+        for begin in range(first, first + length, ROWS):
+            end = min(begin + ROWS, first + length)
+            some = rows(columns, begin, end)
+            before = columns["seq"][begin - 1] if begin > first else None
+            check(found, at, some, before, number)
+            at += 1
+    assert at == len(found["part"])
+
+
+def check(found: Bins, at: int, some: dict[str, Any], before: Any, part: int) -> None:
+    """One bin against the plainest way to work it out."""
+    seq = [*([int(before)] if before is not None else []), *some["seq"].tolist()]
+    half_n = np.float32(1.96) * some["grf_sigma_n"]
+    with np.errstate(all="ignore"):
+        expected = {
+            "t_first_ns": some["t_ns"][0],
+            "t_last_ns": some["t_ns"][-1],
+            "part": part,
+            "frames": len(some["seq"]),
+            "missing": sum(b - a - 1 for a, b in itertools.pairwise(seq)),
+            "grf_n_min": np.fmin.reduce(some["grf_n"]),
+            "grf_n_max": np.fmax.reduce(some["grf_n"]),
+            "grf_low_n_min": np.fmin.reduce(some["grf_n"] - half_n),
+            "grf_high_n_max": np.fmax.reduce(some["grf_n"] + half_n),
+            "grf_unknown": np.isnan(some["grf_n"]).sum(),
+            "force_n_1_max": some["force_n"][:, 1].max(),
+            "cop_x_m_min": some["cop_x_m"].min(),
+            "estimate_status": np.bitwise_or.reduce(some["estimate_status"]),
+            "status_0": np.bitwise_or.reduce(some["status"][:, 0]),
+            "contact": sum(
+                bit
+                for bit, value in ((WITHOUT, 0), (WITH, 1), (UNKNOWN, 255))
+                if (some["contact"] == value).any()
+            ),
+        }
+    for name, value in expected.items():
+        np.testing.assert_array_equal(found[name][at], value, err_msg=name)
+
+
+def test_each_level_has_the_extremes_of_the_frames_whatever_is_in_between() -> None:
+    columns = frames(ROWS * TOP * 3, parts=(ROWS * TOP * 2 + 7, ROWS * TOP - 7))
+    finest = gathered(columns).finest()
+    assert finest is not None
+    levels = levels_over(finest)
+    assert [len(level["part"]) for level in levels[1:]] == [
+        -(-(2 * TOP + 1) // FACTOR) + TOP // FACTOR
+    ]
+    for level in levels:
+        assert level["frames"].sum() == len(columns["seq"])
+        assert np.nanmax(level["grf_n_max"]) == np.nanmax(columns["grf_n"])
+        assert level["missing"].sum() == finest["missing"].sum()
+    same(levels[1], merged(finest, FACTOR))
+
+
+def test_parts_of_a_bin_each_do_not_go_on_for_ever() -> None:
+    columns = frames(TOP + 10, parts=(1,) * (TOP + 10))
+    finest = gathered(columns).finest()
+    assert finest is not None
+    assert [len(level["part"]) for level in levels_over(finest)] == [TOP + 10]
+
+
+def test_frames_without_estimates_have_their_counts_and_what_was_not_read_is_no_extreme() -> None:
+    n = 100
+    columns = {
+        name: values for name, values in frames(n).items() if name in frame_columns(estimated=False)
+    }
+    columns["padc"] = np.tile(np.array([500, 400], dtype=np.uint16), (n, 1))
+    columns["padc"][3:5, 0] = NOT_READ, 510
+    columns["padc"][ROWS:, 1] = NOT_READ
+    found = gathered(columns).finest()
+    assert found is not None
+    assert set(found) == set(bin_columns(TILES, estimated=False))
+    assert found["padc_0_min"].tolist() == [500, 500]
+    assert found["padc_0_max"].tolist() == [510, 500]
+    assert found["padc_1_max"][0] == 400
+    assert np.isnan(found["padc_1_max"][1])
+
+
+def test_without_a_frame_there_is_nothing() -> None:
+    pyramid = Pyramid()
+    pyramid.feed(rows(frames(10), 0, 0))
+    assert pyramid.finest() is None
+    assert pyramid.levels() == []
+
+
+@pytest.mark.parametrize("estimated", [True, False])
+def test_every_column_of_a_bin_has_its_type(estimated: bool) -> None:
+    columns = dict(frames(200))
+    if not estimated:
+        columns = {n: columns[n] for n in frame_columns(estimated=False) if n in columns}
+        columns["padc"] = np.full((200, TILES), 500, dtype=np.uint16)
+    found = gathered(columns).finest()
+    assert found is not None
+    for name, type_ in bin_columns(TILES, estimated=estimated).items():
+        assert np.can_cast(found[name].dtype, type_, casting="same_kind"), name

@@ -1,0 +1,128 @@
+"""The live trace begins with what was there before, joins it by number, and can stand still."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.builders.arrays import PERIOD_NS
+from tests.service.fake_node import Play
+from tests.waiting import until
+from tests.web.scripted import Scripted
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+LIVE = "body[data-live=true]"
+
+JOINED = """async () => {
+  const { Points } = await import("/static/live/points.js");
+  const { recent } = await import("/static/common/api.js");
+  const points = new Points();
+  const socket = new WebSocket(`ws://${location.host}/api/v1/live?rate_hz=60`);
+  let heard = 0;
+  await new Promise((resolve) => {
+    socket.onmessage = async ({ data }) => {
+      const frame = JSON.parse(data);
+      if (frame.type !== "frame") return;
+      points.add(frame, performance.now());
+      heard += 1;
+      if (heard === 5) {
+        const before = frame.seq_first;
+        points.precede(await recent("bench", 10, before), before, performance.now());
+      }
+      if (heard === 15) resolve();
+    };
+  });
+  socket.close();
+  return points.all.map(({ seqFirst, seq, n, gap }) => [seqFirst, seq, n, gap]);
+}"""
+"""The page's own parts, with a socket and an answer of the server."""
+
+DRAWN = """() => {
+  const canvas = document.querySelector("#trace");
+  const { width, height } = canvas;
+  const copy = new OffscreenCanvas(width, height).getContext("2d");
+  copy.drawImage(canvas, -60, 0);
+  const box = copy.getImageData(0, 0, width / 2 - 60, height).data;
+  let blue = 0;
+  for (let i = 0; i < box.length; i += 4) blue += box[i + 2] - box[i] > 60 && box[i + 3] > 200;
+  return blue;
+}"""
+"""How much of the trace's older half has its colour."""
+
+PICTURE = (
+    "() => document.querySelector('#trace').toDataURL() + document.querySelector('#bars').outerHTML"
+)
+
+
+def streamed(scripted: Scripted) -> None:
+    """Some seconds up to now, that no screen has seen."""
+    scripted.node.next_t_mono_ns = time.monotonic_ns() - 4000 * PERIOD_NS
+    scripted.node.send(4000, 20.0)
+
+
+def test_what_was_before_joins_what_is_heard_without_a_seam(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    streamed(scripted)
+    with Play(scripted.node, 20.0):
+        page = open_page(scripted.url)
+        expect(page.locator(LIVE)).to_have_count(1)
+        spans: list[Any] = page.evaluate(JOINED)
+    assert len(spans) > 30
+    assert spans[0][1] < scripted.node.seq - 1000
+    assert {b[0] - a[1] for a, b in pairwise(spans)} == {1}
+    assert all(n == last - first + 1 for first, last, n, _ in spans)
+
+
+def test_a_page_that_is_opened_has_a_trace_at_once(scripted: Scripted, open_page: OpenPage) -> None:
+    streamed(scripted)
+    with Play(scripted.node, 20.0):
+        page = open_page(scripted.url)
+        expect(page.locator(LIVE)).to_have_count(1)
+        opened_s = time.monotonic()
+        until(lambda: page.evaluate(DRAWN) > 100)
+        assert time.monotonic() - opened_s < 3.0  # it would take five by itself
+        page.select_option("#trace-window", "60")
+        until(lambda: page.evaluate(DRAWN) == 0)  # no minute was played
+        page.reload()
+        expect(page.locator("#trace-window")).to_have_value("60")
+
+
+def test_a_paused_picture_stands_still_says_so_and_goes_on(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node, 20.0) as play:
+        page = open_page(scripted.url)
+        expect(page.locator(LIVE)).to_have_count(1)
+        expect(page.locator("#paused")).to_be_hidden()
+        page.keyboard.press("p")
+        expect(page.locator("#paused")).to_contain_text("Data and recordings go on")
+        expect(page.locator("#pause")).to_have_attribute("aria-pressed", "true")
+        page.wait_for_timeout(200)
+        before, sent, grf = page.evaluate(PICTURE), play.node.seq, page.inner_text("#grf")
+        play.force_n = 50.0
+        page.wait_for_timeout(600)
+        assert page.evaluate(PICTURE) == before
+        assert page.inner_text("#grf") == grf
+        assert play.node.seq > sent + 100
+        expect(page.locator(LIVE)).to_have_count(1)
+        page.keyboard.press("p")
+        expect(page.locator("#paused")).to_be_hidden()
+        expect(page.locator("#grf")).to_contain_text("100")
+
+
+def test_help_names_every_key(scripted: Scripted, open_page: OpenPage) -> None:
+    page = open_page(scripted.url)
+    page.keyboard.press("?")
+    expect(page.locator("#help-dialog")).to_be_visible()
+    keys = page.locator("#help-dialog kbd").all_inner_texts()
+    assert {"t", "r", "s", "m", "p", "?"} <= set(keys)
+    page.keyboard.press("Escape")
+    expect(page.locator("#help-dialog")).to_be_hidden()

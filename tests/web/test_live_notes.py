@@ -1,0 +1,70 @@
+"""Each warning says since when it stands, and why it is there, in two sentences."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.service.fake_node import Play
+from tests.web.scripted import Scripted
+from tests.web.test_accessible import complaints
+
+LIVE_JS = Path(__file__).resolve().parents[2] / "web" / "live"
+OpenPage = Callable[..., Page]
+
+
+def explained() -> list[tuple[str, str]]:
+    text = (LIVE_JS / "why.js").read_text("utf-8")
+    return re.findall(r"^  \[/(.+)/, \"(.+)\"\],$", text, re.MULTILINE)
+
+
+def test_every_flag_of_frames_and_estimates_is_explained() -> None:
+    said = re.findall(r"\[(?:ESTIMATE|FRAME)\.\w+, \"(.+)\"\]", (LIVE_JS / "notes.js").read_text())
+    assert len(said) > 6
+    for text in said:
+        assert any(re.search(begins, text) for begins, _ in explained()), text
+
+
+@pytest.mark.parametrize("why", [why for _, why in explained()])
+def test_an_explanation_has_two_sentences_in_plain_words(why: str) -> None:
+    assert re.fullmatch(r"[A-Z][^.]+\. [A-Z][^.]+\.", why), why
+    assert "slot" not in why
+
+
+@pytest.mark.real_time
+def test_a_warning_says_since_when_and_why_and_stays_open(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node):
+        page = open_page(scripted.url)
+        expect(page.locator("body[data-live=true]")).to_have_count(1)
+        page.wait_for_timeout(3200)
+        tell(scripted, "tile S0 (mux 0x70 channel 0) does not answer")
+        note = page.locator("#notes li", has_text="does not answer")
+        expect(note.locator("time")).to_have_text(re.compile(r" since \d\d:\d\d:\d\d$"))
+        expect(note.get_by_text("Tile S0 (mux 0x70 channel 0) does not answer.")).to_be_visible()
+        since = note.locator("time").inner_text()
+        note.get_by_text("why?").click()
+        expect(note.locator("p")).to_contain_text("what it bears is not known")
+        tell(scripted, "tile S0 (mux 0x70 channel 0) does not answer", "another trouble")
+        expect(page.locator("#notes")).to_contain_text("Another trouble.")
+        expect(note.locator("p")).to_be_visible()
+        assert note.locator("time").inner_text() == since
+        assert complaints(page) == []
+        page.reload()
+        expect(note.locator("time")).to_contain_text("or before")
+
+
+def tell(scripted: Scripted, *troubles: str) -> None:
+    def change() -> None:
+        server: Any = scripted.running.server
+        node = server.nodes.get("bench")
+        node.troubles = troubles
+        server.tell_node(node)
+
+    scripted.running.call(change)

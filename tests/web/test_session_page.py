@@ -1,0 +1,404 @@
+"""The page of one session: its plots at every zoom, cursor, keys, stances, and what waits."""
+
+from __future__ import annotations
+
+import gzip
+import re
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from playwright.sync_api import Browser, Page, Response, expect
+
+import service.api.routes.ingest
+import service.api.routes.sessions
+import service.server.recorder
+from tests.service.fake_node import FakeNode, Play
+from tests.service.recording import Recording
+from tests.service.running import Running
+from tests.waiting import PATIENCE_S
+from tests.web.scripted import Scripted
+from tests.web.test_accessible import complaints
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+
+LOST = 40
+LABEL = "a <b>stone</b>"
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    running = Running(tmp_path_factory.mktemp("session-page") / "data")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # what nodes say is of long ago
+        patch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
+        patch.setattr(service.api.routes.ingest, "SILENCE_S", PATIENCE_S)
+        running.start()
+        yield running
+        running.stop()
+
+
+@pytest.fixture(scope="module")
+def walk(server: Running) -> Recording:
+    """Six stances of 80 N, one frame of 90 N, a saturated tile, and forty frames that are lost."""
+    node = FakeNode(server)
+    node.connect()
+    node.tared()
+    session = node.record(name="walk", subject="leg 2", tags=["wet"], notes="slow")
+    for _ in range(6):
+        node.send(200, [0.0, 0.0], alive=True)
+        node.send(200, [20.0, 60.0], alive=True)
+    node.send(1, [20.0, 70.0])
+    node.send(200, [0.0, 0.0], alive=True)
+    node.send(50, [20.0, 200.0], alive=True)
+    node.send(200, [0.0, 0.0], alive=True)
+    first = node.seq
+    node.frames(LOST)
+    node.say_lost(evicted=[[first, first + LOST - 1]])
+    node.deliver(200, [0.0, 0.0], alive=True)
+    node.finish(session)
+    t_ns = int(session.column("t_ns")[700])
+    answer = server.http.post(f"{session.url}/events", json={"label": LABEL, "t_ns": t_ns})
+    assert answer.status_code == 201
+    node.close()
+    return session
+
+
+@pytest.fixture(scope="module")
+def raw(server: Running) -> Recording:
+    """A session of an array that nobody calibrated."""
+    node = FakeNode(server, "raw", calibration=None)
+    node.connect()
+    node.send(10)
+    node.taken_in()
+    session = node.record(name="raw")
+    node.deliver(300, [0.0, 30.0], alive=True)
+    node.finish(session)
+    node.close()
+    return session
+
+
+@pytest.fixture(scope="module")
+def twice(server: Running) -> Recording:
+    """A session over which the node was switched off and on again."""
+    node = FakeNode(server, "twice")
+    node.connect()
+    node.tared()
+    session = node.record(name="twice")
+    node.deliver(200, [20.0, 60.0], alive=True)
+    node.restart()
+    node.come_back()
+    node.next_t_mono_ns = node.before[0].sent[-1].t_mono_ns[-1] + 500_000_000
+    node.deliver(200, [20.0, 60.0], alive=True)
+    node.finish(session)
+    node.close()
+    assert len(session.now()["parts"]) == 2
+    return session
+
+
+@pytest.fixture(scope="module")
+def live_page(server: Running, browser: Browser) -> Iterator[Page]:
+    """Any page of the server, to ask modules something."""
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(server.url)
+        yield page
+
+
+def url_of(session: Recording, query: str = "") -> str:
+    return f"{session.running.url}/sessions/{session.id}{query}"
+
+
+def settled(page: Page) -> Any:
+    """The plots, once all bins of the view have come."""
+    plots = page.locator("#plots[data-settled=true]")
+    expect(plots).to_have_count(1)
+    return plots
+
+
+def seen(page: Page) -> tuple[float, float]:
+    plots = settled(page)
+    return float(plots.get_attribute("data-from")), float(plots.get_attribute("data-to"))
+
+
+def summary(page: Page, name: str) -> float:
+    return float(page.locator("#summary").get_attribute(f"data-{name}") or "nan")
+
+
+def grf(session: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds after the first frame, and the GRF, by the sealed file alone."""
+    table = pq.read_table(session.folder / "frames.parquet", columns=["t_ns", "grf_n"])
+    t_ns = table["t_ns"].to_numpy()
+    return (t_ns - t_ns[0]) * 1e-9, table["grf_n"].to_numpy().astype(float)
+
+
+@pytest.mark.parametrize(
+    "query", ["", "?from=0.5&to=4.1", "?from=4.6&to=5.1", "?from=4.79&to=4.83", "?from=1.85&to=1.9"]
+)
+def test_no_peak_hides_at_any_zoom(walk: Recording, open_page: OpenPage, query: str) -> None:
+    page = open_page(url_of(walk, query))
+    since_s, grf_n = grf(walk)
+    begin_s, end_s = seen(page)
+    first_s, last_s = summary(page, "first-s"), summary(page, "last-s")
+    in_bin = int(page.locator("#plots").get_attribute("data-frames-in-bin") or 0)
+    # Bins at the edges reach a little beyond what is in view.
+    assert begin_s - 0.002 * in_bin <= first_s <= begin_s + 0.002
+    assert end_s - 0.002 <= last_s <= end_s + 0.002 * in_bin
+    inside = (since_s >= first_s - 1e-6) & (since_s <= last_s + 1e-6)
+    assert summary(page, "frames") == inside.sum()
+    assert summary(page, "grf-max") == pytest.approx(np.nanmax(grf_n[inside]), abs=1e-5)
+    assert summary(page, "grf-min") == pytest.approx(np.nanmin(grf_n[inside]), abs=1e-5)
+
+
+def test_the_page_says_what_the_session_is_and_what_is_drawn(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk))
+    expect(page.locator("h1")).to_have_text("walk")
+    about = page.locator("#about")
+    for fact in ("bench", "leg 2", "#wet", f"{int(walk.now()['frames']):,}"):
+        expect(about).to_contain_text(fact)
+    expect(page.locator("header")).to_contain_text("40 frames: the link was down for longer")
+    plots = settled(page)
+    assert (plots.get_attribute("data-panels") or "").split()[:3] == ["grf", "tile-0", "tile-1"]
+    legend = page.locator("#legend")
+    expect(legend.locator("[data-kind=lost]")).to_have_text("frames lost")
+    expect(legend.locator("[data-kind=saturated]")).to_contain_text("a tile is saturated")
+    assert summary(page, "missing") == LOST
+    expect(page.locator("#marks-list")).to_contain_text(LABEL)
+    since_s, _ = grf(walk)
+    mark_s = page.locator("#marks-list li").get_attribute("data-time-s")
+    assert float(mark_s or "nan") == pytest.approx(since_s[700], abs=1e-4)
+    # Where nothing is wrong nothing is drawn to be.
+    page.goto(url_of(walk, "?from=0.5&to=1.5"))
+    settled(page)
+    expect(legend.locator("[data-kind=stance]")).to_have_count(1)
+    expect(legend.locator("[data-kind=lost]")).to_have_count(0)
+    expect(legend.locator("[data-kind=saturated]")).to_have_count(0)
+
+
+def test_what_is_shown_is_in_the_link_and_comes_back_with_it(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk))
+    all_s = seen(page)
+    box = page.locator("#plots").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 300, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 600, box["y"] + 100, steps=4)
+    page.mouse.up()
+    expect(page).to_have_url(re.compile(r"\?from=[0-9.]+&to=[0-9.]+$"))
+    chosen = seen(page)
+    assert 0 < chosen[0] < chosen[1] < all_s[1]
+    again = open_page(page.url)
+    assert seen(again) == pytest.approx(chosen, abs=1e-3)
+    again.mouse.move(box["x"] + 400, box["y"] + 100)
+    again.mouse.wheel(0, -300)
+    expect(again.locator("#plots")).not_to_have_attribute("data-from", f"{chosen[0]:.4f}")
+    closer = seen(again)
+    assert chosen[0] < closer[0] < closer[1] < chosen[1]
+    again.mouse.dblclick(box["x"] + 400, box["y"] + 100)
+    expect(again).to_have_url(url_of(walk))
+    assert seen(again) == all_s
+
+
+def test_keys_zoom_move_the_cursor_and_show_all(walk: Recording, open_page: OpenPage) -> None:
+    page = open_page(url_of(walk))
+    all_s = seen(page)
+    for _ in range(9):
+        page.keyboard.press("+")
+    expect(page).to_have_url(re.compile("from="))
+    close = seen(page)
+    assert close[1] - close[0] < (all_s[1] - all_s[0]) / 30
+    page.keyboard.press("-")
+    wider = seen(page)
+    assert close[1] - close[0] < wider[1] - wider[0] < all_s[1]
+    since_s, grf_n = grf(walk)
+    readout = page.locator("#readout")
+    page.keyboard.press("ArrowRight")
+    expect(readout).not_to_have_attribute("data-time-s", "")
+    for key, by in (("ArrowRight", 1), ("ArrowRight", 1), ("ArrowLeft", -1)):
+        before_s = float(readout.get_attribute("data-time-s") or "nan")
+        at = int(np.argmin(np.abs(since_s - before_s)))
+        page.keyboard.press(key)
+        expect(readout).not_to_have_attribute("data-time-s", str(before_s))
+        after_s = float(readout.get_attribute("data-time-s") or "nan")
+        assert after_s == pytest.approx(since_s[at + by], abs=1e-6)
+        shown = f"{grf_n[at + by]:.1f} N"
+        expect(readout.locator("[data-key=grf]")).to_contain_text(shown)
+        expect(page.locator("#plots")).to_have_attribute("aria-valuetext", re.compile(shown))
+    page.keyboard.press("Home")
+    expect(page).to_have_url(url_of(walk))
+    assert seen(page) == all_s
+
+
+def test_a_stance_is_gone_to_from_its_row_and_by_keys(walk: Recording, open_page: OpenPage) -> None:
+    stances = walk.running.http.get(f"{walk.url}/stances").json()
+    begin_ns = int(walk.column("t_ns")[0])
+    page = open_page(url_of(walk))
+    rows = page.locator("#stances-rows tr")
+    expect(rows).to_have_count(len(stances))
+    expect(rows.nth(5)).to_contain_text("90.0 N")
+
+    def shows(number: int) -> None:
+        expect(page.locator("#stances-rows [aria-current]")).to_have_attribute(
+            "data-stance", str(number)
+        )
+        begin_s, end_s = seen(page)
+        stance = stances[number - 1]
+        assert begin_s < (stance["begin_t_ns"] - begin_ns) * 1e-9
+        assert end_s > (stance["end_t_ns"] - begin_ns) * 1e-9
+        assert end_s - begin_s < 2 * stance["duration_s"]
+
+    rows.nth(1).click()
+    shows(2)
+    page.keyboard.press("]")
+    shows(3)
+    page.keyboard.press("[")
+    page.keyboard.press("[")
+    shows(1)
+
+
+def test_a_mark_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk, "?from=1&to=1.2"))
+    settled(page)
+    page.keyboard.press("ArrowRight")
+    readout = page.locator("#readout")
+    expect(readout).to_have_attribute("data-time-s", re.compile("."))
+    at_s = readout.get_attribute("data-time-s")
+    page.fill("#new-mark-label", "here")
+    page.press("#new-mark-label", "Enter")
+    expect(page.locator("#notices")).to_contain_text("Marked “here”")
+    events = walk.running.http.get(f"{walk.url}/events").json()["items"]
+    t_ns = next(event["t_ns"] for event in events if event["label"] == "here")
+    since_s = (t_ns - int(walk.column("t_ns")[0])) * 1e-9
+    assert since_s == pytest.approx(float(at_s or "nan"), abs=1e-5)
+    with page.expect_download() as download:
+        page.click("#download-csv")
+    lines = download.value.path().read_text("utf-8").splitlines()
+    assert len([line for line in lines if not line.startswith("#")]) == 101
+    with page.expect_download() as picture:
+        page.click("#picture")
+    assert picture.value.path().read_bytes().startswith(b"\x89PNG")
+
+
+def test_where_the_node_was_started_again_is_shown(twice: Recording, open_page: OpenPage) -> None:
+    page = open_page(url_of(twice))
+    plots = settled(page)
+    expect(page.locator("#legend [data-kind=restarted]")).to_have_count(1)
+    expect(page.locator("#about")).to_contain_text("Parts")
+    t_ns = twice.column("t_ns")
+    gap = int(np.argmax(np.diff(t_ns)))
+    before_s, after_s = (t_ns[gap : gap + 2] - t_ns[0]) * 1e-9
+    assert after_s - before_s > 0.1
+    page.goto(url_of(twice, f"?from={before_s - 0.1}&to={before_s - 0.01}"))
+    settled(page)
+    expect(plots).to_have_attribute("data-kinds", "")
+    page.goto(url_of(twice, f"?from={before_s - 0.1}&to={after_s + 0.1}"))
+    expect(plots).to_have_attribute("data-kinds", "restarted")
+
+
+@pytest.mark.parametrize(
+    ("time_s", "step", "said"),
+    [
+        (0.0, 0.001, "0.000 s"),
+        (59.99, 0.01, "59.99 s"),
+        (59.999, 0.01, "1:00.00 min"),
+        (75.123, 0.001, "1:15.123 min"),
+        (119.999, 0.01, "2:00.00 min"),
+        (3600.0, 20.0, "60:00 min"),
+        (70.0, 10.0, "1:10 min"),
+    ],
+)
+def test_instants_are_said_with_the_unit_that_they_are_in(
+    live_page: Page, time_s: float, step: float, said: str
+) -> None:
+    code = "async ([t, s]) => (await import('/static/session/overlay.js')).timeWords(t, s)"
+    assert live_page.evaluate(code, [time_s, step]) == said
+
+
+def test_without_estimates_raw_counts_are_plotted(raw: Recording, open_page: OpenPage) -> None:
+    page = open_page(url_of(raw))
+    plots = settled(page)
+    expect(plots).to_have_attribute("data-panels", "tile-0 tile-1")
+    expect(page.locator("#summary")).to_contain_text("these are raw counts")
+    page.keyboard.press("ArrowRight")
+    expect(page.locator("#readout [data-key=tile-1]")).to_contain_text(
+        re.compile("4[67][0-9] counts")
+    )
+
+
+def test_a_session_that_is_recorded_says_so_and_turns_into_plots_when_it_is_sealed(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    with Play(scripted.node):
+        session = scripted.node.record(name="now")
+        page = open_page(scripted.url)
+        page.click('#sessions [data-part="open"]')
+        expect(page.locator("#message")).to_contain_text("still being recorded")
+        scripted.running.http.post(f"{session.url}/events", json={"label": "a stone"})
+        expect(page.locator("#message")).to_contain_text("a stone")
+        expect(page.locator("#plots-card")).to_be_hidden()
+        assert complaints(page) == []
+        time.sleep(0.3)
+        session.stop()
+        session.sealed()
+    expect(page.locator("#message")).to_be_hidden()
+    settled(page)
+    assert summary(page, "frames") == session.now()["frames"]
+    page.click("#back")
+    expect(page.locator("#sessions")).to_contain_text("now")
+
+
+def test_the_page_is_small_and_the_live_page_does_not_carry_it(
+    walk: Recording, browser: Browser
+) -> None:
+    with browser.new_context() as context:
+        page = context.new_page()
+        sizes: dict[str, int] = {}
+
+        def weigh(response: Response) -> None:
+            if "/api/" not in response.url:
+                sizes[response.url] = len(gzip.compress(response.body()))
+
+        page.on("response", weigh)
+        page.goto(url_of(walk))
+        settled(page)
+        assert len(sizes) > 15
+        assert sum(sizes.values()) < 100_000
+        sizes.clear()
+        page.goto(walk.running.url)
+        expect(page.locator("#sessions")).to_contain_text("walk")
+        assert sizes
+        assert not [url for url in sizes if "/session/" in url or "session.css" in url]
+
+
+def test_a_session_that_is_not_there_is_said_not_to_be(server: Running, browser: Browser) -> None:
+    with browser.new_context() as context:  # its console says 404, and is right
+        page = context.new_page()
+        page.goto(f"{server.url}/sessions/none")
+        expect(page.locator("#message")).to_contain_text("There is no such session")
+        expect(page.locator("#message")).to_contain_text("in the trash")
+        page.click("#back")
+        expect(page.locator("#sessions-card")).to_be_visible()
+
+
+@pytest.mark.parametrize("size", [(390, 844), (320, 640), (1366, 768)])
+def test_axe_has_nothing_to_complain_of_and_nothing_is_wider_than_the_screen(
+    walk: Recording, open_page: OpenPage, size: tuple[int, int]
+) -> None:
+    page = open_page(url_of(walk, "?from=1&to=1.1"), *size)
+    settled(page)
+    page.keyboard.press("ArrowRight")
+    page.click("#numbers-card summary")
+    expect(page.locator("#numbers-rows tr").nth(11)).to_be_attached()
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    assert complaints(page) == []

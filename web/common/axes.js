@@ -1,0 +1,68 @@
+// What every plot on a canvas has: sharpness, colours of the style sheet, steps of axes, hatching.
+
+/** Fit a canvas to its box at the screen's own pixels; its context, in CSS pixels from then on. */
+export function fit(canvas, width, height) {
+  const ratio = devicePixelRatio || 1;
+  const [across, down] = [Math.round(width * ratio), Math.round(height * ratio)];
+  if (canvas.width !== across || canvas.height !== down) {
+    canvas.width = across;
+    canvas.height = down;
+  }
+  const context = canvas.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  return context;
+}
+
+/** A line of one pixel is sharp between two of them. */
+export const crisp = (value) => Math.round(value) + 0.5;
+
+/**
+ * Steps of 1, 2 or 5 times a power of ten that lie within an interval.
+ * @param {number} low
+ * @param {number} high
+ * @param {number} most how many at most
+ * @returns {{step: number, values: number[]}}
+ */
+export function ticks(low, high, most) {
+  const rough = (high - low) / Math.max(1, most);
+  if (!(rough > 0) || !Number.isFinite(rough)) return { step: 1, values: [low] };
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = power * ([1, 2, 5].find((factor) => factor * power >= rough * 0.999) ?? 10);
+  const values = [];
+  for (let n = Math.ceil(low / step - 1e-6); n * step <= high + step * 1e-6; n++) values.push(n * step);
+  return { step, values };
+}
+
+/** Decimals that tell two neighbouring steps apart. */
+export const decimalsOf = (step) => Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9)));
+
+/** Colours by the names of the style sheet's variables, as they are for this element now. */
+export function coloursOf(element, names) {
+  const style = getComputedStyle(element);
+  return Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
+}
+
+const TILE_PX = 8;
+
+/** Stripes as a fill: "/", "\\" or both ways, "x". */
+export function hatching(context, colour, way) {
+  const ratio = devicePixelRatio || 1;
+  const tile = document.createElement("canvas");
+  tile.width = tile.height = Math.round(TILE_PX * ratio);
+  const draw = tile.getContext("2d");
+  draw.scale(tile.width / TILE_PX, tile.height / TILE_PX);
+  draw.strokeStyle = colour;
+  draw.lineWidth = 1.2;
+  for (const one of way === "x" ? ["/", "\\"] : [way]) {
+    draw.beginPath();
+    for (const shift of [-TILE_PX, 0, TILE_PX]) {
+      draw.moveTo(shift - 1, one === "/" ? TILE_PX + 1 : -1);
+      draw.lineTo(shift + TILE_PX + 1, one === "/" ? -1 : TILE_PX + 1);
+    }
+    draw.stroke();
+  }
+  const pattern = context.createPattern(tile, "repeat");
+  pattern.setTransform(new DOMMatrix().scale(TILE_PX / tile.width));
+  return pattern;
+}

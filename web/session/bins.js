@@ -1,0 +1,79 @@
+// Bins of a session as GET /sessions/ID/overview answers, and what they say of some time.
+
+/** @typedef {import("./view.js").View} View */
+
+/** First place in a rising list at which `value` is not above. */
+function placeOf(list, value) {
+  let [low, high] = [0, list.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (list[middle] < value) low = middle + 1;
+    else high = middle;
+  }
+  return low;
+}
+
+export class Bins {
+  /**
+   * @param {{begin_t_ns: number, duration_s: number, frames_in_bin: number, serials: string[],
+   *   columns: Record<string, (number | null)[]>}} overview
+   * @param {View} covers the time that was asked for
+   */
+  constructor(overview, covers) {
+    this.columns = overview.columns;
+    this.first = overview.columns.t_first_s;
+    this.last = overview.columns.t_last_s;
+    this.count = this.first.length;
+    this.framesInBin = overview.frames_in_bin;
+    this.durationS = overview.duration_s;
+    this.beginNs = overview.begin_t_ns;
+    this.serials = overview.serials;
+    this.covers = covers;
+    this.estimated = "grf_n_min" in overview.columns;
+  }
+
+  has(name) { return Boolean(this.columns[name]?.some((value) => value !== null)); }
+
+  contains(view) { return this.covers.from <= view.from && this.covers.to >= view.to; }
+
+  /** Bins that have something of this time: from, up to but not including. */
+  within(view) {
+    return [placeOf(this.last, view.from), placeOf(this.first, view.to + 1e-9)];
+  }
+
+  /** The bin nearest to an instant; -1 if there is none. */
+  at(timeS) {
+    if (!this.count) return -1;
+    const next = Math.min(this.count - 1, placeOf(this.last, timeS));
+    if (next === 0 || this.first[next] <= timeS) return next;
+    return timeS - this.last[next - 1] <= this.first[next] - timeS ? next - 1 : next;
+  }
+
+  /** Where a bin's column ends: at the next one, or with its last frame if that is not its neighbour. */
+  edge(i) {
+    return i + 1 < this.count && this.follows(i + 1) ? this.first[i + 1] : this.last[i];
+  }
+
+  /** No frame is missing between this bin and the one before it, as far as is known. */
+  follows(i) {
+    return i > 0 && this.columns.part[i] === this.columns.part[i - 1] && this.columns.missing[i] === 0;
+  }
+
+  /** Least of one column and greatest of another, and where that is; null if nothing is known. */
+  extremes(lowName, highName, begin, end) {
+    const [lows, highs] = [this.columns[lowName], this.columns[highName]];
+    let found = null;
+    for (let i = begin; i < end; i++) {
+      const [low, high] = [lows[i], highs[i]];
+      if (low !== null && (found === null || low < found.low)) found = { ...(found ?? { high: -Infinity, at: i }), low };
+      if (high !== null && (found === null || high > found.high)) found = { ...(found ?? { low: Infinity }), high, at: i };
+    }
+    return found && Number.isFinite(found.low) && Number.isFinite(found.high) ? found : null;
+  }
+
+  sum(name, begin, end) {
+    let total = 0;
+    for (let i = begin; i < end; i++) total += this.columns[name][i];
+    return total;
+  }
+}

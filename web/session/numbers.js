@@ -1,0 +1,44 @@
+// The same as the plots, as a table: for who does not see them, and for who wants the numbers.
+
+import * as api from "../common/api.js";
+import { byId, el, setText } from "../common/text.js";
+import { Bins } from "./bins.js";
+import { flagsInWords } from "./flags.js";
+import { readingsOf } from "./readout.js";
+
+const POINTS = 12; // rows at least, where there are as many frames
+const SETTLED_MS = 400;
+
+export class Numbers {
+  constructor(id) {
+    this.id = id;
+    this.shown = "";
+  }
+
+  /** The view's numbers, if anyone looks at them. */
+  draw(view, panels) {
+    const key = `${view.from} ${view.to}`;
+    if (!byId("numbers-card").open || key === this.shown) return;
+    this.shown = key;
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.load(view, key, panels), SETTLED_MS);
+  }
+
+  async load(view, key, panels) {
+    let answer;
+    try {
+      answer = await api.overview(this.id, { points: POINTS, start_s: view.from, end_s: view.to + 1e-6 });
+    } catch (error) {
+      if (!(error instanceof api.Refusal)) throw error;
+      setText(byId("numbers-problem"), error.message);
+      return;
+    }
+    if (key !== this.shown) return;
+    const bins = new Bins(answer, view);
+    const rows = Array.from({ length: bins.count }, (_, i) => [readingsOf(bins, i, panels), flagsInWords(bins, i).join(", ")]);
+    const names = (rows[0]?.[0] ?? []).map(([, name]) => name).concat("To know");
+    byId("numbers-head").replaceChildren(...names.map((name) => el("th", { scope: "col", text: name })));
+    byId("numbers-rows").replaceChildren(...rows.map(([readings, flags]) =>
+      el("tr", {}, ...readings.map(([, , value]) => el("td", { text: value })), el("td", { text: flags }))));
+  }
+}

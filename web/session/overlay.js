@@ -1,0 +1,101 @@
+// What lies over all plots: stances with their numbers, marks, and the axis of time.
+
+import { crisp, decimalsOf, ticks } from "../common/axes.js";
+import { number } from "../common/text.js";
+
+/** @typedef {import("./plots.js").Plots} Plots */
+
+export const HEAD_PX = 38; // marks and the numbers of stances
+
+/** An instant as a label: seconds, or minutes and seconds from a minute on. */
+export function timeLabel(timeS, step) {
+  const decimals = decimalsOf(step);
+  const rounded = Number(timeS.toFixed(decimals));
+  if (rounded < 60) return number(rounded, decimals);
+  const minutes = Math.floor(rounded / 60);
+  const rest = (rounded - 60 * minutes).toFixed(decimals);
+  return `${minutes}:${rest.padStart(decimals ? decimals + 3 : 2, "0")}`;
+}
+
+/** The same with its unit: "59.99 s", "1:00.00 min". */
+export function timeWords(timeS, step) {
+  const label = timeLabel(timeS, step);
+  return `${label} ${label.includes(":") ? "min" : "s"}`;
+}
+
+/** @param {Plots} plots */
+export function drawStances(plots, context, view, x, bottom, current) {
+  const { colours } = plots;
+  context.textAlign = "center";
+  context.textBaseline = "bottom";
+  let freeFrom = -Infinity;
+  plots.stances.forEach((stance, i) => {
+    if (stance.to < view.from || stance.from > view.to) return;
+    const [left, right] = [Math.max(plots.left, x(stance.from)), Math.min(plots.left + plots.plotWidth, x(stance.to))];
+    context.fillStyle = colours.stance;
+    context.fillRect(left, HEAD_PX - 4, Math.max(1, right - left), bottom - HEAD_PX + 4);
+    context.fillStyle = i === current ? colours.text : colours.edge;
+    context.fillRect(left, HEAD_PX - 6, Math.max(1, right - left), i === current ? 4 : 2);
+    const middle = (left + right) / 2;
+    const text = String(stance.number);
+    const half = context.measureText(text).width / 2;
+    if (middle - half < freeFrom) return; // numbers must not lie on each other
+    freeFrom = middle + half + 6;
+    context.fillStyle = i === current ? colours.text : colours.soft;
+    context.fillText(text, middle, HEAD_PX - 6);
+  });
+}
+
+/** @param {Plots} plots */
+export function drawTime(plots, context, view, x, bottom) {
+  const { colours } = plots;
+  const { step, values } = ticks(view.from, view.to, Math.max(3, plots.plotWidth / (plots.width < 600 ? 55 : 90)));
+  context.strokeStyle = colours.edge;
+  context.lineWidth = 1;
+  context.beginPath();
+  context.moveTo(plots.left, crisp(bottom));
+  context.lineTo(plots.left + plots.plotWidth, crisp(bottom));
+  for (const value of values) {
+    context.moveTo(crisp(x(value)), bottom);
+    context.lineTo(crisp(x(value)), bottom + 5);
+  }
+  context.stroke();
+  context.fillStyle = colours.text;
+  context.textBaseline = "top";
+  for (const [i, value] of values.entries()) {
+    context.textAlign = "center";
+    const text = (i === values.length - 1 ? timeWords : timeLabel)(value, step);
+    const half = context.measureText(text).width / 2;
+    context.fillText(text, Math.min(plots.width - half - 1, Math.max(half + 1, x(value))), bottom + 8);
+  }
+}
+
+/** Flags with what is written on them, as far as there is room. */
+export function drawMarks(plots, context, view, x, bottom) {
+  const { colours } = plots;
+  context.textAlign = "left";
+  context.textBaseline = "middle";
+  let freeFrom = -Infinity;
+  for (const mark of plots.marks) {
+    if (mark.timeS < view.from || mark.timeS > view.to) continue;
+    const at = crisp(x(mark.timeS));
+    context.strokeStyle = colours.text;
+    context.lineWidth = 1.5;
+    context.setLineDash([4, 3]);
+    context.beginPath();
+    context.moveTo(at, 15);
+    context.lineTo(at, bottom);
+    context.stroke();
+    context.setLineDash([]);
+    let text = mark.label.length > 24 ? `${mark.label.slice(0, 23)}…` : mark.label;
+    let width = context.measureText(text).width + 10;
+    const before = at + width > plots.width; // no room on the right: the flag hangs to the left
+    if ((before ? at - width : at) < freeFrom) { text = ""; width = 8; }
+    const left = before ? at - width : at - 1;
+    freeFrom = left + width + 2;
+    context.fillStyle = colours.text;
+    context.fillRect(left, 0, width, 16);
+    context.fillStyle = colours.page;
+    context.fillText(text, left + 5, 8.5);
+  }
+}

@@ -1,0 +1,30 @@
+// The plots as a picture to keep, with what they are of written above them.
+
+import { coloursOf } from "../common/axes.js";
+import { localTime } from "../common/text.js";
+
+const HEAD_PX = 34;
+
+/** @param {import("./plots.js").Plots} plots */
+export function savePicture(plots, session) {
+  const ratio = plots.canvas.width / plots.width;
+  const canvas = document.createElement("canvas");
+  canvas.width = plots.canvas.width;
+  canvas.height = plots.canvas.height + Math.round(HEAD_PX * ratio);
+  const context = canvas.getContext("2d");
+  const { page, text } = coloursOf(plots.box, ["page", "text"]);
+  context.fillStyle = page;
+  context.fillRect(0, 0, canvas.width, canvas.height);
+  context.drawImage(plots.canvas, 0, Math.round(HEAD_PX * ratio));
+  context.scale(ratio, ratio);
+  context.fillStyle = text;
+  context.font = "700 14px system-ui, sans-serif";
+  context.fillText(`${session.name}, ${session.node}, ${localTime(new Date(session.started_t_ns / 1e6))}`, 8, 22, plots.width - 16);
+  canvas.toBlob((blob) => {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(blob);
+    link.download = `${session.id}.png`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  });
+}

@@ -1,0 +1,344 @@
+// All plots of a session over one time axis, on one canvas; the cursor is on another above it.
+
+import { coloursOf, crisp, decimalsOf, fit, hatching, ticks } from "../common/axes.js";
+import { byId, number, setData } from "../common/text.js";
+import { KINDS, stretchesOf } from "./flags.js";
+import { HEAD_PX, drawMarks, drawStances, drawTime } from "./overlay.js";
+import { panelsOf } from "./panels.js";
+import { drawBand, drawBound, drawHeat, drawSeries } from "./series.js";
+
+const AXIS_PX = 26;
+const FOOT_PX = 6;
+const ROOM_PX = 240; // of the window, for what is above and below the plots
+const RIGHT_PX = 12;
+const FONT = "600 12px system-ui, sans-serif";
+const NAMES = [
+  "page", "text", "soft", "edge", "grid", "series", "interval", "stance", "contact", "warn-line", "bad-line", "cop",
+  "heat-0", "heat-1", "heat-2", "heat-3",
+];
+const CONTACT = 2;
+
+export class Plots {
+  constructor() {
+    this.box = byId("plots");
+    this.canvas = byId("plots-canvas");
+    this.over = byId("cursor-canvas");
+    this.whole = null;
+    this.detail = null;
+    this.marks = [];
+    this.stances = [];
+    this.asHeat = null;
+    this.panels = [];
+    this.drawn = []; // where each panel is, and its scale
+    for (const query of ["(prefers-color-scheme: dark)", "(forced-colors: active)", "(prefers-contrast: more)"]) {
+      matchMedia(query).addEventListener("change", () => { this.colours = null; this.changed(); });
+    }
+    this.changed = () => {};
+  }
+
+  /** @param {import("./bins.js").Bins} whole */
+  show(whole) {
+    this.whole = whole;
+    this.panels = panelsOf(whole, this.asHeat);
+    setData(this.box, "panels", this.panels.map((panel) => panel.key).join(" "));
+  }
+
+  get width() { return this.box.clientWidth; }
+  get left() { return this.width < 600 ? 40 : 56; }
+  get plotWidth() { return Math.max(1, this.width - this.left - RIGHT_PX); }
+  get height() {
+    return HEAD_PX + AXIS_PX + FOOT_PX + this.panels.reduce((sum, panel) => sum + panel.head + this.scaled(panel), 0);
+  }
+
+  /** On a high screen plots are higher, so that all of them are in sight where that is possible. */
+  scaled(panel) {
+    const all = this.panels.reduce((sum, one) => sum + one.height, 0);
+    const heads = HEAD_PX + AXIS_PX + this.panels.reduce((sum, one) => sum + one.head, 0);
+    return Math.round(panel.height * Math.min(1.5, Math.max(0.7, (innerHeight - ROOM_PX - heads) / all)));
+  }
+
+  x(view) {
+    const scale = this.plotWidth / (view.to - view.from);
+    return (timeS) => this.left + (timeS - view.from) * scale;
+  }
+
+  timeAt(px, view) {
+    const share = Math.min(1, Math.max(0, (px - this.left) / this.plotWidth));
+    return view.from + share * (view.to - view.from);
+  }
+
+  /** The finest bins that have all of a view. */
+  best(view) {
+    return this.detail?.contains(view) ? this.detail : this.whole;
+  }
+
+  /** What is drawn, and from which time to which: old bins are scaled while new ones are on their way. */
+  layers(view) {
+    const { detail, whole } = this;
+    const covers = detail?.covers;
+    if (!covers || covers.to <= view.from || covers.from >= view.to) return [[whole, view.from, view.to]];
+    return [
+      [whole, view.from, Math.min(view.to, covers.from)],
+      [detail, Math.max(view.from, covers.from), Math.min(view.to, covers.to)],
+      [whole, Math.max(view.from, covers.to), view.to],
+    ].filter(([, from, to]) => to > from);
+  }
+
+  draw(view, current = -1) {
+    if (!this.whole || this.width < 50) return;
+    this.colours ??= coloursOf(this.box, NAMES);
+    this.box.style.height = `${this.height}px`;
+    const context = fit(this.canvas, this.width, this.height);
+    context.font = FONT;
+    context.fillStyle = this.colours.page;
+    context.fillRect(0, 0, this.width, this.height);
+    this.patterns = new Map();
+    const x = this.x(view);
+    const bottom = this.height - AXIS_PX;
+    const right = this.left + this.plotWidth;
+    drawStances(this, context, view, x, bottom, current);
+    const scales = this.scales(view);
+    let top = HEAD_PX;
+    this.drawn = this.panels.map((panel) => {
+      const box = { left: this.left, right, top: top + panel.head, bottom: top + panel.head + this.scaled(panel) };
+      top = box.bottom;
+      return { panel, box, y: this.drawPanel(context, panel, box, view, x, scales.get(panel.group ?? panel.key)) };
+    });
+    this.drawFlags(context, view, x);
+    drawTime(this, context, view, x, bottom);
+    drawMarks(this, context, view, x, bottom);
+    setData(this.box, "framesInBin", String(this.best(view).framesInBin));
+    setData(this.box, "kinds", this.shownKinds.map(({ key }) => key).join(" "));
+  }
+
+  /** Least and greatest of what is in view; panels of a group share theirs. */
+  scales(view) {
+    const bins = this.best(view);
+    const [begin, end] = bins.within(view);
+    const scales = new Map();
+    for (const panel of this.panels) {
+      if (panel.kind !== "series") continue;
+      const factor = panel.factor ?? 1;
+      const key = panel.group ?? panel.key;
+      const scale = scales.get(key) ?? { low: panel.zero ? 0 : Infinity, high: panel.zero ? 0 : -Infinity };
+      for (const [low, high] of [panel.columns, panel.band].filter(Boolean)) {
+        const found = bins.extremes(low, high, begin, end);
+        if (!found) continue;
+        scale.low = Math.min(scale.low, found.low * factor);
+        scale.high = Math.max(scale.high, found.high * factor);
+      }
+      if (panel.bound) scale.high = Math.max(scale.high, bins.extremes(panel.bound, panel.bound, begin, end)?.high ?? 0);
+      scales.set(key, scale);
+    }
+    for (const scale of scales.values()) {
+      if (!(scale.high >= scale.low)) Object.assign(scale, { low: 0, high: 1, empty: true });
+      const room = Math.max(0.06 * (scale.high - scale.low), 1e-3, scale.high === scale.low ? 0.5 : 0);
+      scale.high += room;
+      scale.low -= scale.low === 0 ? 0 : room;
+    }
+    return scales;
+  }
+
+  drawPanel(context, panel, box, view, x, scale) {
+    const { colours } = this;
+    context.textBaseline = "middle";
+    let y = null;
+    if (panel.kind === "heat") this.drawTiles(context, panel, box, view, x);
+    else {
+      const factor = panel.factor ?? 1;
+      const shown = (value) => box.bottom - ((value - scale.low) / (scale.high - scale.low)) * (box.bottom - box.top);
+      y = (value) => shown(value * factor);
+      this.drawScale(context, box, scale, shown);
+      for (const [bins, from, to] of this.layers(view)) {
+        const [begin, end] = bins.within({ from, to });
+        context.save();
+        context.beginPath();
+        context.rect(x(from), box.top - 3, x(to) - x(from), box.bottom - box.top + 6);
+        context.clip();
+        // One bin more on both sides, so that lines run to the edges.
+        const [b, e] = [Math.max(0, begin - 1), Math.min(bins.count, end + 1)];
+        if (panel.key === "grf") this.drawContact(context, bins, b, e, x, box);
+        if (panel.band) drawBand(context, bins, b, e, x, y, panel.band, colours.interval);
+        drawSeries(context, bins, b, e, x, y, panel.columns, panel.key.startsWith("cop") ? colours.cop : colours.series);
+        if (panel.bound) drawBound(context, bins, b, e, x, y, panel.bound, colours["warn-line"]);
+        context.restore();
+      }
+    }
+    this.drawTitle(context, panel, box);
+    return y;
+  }
+
+  drawTitle(context, panel, box) {
+    const { colours } = this;
+    const inside = panel.tile !== undefined;
+    const text = `${panel.title}, ${panel.unit}`;
+    context.textAlign = "left";
+    context.textBaseline = "top";
+    const [left, top] = inside ? [box.left + 6, box.top + 2] : [box.left, box.top - 15];
+    context.lineJoin = "round";
+    context.lineWidth = 4;
+    context.strokeStyle = colours.page;
+    context.strokeText(text, left, top);
+    context.fillStyle = colours.text;
+    context.fillText(text, left, top);
+  }
+
+  drawScale(context, box, scale, y) {
+    const { colours } = this;
+    context.lineWidth = 1;
+    const most = Math.max(3, Math.floor((box.bottom - box.top) / 28));
+    const { step, values } = ticks(scale.low, scale.high, most);
+    context.textAlign = "right";
+    for (const value of values) {
+      const row = crisp(y(value));
+      context.strokeStyle = Math.abs(value) < step * 1e-6 ? colours.edge : colours.grid;
+      context.beginPath();
+      context.moveTo(box.left, row);
+      context.lineTo(box.right, row);
+      context.stroke();
+      context.fillStyle = colours.text;
+      if (!scale.empty) context.fillText(number(value, decimalsOf(step)), box.left - 6, row);
+    }
+    context.strokeStyle = colours.edge;
+    context.beginPath();
+    context.moveTo(crisp(box.left), box.top);
+    context.lineTo(crisp(box.left), box.bottom);
+    context.stroke();
+  }
+
+  /** Contact as a strip at the foot of the plot of the force. */
+  drawContact(context, bins, begin, end, x, box) {
+    context.fillStyle = this.colours.contact;
+    for (let i = begin; i < end; i++) {
+      if (!(bins.columns.contact[i] & CONTACT)) continue;
+      const left = Math.floor(x(bins.first[i]));
+      context.fillRect(left, box.bottom + 1, Math.max(1, Math.ceil(x(bins.edge(i))) - left), 4);
+    }
+  }
+
+  drawTiles(context, panel, box, view, x) {
+    const { colours, whole } = this;
+    const inner = box;
+    const counts = !whole.estimated;
+    const names = whole.serials.map((_, i) => (counts ? `padc_${i}_min` : `force_n_${i}_max`));
+    this.heat ??= heatRange(whole, counts);
+    const stops = ["heat-0", "heat-1", "heat-2", "heat-3"].map((name) => colours[name]);
+    const rows = names.length;
+    const rowPx = (inner.bottom - inner.top) / rows;
+    for (const [bins, from, to] of this.layers(view)) {
+      const [begin, end] = bins.within({ from, to });
+      const part = { ...inner, left: x(from), right: x(to) };
+      drawHeat(context, bins, begin, end, x, part, { names, ...this.heat, stops });
+    }
+    context.strokeStyle = colours.edge;
+    context.lineWidth = 1;
+    context.strokeRect(crisp(inner.left), crisp(inner.top), inner.right - inner.left - 1, inner.bottom - inner.top);
+    context.fillStyle = colours.text;
+    context.textAlign = "right";
+    context.textBaseline = "middle";
+    const every = Math.max(1, Math.ceil(13 / rowPx));
+    for (let i = 0; i < rows; i += every) context.fillText(whole.serials[i], inner.left - 6, inner.top + (i + 0.5) * rowPx);
+    // What the colours mean, at the right of the title.
+    const bar = { left: inner.right - 130, right: inner.right - 60, top: box.top - 14, bottom: box.top - 4 };
+    const blend = context.createLinearGradient(bar.left, 0, bar.right, 0);
+    stops.forEach((stop, i) => blend.addColorStop(i / (stops.length - 1), stop));
+    context.fillStyle = blend;
+    context.fillRect(bar.left, bar.top, bar.right - bar.left, bar.bottom - bar.top);
+    context.strokeRect(crisp(bar.left), crisp(bar.top), bar.right - bar.left, bar.bottom - bar.top);
+    context.fillStyle = colours.text;
+    const decimals = counts || this.heat.high >= 20 ? 0 : 1;
+    context.fillText(number(this.heat.low, decimals), bar.left - 5, bar.top + 5);
+    context.textAlign = "left";
+    context.fillText(`${number(this.heat.high, decimals)} ${counts ? "" : panel.unit}`, bar.right + 5, bar.top + 6);
+  }
+
+  pattern(context, colour, way) {
+    const key = `${colour} ${way}`;
+    if (!this.patterns.has(key)) this.patterns.set(key, hatching(context, this.colours[colour], way));
+    return this.patterns.get(key);
+  }
+
+  drawFlags(context, view, x) {
+    const all = { top: HEAD_PX, bottom: this.height - AXIS_PX };
+    const forces = this.drawn.filter(({ panel }) => panel.force).map(({ box }) => box);
+    this.shownKinds = [];
+    const right = this.left + this.plotWidth;
+    for (const kind of KINDS) {
+      let some = false;
+      for (const [bins, from, to] of this.layers(view)) {
+        for (const [begin, end] of stretchesOf(kind, bins, ...bins.within({ from, to }))) {
+          if (end < from || begin > to) continue;
+          some = true;
+          const left = Math.max(this.left, x(Math.max(begin, from)));
+          const width = Math.max(2, Math.min(right, x(Math.min(end, to))) - left);
+          context.fillStyle = kind.way === "line" ? this.colours[kind.colour] : this.pattern(context, kind.colour, kind.way);
+          if (kind.over === "all") {
+            context.fillRect(left, all.top, width, all.bottom - all.top);
+            context.fillStyle = this.colours[kind.colour];
+            context.globalAlpha = 0.25;
+            context.fillRect(left, all.top, width, all.bottom - all.top);
+            context.globalAlpha = 1;
+          } else if (kind.over === "force") {
+            context.globalAlpha = 0.55;
+            for (const box of forces) context.fillRect(left, box.top, width, box.bottom - box.top);
+            context.globalAlpha = 1;
+          } else if (forces.length) {
+            context.fillRect(left, kind.key === "late" ? forces[0].bottom - 8 : forces[0].bottom + 6, width, kind.key === "late" ? 8 : 3);
+          }
+        }
+      }
+      if (some) this.shownKinds.push(kind);
+    }
+  }
+
+  /** One cursor over all plots, and the stretch that is being chosen. */
+  drawCursor(view, timeS, chosen = null) {
+    if (!this.whole) return;
+    this.colours ??= coloursOf(this.box, NAMES);
+    const context = fit(this.over, this.width, this.height);
+    const x = this.x(view);
+    const bottom = this.height - AXIS_PX;
+    if (chosen) {
+      const [from, to] = chosen.map((at) => x(at));
+      context.fillStyle = this.colours.series;
+      context.globalAlpha = 0.22;
+      context.fillRect(Math.min(from, to), HEAD_PX - 6, Math.abs(to - from), bottom - HEAD_PX + 6);
+      context.globalAlpha = 1;
+    }
+    if (timeS === null || timeS < view.from || timeS > view.to) return;
+    const bins = this.best(view);
+    const i = bins.at(timeS);
+    context.strokeStyle = this.colours.text;
+    context.lineWidth = 1.5;
+    context.beginPath();
+    context.moveTo(x(timeS), HEAD_PX - 6);
+    context.lineTo(x(timeS), bottom + 5);
+    context.stroke();
+    if (i < 0) return;
+    for (const { panel, y } of this.drawn) {
+      const value = y && bins.columns[panel.columns[1]][i];
+      if (value === null) continue;
+      context.fillStyle = this.colours.text;
+      context.strokeStyle = this.colours.page;
+      context.beginPath();
+      context.arc(x(timeS), y(value), 4, 0, 7);
+      context.fill();
+      context.stroke();
+    }
+  }
+}
+
+/** Of the whole session, so that a colour means the same at every zoom. */
+function heatRange(bins, counts) {
+  let [low, high] = [Infinity, -Infinity];
+  bins.serials.forEach((_, i) => {
+    const stem = `${counts ? "padc" : "force_n"}_${i}`;
+    const found = bins.extremes(`${stem}_min`, `${stem}_max`, 0, bins.count);
+    if (!found) return;
+    low = Math.min(low, found.low);
+    high = Math.max(high, found.high);
+  });
+  if (!Number.isFinite(low)) return { low: 0, high: 1 };
+  if (counts) return low < high ? { low: high, high: low } : { low: high + 1, high };
+  return { low: 0, high: Math.max(high, 0.1) };
+}

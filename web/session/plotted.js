@@ -1,0 +1,231 @@
+// A sealed session: which time is shown, where the cursor is, and all that follows from these.
+
+import * as api from "../common/api.js";
+import { notice, quietly } from "../common/notices.js";
+import { byId, setText } from "../common/text.js";
+import { offsetAt } from "./clock.js";
+import { listen } from "./gestures.js";
+import { drawLegend } from "./legend.js";
+import { Loader } from "./load.js";
+import { Marks } from "./marks.js";
+import { Numbers } from "./numbers.js";
+import { savePicture } from "./picture.js";
+import { Plots } from "./plots.js";
+import { Readout, drawSummary } from "./readout.js";
+import { Stances, placed } from "./stances.js";
+import * as views from "./view.js";
+
+const KEY_ZOOM = 1.5;
+const SETTLED_MS = 250;
+
+export class Plotted {
+  constructor(session) {
+    this.session = session;
+    this.plots = new Plots();
+    this.plots.changed = () => this.draw();
+    this.readout = new Readout();
+    this.numbers = new Numbers(session.id);
+    this.stances = new Stances((index) => this.goTo(index));
+    this.marks = new Marks(session.id, (timeS) => this.goToMark(timeS), () => this.draw());
+    this.loader = new Loader(session.id, (bins) => this.take(bins), (error) => notice(error.message, { bad: true }));
+    this.cursorS = null;
+    this.drawing = 0;
+  }
+
+  async load() {
+    byId("plots-card").hidden = false; // its width says how finely to ask
+    const whole = await this.loader.whole(byId("plots").clientWidth).catch((error) => {
+      byId("plots-card").hidden = true;
+      throw error;
+    });
+    this.durationS = whole.durationS;
+    this.view = views.fromLink(location.search, this.durationS);
+    this.plots.show(whole);
+    const tiles = whole.serials.length;
+    byId("as-heat").hidden = tiles < 2 || tiles > 32;
+    this.listen();
+    this.draw();
+    // What may be missing holds no plot up.
+    const none = (error) => { if (!(error instanceof api.Refusal)) throw error; return null; };
+    const [stances, events, clock] = await Promise.all([
+      whole.estimated ? api.listStances(this.session.id).catch(none) : null,
+      api.listEvents(this.session.id).catch(none), api.clockOf(this.session.id).catch(none),
+    ]);
+    this.plots.stances = placed(stances ?? [], whole.beginNs);
+    this.stances.show(this.plots.stances);
+    const offset = (tNs, ofServer) => (clock && offsetAt(clock, tNs, ofServer));
+    this.marks.show(events?.items ?? [], whole.beginNs, offset);
+    this.plots.marks = this.marks.placed;
+    this.draw();
+  }
+
+  listen() {
+    const { plots } = this;
+    const time = (px) => plots.timeAt(px, this.view);
+    const scale = () => (this.view.to - this.view.from) / plots.plotWidth;
+    listen(byId("plots"), {
+      point: (px) => this.point(time(px)),
+      choosing: (from, to) => { this.chosen = [time(from), time(to)]; this.draw(); },
+      choose: (from, to) => {
+        this.chosen = null;
+        const [a, b] = [time(from), time(to)];
+        if (from !== to) this.show({ from: Math.min(a, b), to: Math.max(a, b) });
+        else this.draw();
+      },
+      zoom: (factor, px) => this.show(views.zoomed(this.view, factor, time(px), this.durationS)),
+      move: (px) => this.show(views.moved(this.view, px * scale(), this.durationS)),
+      all: () => this.showAll(),
+      key: (event) => this.key(event),
+    });
+    const buttons = {
+      "zoom-in": () => this.zoom(1 / KEY_ZOOM), "zoom-out": () => this.zoom(KEY_ZOOM), "zoom-all": () => this.showAll(),
+      earlier: () => this.move(-0.5), later: () => this.move(0.5),
+      "stance-before": () => this.step(-1), "stance-next": () => this.step(1),
+      "as-heat": () => this.toggleHeat(),
+      picture: () => savePicture(plots, this.session),
+    };
+    for (const [name, act] of Object.entries(buttons)) byId(name).addEventListener("click", act);
+    byId("mark-here").addEventListener("submit", (event) => {
+      event.preventDefault();
+      quietly(() => this.marks.add(this.cursorS ?? this.middle));
+    });
+    byId("numbers-card").addEventListener("toggle", () => this.draw());
+    new ResizeObserver(() => this.draw()).observe(byId("plots"));
+  }
+
+  get middle() { return (this.view.from + this.view.to) / 2; }
+
+  show(view) {
+    this.view = views.clamped(view, this.durationS);
+    byId("plots").dataset.settled = "false";
+    // Not at every turn of a wheel: browsers allow few changes of the address in some time.
+    clearTimeout(this.linking);
+    this.linking = setTimeout(() => {
+      history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS));
+    }, SETTLED_MS);
+    this.draw();
+  }
+
+  showAll() { this.show(views.whole(this.durationS)); }
+
+  /** About the cursor, if it is in sight. */
+  zoom(factor) {
+    const { view, cursorS } = this;
+    const about = cursorS !== null && cursorS >= view.from && cursorS <= view.to ? cursorS : this.middle;
+    this.show(views.zoomed(view, factor, about, this.durationS));
+  }
+
+  move(share) { this.show(views.moved(this.view, share * (this.view.to - this.view.from), this.durationS)); }
+
+  point(timeS) {
+    this.cursorS = timeS;
+    this.draw();
+  }
+
+  /** To the next bin at the cursor; the view follows. */
+  walk(by) {
+    const bins = this.plots.best(this.view);
+    const from = this.cursorS ?? this.middle;
+    const i = Math.min(bins.count - 1, Math.max(0, bins.at(from) + by));
+    this.cursorS = bins.first[i];
+    const { view } = this;
+    const beyond = Math.max(0, this.cursorS - view.to) - Math.max(0, view.from - this.cursorS);
+    if (beyond) this.show(views.moved(view, beyond + Math.sign(beyond) * 0.1 * (view.to - view.from), this.durationS));
+    else this.draw();
+  }
+
+  step(by) { this.stances.step(by, this.cursorS ?? this.middle); }
+
+  goTo(index) {
+    const stance = this.plots.stances[index];
+    this.stances.choose(index);
+    this.cursorS = stance.peak_t_ns === null ? stance.from : stance.from + (stance.peak_t_ns - stance.begin_t_ns) * 1e-9;
+    this.show(views.around(stance.from, stance.to, this.durationS));
+  }
+
+  goToMark(timeS) {
+    this.cursorS = timeS;
+    const half = Math.min(1, (this.view.to - this.view.from) / 2);
+    this.show({ from: timeS - half, to: timeS + half });
+  }
+
+  toggleHeat() {
+    const { plots } = this;
+    plots.asHeat = !plots.panels.some((panel) => panel.kind === "heat");
+    plots.show(plots.whole);
+    this.draw();
+  }
+
+  key(event) {
+    const onButton = event.target.closest?.("button, a, summary");
+    const acts = {
+      "+": () => this.zoom(1 / KEY_ZOOM), "=": () => this.zoom(1 / KEY_ZOOM), "-": () => this.zoom(KEY_ZOOM),
+      "[": () => this.step(-1), "]": () => this.step(1),
+      ArrowLeft: () => this.walk(event.shiftKey ? -10 : -1), ArrowRight: () => this.walk(event.shiftKey ? 10 : 1),
+    };
+    if (event.target.closest?.("#stances-scroll, .scroll")) { // there they scroll the table
+      delete acts.ArrowLeft;
+      delete acts.ArrowRight;
+    }
+    // These scroll the page, too: only on the plots they are ours.
+    if (event.target === byId("plots")) {
+      Object.assign(acts, { Home: () => this.showAll(), PageUp: () => this.move(-0.5), PageDown: () => this.move(0.5) });
+    } else if (!onButton) acts.Home = () => this.showAll();
+    acts[event.key]?.();
+    return event.key in acts;
+  }
+
+  take(bins) {
+    this.plots.detail = bins;
+    this.draw();
+  }
+
+  draw() {
+    this.drawing ||= requestAnimationFrame(() => {
+      this.drawing = 0;
+      this.drawNow();
+    });
+  }
+
+  drawNow() {
+    const { plots, view } = this;
+    const box = byId("plots");
+    if (!view || !box.clientWidth) return;
+    box.dataset.whole = String(views.isWhole(view, this.durationS));
+    box.dataset.from = view.from.toFixed(4);
+    box.dataset.to = view.to.toFixed(4);
+    const drawnKey = [view.from, view.to, plots.width, plots.detail, plots.marks.length, plots.stances.length, plots.asHeat,
+      this.stances.current, plots.colours, devicePixelRatio];
+    if (drawnKey.some((one, i) => one !== this.drawnKey?.[i])) {
+      plots.draw(view, this.stances.current);
+      drawnKey[8] = plots.colours;
+      this.drawnKey = drawnKey;
+      drawLegend(plots);
+    }
+    plots.drawCursor(view, this.cursorS, this.chosen);
+    this.loader.want(view, plots.plotWidth, plots.best(view));
+    const bins = plots.best(view);
+    box.dataset.settled = String(!this.loader.busy);
+    drawSummary(bins, view, byId("summary"));
+    const sentence = this.readout.draw(bins, this.cursorS === null ? -1 : bins.at(this.cursorS), plots.panels);
+    const timeS = this.cursorS ?? this.middle;
+    box.setAttribute("aria-valuemin", "0");
+    box.setAttribute("aria-valuemax", this.durationS.toFixed(3));
+    box.setAttribute("aria-valuenow", timeS.toFixed(3));
+    box.setAttribute("aria-valuetext", sentence || byId("summary").textContent);
+    byId("as-heat").setAttribute("aria-pressed", String(plots.panels.some((panel) => panel.kind === "heat")));
+    setText(byId("mark-at"), `${this.cursorS === null ? "in the middle of the view" : "at the cursor"}`);
+    this.drawLinks();
+    this.numbers.draw(view, plots.panels);
+  }
+
+  /** Downloads of what is in view. */
+  drawLinks() {
+    const all = views.isWhole(this.view, this.durationS);
+    const part = all ? "" : `&start_s=${this.view.from.toFixed(6)}&end_s=${this.view.to.toFixed(6)}`;
+    setText(byId("download-what"), all ? "Download" : "Download what is in view");
+    for (const format of ["parquet", "arrow", "csv"]) {
+      byId(`download-${format}`).href = api.dataAddress({ ...this.session, marks: this.plots.marks.length }, format, part);
+    }
+  }
+}

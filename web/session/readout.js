@@ -1,0 +1,121 @@
+// The numbers at the cursor, and what is in view, in words.
+
+import { byId, el, number, setData, setText } from "../common/text.js";
+import { flagsInWords } from "./flags.js";
+import { timeWords } from "./overlay.js";
+
+const TILES_MOST = 8;
+
+/** "3.1" of a single frame, "1.2 to 3.1" of several. */
+function span(bins, i, [lowName, highName], factor = 1, decimals = 1) {
+  const [low, high] = [bins.columns[lowName]?.[i] ?? null, bins.columns[highName]?.[i] ?? null];
+  if (low === null || high === null) return null;
+  const [from, to] = [number(low * factor, decimals), number(high * factor, decimals)];
+  return from === to ? to : `${from} to ${to}`;
+}
+
+function grfAt(bins, i) {
+  const value = span(bins, i, ["grf_n_min", "grf_n_max"]);
+  const bound = bins.columns.grf_at_least_n_max[i];
+  if (value === null) return bound > 0 ? `at least ${number(bound)} N` : "not known";
+  const [low, high] = [bins.columns.grf_low_n_min[i], bins.columns.grf_high_n_max[i]];
+  if (low === null || high === null) return `${value} N`;
+  if (bins.framesInBin === 1) return `${value} N ± ${number((high - low) / 2)}`;
+  return `${value} N (95 %: ${number(low)} to ${number(high)})`;
+}
+
+const CONTACT_WORDS = { 1: "no", 2: "yes", 4: "not known", 3: "begins or ends", 5: "no, or not known", 6: "yes, or not known", 7: "begins or ends" };
+
+/**
+ * What is known at a bin, of all that has a plot.
+ * @param {import("./panels.js").Panel[]} panels
+ * @returns {[string, string, string][]} key, name, value
+ */
+export function readingsOf(bins, i, panels) {
+  const shown = new Set(panels.map((panel) => panel.key));
+  const many = bins.columns.frames[i];
+  const time = timeWords(bins.first[i], 0.001);
+  const found = [["time", "Time", many > 1 ? `${time}, ${many} frames` : time]];
+  if (bins.estimated) {
+    found.push(["grf", "GRF", grfAt(bins, i)]);
+    found.push(["contact", "Contact", CONTACT_WORDS[bins.columns.contact[i]] ?? "–"]);
+    for (const [axis, name] of [["x", "COP forward"], ["y", "COP left"]]) {
+      const place = span(bins, i, [`cop_${axis}_m_min`, `cop_${axis}_m_max`], 1e3);
+      if (shown.has(`cop-${axis}`)) found.push([`cop-${axis}`, name, place === null ? "–" : `${place} mm`]);
+    }
+    if (shown.has("angle")) {
+      const angle = span(bins, i, ["angle_rad_min", "angle_rad_max"], 180 / Math.PI);
+      found.push(["angle", "Angle", angle === null ? "–" : `${angle}°`]);
+    }
+  }
+  return found.concat(tilesAt(bins, i).filter(([key]) => shown.has(key) || shown.has("tiles")));
+}
+
+function tilesAt(bins, i) {
+  const [stem, unit, decimals] = bins.estimated ? ["force_n", "N", 1] : ["padc", "counts", 0];
+  const names = (tile) => [`${stem}_${tile}_min`, `${stem}_${tile}_max`];
+  const order = bins.serials.map((_, tile) => tile);
+  const greatest = (tile) => bins.columns[names(tile)[bins.estimated ? 1 : 0]][i] ?? (bins.estimated ? -Infinity : Infinity);
+  if (order.length <= TILES_MOST) {
+    return order.map((tile) => {
+      const value = span(bins, i, names(tile), 1, decimals);
+      return [`tile-${tile}`, bins.serials[tile], value === null ? "–" : `${value} ${unit}`];
+    });
+  }
+  order.sort((a, b) => (bins.estimated ? greatest(b) - greatest(a) : greatest(a) - greatest(b)));
+  const text = order.slice(0, 3).map((tile) => `${bins.serials[tile]} ${span(bins, i, names(tile), 1, decimals) ?? "–"}`).join(", ");
+  return [["tiles", "Most loaded", `${text} ${unit}`]];
+}
+
+export class Readout {
+  constructor() {
+    this.list = byId("readout");
+    this.cells = new Map();
+  }
+
+  /** @returns {string} the same in a sentence, for who hears the page */
+  draw(bins, i, panels) {
+    const readings = i < 0 ? [] : readingsOf(bins, i, panels);
+    const flags = i < 0 ? [] : flagsInWords(bins, i);
+    byId("readout-hint").hidden = i >= 0;
+    for (const key of this.cells.keys()) {
+      if (readings.some(([one]) => one === key)) continue;
+      this.cells.get(key).parentElement.remove();
+      this.cells.delete(key);
+    }
+    for (const [key, name, value] of readings) {
+      if (!this.cells.has(key)) {
+        const cell = el("dd");
+        this.cells.set(key, cell);
+        this.list.append(el("div", { "data-key": key }, el("dt", { text: name }), cell));
+      }
+      setText(this.cells.get(key), value);
+    }
+    setText(byId("readout-flags"), flags.join(" · "));
+    setData(this.list, "timeS", i < 0 ? "" : String(bins.first[i]));
+    return [...readings.map(([, name, value]) => `${name} ${value}`), ...flags].join(", ");
+  }
+}
+
+/** What is in view, as a sentence, and its numbers for whoever reads them from the page. */
+export function drawSummary(bins, view, box) {
+  const [begin, end] = bins.within(view);
+  const time = (timeS) => timeWords(timeS, 0.01);
+  const frames = bins.sum("frames", begin, end);
+  const parts = [`${time(view.from)} to ${time(view.to)}: ${frames.toLocaleString("en-GB")} frames`];
+  const missing = bins.sum("missing", begin, end);
+  if (missing) parts.push(`${missing.toLocaleString("en-GB")} lost`);
+  const grf = bins.estimated ? bins.extremes("grf_n_min", "grf_n_max", begin, end) : null;
+  if (grf) parts.push(`GRF ${number(grf.low)} to ${number(grf.high)} N, greatest at ${time(bins.first[grf.at])}`);
+  const unknown = bins.estimated ? bins.sum("grf_unknown", begin, end) : 0;
+  if (unknown) parts.push(`GRF not known in ${unknown.toLocaleString("en-GB")} frames`);
+  if (!bins.estimated) parts.push("there are no estimates: these are raw counts");
+  parts.push(bins.framesInBin === 1 ? "every frame is drawn" : `up to ${bins.framesInBin} frames in a column, from least to greatest`);
+  setText(box, `${parts.join(", ")}.`);
+  setData(box, "grfMax", grf ? String(grf.high) : "");
+  setData(box, "grfMin", grf ? String(grf.low) : "");
+  setData(box, "missing", String(missing));
+  setData(box, "frames", String(frames));
+  setData(box, "firstS", end > begin ? String(bins.first[begin]) : "");
+  setData(box, "lastS", end > begin ? String(bins.last[end - 1]) : "");
+}
