@@ -53,16 +53,18 @@ def contents(out: Path) -> dict[str, bytes]:
 def test_a_worker_that_is_killed_costs_nothing_and_results_are_those_of_one_process(
     cluster: Cluster, trials: Path, tmp_path: Path
 ) -> None:
-    out, there = tmp_path / "out", 0
+    out, states = tmp_path / "out", list[str]()
     cluster.add_worker()
     for outcome in outcomes(
         jobs(trials, out), partial(spread_over_cluster, address=cluster.address)
     ):
-        assert outcome.state == "made", outcome.reason
-        there += 1
-        if there == 3:
+        # One that the killed worker had finished but not told is found by the worker after it.
+        assert outcome.state == "made" or (outcome.state == "there" and len(states) >= 3), outcome
+        states.append(outcome.state)
+        if len(states) == 3:
             cluster.workers[0].kill()
-    assert there == COPIES
+    assert len(states) == COPIES
+    assert states.count("there") <= 1
     for outcome in outcomes(jobs(trials, tmp_path / "alone"), partial(spread, jobs=1)):
         assert outcome.state == "made"
     assert contents(out) == contents(tmp_path / "alone")
