@@ -1,0 +1,106 @@
+// Where the tiles of a foot are in a picture: from the side (a line of tiles) or from above (a grid). Pure.
+
+const GRID_FROM_M = 0.005; // tiles spread wider than this in y are a grid
+
+/** @typedef {{serial: string, x_m: number, y_m: number, z_m: number}} Tile */
+/** @typedef {{x: number, y: number}} Point in pixels */
+
+const range = (values) => [Math.min(...values), Math.max(...values)];
+
+/** @param {Tile[]} tiles */
+export function isPlan(tiles) {
+  const [least, most] = range(tiles.map((tile) => tile.y_m));
+  return most - least > GRID_FROM_M;
+}
+
+/** Distance of a tile to its nearest neighbour: sets the size of the domes. */
+function spacing(tiles, up) {
+  let least = Infinity;
+  tiles.forEach((a, i) => tiles.slice(0, i).forEach((b) => {
+    const distance = Math.hypot(a.x_m - b.x_m, up(a) - up(b));
+    if (distance > 1e-6) least = Math.min(least, distance);
+  }));
+  return Number.isFinite(least) ? least : 0.014;
+}
+
+export class FootLayout {
+  /**
+   * @param {Tile[]} tiles
+   * @param {object} box
+   * @param {number} box.widthPx
+   * @param {number} box.heightPx
+   * @param {number} box.roomPx of the height, for what is not the foot
+   * @param {number} [box.basePx] from the lower edge to the sole, seen from the side
+   * @param {boolean} [box.turns] a servo rolls it about the ankle
+   * @param {boolean} [box.toesUp] from above, forward is up and not to the right
+   */
+  constructor(tiles, { widthPx, heightPx, roomPx, basePx = 74, turns = false, toesUp = false }) {
+    this.plan = isPlan(tiles);
+    this.toesUp = this.plan && toesUp;
+    const up = (tile) => (this.plan ? tile.y_m : tile.z_m);
+    const [back, front] = range(tiles.map((tile) => tile.x_m));
+    const [low, high] = range(tiles.map(up));
+    /** Between neighbours, in metres. */
+    this.pitch = spacing(tiles, up);
+    const margin = 0.9 * this.pitch;
+    // Rolling by 10 degrees about the ankle must stay in the picture.
+    const roll = !this.plan && turns ? Math.abs(low) * Math.sin(0.17) : 0;
+    const spanX = front - back + 2 * (margin + roll);
+    const spanUp = high - low + 2 * margin;
+    const [across, down] = this.toesUp ? [spanUp, spanX] : [spanX, spanUp];
+    /** Pixels a metre. */
+    this.scale = Math.min(widthPx / across, (heightPx - roomPx) / down, this.plan ? 4000 : 5000);
+    this.widthPx = widthPx;
+    this.heightPx = heightPx;
+    this.middle = { x: (back + front) / 2, up: this.plan ? (low + high) / 2 : low };
+    this.baseline = this.plan ? heightPx / 2 : heightPx - basePx;
+    this.radiusPx = Math.min(0.44 * this.pitch * this.scale, 30);
+    this.points = tiles.map((tile) => this.at(tile.x_m, up(tile)));
+    /** Tiles from heel to toe. */
+    this.order = tiles.map((_, i) => i).sort((a, b) => tiles[a].x_m - tiles[b].x_m);
+  }
+
+  /**
+   * A place in the foot's frame; `upM` is y (to the left) from above, z from the side.
+   * @returns {Point}
+   */
+  at(xM, upM) {
+    const [forward, up] = [(xM - this.middle.x) * this.scale, (upM - this.middle.up) * this.scale];
+    if (this.toesUp) return { x: this.widthPx / 2 - up, y: this.baseline - forward };
+    return { x: this.widthPx / 2 + forward, y: this.baseline - up };
+  }
+
+  /** The sole behind a line of tiles, open to the leg above, as an SVG path. */
+  sole() {
+    const first = this.points[this.order[0]];
+    const last = this.points[this.order.at(-1)];
+    const edge = 0.6 * this.pitch * this.scale;
+    const line = this.order.map((i) => `L${this.points[i].x} ${this.points[i].y}`).join("");
+    // Narrows to the leg, which leaves the picture at the top.
+    const knee = Math.min(first.y, last.y) - 0.45 * this.heightPx;
+    const middle = (first.x + last.x) / 2;
+    const leg = 0.3 * (last.x - first.x) + 14;
+    const top = -2 * this.heightPx;
+    return `M${middle - leg} ${top}V${knee}L${first.x - edge} ${first.y - edge}L${first.x - edge} ${first.y}${line}`
+      + `L${last.x + edge} ${last.y}L${last.x + edge} ${last.y - edge}L${middle + leg} ${knee}V${top}`;
+  }
+
+  /** Unit vector from the ground into the foot at tile i, from its neighbours on the line. */
+  inward(i) {
+    const k = this.order.indexOf(i);
+    const a = this.points[this.order[Math.max(0, k - 1)]];
+    const b = this.points[this.order[Math.min(this.order.length - 1, k + 1)]];
+    const length = Math.hypot(b.x - a.x, b.y - a.y);
+    return length ? { x: (b.y - a.y) / length, y: -(b.x - a.x) / length } : { x: 0, y: -1 };
+  }
+
+  /** Height of the line of tiles at a place across, so that a marker sits on the arc. */
+  lineAt(xPx) {
+    const line = this.order.map((i) => this.points[i]);
+    if (line.length === 1) return line[0].y;
+    let k = line.findIndex((point) => point.x >= xPx);
+    k = k < 0 ? line.length - 1 : Math.max(1, k);
+    const [a, b] = [line[k - 1], line[k]];
+    return b.x === a.x ? a.y : a.y + ((xPx - a.x) / (b.x - a.x)) * (b.y - a.y);
+  }
+}
