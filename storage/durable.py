@@ -19,7 +19,6 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import BinaryIO
 
 from devices.errors import DamagedFileError, FolderGoneError, FootTileError, StorageError
 from devices.words import printable
@@ -108,7 +107,7 @@ def _without_following(name: str, flags: int) -> int:
 
 
 @contextmanager
-def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[BinaryIO]:
+def whole_file(path: Path, *, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
     """A file to write that takes its place, whole and on the disk, when the block ends well.
 
     Raises:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,8 +76,9 @@ class OverviewBeside:
         if self.problem is not None:
             return
         try:
-            content = _content(self._pyramid, self._tiles, frames_sha256)
-            write_overview(folder / OVERVIEW_NAME, content)
+            levels = self._pyramid.levels()
+            path = folder / OVERVIEW_NAME
+            write_overview(path, levels, tiles=self._tiles, frames_sha256=frames_sha256)
         except Exception as error:
             if not isinstance(error, FootTileError):
                 log.exception("overview: this is a bug")
@@ -126,10 +126,7 @@ def overview_of_session(
         with open_overview(path) as kept:
             found = _of_levels(kept, frames_sha256, bounds, points)
     except (FileNotFoundError, FileFormatError, StorageError):
-        content = _content(_pyramid_of(session), len(session.info.tiles), frames_sha256)
-        with suppress(StorageError):
-            write_overview(path, content)
-        with Overview(pa.BufferReader(content), where=str(path)) as made:
+        with _made(path, session, frames_sha256) as made:
             found = _of_levels(made, frames_sha256, bounds, points)
     if isinstance(found, int):
         found = _of_frames(session, part, begin_ns, points, found)
@@ -193,5 +190,12 @@ def _pyramid_of(session: SessionReader) -> Pyramid:
     return pyramid
 
 
-def _content(pyramid: Pyramid, tiles: int, frames_sha256: str) -> pa.Buffer:
-    return overview_content(pyramid.levels(), tiles=tiles, frames_sha256=frames_sha256)
+def _made(path: Path, session: SessionReader, frames_sha256: str) -> Overview:
+    """A new one, kept beside the frames if their folder can be written to."""
+    levels, tiles = _pyramid_of(session).levels(), len(session.info.tiles)
+    try:
+        write_overview(path, levels, tiles=tiles, frames_sha256=frames_sha256)
+        return open_overview(path)
+    except (FileNotFoundError, FileFormatError, StorageError):
+        content = overview_content(levels, tiles=tiles, frames_sha256=frames_sha256)
+        return Overview(pa.BufferReader(content), where=str(path))

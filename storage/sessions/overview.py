@@ -9,9 +9,10 @@ lacks it, or finds it damaged or of other frames, makes it again (`service.sessi
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -26,6 +27,7 @@ from storage.sessions.pyramid import FACTOR, ROWS, Bins, bin_columns, joined
 OVERVIEW_NAME = "overview.arrow"
 _KEY, _CHECK_KEY = b"foottile.overview", b"foottile.overview_sha256"
 _VERSION = 1
+Types = Mapping[str, np.dtype[Any]]
 _PIECE = 4096
 """Bins that are read, and proven, at a time."""
 
@@ -114,41 +116,68 @@ def overview_content(levels: Sequence[Bins], *, tiles: int, frames_sha256: str) 
         tiles: of the array.
         frames_sha256: hash of the frames that it is of.
     """
-    estimated = "grf_n_min" in levels[0]
-    types = bin_columns(tiles, estimated=estimated)
-    batches, pieces = [], []
-    for level, bins in enumerate(levels):
-        ordered = {name: np.ascontiguousarray(bins[name], type_) for name, type_ in types.items()}
-        for at in range(0, len(ordered["part"]), _PIECE):
-            some = {name: values[at : at + _PIECE] for name, values in ordered.items()}
-            batches.append([pa.array(values) for values in some.values()])
-            begin_ns, end_ns = int(some["t_first_ns"].min()), int(some["t_last_ns"].max())
-            pieces.append(Piece(level, len(some["part"]), begin_ns, end_ns, _crc(some)))
-    begin_ns = int(levels[0]["t_first_ns"][0])
-    text = Index(frames_sha256, tiles, estimated, begin_ns, tuple(pieces)).to_json()
-    schema = pa.schema(
-        [pa.field(name, pa.from_numpy_dtype(t), nullable=False) for name, t in types.items()],
-        metadata={_KEY: text, _CHECK_KEY: hashlib.sha256(text).hexdigest().encode()},
-    )
     sink = pa.BufferOutputStream()
-    with pa.ipc.new_file(sink, schema) as file:
-        for arrays in batches:
-            file.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
+    _write(sink, levels, tiles, frames_sha256)
     return sink.getvalue()
 
 
-def write_overview(path: Path, content: pa.Buffer) -> None:
-    """Write `overview.arrow`, in place of the one that is there.
+def write_overview(path: Path, levels: Sequence[Bins], *, tiles: int, frames_sha256: str) -> None:
+    """Write `overview.arrow`, in place of the one that is there; it is never whole in memory.
 
     Args:
         path: of the file.
-        content: of `overview_content`.
+        levels: as for `overview_content`.
+        tiles: likewise.
+        frames_sha256: likewise.
 
     Raises:
         StorageError: the disk is full or not writable; the old one is still there then.
     """
     with whole_file(path) as out:
-        out.write(content)
+        _write(out, levels, tiles, frames_sha256)
+
+
+def _write(
+    sink: pa.NativeFile | io.BufferedWriter, levels: Sequence[Bins], tiles: int, frames_sha256: str
+) -> None:
+    types = bin_columns(tiles, estimated="grf_n_min" in levels[0])
+    text = _index_over(levels, types, tiles, frames_sha256).to_json()
+    schema = pa.schema(
+        [pa.field(name, pa.from_numpy_dtype(t), nullable=False) for name, t in types.items()],
+        metadata={_KEY: text, _CHECK_KEY: hashlib.sha256(text).hexdigest().encode()},
+    )
+    with pa.ipc.new_file(sink, schema) as file:
+        for _, bins in _pieces_of(levels, types):
+            arrays = [pa.array(values) for values in bins.values()]
+            file.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
+
+
+def _index_over(levels: Sequence[Bins], types: Types, tiles: int, frames_sha256: str) -> Index:
+    pieces = tuple(
+        Piece(
+            level,
+            len(bins["part"]),
+            int(bins["t_first_ns"].min()),
+            int(bins["t_last_ns"].max()),
+            _crc(bins),
+        )
+        for level, bins in _pieces_of(levels, types)
+    )
+    begin_ns = int(levels[0]["t_first_ns"][0])
+    return Index(frames_sha256, tiles, "grf_n_min" in types, begin_ns, pieces)
+
+
+def _pieces_of(levels: Sequence[Bins], types: Types) -> Iterator[tuple[int, Bins]]:
+    """Each level and its bins, some at a time, in the columns' order."""
+    for level, bins in enumerate(levels):
+        for at in range(0, len(bins["part"]), _PIECE):
+            yield (
+                level,
+                {
+                    name: np.ascontiguousarray(bins[name][at : at + _PIECE], type_)
+                    for name, type_ in types.items()
+                },
+            )
 
 
 def open_overview(path: Path) -> Overview:

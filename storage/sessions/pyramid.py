@@ -213,9 +213,11 @@ class Pyramid:
         return joined(pieces) if pieces else None
 
     def levels(self) -> list[Bins]:
-        """The finest level, and the coarser ones over it."""
-        finest = self.finest()
-        return [] if finest is None else levels_over(finest)
+        """The finest level, and the coarser ones over it; no more frames will come."""
+        if self._begun:
+            self._whole.append(merged(joined(self._begun), ROWS))
+        pieces, self._whole, self._begun = self._whole, [], []
+        return levels_over(_drained(pieces)) if pieces else []
 
     def _close_full(self) -> None:
         frames = joined(self._begun)
@@ -227,6 +229,11 @@ class Pyramid:
             frames = {name: values[:last] for name, values in frames.items()}
         if len(starts):
             self._whole.append(_joined_at(frames, starts))
+
+
+def _drained(pieces: list[Bins]) -> Bins:
+    """One after the other; the pieces lose column by column what has gone over."""
+    return {name: np.concatenate([piece.pop(name) for piece in pieces]) for name in list(pieces[0])}
 
 
 def levels_over(finest: Bins) -> list[Bins]:

@@ -7,11 +7,13 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Request
 from fastapi.responses import FileResponse
+from pydantic import BaseModel, ConfigDict, Field
 
 from devices.errors import StateError, UnknownError
 from service.api.problems import MEDIA_TYPE, Problem
 from service.server.server import Server
 from storage.formats.export import MEDIA_TYPES
+from storage.formats.slice import SECONDS_MAX
 from storage.sessions.folder import Session
 
 _SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}
@@ -56,6 +58,25 @@ def stored_table(session: Session, path: Path) -> FileResponse:
 def _server(request: Request) -> Server:
     server: Server = request.app.state.server
     return server
+
+
+class SecondsQuery(BaseModel):
+    """Which time of a session."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    start_s: Annotated[float, Field(ge=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
+        default=None, description="Seconds after the first frame."
+    )
+    end_s: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
+        default=None, description="Up to, not including, so many seconds after the first frame."
+    )
+
+
+def has_it(request: Request, tag: str) -> bool:
+    """Does If-None-Match name this entity tag, without its quotes?"""
+    given = request.headers.get("if-none-match", "")
+    return any(t.strip().removeprefix("W/") in (f'"{tag}"', "*") for t in given.split(","))
 
 
 ServerState = Annotated[Server, Depends(_server)]

@@ -12,13 +12,13 @@ from typing import Annotated
 import pyarrow as pa
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from starlette.datastructures import MutableHeaders
 
 from devices.errors import StateError, UnknownError, UsageError
 from service.api.problems import problem
-from service.api.routes.access import ServerState, present, problems
+from service.api.routes.access import SecondsQuery, ServerState, has_it, present, problems
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
 from service.version import SOFTWARE
@@ -27,7 +27,7 @@ from storage.file_hash import sha256_of
 from storage.formats.export import MEDIA_TYPES, ClockName, Format, content_of, export
 from storage.formats.marks import TIMES, Marks, place
 from storage.formats.sealed import export_file, marks_of
-from storage.formats.slice import SECONDS_MAX, Slice
+from storage.formats.slice import Slice
 from storage.schema import ROUNDED_TO
 from storage.sessions.folder import FRAMES_NAME, Session
 
@@ -38,18 +38,10 @@ _SINGLE_RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{0,18})|-(\d{1,18}))")
 _YEAR_S = 31_536_000
 
 
-class DataQuery(BaseModel):
+class DataQuery(SecondsQuery):
     """Which data, and how."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     format: Format = "parquet"
-    start_s: Annotated[float, Field(ge=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
-        default=None, description="Seconds after the first frame."
-    )
-    end_s: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
-        default=None, description="Up to, not including, so many seconds after the first frame."
-    )
     columns: str | None = Field(
         default=None,
         description="Names with commas between: of all tiles (`force_n`) or one (`force_n_0`).",
@@ -153,7 +145,7 @@ def _stored(
         "Cache-Control": f"private, max-age={_YEAR_S}, immutable",
         "Repr-Digest": f"sha-256=:{b64encode(bytes.fromhex(sha256)).decode()}:",
     }
-    if _matches(request, sha256):
+    if has_it(request, sha256):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     size = path.stat().st_size
     wanted = request.headers.get("range")
@@ -197,7 +189,7 @@ async def _made(
     tag = hashlib.sha256(about.encode()).hexdigest()
     headers |= {"ETag": f'{weak}"{tag}"'}
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
-    if _matches(request, tag):
+    if has_it(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     headers["Content-Disposition"] = f'attachment; filename="{session.id}.{query.format}"'
     marks = None
@@ -258,8 +250,3 @@ def _chunks(
         return
     with server.sessions.frames(session.id, only_slices=not part.is_all) as reader:
         yield from export_file(reader, to, part, clock=query.clock, marks=marks)
-
-
-def _matches(request: Request, tag: str) -> bool:
-    given = request.headers.get("if-none-match", "")
-    return any(t.strip().removeprefix("W/") in (f'"{tag}"', "*") for t in given.split(","))

@@ -11,16 +11,16 @@ from typing import Annotated, Any
 import numpy as np
 import pyarrow as pa
 from anyio import CapacityLimiter, to_thread
-from fastapi import APIRouter, Header, Query, Response
-from pydantic import BaseModel, ConfigDict, Field
+from fastapi import APIRouter, Header, Query, Request, Response
+from pydantic import BaseModel, Field
 
 from devices.errors import StateError, UnknownError, UsageError
-from service.api.routes.access import ServerState, problems
+from service.api.routes.access import SecondsQuery, ServerState, has_it, problems
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX, Seen, overview_of_session
 from service.version import SOFTWARE
 from storage.formats.export import MEDIA_TYPES
-from storage.formats.slice import SECONDS_MAX, Slice
+from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions.folder import Session
 
@@ -32,19 +32,11 @@ _ONE_AT_A_TIME = CapacityLimiter(1)
 take milliseconds."""
 
 
-class OverviewQuery(BaseModel):
+class OverviewQuery(SecondsQuery):
     """Which time, and how finely."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     points: Annotated[int, Field(ge=1, le=POINTS_MAX)] = Field(
         default=1000, description="Bins at least, if there are as many frames; four times at most."
-    )
-    start_s: Annotated[float, Field(ge=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
-        default=None, description="Seconds after the first frame."
-    )
-    end_s: Annotated[float, Field(gt=0, le=SECONDS_MAX, allow_inf_nan=False)] | None = Field(
-        default=None, description="Up to, not including, so many seconds after the first frame."
     )
     columns: str | None = Field(
         default=None,
@@ -82,9 +74,9 @@ class OverviewView(BaseModel):
 async def overview(
     session_id: str,
     query: Annotated[OverviewQuery, Query()],
+    request: Request,
     server: ServerState,
     accept: Annotated[str, Header(description="The Arrow media type for an Arrow stream.")] = "",
-    if_none_match: Annotated[str, Header()] = "",
 ) -> Response:
     """Least and greatest of every column in each of some bins, so that no peak hides.
 
@@ -100,9 +92,9 @@ async def overview(
         raise UnknownError(f"session {session_id}: {session.problem}")
     as_arrow = _ARROW in accept
     asked = f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{SOFTWARE}"
-    tag = f'"{hashlib.sha256(asked.encode()).hexdigest()}"'
-    headers = {"ETag": tag, "Cache-Control": "private, no-cache", "Vary": "Accept"}
-    if tag in if_none_match:
+    tag = hashlib.sha256(asked.encode()).hexdigest()
+    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Accept"}
+    if has_it(request, tag):
         return Response(status_code=304, headers=headers)
     make = partial(_content, session, query, server, as_arrow=as_arrow)
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)

@@ -25,7 +25,8 @@ def content(n: int, parts: tuple[int, ...] = ()) -> tuple[list[Bins], pa.Buffer]
 
 def test_every_level_is_read_as_it_was_written(tmp_path: Path) -> None:
     levels, written = content(100_000)
-    write_overview(tmp_path / "overview.arrow", written)
+    write_overview(tmp_path / "overview.arrow", levels, tiles=TILES, frames_sha256=HASH)
+    assert (tmp_path / "overview.arrow").read_bytes() == written.to_pybytes()
     with open_overview(tmp_path / "overview.arrow") as overview:
         assert overview.index.frames_sha256 == HASH
         assert overview.index.levels == len(levels) == 2
