@@ -17,6 +17,7 @@ from service.api import problems
 from service.api.guard import Guard
 from service.api.routes import (
     access,
+    array,
     clock,
     data,
     health,
@@ -87,7 +88,7 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
             _503="There are too many connections, or the data folder is not there.",
         ),
     )
-    for module in (health, nodes, sessions, trash, data, clock, stances, overview):
+    for module in (health, nodes, sessions, trash, data, clock, array, stances, overview):
         api.include_router(module.router)
     app.include_router(api)
 

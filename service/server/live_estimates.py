@@ -12,10 +12,9 @@ from devices.arrays import Floats
 from devices.chips.compensation import Compensation
 from devices.errors import FootTileError, TareError
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
-from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.calibration import Calibration
 from service.estimation.foot import UNSEEN_NS
 from service.estimation.ladder.plan import make_plan
-from service.estimation.models.static import StaticCurves
 from service.estimation.tare.automatic import (
     LOOK_BACK_NS,
     Look,
@@ -25,6 +24,7 @@ from service.estimation.tare.automatic import (
 )
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import TareFrames, take_tare
+from service.server.ranges import Ranges
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
 
 LIVE_LAG_MS = 10.0
@@ -48,14 +48,8 @@ class LiveEstimates:
         self._calibration: Calibration | None = None
         self.calibration_id: str | None = None
         """Of the calibration in use: a hash, which takes longer than all else a screen is told."""
-        self.entries: tuple[TileCalibration | None, ...] = (None,) * len(info.tiles)
-        """What the calibration in use knows of each tile; None for bare ones."""
-        self.range_kpa: Floats | None = None
-        """End of each tile's calibrated range, NaN for bare ones; None without a calibration."""
-        self.full_scale_n: Floats | None = None
-        """Force at that end."""
-        self.slope_n_per_kpa: Floats | None = None
-        """Newtons for a kilopascal near zero, per tile; NaN for tiles that bear no load."""
+        self.ranges: Ranges | None = None
+        """What the calibration in use says of the tiles; None without one."""
         self.free_since_t_ns: int | None = None
         """Since when every estimate has said that there is no contact; None: not yet."""
         self._run: EstimateRun | None = None
@@ -67,26 +61,10 @@ class LiveEstimates:
                 EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
                 self._calibration = calibration
                 self.calibration_id = calibration.id
-                self.entries = tuple(calibration.find(serial) for serial in info.serials)
-                self._know_ranges(calibration)
+                self.ranges = Ranges.of(info, calibration)
             except FootTileError as error:  # does not fit these tiles: report it and go without
                 self.calibration_problem = str(error)
         self.use(tare)
-
-    def _know_ranges(self, calibration: Calibration) -> None:
-        bearing = np.flatnonzero(self._bears)
-        curves = StaticCurves([calibration.of(self._info.serials[i]) for i in bearing])
-
-        def by_tile(values: Floats) -> Floats:
-            of_all = np.full(len(self._info.tiles), np.nan)
-            of_all[bearing] = values
-            return of_all
-
-        gains = [calibration.gain(self._info.serials[i]) for i in bearing]
-        gain = np.array([1.0 if one is None else one.value for one in gains])
-        self.range_kpa = by_tile(curves.high_kpa)
-        self.full_scale_n = by_tile(gain * curves.force(curves.high_kpa[None]).force_n[0])
-        self.slope_n_per_kpa = by_tile(gain * curves.slope_at_zero_n_per_kpa)
 
     @property
     def calibration(self) -> Calibration | None:
@@ -155,9 +133,10 @@ class LiveEstimates:
 
     def newtons(self, shift_kpa: Floats) -> float | None:
         """What a shift of all baselines makes of the GRF; None where that is not known."""
-        if self.slope_n_per_kpa is None:
+        if self.ranges is None:
             return None
-        shift_n = (self.slope_n_per_kpa * shift_kpa)[np.isfinite(self.slope_n_per_kpa)]
+        slope_n_per_kpa = self.ranges.slope_n_per_kpa
+        shift_n = (slope_n_per_kpa * shift_kpa)[np.isfinite(slope_n_per_kpa)]
         return float(shift_n.sum()) if np.isfinite(shift_n).all() else None
 
     def tare_from_lead(self, lead: FrameBatch) -> Tare:

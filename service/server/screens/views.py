@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from devices.frames import ServoInfo
-from service.estimation.calibration import TileCalibration
+from devices.frames import ArrayInfo, ServoInfo
 from service.estimation.tare.tare import TakenFrom, expected_shift_kpa, trend, warmer_k
 from service.server.node import ServerNode
+from service.server.ranges import Ranges
 from service.server.recorder import Recorder
 from service.server.tare_keeper import AutoTare
 from service.sessions.tare_file import RecordedTare
@@ -120,7 +119,7 @@ class DriftView(View):
         live, tiles = node.live, len(node.info.tiles)
         line = trend(node.tares.valid(node.info), tiles=tiles)
         none = np.full(tiles, np.nan)
-        slope = live.slope_n_per_kpa if live.slope_n_per_kpa is not None else none
+        slope = none if live.ranges is None else live.ranges.slope_n_per_kpa
         warmer_by_k = none if live.tare is None else warmer_k(live.tare, live.recent_tadc())
         since_kpa = none if live.tare is None else expected_shift_kpa(live.tare, warmer_by_k)
         # A bare tile has no sealed gas.
@@ -210,16 +209,14 @@ class NodeView(View):
             boot_id=node.boot_id,
             scene=info.scene,
             emulated=node.hello.emulated,
-            tiles=_tiles(node),
+            tiles=tiles_of(info, live.ranges),
             servo=info.servo,
             schedule=info.schedule,
             nominal_rate_hz=info.nominal_rate_hz,
             calibration=None
-            if calibration is None or live.calibration_id is None
+            if calibration is None or live.calibration_id is None or live.ranges is None
             else CalibrationView(
-                id=live.calibration_id,
-                name=calibration.name,
-                absolute_scale=_scale(live.entries),
+                id=live.calibration_id, name=calibration.name, absolute_scale=scale_of(live.ranges)
             ),
             calibration_problem=live.calibration_problem or node.hello.calibration_problem,
             tare=TareView.of(tare) if tare is not None else None,
@@ -337,17 +334,19 @@ class EventView(View):
     t_ns: int = Field(description="Server's UTC.")
 
 
-def _tiles(node: ServerNode) -> list[TileView]:
-    full_scale_n = node.live.full_scale_n
-    full_scales = [None] * len(node.info.tiles) if full_scale_n is None else _known(full_scale_n)
+def tiles_of(info: ArrayInfo, ranges: Ranges | None) -> list[TileView]:
+    """Tiles of an array; without a calibration their ranges are not known."""
+    none = [None] * len(info.tiles)
+    full_scales = none if ranges is None else _known(ranges.full_scale_n)
+    entries = none if ranges is None else ranges.entries
     placed = {"serial", "mux", "channel", "x_m", "y_m", "z_m", "reference"}
     return [
         TileView(
             range_kpa=entry.range_kpa if entry is not None else None,
-            full_scale_n=full_scales[i],
+            full_scale_n=full_scale_n,
             **tile.model_dump(include=placed),
         )
-        for i, (tile, entry) in enumerate(zip(node.info.tiles, node.live.entries, strict=True))
+        for tile, entry, full_scale_n in zip(info.tiles, entries, full_scales, strict=True)
     ]
 
 
@@ -355,6 +354,7 @@ def _known(values: npt.NDArray[np.float64]) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
-def _scale(entries: Iterable[TileCalibration | None]) -> Literal["measured", "assumed"]:
-    assumed = any(entry is not None and entry.absolute_scale == "assumed" for entry in entries)
+def scale_of(ranges: Ranges) -> Literal["measured", "assumed"]:
+    """Are newtons of these tiles measured, or is the scale of one of them assumed?"""
+    assumed = any(e is not None and e.absolute_scale == "assumed" for e in ranges.entries)
     return "assumed" if assumed else "measured"

@@ -1,0 +1,100 @@
+"""The array of a session: which tiles it was recorded with, and how its forces were estimated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter
+from pydantic import Field
+from starlette.concurrency import run_in_threadpool
+
+from devices.errors import FootTileError, UnknownError
+from devices.frames import ArrayInfo, ServoInfo
+from service.api.routes.access import ServerState, problems
+from service.estimation import OFFLINE_LAG_MS
+from service.estimation.calibration import Calibration
+from service.server.ranges import Ranges
+from service.server.screens.views import CalibrationView, TileView, View, scale_of, tiles_of
+from service.server.server import Server
+
+router = APIRouter(prefix="/sessions", tags=["sessions"])
+
+
+class ArrayView(View):
+    """Tiles of a session, and what is known of its estimates."""
+
+    session_id: str
+    node: str
+    tiles: list[TileView]
+    servo: ServoInfo | None
+    nominal_rate_hz: float
+    calibration: CalibrationView | None
+    lag_ms: float | None = Field(
+        description="Look-ahead of the estimates: for so long after a frame its estimate still "
+        "takes notice of what was read; null: there are none."
+    )
+    estimates_problem: str | None = Field(description="Why there are no estimates.")
+
+
+@router.get(
+    "/{session_id}/array",
+    operation_id="getArray",
+    summary="Tiles",
+    responses=problems(_404="No such session, or nothing was recorded.", _409="It is damaged."),
+)
+async def array(session_id: str, server: ServerState) -> ArrayView:
+    """Where its tiles are on the foot, their ranges, and the look-ahead of its estimates."""
+    session = server.sessions.get(session_id)
+    if session.state == "sealed" and session.sha256 is None:
+        raise UnknownError(f"session {session_id}: {session.problem}")
+    if session.state == "sealed":
+        return await run_in_threadpool(_sealed, session_id, server)
+    sources = server.recorder.sources(session_id)
+    content = sources.calibration
+    lag_ms = None if content is None else OFFLINE_LAG_MS
+    return _view(session_id, sources.info, content, lag_ms, sources.problem)
+
+
+def _sealed(session_id: str, server: Server) -> ArrayView:
+    with server.sessions.frames(session_id, only_slices=True) as reader:
+        info, notes, estimated = reader.info, reader.notes, reader.has("grf_n")
+    if not estimated:
+        said = str(notes.get("estimates", "no estimates")).removeprefix("no estimates: ")
+        return _view(session_id, info, _calibration(notes), None, said)
+    lag_ms = notes.get("lag_ms")
+    known_ms = float(lag_ms) if isinstance(lag_ms, int | float) else None
+    return _view(session_id, info, _calibration(notes), known_ms, None)
+
+
+def _calibration(notes: dict[str, Any]) -> Calibration | None:
+    try:
+        return Calibration.model_validate(notes["calibration"])
+    except (KeyError, FootTileError, ValueError):  # none, or of another version
+        return None
+
+
+def _view(
+    session_id: str,
+    info: ArrayInfo,
+    calibration: Calibration | None,
+    lag_ms: float | None,
+    problem: str | None,
+) -> ArrayView:
+    try:
+        ranges = None if calibration is None else Ranges.of(info, calibration)
+    except FootTileError:  # it is of other tiles: then there are no estimates by it either
+        ranges = None
+    said = None
+    if calibration is not None and ranges is not None:
+        scale = scale_of(ranges)
+        said = CalibrationView(id=calibration.id, name=calibration.name, absolute_scale=scale)
+    return ArrayView(
+        session_id=session_id,
+        node=info.node,
+        tiles=tiles_of(info, ranges),
+        servo=info.servo,
+        nominal_rate_hz=info.nominal_rate_hz,
+        calibration=said,
+        lag_ms=lag_ms,
+        estimates_problem=problem,
+    )

@@ -1,0 +1,55 @@
+"""What a calibration says of an array's tiles: where each one's range ends, and its force there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from devices.arrays import Floats
+from devices.frames import ArrayInfo
+from service.estimation.calibration import Calibration, TileCalibration
+from service.estimation.models.static import StaticCurves
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """Of the tiles of an array; arrays are (tiles,), NaN for those that bear no load.
+
+    Attributes:
+        entries: what the calibration knows of each tile; None for bare ones.
+        end_kpa: end of each tile's calibrated range.
+        full_scale_n: force at that end.
+        slope_n_per_kpa: newtons for a kilopascal near zero.
+    """
+
+    entries: tuple[TileCalibration | None, ...]
+    end_kpa: Floats
+    full_scale_n: Floats
+    slope_n_per_kpa: Floats
+
+    @classmethod
+    def of(cls, info: ArrayInfo, calibration: Calibration) -> Self:
+        """By its curves, and by how the foot is mounted.
+
+        Raises:
+            CalibrationError: it does not have a tile that bears load.
+        """
+        serials = info.serials
+        bearing = [i for i, tile in enumerate(info.tiles) if not tile.reference]
+        curves = StaticCurves([calibration.of(serials[i]) for i in bearing])
+        gains = [calibration.gain(serials[i]) for i in bearing]
+        gain = np.array([1.0 if one is None else one.value for one in gains])
+
+        def by_tile(values: Floats) -> Floats:
+            of_all = np.full(len(info.tiles), np.nan)
+            of_all[bearing] = values
+            return of_all
+
+        return cls(
+            entries=tuple(calibration.find(serial) for serial in serials),
+            end_kpa=by_tile(curves.high_kpa),
+            full_scale_n=by_tile(gain * curves.force(curves.high_kpa[None]).force_n[0]),
+            slope_n_per_kpa=by_tile(gain * curves.slope_at_zero_n_per_kpa),
+        )
