@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import math
+from functools import partial
 from typing import Annotated, Any
 
+import numpy as np
 import pyarrow as pa
-from fastapi import APIRouter, Header, Response
-from pydantic import BaseModel
+from anyio import CapacityLimiter, to_thread
+from fastapi import APIRouter, Header, Query, Response
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
+from devices.arrays import Floats
 from devices.errors import StateError, UnknownError
 from service.api.routes.access import ServerState, problems
+from service.server.server import Server
+from service.sessions.stance_overlay import overlay_of_session
 from service.sessions.stances import stances_of_session
+from service.version import SOFTWARE
 from storage.formats.export import MEDIA_TYPES
+from storage.sessions.folder import Session
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 _ARROW = MEDIA_TYPES["arrow"]
+_ONE_AT_A_TIME = CapacityLimiter(1)
+"""An overlay reads every frame under load: of several that are asked for one after the other is."""
+_DIGITS = 6
+"""Of SI units: micrometres and micronewtons."""
 
 
 class StanceView(BaseModel):
@@ -65,15 +80,7 @@ async def stances(
 
     Of a session that was sealed before there were any they are made from its frames.
     """
-    session = server.sessions.get(session_id)
-    if session.state != "sealed":
-        raise StateError(
-            f"session {session_id} is {session.state}, and its stances are counted when it is "
-            "sealed",
-            remedy="Stop it",
-        )
-    if session.sha256 is None:
-        raise UnknownError(f"session {session_id}: {session.problem}")
+    session = _sealed(session_id, server)
     folder = server.sessions.folder.path(session_id)
     table = await run_in_threadpool(stances_of_session, folder, frames_sha256=session.sha256)
     if _ARROW in accept:
@@ -83,3 +90,142 @@ async def stances(
         return Response(sink.getvalue().to_pybytes(), media_type=_ARROW)
     rows: list[dict[str, Any]] = table.to_pylist()
     return rows
+
+
+class OverlayQuery(BaseModel):
+    """How finely, and how many one by one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    points: Annotated[int, Field(ge=2, le=1001)] = Field(
+        default=101, description="Percentages from 0 to 100, both included."
+    )
+    curves: Annotated[int, Field(ge=0, le=1000)] = Field(
+        default=60,
+        description="Stances one by one at the most: if there are more, so many of them, evenly "
+        "over the session. Mean and spread are of all.",
+    )
+
+
+class PlaceView(BaseModel):
+    """Where a tile is, in the foot's frame."""
+
+    serial: str
+    x_m: float
+    y_m: float
+    z_m: float
+    reference: bool
+
+
+class SpreadView(BaseModel):
+    """One quantity at every percentage; what is not known is null."""
+
+    mean: list[float | None]
+    sd: list[float | None] = Field(
+        description="Standard deviation over stances, their number less one."
+    )
+    count: list[int] = Field(description="Stances in which it is known there.")
+
+
+class CurveView(BaseModel):
+    """One stance at every percentage; what is not known is null."""
+
+    number: int
+    grf_n: list[float | None]
+    cop_x_m: list[float | None]
+    cop_y_m: list[float | None]
+
+
+class OverlayView(BaseModel):
+    """Stances one upon another, from 0 to 100 % of their duration."""
+
+    session_id: str
+    points: int
+    overlaid: int = Field(description="Stances of which mean and spread are.")
+    not_whole: int = Field(description="Left out, since they were not seen whole.")
+    too_short: int = Field(description="Left out, since they are a single frame.")
+    tiles: list[PlaceView]
+    spread: dict[str, SpreadView] = Field(description="Of grf_n, cop_x_m and cop_y_m.")
+    curves: list[CurveView]
+
+
+@router.get(
+    "/{session_id}/stances/overlay",
+    operation_id="getStancesOverlay",
+    summary="Stances one upon another",
+    response_model=OverlayView,
+    responses={
+        304: {"description": "It is what If-None-Match names."},
+        **problems(
+            _404="No such session, nothing was recorded, or it has no estimates.",
+            _409="Stances are counted when the session is sealed.",
+        ),
+    },
+)
+async def stances_overlay(
+    session_id: str,
+    query: Annotated[OverlayQuery, Query()],
+    server: ServerState,
+    if_none_match: Annotated[str, Header()] = "",
+) -> Response:
+    """GRF and COP of the whole stances, normalised to 0 to 100 % of their duration.
+
+    Between two frames they are on the straight line between them.
+    """
+    session = _sealed(session_id, server)
+    asked = f"{session.sha256}|{query.model_dump_json()}|{SOFTWARE}"
+    tag = f'"{hashlib.sha256(asked.encode()).hexdigest()}"'
+    headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+    if tag in if_none_match:
+        return Response(status_code=304, headers=headers)
+    make = partial(_overlay, session, query, server)
+    content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
+    return Response(content, headers=headers, media_type="application/json")
+
+
+def _sealed(session_id: str, server: Server) -> Session:
+    session = server.sessions.get(session_id)
+    if session.state != "sealed":
+        raise StateError(
+            f"session {session_id} is {session.state}, and its stances are counted when it is "
+            "sealed",
+            remedy="Stop it",
+        )
+    if session.sha256 is None:
+        raise UnknownError(f"session {session_id}: {session.problem}")
+    return session
+
+
+def _overlay(session: Session, query: OverlayQuery, server: Server) -> bytes:
+    folder = server.sessions.folder.path(session.id)
+    table = stances_of_session(folder, frames_sha256=session.sha256)
+    with server.sessions.frames(session.id, only_slices=True) as reader:
+        found = overlay_of_session(reader, table, points=query.points, curves=query.curves)
+        tiles = [tile.model_dump(include={*PlaceView.model_fields}) for tile in reader.info.tiles]
+    content = {
+        "session_id": session.id,
+        "points": query.points,
+        "overlaid": found.overlaid,
+        "not_whole": found.not_whole,
+        "too_short": found.too_short,
+        "tiles": tiles,
+        "spread": {
+            name: {
+                "mean": _plain(spread.mean),
+                "sd": _plain(spread.sd),
+                "count": spread.count.tolist(),
+            }
+            for name, spread in found.overlay.spread.items()
+        },
+        "curves": [
+            {"number": number}
+            | {name: _plain(curves[i]) for name, curves in found.overlay.curves.items()}
+            for i, number in enumerate(found.numbers)
+        ],
+    }
+    return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _plain(values: Floats) -> list[float | None]:
+    rounded: list[float] = np.round(values, _DIGITS).tolist()
+    return [None if math.isnan(value) else value for value in rounded]

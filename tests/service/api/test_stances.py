@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import service.sessions.stances
@@ -155,3 +157,62 @@ def test_stances_are_counted_when_the_session_is_sealed(tared: FakeNode) -> None
     tared.deliver(10)
     tared.finish(session)
     assert stances_over_rest(session).json() == []
+
+
+def test_stances_one_upon_another_are_those_of_the_file(tared: FakeNode) -> None:
+    session = tared.record()
+    for force_n in (60.0, 70.0, 80.0):
+        tared.send(100, [0.0, 0.0])
+        tared.send(80, [20.0, force_n - 20.0], alive=True)
+    tared.send(100, [0.0, 0.0])
+    tared.deliver(20, [20.0, 60.0])  # ends in the air: nobody saw this one lift off
+    tared.finish(session)
+    rows = stances_over_rest(session).json()
+    found = session.running.http.get(f"{session.url}/stances/overlay").json()
+    assert (found["overlaid"], found["not_whole"], found["too_short"]) == (3, 1, 0)
+    assert [curve["number"] for curve in found["curves"]] == [1, 2, 3]
+    assert [tile["serial"] for tile in found["tiles"]] == [*tared.info.serials]
+    table = pq.read_table(session.folder / "frames.parquet").to_pydict()
+    for row, curve in zip(rows, found["curves"], strict=False):
+        begin_ns, end_ns = row["begin_t_ns"], row["end_t_ns"]
+        at_ns = begin_ns + np.linspace(0.0, 1.0, 101) * (end_ns - begin_ns)
+        true_n = np.interp(at_ns - begin_ns, np.array(table["t_ns"]) - begin_ns, table["grf_n"])
+        assert curve["grf_n"] == pytest.approx(true_n, abs=1e-3)
+    curves = np.array([curve["grf_n"] for curve in found["curves"]])
+    spread = found["spread"]["grf_n"]
+    assert spread["mean"] == pytest.approx(curves.mean(axis=0), abs=1e-5)
+    assert spread["sd"] == pytest.approx(curves.std(axis=0, ddof=1), abs=1e-5)
+    assert spread["count"] == [3] * 101
+
+
+def test_of_many_stances_some_are_there_one_by_one_and_the_mean_is_of_all(tared: FakeNode) -> None:
+    session = hopped(tared)
+    http, url = session.running.http, f"{session.url}/stances/overlay"
+    answer = http.get(url, params={"curves": 1, "points": 11})
+    found = answer.json()
+    assert (found["points"], found["overlaid"], len(found["curves"])) == (11, 2, 1)
+    assert found["spread"]["grf_n"]["count"] == [2] * 11
+    tag = answer.headers["etag"]
+    again = http.get(url, params={"curves": 1, "points": 11}, headers={"If-None-Match": tag})
+    assert again.status_code == 304
+    assert http.get(url, params={"curves": 2}).headers["etag"] != tag
+    assert_refused(http.get(url, params={"points": 1}), 422, "points")
+
+
+def test_nothing_is_overlaid_of_what_has_no_stances(
+    tared: FakeNode, running: Running, node_of: NodeOf
+) -> None:
+    session = tared.record()
+    assert_refused(running.http.get(f"{session.url}/stances/overlay"), 409, "Stop it")
+    tared.deliver(30, [0.0, 0.0])
+    tared.finish(session)
+    found = running.http.get(f"{session.url}/stances/overlay").json()
+    assert (found["overlaid"], found["curves"]) == (0, [])
+    assert found["spread"]["grf_n"]["mean"] == [None] * 101
+    bare = node_of(running, "bare", calibration=None)
+    bare.connect()
+    bare.deliver(10)
+    raw = bare.record()
+    bare.deliver(20)
+    bare.finish(raw)
+    assert_refused(running.http.get(f"{raw.url}/stances/overlay"), 404, "no estimates")

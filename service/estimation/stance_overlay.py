@@ -1,0 +1,175 @@
+"""Stances one upon another: what was measured in each, over 0 to 100 % of its duration.
+
+This is what normalising a stance to its duration is, wherever it is done. A stance lasts from its
+first frame to its last (`service.estimation.stances`). What is said at a percentage that is between
+two frames lies on the straight line between them, and is not known if one of them is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.arrays import Floats, Times
+
+OVERLAID = ("grf_n", "cop_x_m", "cop_y_m")
+"""Columns of estimates that are laid one upon another."""
+
+Columns = Mapping[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """One quantity over all stances, (points,) each.
+
+    Attributes:
+        mean: over the stances in which it is known there; NaN if it is in none.
+        sd: standard deviation over these, with their number less one; NaN of fewer than two.
+        count: of these stances.
+    """
+
+    mean: Floats
+    sd: Floats
+    count: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Stances one upon another.
+
+    Attributes:
+        spread: of every column.
+        rows: (k,), which of the stances are there one by one.
+        curves: by column, (k, points) of these.
+    """
+
+    spread: Mapping[str, Spread]
+    rows: npt.NDArray[np.int64]
+    curves: Mapping[str, Floats]
+
+
+def evenly(count: int, most: int) -> npt.NDArray[np.int64]:
+    """`most` of so many rows at the most, the first and the last with others evenly in between."""
+    if count <= most:
+        return np.arange(count)
+    return np.round(np.linspace(0, count - 1, most)).astype(np.int64)
+
+
+def normalised(t_ns: Times, values: Floats, points: int) -> Floats:
+    """One stance at `points` percentages from 0 to 100, (points, ...).
+
+    Args:
+        t_ns: (n,), of its frames, rising, two at least.
+        values: (n, ...), in these.
+        points: how many, two at least.
+    """
+    share = (t_ns - t_ns[0]) / float(t_ns[-1] - t_ns[0])
+    at = np.linspace(0.0, 1.0, points)
+    behind = np.clip(np.searchsorted(share, at), 1, len(share) - 1)
+    before = behind - 1
+    wide = (slice(None), *(None,) * (values.ndim - 1))
+    part = ((at - share[before]) / (share[behind] - share[before]))[wide]
+    low, high = values[before], values[behind]
+    # A frame that is exactly there is what it is, whatever is known of the one beside it.
+    between = np.where(part >= 1.0, high, low + (high - low) * part)
+    return np.asarray(np.where(part <= 0.0, low, between))
+
+
+class StanceOverlay:
+    """Gathers stances from consecutive frames; any batches give the same, to the bit.
+
+    Sums are kept, and the curves of some stances: the memory does not depend on how many there are.
+    """
+
+    def __init__(
+        self,
+        part: npt.NDArray[Any],
+        begin_t_ns: Times,
+        end_t_ns: Times,
+        *,
+        points: int,
+        rows: Collection[int],
+    ) -> None:
+        """Begin.
+
+        Args:
+            part: (m,), of each stance, in the order of the frames.
+            begin_t_ns: (m,), of its first frame.
+            end_t_ns: (m,), of its last, later than that.
+            points: percentages from 0 to 100, both included.
+            rows: which stances are kept one by one.
+        """
+        self._windows = list(
+            zip(part.tolist(), begin_t_ns.tolist(), end_t_ns.tolist(), strict=True)
+        )
+        self._next = 0
+        self._open: list[tuple[Times, Floats]] = []
+        self._points = points
+        self._wanted = frozenset(int(row) for row in rows)
+        self._kept: list[tuple[int, Floats]] = []
+        shape = (points, len(OVERLAID))
+        self._count = np.zeros(shape, np.int64)
+        self._mean, self._squares = np.zeros(shape), np.zeros(shape)
+
+    def feed(self, t_ns: Times, columns: Columns) -> None:
+        """Take n more frames.
+
+        Args:
+            t_ns: (n,), rising within a part.
+            columns: `OVERLAID`, (n,) each; `part`, 0 if absent.
+        """
+        if not len(t_ns) or self._next >= len(self._windows):
+            return
+        part = columns["part"] if "part" in columns else np.zeros(len(t_ns), np.uint16)
+        values = np.stack([columns[name].astype(np.float64) for name in OVERLAID], axis=1)
+        edges = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(part)]
+        for first, end in pairwise(edges):
+            self._feed_part(int(part[first]), t_ns[first:end], values[first:end])
+
+    def finish(self) -> Overlay:
+        """All of it; no more frames will come."""
+        known = self._count > 0
+        mean = np.where(known, self._mean, np.nan)
+        several = self._count > 1
+        sd = np.sqrt(np.where(several, self._squares / np.maximum(1, self._count - 1), np.nan))
+        spread = {
+            name: Spread(mean[:, i], sd[:, i], self._count[:, i]) for i, name in enumerate(OVERLAID)
+        }
+        rows = np.array([row for row, _ in self._kept], np.int64)
+        empty = np.empty((0, self._points, len(OVERLAID)))
+        curves = np.stack([curve for _, curve in self._kept]) if self._kept else empty
+        return Overlay(spread, rows, {name: curves[:, :, i] for i, name in enumerate(OVERLAID)})
+
+    def _feed_part(self, part: int, t_ns: Times, values: Floats) -> None:
+        while self._next < len(self._windows):
+            of, begin_ns, end_ns = self._windows[self._next]
+            if of != part or begin_ns > t_ns[-1]:
+                return
+            rows = slice(
+                int(np.searchsorted(t_ns, begin_ns)),
+                int(np.searchsorted(t_ns, end_ns, side="right")),
+            )
+            self._open.append((t_ns[rows], values[rows]))
+            if t_ns[-1] < end_ns:
+                return
+            self._close()
+
+    def _close(self) -> None:
+        row, pieces = self._next, self._open
+        self._next, self._open = row + 1, []
+        t_ns = np.concatenate([piece for piece, _ in pieces])
+        values = np.concatenate([piece for _, piece in pieces])
+        curve = normalised(t_ns, values, self._points)
+        if row in self._wanted:
+            self._kept.append((row, curve))
+        # Welford (1962): nothing cancels, however many stances there are.
+        known = np.isfinite(curve)
+        self._count += known
+        off = np.where(known, curve - self._mean, 0.0)
+        self._mean += off / np.maximum(1, self._count)
+        self._squares += np.where(known, off * (curve - self._mean), 0.0)

@@ -1,0 +1,178 @@
+"""Stances one upon another: what normalising keeps, and what mean and spread are of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from service.estimation.stance_overlay import (
+    OVERLAID,
+    Overlay,
+    StanceOverlay,
+    evenly,
+    normalised,
+)
+
+NAN = float("nan")
+STEPS_NS = st.lists(st.integers(1, 10_000_000), min_size=1, max_size=60)
+FORCES = st.floats(-1e3, 1e3, width=32)
+
+
+def instants(steps_ns: list[int], begin_ns: int = 1_700_000_000_000_000_000) -> Any:
+    return begin_ns + np.concatenate([[0], np.cumsum(steps_ns)]).astype(np.int64)
+
+
+@given(STEPS_NS, st.data(), st.integers(2, 300))
+def test_a_curve_begins_and_ends_with_its_frames_and_never_leaves_what_they_span(
+    steps_ns: list[int], data: st.DataObject, points: int
+) -> None:
+    t_ns = instants(steps_ns)
+    force_n = data.draw(hnp.arrays(np.float64, len(t_ns), elements=FORCES))
+    curve_n = normalised(t_ns, force_n, points)
+    assert curve_n.shape == (points,)
+    assert (curve_n[0], curve_n[-1]) == (force_n[0], force_n[-1])
+    slack_n = 1e-12 * np.abs(force_n).max()
+    assert curve_n.min() >= force_n.min() - slack_n
+    assert curve_n.max() <= force_n.max() + slack_n
+
+
+@given(STEPS_NS, st.integers(2, 300), st.floats(-100, 100), st.floats(-100, 100))
+def test_a_straight_line_stays_one_however_the_frames_lie(
+    steps_ns: list[int], points: int, first_n: float, last_n: float
+) -> None:
+    t_ns = instants(steps_ns)
+    share = (t_ns - t_ns[0]) / (t_ns[-1] - t_ns[0])
+    curve_n = normalised(t_ns, first_n + share * (last_n - first_n), points)
+    assert curve_n == pytest.approx(np.linspace(first_n, last_n, points), abs=1e-9)
+
+
+@given(STEPS_NS, st.data(), st.integers(2, 9))
+def test_how_long_a_stance_lasts_does_not_matter(
+    steps_ns: list[int], data: st.DataObject, times: int
+) -> None:
+    t_ns = instants(steps_ns)
+    force_n = data.draw(hnp.arrays(np.float64, len(t_ns), elements=FORCES))
+    slower = t_ns[0] + times * (t_ns - t_ns[0])
+    one, other = (normalised(t, force_n, 101) for t in (t_ns, slower))
+    assert one == pytest.approx(other, abs=1e-6)
+
+
+def test_what_is_not_known_is_not_known_between_its_neighbours_and_nowhere_else() -> None:
+    t_ns = instants([1_000_000] * 4)
+    curve = normalised(t_ns, np.array([1.0, 2.0, NAN, 4.0, 5.0]), 9)
+    assert curve.tolist()[:3] == [1.0, 1.5, 2.0]
+    assert np.isnan(curve[3:6]).all()
+    assert curve.tolist()[6:] == [4.0, 4.5, 5.0]
+
+
+def recording(
+    stances: list[npt.NDArray[np.float64]], part: list[int] | None = None
+) -> tuple[npt.NDArray[np.int64], dict[str, npt.NDArray[Any]], list[tuple[int, int]]]:
+    """Frames 2 ms apart with five in flight before each stance; where the stances are."""
+    forces: list[npt.NDArray[np.float64]] = []
+    of: list[int] = []
+    rows: list[tuple[int, int]] = []
+    for i, stance in enumerate(stances):
+        begin = len(of) + 5
+        rows.append((begin, begin + len(stance) - 1))
+        forces.append(np.concatenate([np.zeros(5), stance]))
+        of += [(part or [0] * len(stances))[i]] * len(forces[-1])
+    force_n = np.concatenate(forces)
+    t_ns = np.arange(len(force_n), dtype=np.int64) * 2_000_000
+    columns: dict[str, npt.NDArray[Any]] = {
+        "grf_n": force_n.astype(np.float32),
+        "cop_x_m": np.where(force_n > 10, 0.01, NAN).astype(np.float32),
+        "cop_y_m": np.zeros(len(force_n), np.float32),
+        "part": np.array(of, np.uint16),
+    }
+    return t_ns, columns, rows
+
+
+def overlaid(
+    t_ns: Any, columns: Any, rows: list[tuple[int, int]], *, cuts: Sequence[int] = (), **how: Any
+) -> Overlay:
+    first, last = (np.array(each) for each in zip(*rows, strict=True))
+    gathered = StanceOverlay(
+        columns["part"][first],
+        t_ns[first],
+        t_ns[last],
+        points=how.get("points", 101),
+        rows=how.get("kept", range(len(rows))),
+    )
+    edges = [0, *sorted(cut % len(t_ns) for cut in cuts), len(t_ns)]
+    for begin, end in pairwise(edges):
+        gathered.feed(t_ns[begin:end], {name: v[begin:end] for name, v in columns.items()})
+    return gathered.finish()
+
+
+STANCES = st.lists(
+    hnp.arrays(np.float64, st.integers(2, 40), elements=st.floats(1, 100, width=32)),
+    min_size=1,
+    max_size=6,
+)
+
+
+@given(STANCES)
+def test_mean_and_spread_are_those_of_the_curves(
+    stances: list[npt.NDArray[np.float64]],
+) -> None:
+    found = overlaid(*recording(stances))
+    assert found.rows.tolist() == list(range(len(stances)))
+    for name in OVERLAID:
+        curves, spread = found.curves[name], found.spread[name]
+        known = np.isfinite(curves)
+        assert (spread.count == known.sum(axis=0)).all()
+        for i in range(101):
+            values = curves[known[:, i], i]
+            mean = values.mean() if len(values) else NAN
+            sd = values.std(ddof=1) if len(values) > 1 else NAN
+            assert spread.mean[i] == pytest.approx(mean, rel=1e-9, abs=1e-12, nan_ok=True)
+            assert spread.sd[i] == pytest.approx(sd, rel=1e-6, abs=1e-9, nan_ok=True)
+
+
+@given(STANCES, st.lists(st.integers(0, 10_000), max_size=8), st.booleans())
+def test_batches_do_not_matter_to_the_bit(
+    stances: list[npt.NDArray[np.float64]], cuts: list[int], several: bool
+) -> None:
+    frames = recording(stances, list(range(len(stances))) if several else None)
+    whole, pieces = overlaid(*frames), overlaid(*frames, cuts=cuts)
+    for name in OVERLAID:
+        assert whole.curves[name].tobytes() == pieces.curves[name].tobytes()
+        for field in ("mean", "sd", "count"):
+            one, other = (getattr(o.spread[name], field) for o in (whole, pieces))
+            assert one.tobytes() == other.tobytes()
+
+
+def test_mean_and_spread_are_of_stances_that_are_not_kept_as_well() -> None:
+    stances = [np.full(10, float(force)) for force in (10, 20, 30, 80)]
+    found = overlaid(*recording(stances), kept=[1])
+    assert found.rows.tolist() == [1]
+    assert found.curves["grf_n"].shape == (1, 101)
+    assert found.spread["grf_n"].mean == pytest.approx(np.full(101, 35.0))
+    assert found.spread["grf_n"].sd == pytest.approx(np.full(101, np.std([10, 20, 30, 80], ddof=1)))
+
+
+def test_of_one_stance_there_is_no_spread_and_of_none_no_mean() -> None:
+    found = overlaid(*recording([np.full(10, 5.0)]))
+    assert (found.spread["grf_n"].mean == 5.0).all()
+    assert np.isnan(found.spread["grf_n"].sd).all()
+    assert np.isnan(found.spread["cop_x_m"].mean).all()
+    assert not found.spread["cop_x_m"].count.any()
+
+
+@given(st.integers(0, 5000), st.integers(1, 200))
+def test_rows_that_are_kept_lie_evenly_from_the_first_to_the_last(count: int, most: int) -> None:
+    rows = evenly(count, most).tolist()
+    assert len(rows) == len(set(rows)) == min(count, most)
+    assert rows == sorted(rows)
+    if most > 1 and count:
+        assert (rows[0], rows[-1]) == (0, count - 1)
+        assert max(np.diff(rows), default=1) - min(np.diff(rows), default=1) <= 1
