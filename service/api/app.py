@@ -7,14 +7,13 @@ from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from fastapi import APIRouter, FastAPI
-from fastapi.responses import FileResponse
-from starlette.staticfiles import StaticFiles
+from fastapi import APIRouter, FastAPI, Request, Response
 from starlette.websockets import WebSocket
 
 from devices.errors import FootTileError
 from service.api import problems
 from service.api.guard import Guard
+from service.api.page import PageFiles
 from service.api.routes import (
     access,
     array,
@@ -52,7 +51,6 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
         hosts: names under which it is reached, in addition to addresses and localhost.
         token: asked for on every change of state and on ingest; None: not asked for.
     """
-    page = page_folder()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -100,15 +98,17 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
     async def ingest_socket(socket: WebSocket) -> None:
         await ingest(socket, server)
 
+    page = PageFiles(page_folder())
+
     @app.get("/", include_in_schema=False)
-    async def index() -> FileResponse:
-        return FileResponse(page / "index.html", headers={"Cache-Control": "no-cache"})
+    async def index(request: Request) -> Response:
+        return await page.get_response("index.html", request.scope)
 
     @app.get("/sessions/{session_id}", include_in_schema=False)
-    async def session_page(session_id: str) -> FileResponse:  # it asks for the session itself
-        return FileResponse(page / "session.html", headers={"Cache-Control": "no-cache"})
+    async def session_page(session_id: str, request: Request) -> Response:  # it asks for it itself
+        return await page.get_response("session.html", request.scope)
 
-    app.mount("/static", StaticFiles(directory=page), name="static")
+    app.mount("/static", page, name="static")
     app.add_middleware(Guard, hosts=tuple(hosts), token=token)
     return app
 

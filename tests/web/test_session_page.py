@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from playwright.sync_api import Browser, Page, Response, expect
+from playwright.sync_api import Browser, Page, expect
 
 import service.api.routes.ingest
 import service.api.routes.sessions
@@ -20,6 +19,7 @@ from tests.service.fake_node import FakeNode, Play
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import PATIENCE_S
+from tests.web.received import Received
 from tests.web.scripted import Scripted
 from tests.web.test_accessible import complaints
 
@@ -358,27 +358,31 @@ def test_a_session_that_is_recorded_says_so_and_turns_into_plots_when_it_is_seal
     expect(page.locator("#sessions")).to_contain_text("now")
 
 
-def test_the_page_is_small_and_the_live_page_does_not_carry_it(
+def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
     walk: Recording, browser: Browser
 ) -> None:
     with browser.new_context() as context:
         page = context.new_page()
-        sizes: dict[str, int] = {}
-
-        def weigh(response: Response) -> None:
-            if "/api/" not in response.url:
-                sizes[response.url] = len(gzip.compress(response.body()))
-
-        page.on("response", weigh)
+        received = Received(page)
         page.goto(url_of(walk))
         settled(page)
-        assert len(sizes) > 15
-        assert sum(sizes.values()) < 100_000
-        sizes.clear()
+        assert len(received.bytes_of) > 15
+        bins = sum(size for url, size in received.bytes_of.items() if "/overview" in url)
+        assert 0 < bins < 300_000
+        assert received.bytes_in_all - bins < 100_000, received.bytes_of
+    node = FakeNode(walk.running, "weighed")
+    node.connect()
+    node.tared()
+    with browser.new_context() as context, Play(node):
+        page = context.new_page()
+        received = Received(page)
         page.goto(walk.running.url)
+        expect(page.locator("body")).to_have_attribute("data-live", "true")
         expect(page.locator("#sessions")).to_contain_text("walk")
-        assert sizes
-        assert not [url for url in sizes if "/session/" in url or "session.css" in url]
+        received.wait_for("/recent")
+        assert received.bytes_in_all < 120_000, received.bytes_of
+        assert not [u for u in received.bytes_of if "/session/" in u or "session.css" in u]
+    node.close()
 
 
 def test_a_session_that_is_not_there_is_said_not_to_be(server: Running, browser: Browser) -> None:

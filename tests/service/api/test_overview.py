@@ -102,6 +102,24 @@ def test_some_columns_come_with_the_instants_and_as_arrow_they_are_the_same(
     assert (again.status_code, again.content) == (304, b"")
 
 
+def test_as_json_it_goes_compressed_to_who_takes_that_and_is_the_same(hopped: Recording) -> None:
+    http, url = hopped.running.http, f"{hopped.url}/overview"
+    packed = http.get(url, headers={"Accept-Encoding": "gzip"})
+    plain = http.get(url, headers={"Accept-Encoding": "identity"})
+    assert packed.headers["content-encoding"] == "gzip"
+    assert "content-encoding" not in plain.headers
+    assert packed.json() == plain.json()
+    assert 2 * int(packed.headers["content-length"]) < int(plain.headers["content-length"])
+    assert packed.headers["etag"] != plain.headers["etag"]
+    assert packed.headers["vary"] == plain.headers["vary"] == "Accept, Accept-Encoding"
+    asked = {"Accept-Encoding": "gzip", "If-None-Match": packed.headers["etag"]}
+    again = http.get(url, headers=asked)
+    assert (again.status_code, again.content) == (304, b"")
+    assert again.headers["vary"] == packed.headers["vary"]
+    arrow = http.get(url, headers={"Accept-Encoding": "gzip", "Accept": ARROW})
+    assert "content-encoding" not in arrow.headers
+
+
 def test_what_sealing_wrote_is_what_is_made_again_from_the_frames(
     hopped: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:

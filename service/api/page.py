@@ -1,0 +1,81 @@
+"""The files of the page, compressed once and kept for as long as they stay as they are."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from starlette.datastructures import Headers
+from starlette.responses import Response
+from starlette.staticfiles import NotModifiedResponse, PathLike, StaticFiles
+from starlette.types import Scope
+
+from service.api.encoding import takes_gzip
+
+_WORTH_IT = 0.9
+"""Of its length: what does not become shorter than that is sent as it is."""
+
+_MEDIA_TYPES = {
+    ".html": "text/html",
+    ".css": "text/css",
+    ".js": "text/javascript",
+    ".svg": "image/svg+xml",
+}
+"""The same on every machine: `mimetypes` would ask the machine's own tables."""
+
+
+@dataclass(frozen=True)
+class _Kept:
+    written: tuple[int, int]
+    """Nanoseconds of its last change, and bytes: what tells that it is another one."""
+    plain: bytes
+    packed: bytes | None
+    tag: str
+
+
+class PageFiles(StaticFiles):
+    """A folder of files that are the same for everyone."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(directory=folder)
+        self._kept: dict[str, _Kept] = {}
+
+    def file_response(
+        self,
+        full_path: PathLike,
+        stat_result: os.stat_result,
+        scope: Scope,
+        status_code: int = 200,
+    ) -> Response:
+        """Answer with a file, as gzip to who takes it; each form has a tag of its own."""
+        asked = Headers(scope=scope)
+        file = self._file(Path(full_path), stat_result)
+        packed = file.packed is not None and takes_gzip(asked.get("accept-encoding", ""))
+        answer = Response(
+            file.packed if packed else file.plain,
+            status_code=status_code,
+            headers={"ETag": f'"{file.tag}{"-gzip" if packed else ""}"', "Vary": "Accept-Encoding"},
+            media_type=_MEDIA_TYPES.get(Path(full_path).suffix),
+        )
+        if packed:
+            answer.headers["Content-Encoding"] = "gzip"
+        if self.is_not_modified(answer.headers, asked):
+            return NotModifiedResponse(answer.headers)
+        return answer
+
+    def _file(self, path: Path, stat: os.stat_result) -> _Kept:
+        written = (stat.st_mtime_ns, stat.st_size)
+        kept = self._kept.get(str(path))
+        if kept is None or kept.written != written:
+            plain = path.read_bytes()
+            packed = gzip.compress(plain, 9, mtime=0)
+            kept = self._kept[str(path)] = _Kept(
+                written,
+                plain,
+                packed if len(packed) < _WORTH_IT * len(plain) else None,
+                hashlib.sha256(plain).hexdigest(),
+            )
+        return kept
