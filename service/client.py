@@ -71,15 +71,20 @@ class Client:
 
     Args:
         server: its address.
+        token: its token; None: FOOTTILE_TOKEN, if that is set.
 
     Raises:
         UsageError: that is no address.
     """
 
-    def __init__(self, server: str) -> None:
+    def __init__(self, server: str, token: str | None = None) -> None:
         self.server = server.rstrip("/")
+        token = token or os.environ.get("FOOTTILE_TOKEN")
+        headers = [(b"Authorization", f"Bearer {token}".encode())] if token else []
         try:
-            self._http = httpx.Client(base_url=self.server + API, timeout=10.0, trust_env=False)
+            self._http = httpx.Client(
+                base_url=self.server + API, headers=headers, timeout=10.0, trust_env=False
+            )
         except (httpx.InvalidURL, ValueError) as error:
             raise UsageError(f"{server!r} is no server address: {error}") from error
         if self._http.base_url.scheme not in ("http", "https"):
@@ -139,6 +144,14 @@ class Client:
             LinkError: the server does not answer or refuses.
         """
         return self._post(f"/sessions/{quote(session_id, safe='')}/stop", None)
+
+    def ticket(self, may: str) -> dict[str, Any]:
+        """A ticket for somebody who may `look` or `press`.
+
+        Raises:
+            LinkError: the server does not answer or refuses.
+        """
+        return self._post("/tickets", {"may": may})
 
     def pull(self, session_id: str, out: Path) -> dict[str, Any]:
         """Download a sealed session into the folder `out`/`session_id`.

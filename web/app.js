@@ -7,8 +7,8 @@
 // A panel is a class that owns one element of index.html; it is made here and handed what the
 // server says. Panels do not know each other. No build step, and nothing from another host.
 
-import { takeTokenFromAddress } from "./common/api.js";
 import { Link } from "./common/link.js";
+import { look } from "./common/login.js";
 import { byId, el, setText } from "./common/text.js";
 import { Actions } from "./live/actions.js";
 import { Bars } from "./live/bars.js";
@@ -41,7 +41,6 @@ const state = {
   serverNowMs: () => Date.now() + state.serverAheadMs,
 };
 
-takeTokenFromAddress();
 const bars = new Bars(() => { state.fresh = true; });
 const foot = new Foot();
 foot.resized = () => { state.fresh = true; };
@@ -71,6 +70,7 @@ const handlers = {
     chooseNode();
     sessions.reload().then((items) => items.forEach(takeSession));
     marks.send(); // the server is back
+    look(); // and may know us no more
     trash.changed();
   },
   node({ node }) {

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ipaddress
 import logging
+import os
 import re
 import secrets
 import socket
@@ -73,30 +74,56 @@ def _own_addresses() -> list[str]:
         return [name for name in (probe.getsockname()[0],) if not is_loopback(name)]
 
 
-def token_for(host: str, given: str | None, data: Path) -> str | None:
-    """The token to ask for: the one given; off loopback one that is kept in the data folder.
+def token_for(host: str, given: str | None, data: Path, *, is_private: bool = False) -> str | None:
+    """The token to ask for: the one given, else one that is kept in the data folder.
+
+    On loopback it is None if none is given, unless the server is private.
 
     Raises:
         StorageError: it cannot be read or kept.
     """
-    if given or is_loopback(host):
+    if given or (is_loopback(host) and not is_private):
         return given or None
     path = data / KEPT_IN
     try:
-        kept = read_whole(path).decode("ascii", "replace").strip()
-        if not _TOKEN.fullmatch(kept):
-            raise DamagedFileError("it holds no token", where=str(path))  # noqa: TRY301  # caught below
+        return kept_token(data)
     except FileNotFoundError:
         pass
     except DamagedFileError as error:
         log.warning("%s, and a new token is made", put_aside(path, error))
-    else:
-        return kept
     with storage_errors(path):
         data.mkdir(parents=True, exist_ok=True)
         kept = secrets.token_urlsafe(18)
         write_whole(path, kept.encode() + b"\n", mode=0o600)
     return kept
+
+
+def kept_token(data: Path) -> str:
+    """The token that a server has made and keeps in its data folder.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DamagedFileError: the file holds no token.
+        StorageError: it cannot be read: it is its user's alone.
+    """
+    path = data / KEPT_IN
+    kept = read_whole(path).decode("ascii", "replace").strip()
+    if not _TOKEN.fullmatch(kept):
+        raise DamagedFileError("it holds no token", where=str(path))
+    return kept
+
+
+def known_token(data: Path) -> str | None:
+    """The token of this machine's server: FOOTTILE_TOKEN, else the one in its data folder.
+
+    Raises:
+        DamagedFileError: the file holds no token.
+        StorageError: it cannot be read: it is its user's alone.
+    """
+    try:
+        return os.environ.get("FOOTTILE_TOKEN") or kept_token(data)
+    except FileNotFoundError:
+        return None
 
 
 _TOKEN = re.compile(r"[!-~]{8,200}")

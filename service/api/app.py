@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from starlette.websockets import WebSocket
 from devices.errors import FootTileError
 from service.api import problems
 from service.api.guard import Guard
+from service.api.logins import Logins
 from service.api.page import PageFiles
 from service.api.routes import (
     access,
@@ -20,6 +21,7 @@ from service.api.routes import (
     clock,
     data,
     health,
+    login,
     nodes,
     overview,
     sessions,
@@ -43,14 +45,24 @@ websocket `/api/v1/live`; nodes connect to `/api/v1/ingest` with the subprotocol
 """
 
 
-def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = None) -> FastAPI:
+def make_app(
+    server: Server,
+    *,
+    hosts: Iterable[str] = (),
+    token: str | None = None,
+    logins: Logins | None = None,
+    urls: Sequence[str] = (),
+) -> FastAPI:
     """Build the application.
 
     Args:
         server: the state it serves.
         hosts: names under which it is reached, in addition to addresses and localhost.
         token: asked for on every change of state and on ingest; None: not asked for.
+        logins: of this token, if more is to be said of them.
+        urls: its addresses, as they are said to people; the first one is shown to phones.
     """
+    logins = logins if logins is not None else Logins(token)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -72,13 +84,16 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
         lifespan=lifespan,
     )
     app.state.server = server
+    app.state.logins = logins
+    app.state.urls = tuple(urls)
     problems.install(app)
     api = APIRouter(
         prefix=API,
         responses=access.problems(
             _400="This is not a request as HTTP/1.1 has them, or its body is not UTF-8.",
-            _401="Off loopback a change needs the token.",
-            _403="The Host header, or the Origin of a change, is not this server's.",
+            _401="Off loopback a change needs the token or a login; if it is private, all does.",
+            _403="The Host header, or the Origin of a change, is not this server's; or the login "
+            "that was shown is a viewer's.",
             _408="Its headers or its body did not come in time.",
             _413="The body is too long.",
             _422="A parameter or the body is not as described.",
@@ -86,7 +101,7 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
             _503="There are too many connections, or the data folder is not there.",
         ),
     )
-    for module in (health, nodes, sessions, trash, data, clock, array, stances, overview):
+    for module in (health, login, nodes, sessions, trash, data, clock, array, stances, overview):
         api.include_router(module.router)
     app.include_router(api)
 
@@ -109,7 +124,7 @@ def make_app(server: Server, *, hosts: Iterable[str] = (), token: str | None = N
         return await page.get_response("session.html", request.scope)
 
     app.mount("/static", page, name="static")
-    app.add_middleware(Guard, hosts=tuple(hosts), token=token)
+    app.add_middleware(Guard, hosts=tuple(hosts), logins=logins)
     return app
 
 

@@ -1,35 +1,55 @@
-"""Who may ask: Host and Origin are checked, and except on loopback a token for every change.
+"""Who may ask: Host and Origin are checked, and except on loopback a right for every change.
 
 A web page of another site can make a browser send requests here; it cannot choose the Host header
 nor hide its Origin. On loopback that is what has to be kept out; on a network others are, too.
+What a request shows of who asks is in `service.api.logins`.
 """
 
 from __future__ import annotations
 
-import hmac
 import ipaddress
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from http import HTTPStatus
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.api.logins import Logins, Right, Shown
 from service.api.problems import problem
 from service.link import LIVE_PATH
 
 BODY_BYTES_MAX = 64 << 10
 """Longest body of a request: names and notes."""
 
+LOGIN_PATH = "/api/v1/login"
+TICKETS_PATH = "/api/v1/tickets"
+
+_HERE = "the computer on which `foottile serve` runs"
 _ASKED = (
-    "To change something here the server's token is needed: it is shown, or where it is, on the "
-    "computer on which `foottile serve` runs. A program sends it as Authorization: Bearer TOKEN"
+    "To change something here the server's token is needed, or a login: the token is shown, or "
+    f"where it is, on {_HERE}, and `foottile ticket` gives a login there. A program sends the "
+    "token as Authorization: Bearer TOKEN"
 )
-_WRONG = (
-    "This is not the server's token: that is shown, or where it is, on the computer on which "
-    "`foottile serve` runs"
+_PRIVATE = (
+    "This server is private: to look, too, a login is needed, which `foottile ticket` gives on "
+    f"{_HERE}, or its token. A program sends the token as Authorization: Bearer TOKEN"
 )
+_WRONG = f"This is not the server's token: that is shown, or where it is, on {_HERE}"
+_ENDED = (
+    "This login has ended: the server was started again, or 12 hours are over. "
+    f"`foottile ticket` gives a new one, on {_HERE}"
+)
+_VIEWER = (
+    "This login may look and not press: it came from a viewer's ticket. `foottile ticket` gives "
+    f"one that may press, on {_HERE}"
+)
+_NO_LOGIN = "For this no login is enough: it needs the server's token"
+_OPEN = re.compile(rf"/|/nodes|/sessions/[^/]+|/static/.*|{LOGIN_PATH}|/api/v1/ready")
+"""What also a private server shows everybody: pages and files without data, how to get in, and for
+those who watch over its process whether it works."""
 _HOST = re.compile(r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)\])(?::[0-9]{1,5})?")
 """As browsers write it: a name or an address, and a port; no user, no path."""
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
@@ -47,13 +67,13 @@ class Guard:
     Args:
         app: what is guarded.
         hosts: names under which it is reached, in addition to addresses of this machine.
-        token: asked for on every change of state and on ingest; None: only for loopback.
+        logins: what is asked for on every change of state and on ingest, and of whom.
     """
 
-    def __init__(self, app: ASGIApp, *, hosts: Iterable[str], token: str | None) -> None:
+    def __init__(self, app: ASGIApp, *, hosts: Iterable[str], logins: Logins) -> None:
         self._app = app
         self._hosts = frozenset(host.lower() for host in hosts)
-        self._token = token
+        self._logins = logins
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection."""
@@ -87,13 +107,25 @@ class Guard:
             return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, what
         if any(ord(character) < ord(" ") for character in scope["path"]):
             return HTTPStatus.BAD_REQUEST, "The path has control characters in it"
-        # Every websocket but the live one, so that no other way of writing a path is a way in.
-        needs_token = changes or (websocket and scope["path"] != LIVE_PATH)
-        if needs_token and self._token is not None:
-            given = bearer_token(headers.getlist("authorization"))
-            if given is None or not hmac.compare_digest(given.encode(), self._token.encode()):
-                return HTTPStatus.UNAUTHORIZED, _ASKED if given is None else _WRONG
-        return None
+        needed = self._needed(scope)
+        if needed is None:
+            return None
+        shown = self._logins.shown_by(HTTPConnection(scope))
+        if shown.left_s is not None and changes and "origin" not in headers:
+            # Cookies are browsers', and each of these says from where it changes something.
+            shown = Shown(None)
+        return _lacking(needed, shown)
+
+    def _needed(self, scope: Scope) -> Right | None:
+        path, looking = scope["path"], Right.LOOK if self._logins.is_private else None
+        if scope["type"] == "websocket":
+            # Every one but the live one, so that no other way of writing a path is a way in.
+            return looking if path == LIVE_PATH else Right.OWN
+        if path == LOGIN_PATH:
+            return None
+        if scope["method"] in SAFE_METHODS:
+            return None if _OPEN.fullmatch(path) else looking
+        return Right.OWN if path == TICKETS_PATH else Right.PRESS
 
     def _is_ours(self, host: str) -> bool:
         found = _HOST.fullmatch(host)
@@ -110,10 +142,16 @@ class Guard:
         return True
 
 
-def bearer_token(given: Sequence[str]) -> str | None:
-    """The token in a request's Authorization headers; None unless it is one `Bearer TOKEN`."""
-    scheme, _, token = (given[0] if len(given) == 1 else "").partition(" ")
-    return token.strip() or None if scheme.lower() == "bearer" else None
+def _lacking(needed: Right, shown: Shown) -> tuple[HTTPStatus, str] | None:
+    """What one who has shown this lacks for what is needed."""
+    if shown.right is None:
+        what = _PRIVATE if needed is Right.LOOK else _ASKED
+        if shown.has_wrong_token:
+            what = _WRONG
+        return HTTPStatus.UNAUTHORIZED, _ENDED if shown.has_ended else what
+    if shown.right < needed:
+        return HTTPStatus.FORBIDDEN, _VIEWER if needed is Right.PRESS else _NO_LOGIN
+    return None
 
 
 class _Limited:

@@ -35,8 +35,10 @@ class Settings(Bounds, BaseSettings):
     data: Path = Field(default_factory=lambda: user_data_path("foottile"))
     """Folder for sessions, journals and what is known of nodes."""
     token: Annotated[str, Field(min_length=8)] | None = None
-    """Asked for on every change of state; made and kept in the data folder if the host is not
-    loopback and none is given."""
+    """Asked for on every change of state; made and kept in the data folder if none is given and
+    the host is not loopback, or the server is private."""
+    private: bool = False
+    """Is a login, or the token, asked for to look, too?"""
     allow_host: tuple[str, ...] = ()
     """Names under which the server is reached, in addition to its addresses."""
     exact: bool = False

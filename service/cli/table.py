@@ -19,6 +19,7 @@ SUMMARIES = {
     "demo": "Run a server and an emulated node, and show where the live page is.",
     "serve": "Take in nodes, estimate, show live, record, and give sessions away over HTTP.",
     "node": "Take frames from an array, keep them on disk and publish them to a server.",
+    "ticket": "Give a ticket for the live page: an address, and on a terminal its QR code.",
     "sessions": "List recorded sessions, newest first.",
     "pull": "Download a sealed session: data, description, events.",
     "export": "Write a sealed session, or a slice of it, in another format.",

@@ -20,6 +20,7 @@ from devices.frames import FrameBatch
 from service.api.address import listen, urls_of
 from service.api.app import make_app
 from service.api.doors import Bounds
+from service.api.logins import Logins
 from service.api.serve import serving
 from service.link import SUBPROTOCOL
 from service.server.server import Server
@@ -45,6 +46,7 @@ class Running:
         data: Path,
         *,
         token: str | None = None,
+        is_private: bool = False,
         hosts: Sequence[str] = (),
         bounds: Bounds | None = None,
         exact: bool = False,
@@ -54,6 +56,8 @@ class Running:
         self.http: httpx.Client
         self.port = 0
         self._token = token
+        self._is_private = is_private
+        self.logins: Logins
         self._hosts = tuple(hosts)
         self._bounds = bounds
         self._exact = exact
@@ -172,7 +176,8 @@ class Running:
         self._stop = asyncio.Event()
         with listen("127.0.0.1", self.port) as listening:
             self.server = Server(self.data, exact=self._exact)
-            app = make_app(self.server, hosts=self._hosts, token=self._token)
+            self.logins = Logins(self._token, is_private=self._is_private)
+            app = make_app(self.server, hosts=self._hosts, logins=self.logins)
             async with serving(app, listening, self._bounds):
                 self.port = int(urls_of(listening, "127.0.0.1")[-1].rsplit(":", 1)[1])
                 ready.set()

@@ -149,16 +149,29 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
     for context in contexts:
         context.close()
     # A server that was killed on purpose, or refuses, shows up there: that is not the page's fault.
-    ours = [c for c in complaints if "ERR_" not in c and "WebSocket" not in c and "409" not in c]
+    others = ("ERR_", "WebSocket", "responded with a status of 4")
+    ours = [c for c in complaints if not any(text in c for text in others)]
     assert ours == []
 
 
 @pytest.fixture
-def scripted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scripted]:
+def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Scripted]]:
+    """Starts a server, of these options, and the node of a test."""
     monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
     monkeypatch.setattr(service.server.server, "TICK_S", 0.05)
     monkeypatch.setattr(service.api.routes.ingest, "SILENCE_S", PATIENCE_S)
     monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # its lead is long ago
-    one = Scripted(tmp_path)
-    yield one
-    one.close()
+    started: list[Scripted] = []
+
+    def start(**options: Any) -> Scripted:
+        started.append(Scripted(tmp_path, **options))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.close()
+
+
+@pytest.fixture
+def scripted(script: Callable[..., Scripted]) -> Scripted:
+    return script()

@@ -13,10 +13,12 @@ from tests.service.running import Running
 class Scripted:
     """A server, and a node that streams whenever the test does not have it do otherwise."""
 
-    def __init__(self, folder: Path) -> None:
-        self.running = Running(folder / "data")
+    def __init__(self, folder: Path, *, token: str | None = None, is_private: bool = False) -> None:
+        self.running = Running(folder / "data", token=token, is_private=is_private)
         self.running.start()
-        self.node = FakeNode(self.running)
+        if token is not None:
+            self.running.http.headers["Authorization"] = f"Bearer {token}"
+        self.node = FakeNode(self.running, token=token)
         self.node.connect()
         self.node.tared()
 

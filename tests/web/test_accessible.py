@@ -99,7 +99,7 @@ def test_dialogs_and_refusals(scripted: Scripted, open_page: OpenPage, dialog: s
     elif dialog == "help":
         page.keyboard.press("?")
     elif dialog == "token":
-        page.evaluate("document.getElementById('token-dialog').showModal()")
+        page.evaluate("import('/static/common/login.js').then((login) => void login.askToLogIn())")
     else:
         page.keyboard.press("m")
         page.click("#stop", force=True)

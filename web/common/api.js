@@ -1,13 +1,8 @@
-// REST calls: the token, problem+json, and nothing the page does not need.
+// REST calls: problem+json, and nothing the page does not need. Who we are is in a cookie: login.js.
 
-import { byId } from "./text.js";
+import { askToLogIn } from "./login.js";
 
 const PREFIX = "/api/v1";
-const TOKEN_KEY = "foottile.token";
-const WHERE = "Ask who started the server: it is shown on that computer, or where it is kept. " +
-  "Type it in here, or open the address with #token=… that is shown there.";
-const ASKED = `Anyone may watch; to tare, record or change something you need the server's token. ${WHERE}`;
-const WRONG_TOKEN = `That is not this server's token. ${WHERE}`;
 
 /** A refusal by the server; `message` is its `detail`, which says what to do. */
 export class Refusal extends Error {
@@ -17,54 +12,10 @@ export class Refusal extends Error {
   }
 }
 
-/** Take #token=... out of the address bar, where it would be shared by accident. */
-export function takeTokenFromAddress() {
-  const fields = new URLSearchParams(location.hash.slice(1));
-  const token = fields.get("token");
-  if (token === null) return;
-  store(token);
-  fields.delete("token");
-  const rest = fields.toString();
-  history.replaceState(null, "", location.pathname + location.search + (rest ? `#${rest}` : ""));
-}
-
-// Storage may be forbidden (private windows): the page must still work, for this visit.
-let tokenHere = null;
-function store(token) {
-  tokenHere = token;
-  try { sessionStorage.setItem(TOKEN_KEY, token); } catch { /* kept in memory */ }
-}
-function token() {
-  try { return tokenHere ?? sessionStorage.getItem(TOKEN_KEY); } catch { return tokenHere; }
-}
-
-let asking = null;
-/** One dialog at a time, however many calls were refused. Resolves to true if a token was given. */
-function askForToken(why) {
-  asking ??= new Promise((resolve) => {
-    const dialog = byId("token-dialog");
-    const field = byId("token-field");
-    byId("token-why").textContent = why;
-    field.value = "";
-    dialog.returnValue = "";
-    dialog.addEventListener("close", () => {
-      const given = field.value.trim();
-      field.value = "";
-      asking = null;
-      if (dialog.returnValue === "ok" && given) store(given);
-      resolve(dialog.returnValue === "ok" && given !== "");
-    }, { once: true });
-    dialog.showModal();
-  });
-  return asking;
-}
-
 /** Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. `stop` takes it back. */
 export async function call(method, path, body, stop = null) {
   const headers = { Accept: "application/json" };
   if (body !== undefined) headers["Content-Type"] = "application/json";
-  const bearer = token();
-  if (bearer && method !== "GET") headers.Authorization = `Bearer ${bearer}`;
   let response;
   try {
     response = await fetch(PREFIX + path, {
@@ -79,7 +30,7 @@ export async function call(method, path, body, stop = null) {
   const answer = response.status === 204 ? null : await response.json().catch(() => null);
   if (response.ok) return answer;
   const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
-  if (response.status === 401 && await askForToken(bearer ? WRONG_TOKEN : ASKED)) return call(method, path, body, stop);
+  if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop);
   throw new Refusal(String(detail), response.status);
 }
 

@@ -1,5 +1,7 @@
 // The websocket: reconnects for ever, measures the round trip, and hands on parsed messages.
 
+import { enter, keptOut, letIn, look } from "./login.js";
+
 const FIRST_WAIT_S = 0.3;
 const LONGEST_WAIT_S = 3;
 const STEADY_AFTER_MS = 2000;
@@ -19,16 +21,17 @@ export class Link {
     this.waitS = FIRST_WAIT_S;
     this.malformed = 0;
     this.retry = null;
-    this.connect();
+    enter().then(() => this.connect());
     setInterval(() => this.ping(), PING_EVERY_MS);
     // A phone back from sleep, or back in the WLAN, should not wait for the timer.
     addEventListener("online", () => this.hurry());
     document.addEventListener("visibilitychange", () => document.hidden || this.hurry());
   }
 
-  connect() {
+  async connect() {
     clearTimeout(this.retry);
     this.retry = null;
+    if (keptOut()) await letIn();
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const socket = new WebSocket(`${scheme}://${location.host}/api/v1/live?rate_hz=30`, "foottile.v1");
     this.socket = socket;
@@ -87,6 +90,7 @@ export class Link {
 
   lost(reason) {
     const socket = this.socket;
+    if (!this.open) look(); // was it refused, because a login is needed?
     this.socket = null;
     this.open = false;
     this.roundTripMs = null;

@@ -1,6 +1,7 @@
 // Tare, Record, Stop, Mark: buttons, fields and shortcuts.
 
 import * as api from "../common/api.js";
+import { mayPress } from "../common/login.js";
 import { notice } from "../common/notices.js";
 import { byId, duration, el, localTime, setText } from "../common/text.js";
 
@@ -52,6 +53,10 @@ export class Actions {
   /** Run an action once at a time, and say what came of it. */
   async run(name) {
     const button = byId(name);
+    if (!mayPress()) {
+      notice("this login may look, and not press. “viewer”, beside the title, says more.", { bad: true });
+      return;
+    }
     if (button.disabled || button.hidden || this.busy.has(name)) {
       if (name === "mark" && !this.running().length) notice("Marks belong to a recording: press Record first.", { bad: true });
       else if (["record", "tare"].includes(name) && this.state.cannotRecord) notice(this.state.cannotRecord, { bad: true });

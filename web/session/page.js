@@ -1,6 +1,7 @@
 // The page of one session: asks for it, and for as long as it is not sealed says so; then plots.
 
 import * as api from "../common/api.js";
+import { enter } from "../common/login.js";
 import { quietly } from "../common/notices.js";
 import { byId, el, localTime, duration, setText } from "../common/text.js";
 import { plainState } from "../sessions/state.js";
@@ -9,7 +10,6 @@ import { Plotted } from "./plotted.js";
 
 const AGAIN_MS = 1000;
 
-api.takeTokenFromAddress();
 const id = decodeURIComponent(location.pathname.split("/").pop());
 let plotted = null;
 
@@ -69,4 +69,4 @@ async function waiting(session) {
   say(session.state === "recording" ? "Being recorded" : "Not sealed yet", WHY[session.state] ?? session.problem ?? "", ...more);
 }
 
-quietly(look);
+enter().then(() => quietly(look));

@@ -28,6 +28,7 @@ from service.cli.options import (
 if TYPE_CHECKING:
     import socket
 
+    from service.api.logins import Logins
     from service.server.server import Server
 
 NODE = "demo"
@@ -76,6 +77,7 @@ async def _demo(
     host: str, port: int, data: Path, seconds: float | None, node_arguments: list[str]
 ) -> None:
     from service.api.address import listen, token_for, urls_of
+    from service.api.logins import Logins
     from storage.private import keep_private
 
     stop = stop_on_signals()
@@ -83,12 +85,13 @@ async def _demo(
     with listen(host, port) as listening:
         given = os.environ.get("FOOTTILE_TOKEN")
         token = token_for(host, given, data)
+        logins = Logins(token)
         urls = urls_of(listening, host)
         # First: while the server is imported and prepared, the tiles are found and measured.
         node = await _start_node(urls[-1], token, node_arguments)
         try:
-            async with _server(listening, data, token) as server:
-                announce(urls, data, token, is_kept=not given)
+            async with _server(listening, data, logins, urls) as server:
+                announce(urls, data, logins, is_kept=not given)
                 remark(f"what was recorded: foottile sessions --server {urls[-1]}")
                 ended = asyncio.create_task(node.wait())
                 stopped = asyncio.create_task(stop.wait())
@@ -110,7 +113,9 @@ async def _demo(
 
 
 @asynccontextmanager
-async def _server(listening: socket.socket, data: Path, token: str | None) -> AsyncIterator[Server]:
+async def _server(
+    listening: socket.socket, data: Path, logins: Logins, urls: list[str]
+) -> AsyncIterator[Server]:
     """A server that answers, while the block runs."""
     from devices.realtime import spare_what_is_loaded
     from service.api.app import make_app
@@ -119,7 +124,7 @@ async def _server(listening: socket.socket, data: Path, token: str | None) -> As
 
     server = Server(data)
     remark(PREPARING)
-    async with serving(make_app(server, token=token), listening):
+    async with serving(make_app(server, logins=logins, urls=urls), listening):
         spare_what_is_loaded()
         yield server
 

@@ -11,8 +11,10 @@ import typer
 
 from devices.errors import needs_extra
 from service.cli.options import remark, say, stop_on_signals
+from service.cli.tickets import reaches_others, show_code
 
 if TYPE_CHECKING:
+    from service.api.logins import Logins
     from service.api.settings import Settings
 
 
@@ -31,6 +33,10 @@ def serve_command(
     allow_host: Annotated[
         list[str] | None,
         typer.Option(help="Name under which the server is reached; may be given several times."),
+    ] = None,
+    private: Annotated[
+        bool | None,
+        typer.Option("--private", help="Ask for a login to look, too; default: only to change."),
     ] = None,
     exact: Annotated[
         bool | None,
@@ -70,6 +76,7 @@ def serve_command(
         port=port,
         data=data,
         allow_host=tuple(allow_host or ()) or None,
+        private=private,
         exact=exact,
         max_connections=max_connections,
         max_connections_per_address=max_connections_per_address,
@@ -87,6 +94,7 @@ async def _serve(settings: Settings) -> None:
     from devices.realtime import spare_what_is_loaded
     from service.api.address import listen, token_for, urls_of
     from service.api.app import make_app
+    from service.api.logins import Logins
     from service.api.serve import serving
     from service.server.server import Server
     from storage.private import keep_private
@@ -95,38 +103,41 @@ async def _serve(settings: Settings) -> None:
     keep_private(settings.data)
     with listen(settings.host, settings.port) as listening:
         server = Server(settings.data, exact=settings.exact)
-        token = token_for(settings.host, settings.token, settings.data)
-        app = make_app(server, hosts=settings.allow_host, token=token)
+        token = token_for(settings.host, settings.token, settings.data, is_private=settings.private)
+        logins = Logins(token, is_private=settings.private)
+        urls = urls_of(listening, settings.host)
+        app = make_app(server, hosts=settings.allow_host, logins=logins, urls=urls)
         remark(PREPARING)
         async with serving(app, listening, settings):
             spare_what_is_loaded()
-            announce(
-                urls_of(listening, settings.host),
-                settings.data,
-                token,
-                is_kept=not settings.token,
-            )
+            announce(urls, settings.data, logins, is_kept=not settings.token)
             await stop.wait()
 
 
 PREPARING = "preparing the models; on a new machine that takes some ten seconds"
 
 
-def announce(urls: list[str], data: Path, token: str | None, *, is_kept: bool) -> None:
-    """Say where the page is, and how a node gets there.
+def announce(urls: list[str], data: Path, logins: Logins, *, is_kept: bool) -> None:
+    """Say where the page is, how a phone gets in, and how a node gets there.
 
-    The token is shown on a terminal only: what is not one is often a log, which others may read.
+    Token and ticket are shown on a terminal only: what is not one is often a log, which others may
+    read.
 
     Args:
         urls: addresses of the server.
         data: its data folder.
-        token: what it asks for.
-        is_kept: is the token the one that is kept in the data folder?
+        logins: what it asks for.
+        is_kept: is its token the one that is kept in the data folder?
     """
     from service.api.address import KEPT_IN
+    from service.api.logins import Right
+    from service.api.routes.login import with_ticket
 
+    token, has_screen = logins.token, sys.stdout.isatty()
     for url in urls:
-        say(f"FootTile is at {url}/" + (f"#token={token}" if token and sys.stdout.isatty() else ""))
+        say(f"FootTile is at {url}/" + (f"#token={token}" if token and has_screen else ""))
+    if token and has_screen and reaches_others(urls[0]):
+        show_code(with_ticket(urls[0], logins.tickets.new(Right.PRESS)))
     remark(f"data in {data}; Ctrl-C ends it")
     if not token:
         return

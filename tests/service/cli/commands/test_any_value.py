@@ -52,6 +52,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "serve": ("--host", "192.0.2.1"),  # no address of this machine: it ends at once
     "sessions": ("--data", "."),
     "simulate": SHORT[1:],
+    "ticket": ("--server", "http://127.0.0.1:1", "--data", "."),
     "verify": ("s.parquet",),
 }
 """For each command, arguments with which it ends within a moment."""
@@ -216,6 +217,7 @@ IN_FOLDERS: dict[tuple[str, str], tuple[object, ...]] = {
     ("reproduce", "out"): ("--out", "{}"),
     ("serve", "data"): ("--port", 0, "--data", "{}"),
     ("sessions", "data"): ("--data", "{}"),
+    ("ticket", "data"): ("--server", "http://127.0.0.1:1", "--data", "{}"),
     ("verify", "data"): ("20200101T000000Z-000000", "--data", "{}"),
 }
 

@@ -1,0 +1,51 @@
+"""A ticket as people see it: the address that has it, and on a terminal a code for a phone."""
+
+from __future__ import annotations
+
+import sys
+from io import StringIO
+from urllib.parse import urlsplit
+
+from service.cli.options import remark, say
+
+_BORDER = 2
+_BLACK_ON_WHITE = "\x1b[38;5;231;48;5;16m"
+"""Light blocks on a dark ground, whatever colours the terminal has: few phones read it inverted."""
+_USUAL = "\x1b[0m"
+
+
+def reaches_others(url: str) -> bool:
+    """Is this an address that a phone could open?"""
+    from service.api.address import is_loopback
+
+    return not is_loopback(urlsplit(url).hostname or "")
+
+
+def qr_lines(text: str) -> list[str]:
+    """A QR code in half blocks, two rows a line, the light modules drawn."""
+    import segno
+
+    drawn = StringIO()
+    segno.make(text, error="l", micro=False).terminal(drawn, border=_BORDER, compact=True)
+    return drawn.getvalue().splitlines()
+
+
+def show_code(address: str, *, viewer: bool = False) -> None:
+    """Show the code of an address that has a ticket; on a terminal only, which no log is."""
+    if not sys.stdout.isatty():
+        return
+    for line in qr_lines(address):
+        sys.stdout.write(f"{_BLACK_ON_WHITE}{line}{_USUAL}\n")
+    sys.stdout.flush()
+    may = "look" if viewer else "tare, record and change"
+    remark(f"for a phone: it may {may}; good once, for five minutes; more with `foottile ticket`")
+
+
+def say_ticket(urls: list[str], *, viewer: bool) -> None:
+    """Say under which addresses a ticket is good, and show the code of the first one."""
+    for url in urls:
+        say(url)
+    if reaches_others(urls[0]):
+        show_code(urls[0], viewer=viewer)
+    else:
+        remark("a phone does not reach this address: start the server with --host 0.0.0.0")

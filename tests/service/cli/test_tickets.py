@@ -1,0 +1,132 @@
+"""Tickets as people get them: at the server's start, and with `foottile ticket`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import httpx
+import pytest
+import segno
+
+from service.api.logins import Logins
+from service.cli.commands.serve import announce
+from service.cli.tickets import qr_lines
+from tests.service.cli.outcome import Run
+from tests.service.running import ServeWith
+
+TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
+AWAY = "http://192.168.4.1:8000"
+_LIGHT_ABOVE_BELOW = {"█": (1, 1), "▀": (1, 0), "▄": (0, 1), " ": (0, 0)}
+
+
+def test_a_code_is_drawn_with_light_blocks_module_by_module() -> None:
+    text = f"{AWAY}/#ticket=0123456789abcdefABCDEF"
+    rows: list[list[int]] = []
+    for line in qr_lines(text):
+        halves = [_LIGHT_ABOVE_BELOW[block] for block in line]
+        rows += [[above for above, _ in halves], [below for _, below in halves]]
+    border = 2
+    drawn = [row[border:-border] for row in rows[border:-border]]
+    dark = [list(row) for row in segno.make(text, error="l", micro=False).matrix]
+    assert [[1 - light for light in row] for row in drawn[: len(dark)]] == dark
+    assert {light for row in rows[:border] for light in row} == {1}  # readers need a margin
+
+
+def announced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], url: str, token: str | None
+) -> tuple[str, Logins]:
+    logins = Logins(token)
+    announce([url], tmp_path, logins, is_kept=True)
+    return capsys.readouterr().out, logins
+
+
+def tickets_of(logins: Logins) -> int:
+    return len(logins.tickets._given)
+
+
+def test_a_server_that_phones_reach_shows_a_code_on_a_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    shown, logins = announced(tmp_path, capsys, AWAY, TOKEN)
+    assert f"{AWAY}/#token={TOKEN}" in shown
+    assert "█▀" in shown
+    assert tickets_of(logins) == 1
+
+
+def test_a_log_gets_neither_code_nor_token(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown, logins = announced(tmp_path, capsys, AWAY, TOKEN)
+    assert shown == f"FootTile is at {AWAY}/\n"
+    assert tickets_of(logins) == 0
+
+
+@pytest.mark.parametrize("token", [None, TOKEN])
+@pytest.mark.parametrize("url", ["http://127.0.0.1:8000", "http://[::1]:8000"])
+def test_a_server_that_no_phone_reaches_shows_no_code(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    url: str,
+    token: str | None,
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    shown, logins = announced(tmp_path, capsys, url, token)
+    assert "█" not in shown
+    assert tickets_of(logins) == 0
+
+
+@pytest.mark.parametrize(("option", "may"), [((), "press"), (("--viewer",), "look")])
+def test_ticket_prints_an_address_that_lets_in_who_opens_it(
+    serve_with: ServeWith,
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    option: tuple[str, ...],
+    may: str,
+) -> None:
+    running = serve_with(token=TOKEN)
+    (tmp_path / "token").write_text(TOKEN + "\n")
+    monkeypatch.delenv("FOOTTILE_TOKEN", raising=False)
+    done = run("ticket", "--server", running.url, "--data", str(tmp_path), *option)
+    assert done.code == 0, done.err
+    address, _, ticket = done.out.strip().partition("#ticket=")
+    assert address == running.url + "/"
+    assert "--host 0.0.0.0" in done.err
+    answer = httpx.post(f"{address}api/v1/login", json={"ticket": ticket}, trust_env=False)
+    assert answer.json()["may"] == may
+
+
+def test_ticket_as_json_by_the_token_of_the_environment(
+    serve_with: ServeWith, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running = serve_with(token=TOKEN)
+    monkeypatch.setenv("FOOTTILE_TOKEN", TOKEN)
+    done = run("ticket", "--server", running.url, "--data", str(tmp_path), "--json")
+    assert json.loads(done.out)["may"] == "press"
+    assert TOKEN not in done.out
+
+
+def test_ticket_without_the_token_says_what_is_lacking(
+    serve_with: ServeWith, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running = serve_with(token=TOKEN)
+    monkeypatch.delenv("FOOTTILE_TOKEN", raising=False)
+    done = run("ticket", "--server", running.url, "--data", str(tmp_path))
+    assert done.code == 1
+    assert "token is needed" in done.err
+
+
+def test_a_private_server_is_read_with_its_token(
+    serve_with: ServeWith, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running = serve_with(token=TOKEN, is_private=True)
+    monkeypatch.delenv("FOOTTILE_TOKEN", raising=False)
+    refused = run("sessions", "--server", running.url)
+    assert refused.code == 1
+    assert "private" in refused.err
+    monkeypatch.setenv("FOOTTILE_TOKEN", TOKEN)
+    assert run("sessions", "--server", running.url).code == 0

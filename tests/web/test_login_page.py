@@ -1,0 +1,109 @@
+"""Getting into a server that asks for a login: by ticket, as a viewer, and where it is private."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.service.fake_node import Play
+from tests.web.scripted import Scripted
+from tests.web.test_accessible import complaints
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+Script = Callable[..., Scripted]
+TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
+PHONE = (390, 844)
+_LIVE = "body[data-live=true]"
+
+
+def address(server: Scripted, may: str = "press") -> str:
+    answer = server.running.http.post("/tickets", json={"may": may})
+    (url,) = answer.json()["urls"]
+    return str(url)
+
+
+def recorded(server: Scripted) -> list[str]:
+    return [str(session["name"]) for session in server.running.sessions()]
+
+
+def test_a_phone_that_opens_a_ticket_may_record_and_a_second_one_may_not(
+    script: Script, open_page: OpenPage
+) -> None:
+    server = script(token=TOKEN)
+    with Play(server.node):
+        url = address(server)
+        page = open_page(url, *PHONE)
+        expect(page.locator(_LIVE)).to_have_count(1)
+        expect(page.locator("body")).to_have_attribute("data-may", "press")
+        assert page.url == f"{server.url}/"
+        assert page.evaluate("document.cookie") == ""
+        page.evaluate("document.getElementById('record').click()")
+        expect(page.locator("#recordings li")).to_have_count(1)
+        page.reload()
+        expect(page.locator("body")).to_have_attribute("data-may", "press")
+        expect(page.locator("#login")).to_be_hidden()
+
+        second = open_page(url, *PHONE)
+        expect(second.locator("#login")).to_have_text("not logged in")
+        expect(second.locator(_LIVE)).to_have_count(1)
+        second.evaluate("document.getElementById('stop').click()")
+        expect(second.locator("#token-why")).to_contain_text("good once")
+        second.fill("#token-field", "wrong")
+        second.press("#token-field", "Enter")
+        expect(second.locator("#token-why")).to_contain_text("not this server's token")
+        assert complaints(second) == []
+        second.fill("#token-field", TOKEN)
+        second.press("#token-field", "Enter")
+        expect(second.locator("#recordings li")).to_have_count(0)
+        expect(second.locator("#login")).to_be_hidden()
+
+
+def test_a_viewer_is_offered_nothing_and_the_server_refuses_it(
+    script: Script, open_page: OpenPage
+) -> None:
+    server = script(token=TOKEN)
+    with Play(server.node):
+        server.node.record(name="by another one")
+        page = open_page(address(server, "look"), *PHONE)
+        expect(page.locator(_LIVE)).to_have_count(1)
+        expect(page.locator("#login")).to_have_text("viewer: looks only")
+        expect(page.locator("#recordings li")).to_have_count(1)
+        expect(page.locator("#sessions .session")).to_have_count(1)
+        for gone in ("#tare", "#record", "#stop", "#mark", "#session-name", "#mark-label"):
+            expect(page.locator(gone)).to_be_hidden()
+        expect(page.get_by_role("button", name="Edit")).to_have_count(0)
+        assert complaints(page) == []
+        page.keyboard.press("s")
+        expect(page.locator("#notices")).to_contain_text("may look, and not press")
+        status = page.evaluate(
+            """fetch('/api/v1/sessions', {method: 'POST', body: '{"node": "bench", "name": "x"}',
+                headers: {'Content-Type': 'application/json'}}).then((answer) => answer.status)"""
+        )
+        assert status == 403
+        assert recorded(server) == ["by another one"]
+
+
+def test_a_private_server_shows_nothing_before_a_login_and_says_when_that_has_ended(
+    script: Script, open_page: OpenPage
+) -> None:
+    server = script(token=TOKEN, is_private=True)
+    session = server.recorded("of nobody's business")
+    page = open_page(f"{server.url}/sessions/{session.id}")
+    expect(page.locator("#token-why")).to_contain_text("This server is private")
+    page.goto(server.url)
+    expect(page.locator("#token-why")).to_contain_text("This server is private")
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.locator("#login")).to_have_text("private")
+    assert complaints(page) == []
+    assert "nobody's business" not in page.content()
+    page.click("#login")
+    page.fill("#token-field", TOKEN)
+    page.press("#token-field", "Enter")
+    expect(page.locator("#sessions .session-name")).to_have_text("of nobody's business")
+    server.node.close()
+    server.running.restart()
+    expect(page.locator("#token-why")).to_contain_text("Your login has ended")
