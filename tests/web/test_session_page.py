@@ -265,6 +265,60 @@ def test_a_stance_is_gone_to_from_its_row_and_by_keys(walk: Recording, open_page
     shows(1)
 
 
+def test_whole_stances_lie_one_upon_another_and_a_click_on_one_goes_there(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk))
+    canvas = page.locator("#overlay-canvas")
+    canvas.scroll_into_view_if_needed()
+    says = page.locator("#overlay-says")
+    expect(says).to_contain_text("6 whole stances")
+    expect(says).to_contain_text("1 stance not seen whole is left out")
+    box = canvas.bounding_box()
+    assert box is not None
+    at = page.locator("#overlay-at")
+    expect(at).to_contain_text("The mean is greatest")
+    overlay = walk.running.http.get(f"{walk.url}/stances/overlay").json()
+    half = overlay["points"] // 2
+    for down in range(0, int(box["height"]), 6):  # from above: some curve is met
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + down)
+        page.evaluate("new Promise(requestAnimationFrame)")
+        if (at.text_content() or "").startswith("Stance"):
+            break
+    found = re.match(r"Stance (\d+): ([0-9.]+) N at (\d+) %", at.text_content() or "")
+    assert found is not None
+    curve = next(one for one in overlay["curves"] if one["number"] == int(found[1]))
+    assert abs(int(found[3]) - half) <= 4
+    assert float(found[2]) == pytest.approx(curve["grf_n"][int(found[3])], abs=0.06)
+    page.mouse.down()
+    page.mouse.up()
+    gone_to = page.locator("#stances-rows [aria-current]")
+    expect(gone_to).to_have_attribute("data-stance", found[1])
+    legend = page.locator("#overlay-legend")
+    expect(legend).to_have_attribute("data-chosen", found[1])
+    expect(legend).to_contain_text(f"stance {found[1]}, frame by frame")
+    page.locator("#stances-rows tr").nth(6).click()  # saturated: it has no place among them
+    expect(legend).to_contain_text("stance 7 was not seen whole")
+
+
+def test_paths_of_the_centre_of_pressure_are_coloured_by_time_or_by_stance(
+    walk: Recording, open_page: OpenPage
+) -> None:
+    page = open_page(url_of(walk))
+    canvas = page.locator("#cop-canvas")
+    canvas.scroll_into_view_if_needed()
+    expect(canvas).to_have_attribute("data-plan", "false")  # two tiles in a line
+    expect(page.locator("#cop-title")).to_contain_text("along the foot")
+    legend = page.locator("#cop-legend")
+    expect(legend).to_contain_text("first contact to lift-off")
+    page.locator("#stances-rows tr").nth(1).click()
+    expect(legend).to_contain_text("ends: stance 2")
+    by_time = canvas.screenshot()
+    page.get_by_role("button", name="stance", exact=True).click()
+    expect(legend).to_contain_text("first stance to last stance")
+    assert canvas.screenshot() != by_time
+
+
 def test_a_mark_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
     walk: Recording, open_page: OpenPage
 ) -> None:
@@ -366,8 +420,11 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
         received = Received(page)
         page.goto(url_of(walk))
         settled(page)
+        page.locator("#overlay-card").scroll_into_view_if_needed()  # all that it ever loads
+        expect(page.locator("#overlay-legend")).to_contain_text("mean")
         assert len(received.bytes_of) > 15
-        bins = sum(size for url, size in received.bytes_of.items() if "/overview" in url)
+        numbers = ("/overview", "/stances/overlay")
+        bins = sum(size for url, size in received.bytes_of.items() if url.split("?")[0].endswith(numbers))
         assert 0 < bins < 300_000
         assert received.bytes_in_all - bins < 100_000, received.bytes_of
     node = FakeNode(walk.running, "weighed")
@@ -404,5 +461,7 @@ def test_axe_has_nothing_to_complain_of_and_nothing_is_wider_than_the_screen(
     page.keyboard.press("ArrowRight")
     page.click("#numbers-card summary")
     expect(page.locator("#numbers-rows tr").nth(11)).to_be_attached()
+    page.locator("#overlay-card").scroll_into_view_if_needed()
+    expect(page.locator("#overlay-legend")).to_contain_text("mean")
     assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
     assert complaints(page) == []

@@ -46,6 +46,8 @@ export const markEvent = (session, event) => call("POST", `/sessions/${id(sessio
 export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
 export const listEvents = (session) => call("GET", `/sessions/${id(session)}/events`);
 export const listStances = (session) => call("GET", `/sessions/${id(session)}/stances`);
+export const stancesOverlay = (session) => call("GET", `/sessions/${id(session)}/stances/overlay`);
+export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/array`);
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
 export const overview = (session, query, stop) =>
   call("GET", `/sessions/${id(session)}/overview?${new URLSearchParams(query)}`, undefined, stop);

@@ -43,6 +43,13 @@ export function coloursOf(element, names) {
   return Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
 }
 
+/** Call when colours are others: at dusk, or in the sun. */
+export function whenColoursChange(then) {
+  for (const query of ["(prefers-color-scheme: dark)", "(forced-colors: active)", "(prefers-contrast: more)"]) {
+    matchMedia(query).addEventListener("change", then);
+  }
+}
+
 const TILE_PX = 8;
 
 /** Stripes as a fill: "/", "\\" or both ways, "x". */

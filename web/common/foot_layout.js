@@ -42,6 +42,8 @@ export class FootLayout {
     const [low, high] = range(tiles.map(up));
     /** Between neighbours, in metres. */
     this.pitch = spacing(tiles, up);
+    /** From the rearmost tile to the foremost, in metres. */
+    this.span = front - back;
     const margin = 0.9 * this.pitch;
     // Rolling by 10 degrees about the ankle must stay in the picture.
     const roll = !this.plan && turns ? Math.abs(low) * Math.sin(0.17) : 0;

@@ -1,6 +1,6 @@
 // All plots of a session over one time axis, on one canvas; the cursor is on another above it.
 
-import { coloursOf, crisp, decimalsOf, fit, hatching, ticks } from "../common/axes.js";
+import { coloursOf, crisp, decimalsOf, fit, hatching, ticks, whenColoursChange } from "../common/axes.js";
 import { byId, number, setData } from "../common/text.js";
 import { KINDS, stretchesOf } from "./flags.js";
 import { HEAD_PX, drawMarks, drawStances, drawTime } from "./overlay.js";
@@ -30,9 +30,7 @@ export class Plots {
     this.asHeat = null;
     this.panels = [];
     this.drawn = []; // where each panel is, and its scale
-    for (const query of ["(prefers-color-scheme: dark)", "(forced-colors: active)", "(prefers-contrast: more)"]) {
-      matchMedia(query).addEventListener("change", () => { this.colours = null; this.changed(); });
-    }
+    whenColoursChange(() => { this.colours = null; this.changed(); });
     this.changed = () => {};
   }
 

@@ -53,10 +53,18 @@ export class Plotted {
     ]);
     this.plots.stances = placed(stances ?? [], whole.beginNs);
     this.stances.show(this.plots.stances);
+    quietly(() => this.showOverlay());
     const offset = (tNs, ofServer) => (clock && offsetAt(clock, tNs, ofServer));
     this.marks.show(events?.items ?? [], whole.beginNs, offset);
     this.plots.marks = this.marks.placed;
     this.draw();
+  }
+
+  /** Stances one upon another: its modules come only where there are stances. */
+  async showOverlay() {
+    if (!this.plots.stances.length) return;
+    const { StanceOverlay } = await import("./stance_overlay.js");
+    this.overlay = new StanceOverlay(this.session.id, this.plots.stances, (index) => this.goTo(index));
   }
 
   listen() {
@@ -139,6 +147,7 @@ export class Plotted {
   goTo(index) {
     const stance = this.plots.stances[index];
     this.stances.choose(index);
+    this.overlay?.choose(index);
     this.cursorS = stance.peak_t_ns === null ? stance.from : stance.from + (stance.peak_t_ns - stance.begin_t_ns) * 1e-9;
     this.show(views.around(stance.from, stance.to, this.durationS));
   }

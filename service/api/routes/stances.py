@@ -11,13 +11,13 @@ from typing import Annotated, Any
 import numpy as np
 import pyarrow as pa
 from anyio import CapacityLimiter, to_thread
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from devices.arrays import Floats
 from devices.errors import StateError, UnknownError
-from service.api.routes.access import ServerState, problems
+from service.api.routes.access import ServerState, has_it, problems
 from service.server.server import Server
 from service.sessions.stance_overlay import overlay_of_session
 from service.sessions.stances import stances_of_session
@@ -107,16 +107,6 @@ class OverlayQuery(BaseModel):
     )
 
 
-class PlaceView(BaseModel):
-    """Where a tile is, in the foot's frame."""
-
-    serial: str
-    x_m: float
-    y_m: float
-    z_m: float
-    reference: bool
-
-
 class SpreadView(BaseModel):
     """One quantity at every percentage; what is not known is null."""
 
@@ -144,7 +134,6 @@ class OverlayView(BaseModel):
     overlaid: int = Field(description="Stances of which mean and spread are.")
     not_whole: int = Field(description="Left out, since they were not seen whole.")
     too_short: int = Field(description="Left out, since they are a single frame.")
-    tiles: list[PlaceView]
     spread: dict[str, SpreadView] = Field(description="Of grf_n, cop_x_m and cop_y_m.")
     curves: list[CurveView]
 
@@ -165,8 +154,8 @@ class OverlayView(BaseModel):
 async def stances_overlay(
     session_id: str,
     query: Annotated[OverlayQuery, Query()],
+    request: Request,
     server: ServerState,
-    if_none_match: Annotated[str, Header()] = "",
 ) -> Response:
     """GRF and COP of the whole stances, normalised to 0 to 100 % of their duration.
 
@@ -174,9 +163,9 @@ async def stances_overlay(
     """
     session = _sealed(session_id, server)
     asked = f"{session.sha256}|{query.model_dump_json()}|{SOFTWARE}"
-    tag = f'"{hashlib.sha256(asked.encode()).hexdigest()}"'
-    headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    if tag in if_none_match:
+    tag = hashlib.sha256(asked.encode()).hexdigest()
+    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
+    if has_it(request, tag):
         return Response(status_code=304, headers=headers)
     make = partial(_overlay, session, query, server)
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
@@ -201,14 +190,12 @@ def _overlay(session: Session, query: OverlayQuery, server: Server) -> bytes:
     table = stances_of_session(folder, frames_sha256=session.sha256)
     with server.sessions.frames(session.id, only_slices=True) as reader:
         found = overlay_of_session(reader, table, points=query.points, curves=query.curves)
-        tiles = [tile.model_dump(include={*PlaceView.model_fields}) for tile in reader.info.tiles]
     content = {
         "session_id": session.id,
         "points": query.points,
         "overlaid": found.overlaid,
         "not_whole": found.not_whole,
         "too_short": found.too_short,
-        "tiles": tiles,
         "spread": {
             name: {
                 "mean": _plain(spread.mean),

@@ -171,7 +171,6 @@ def test_stances_one_upon_another_are_those_of_the_file(tared: FakeNode) -> None
     found = session.running.http.get(f"{session.url}/stances/overlay").json()
     assert (found["overlaid"], found["not_whole"], found["too_short"]) == (3, 1, 0)
     assert [curve["number"] for curve in found["curves"]] == [1, 2, 3]
-    assert [tile["serial"] for tile in found["tiles"]] == [*tared.info.serials]
     table = pq.read_table(session.folder / "frames.parquet").to_pydict()
     for row, curve in zip(rows, found["curves"], strict=False):
         begin_ns, end_ns = row["begin_t_ns"], row["end_t_ns"]

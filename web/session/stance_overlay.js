@@ -1,0 +1,225 @@
+// Whole stances one upon another: GRF and COP over 0 to 100 % of their duration, and a click goes to one.
+
+import * as api from "../common/api.js";
+import { coloursOf, fit, whenColoursChange } from "../common/axes.js";
+import { drawArea, drawCurve, drawFrame, FRAME_COLOURS, roomy } from "../common/frame.js";
+import { byId, el, number, setData, setText } from "../common/text.js";
+import { CopPaths } from "./cop_paths.js";
+
+const HIT_PX = 18;
+const FRAMES_MOST = 4000; // of the stance that was chosen: bins of a longer one, from least to greatest
+const HEIGHT_PX = 320;
+
+/** @typedef {{number: number, grf_n: (number | null)[], cop_x_m: (number | null)[], cop_y_m: (number | null)[]}} Curve */
+
+export class StanceOverlay {
+  /**
+   * @param {string} id of the session
+   * @param {{number: number, from: number, to: number, is_whole: boolean}[]} stances
+   * @param {(index: number) => void} onGo
+   */
+  constructor(id, stances, onGo) {
+    this.id = id;
+    this.stances = stances;
+    this.onGo = onGo;
+    this.canvas = byId("overlay-canvas");
+    this.chosen = null; // number of a stance, and its frames
+    this.hover = null; // number of a curve, and the percentage
+    this.paths = new CopPaths(() => this.draw(), (curve) => this.go(curve.number));
+    const card = byId("overlay-card");
+    card.hidden = false;
+    // Nobody waits for what is out of sight.
+    const seen = new IntersectionObserver((entries) => {
+      if (!entries.some((entry) => entry.isIntersecting)) return;
+      seen.disconnect();
+      this.load().catch((error) => this.refused(error));
+    }, { rootMargin: "300px" });
+    seen.observe(card);
+    new ResizeObserver(() => this.draw()).observe(card);
+    whenColoursChange(() => this.draw());
+    this.canvas.addEventListener("pointermove", (event) => this.point(event));
+    this.canvas.addEventListener("pointerleave", () => { this.hover = null; this.draw(); });
+    this.canvas.addEventListener("click", (event) => {
+      this.point(event);
+      if (this.hover?.curve) this.go(this.hover.curve.number);
+    });
+  }
+
+  async load() {
+    const [answer, array] = await Promise.all([api.stancesOverlay(this.id), api.arrayOf(this.id)]);
+    this.answer = answer;
+    this.percent = Array.from({ length: answer.points }, (_, i) => (100 * i) / (answer.points - 1));
+    this.paths.show(array.tiles, answer);
+    setText(byId("overlay-says"), this.sentence());
+    byId("overlay-plots").hidden = answer.overlaid === 0;
+    this.draw();
+  }
+
+  refused(error) {
+    if (!(error instanceof api.Refusal)) throw error;
+    setText(byId("overlay-says"), error.message);
+    byId("overlay-plots").hidden = true;
+  }
+
+  sentence() {
+    const { overlaid, not_whole: cut, too_short: short, curves } = this.answer;
+    const many = (n, what) => `${n.toLocaleString("en-GB")} ${what}${n === 1 ? "" : "s"}`;
+    if (!overlaid) return "No stance was seen whole: there is nothing to lay one upon another.";
+    const parts = [`${many(overlaid, "whole stance")}, each from its first frame in contact to its last.`];
+    if (curves.length < overlaid) parts.push(`${curves.length} of them are drawn one by one, evenly over the session; mean and spread are of all.`);
+    if (cut) parts.push(`${many(cut, "stance")} not seen whole ${cut === 1 ? "is" : "are"} left out.`);
+    if (short) parts.push(`${many(short, "stance")} of a single frame ${short === 1 ? "is" : "are"} left out.`);
+    if (overlaid === 1) parts.push("Of one stance there is no spread.");
+    return parts.join(" ");
+  }
+
+  go(wanted) {
+    const index = this.stances.findIndex((stance) => stance.number === wanted);
+    if (index >= 0) this.onGo(index);
+  }
+
+  /** The stance that the page went to: drawn frame by frame over all others. */
+  async choose(index) {
+    const stance = this.stances[index];
+    this.chosen = { number: stance.number, whole: stance.is_whole, bins: null };
+    this.draw();
+    const { chosen } = this;
+    try {
+      const answer = await api.overview(this.id, {
+        points: FRAMES_MOST, start_s: Math.max(0, stance.from - 1e-7), end_s: stance.to + 1e-6, columns: "grf_n,cop_x_m,cop_y_m",
+      });
+      chosen.bins = answer.columns;
+      chosen.framesInBin = answer.frames_in_bin;
+    } catch (error) {
+      if (!(error instanceof api.Refusal)) throw error; // the thin curve stays
+    }
+    if (chosen === this.chosen) this.draw();
+  }
+
+  draw() {
+    this.drawing ||= requestAnimationFrame(() => {
+      this.drawing = 0;
+      this.drawNow();
+    });
+  }
+
+  drawNow() {
+    const { answer, canvas } = this;
+    const width = canvas.parentElement.clientWidth;
+    if (!answer?.overlaid || width < 100) return;
+    const colours = this.colours = coloursOf(canvas, FRAME_COLOURS);
+    canvas.style.height = `${HEIGHT_PX}px`;
+    const context = fit(canvas, width, HEIGHT_PX);
+    const box = this.box = { left: 46, right: width - 14, top: 24, bottom: HEIGHT_PX - 44 };
+    const { mean, sd } = answer.spread.grf_n;
+    const low = mean.map((value, i) => (value === null || sd[i] === null ? null : value - sd[i]));
+    const high = mean.map((value, i) => (value === null || sd[i] === null ? null : value + sd[i]));
+    const frames = this.frames();
+    const range = rangeOf([low, high, mean, ...answer.curves.map((curve) => curve.grf_n), ...(frames ? [frames.low, frames.high] : [])]);
+    const { x, y } = drawFrame(context, box, {
+      x: { low: 0, high: 100 }, y: roomy(range), colours, xUnit: "%", xTitle: "of the stance", yTitle: "Ground reaction force, N",
+    });
+    this.y = y;
+    const xs = this.percent.map(x);
+    const rows = (values) => values.map((value) => (value === null ? null : y(value)));
+    context.fillStyle = colours.interval;
+    drawArea(context, xs, rows(low), rows(high));
+    context.strokeStyle = colours.soft;
+    context.globalAlpha = Math.max(0.25, Math.min(0.8, 8 / answer.curves.length));
+    context.lineWidth = 1;
+    for (const curve of answer.curves) drawCurve(context, xs, rows(curve.grf_n));
+    context.globalAlpha = 1;
+    context.lineJoin = "round";
+    context.strokeStyle = colours.text;
+    context.lineWidth = 2.5;
+    context.setLineDash([7, 4]);
+    drawCurve(context, xs, rows(mean));
+    context.setLineDash([]);
+    if (this.hover?.curve) {
+      context.strokeStyle = colours.series;
+      context.lineWidth = 1.5;
+      drawCurve(context, xs, rows(this.hover.curve.grf_n));
+    }
+    if (frames) {
+      context.strokeStyle = context.fillStyle = colours.series;
+      context.lineWidth = 2.5;
+      const places = frames.percent.map(x);
+      drawArea(context, places, rows(frames.low), rows(frames.high));
+      drawCurve(context, places, rows(frames.high));
+    }
+    if (this.hover) {
+      context.strokeStyle = colours.edge;
+      context.lineWidth = 1;
+      const at = x(this.percent[this.hover.at]);
+      drawCurve(context, [at, at], [box.top, box.bottom]);
+    }
+    this.paths.draw(colours, this.chosen, frames, this.hover?.curve);
+    this.drawWords();
+  }
+
+  drawWords() {
+    const { answer, chosen, hover } = this;
+    const { mean, sd, count } = answer.spread.grf_n;
+    const at = hover?.at ?? mean.reduce((best, value, i) => (value > (mean[best] ?? -Infinity) ? i : best), 0);
+    const spread = sd[at] === null ? "" : ` ± ${number(sd[at])}`;
+    const where = `at ${number(this.percent[at], 0)} %`;
+    const said = hover
+      ? `${hover.curve ? `Stance ${hover.curve.number}: ${number(hover.curve.grf_n[at] ?? NaN)} N ${where}; mean` : `Mean ${where}:`} ${number(mean[at] ?? NaN)}${spread} N of ${count[at].toLocaleString("en-GB")}`
+      : `The mean is greatest ${where}: ${number(mean[at] ?? NaN)}${spread} N`;
+    setText(byId("overlay-at"), said);
+    const items = [["single", "single stances"], ["mean", "mean"]];
+    if (answer.overlaid > 1) items.push(["spread", "± one standard deviation over stances"]);
+    if (chosen) {
+      const how = !chosen.whole ? " was not seen whole: it has no place here" : chosen.framesInBin > 1 ? ", from least to greatest" : ", frame by frame";
+      items.push(["chosen", `stance ${chosen.number}${how}`]);
+    }
+    const list = byId("overlay-legend");
+    const key = JSON.stringify(items);
+    setData(list, "chosen", chosen ? String(chosen.number) : "");
+    if (list.dataset.key === key) return;
+    list.dataset.key = key;
+    list.replaceChildren(...items.map(([name, text]) => el("li", { "data-kind": name }, el("i", { cls: `swatch over-${name}`, "aria-hidden": "true" }), text)));
+  }
+
+  /** The stance that was chosen, over its own duration; null: there is none, or not yet. */
+  frames() {
+    const bins = this.chosen?.whole ? this.chosen.bins : null;
+    if (!bins?.t_first_s.length) return null;
+    const [begin, end] = [bins.t_first_s[0], bins.t_last_s.at(-1)];
+    return {
+      percent: bins.t_first_s.map((timeS) => (100 * (timeS - begin)) / Math.max(1e-9, end - begin)),
+      low: bins.grf_n_min, high: bins.grf_n_max, copX: bins.cop_x_m_max, copY: bins.cop_y_m_max,
+    };
+  }
+
+  point(event) {
+    const { answer, box } = this;
+    if (!answer || !box) return;
+    const [px, py] = [event.offsetX, event.offsetY];
+    const share = (px - box.left) / (box.right - box.left);
+    if (share < -0.02 || share > 1.02) { this.hover = null; return this.draw(); }
+    const at = Math.round(Math.min(1, Math.max(0, share)) * (answer.points - 1));
+    let best = { away: HIT_PX, curve: null };
+    for (const curve of answer.curves) {
+      const value = curve.grf_n[at];
+      const away = value === null ? Infinity : Math.abs(this.y(value) - py);
+      if (away < best.away) best = { away, curve };
+    }
+    this.hover = { at, curve: best.curve };
+    this.canvas.style.cursor = best.curve ? "pointer" : "";
+    this.draw();
+  }
+}
+
+/** Zero is always in sight: that is where a stance begins. */
+function rangeOf(series) {
+  const range = { low: 0, high: 0 };
+  for (const values of series) {
+    for (const value of values) {
+      if (value === null) continue;
+      if (value < range.low) range.low = value;
+      if (value > range.high) range.high = value;
+    }
+  }
+  return range;
+}
