@@ -424,7 +424,9 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
         expect(page.locator("#overlay-legend")).to_contain_text("mean")
         assert len(received.bytes_of) > 15
         numbers = ("/overview", "/stances/overlay")
-        bins = sum(size for url, size in received.bytes_of.items() if url.split("?")[0].endswith(numbers))
+        bins = sum(
+            size for url, size in received.bytes_of.items() if url.split("?")[0].endswith(numbers)
+        )
         assert 0 < bins < 300_000
         assert received.bytes_in_all - bins < 100_000, received.bytes_of
     node = FakeNode(walk.running, "weighed")

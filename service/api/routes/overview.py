@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import hashlib
 import json
 import math
@@ -16,7 +15,7 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from devices.errors import StateError, UnknownError, UsageError
-from service.api.encoding import takes_gzip
+from service.api.encoding import packed, takes_gzip
 from service.api.routes.access import SecondsQuery, ServerState, has_it, problems
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX, Seen, overview_of_session
@@ -29,8 +28,6 @@ from storage.sessions.folder import Session
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
 _ARROW = MEDIA_TYPES["arrow"]
-_GZIP_LEVEL = 1
-"""Less than half of the length, in a hundredth of a second; the best takes ten times as long."""
 _ONE_AT_A_TIME = CapacityLimiter(1)
 """Each thread that makes pictures keeps memory of them; and one picture waits for few others, which
 take milliseconds."""
@@ -130,7 +127,7 @@ def _content(
     if not as_arrow:
         content = {**about, "columns": {name: _plain(values) for name, values in columns.items()}}
         text = json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
-        return gzip.compress(text, _GZIP_LEVEL) if as_gzip else text
+        return packed(text) if as_gzip else text
     metadata = {"foottile.overview": json.dumps(about)}
     table = pa.table({name: pa.array(v) for name, v in columns.items()}, metadata=metadata)
     sink = pa.BufferOutputStream()

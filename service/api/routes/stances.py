@@ -17,6 +17,7 @@ from starlette.concurrency import run_in_threadpool
 
 from devices.arrays import Floats
 from devices.errors import StateError, UnknownError
+from service.api.encoding import packed, takes_gzip
 from service.api.routes.access import ServerState, has_it, problems
 from service.server.server import Server
 from service.sessions.stance_overlay import overlay_of_session
@@ -156,19 +157,24 @@ async def stances_overlay(
     query: Annotated[OverlayQuery, Query()],
     request: Request,
     server: ServerState,
+    accept_encoding: Annotated[str, Header(description="It goes as gzip to who takes that.")] = "",
 ) -> Response:
     """GRF and COP of the whole stances, normalised to 0 to 100 % of their duration.
 
     Between two frames they are on the straight line between them.
     """
     session = _sealed(session_id, server)
-    asked = f"{session.sha256}|{query.model_dump_json()}|{SOFTWARE}"
+    as_gzip = takes_gzip(accept_encoding)
+    asked = f"{session.sha256}|{query.model_dump_json()}|{as_gzip}|{SOFTWARE}"
     tag = hashlib.sha256(asked.encode()).hexdigest()
-    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
+    headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache", "Vary": "Accept-Encoding"}
     if has_it(request, tag):
         return Response(status_code=304, headers=headers)
     make = partial(_overlay, session, query, server)
     content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
+    if as_gzip:
+        headers["Content-Encoding"] = "gzip"
+        content = packed(content)
     return Response(content, headers=headers, media_type="application/json")
 
 

@@ -174,8 +174,8 @@ def test_stances_one_upon_another_are_those_of_the_file(tared: FakeNode) -> None
     table = pq.read_table(session.folder / "frames.parquet").to_pydict()
     for row, curve in zip(rows, found["curves"], strict=False):
         begin_ns, end_ns = row["begin_t_ns"], row["end_t_ns"]
-        at_ns = begin_ns + np.linspace(0.0, 1.0, 101) * (end_ns - begin_ns)
-        true_n = np.interp(at_ns - begin_ns, np.array(table["t_ns"]) - begin_ns, table["grf_n"])
+        since_ns = np.linspace(0.0, 1.0, 101) * (end_ns - begin_ns)
+        true_n = np.interp(since_ns, np.array(table["t_ns"]) - begin_ns, table["grf_n"])
         assert curve["grf_n"] == pytest.approx(true_n, abs=1e-3)
     curves = np.array([curve["grf_n"] for curve in found["curves"]])
     spread = found["spread"]["grf_n"]
