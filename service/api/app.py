@@ -26,6 +26,7 @@ from service.api.routes import (
     overview,
     sessions,
     stances,
+    takes,
     trash,
 )
 from service.api.routes.ingest import ingest
@@ -101,7 +102,19 @@ def make_app(
             _503="There are too many connections, or the data folder is not there.",
         ),
     )
-    for module in (health, login, nodes, sessions, trash, data, clock, array, stances, overview):
+    for module in (
+        health,
+        login,
+        nodes,
+        sessions,
+        takes,
+        trash,
+        data,
+        clock,
+        array,
+        stances,
+        overview,
+    ):
         api.include_router(module.router)
     app.include_router(api)
 

@@ -72,6 +72,7 @@ class Recorder:
         subject: str = "",
         notes: str = "",
         tags: tuple[str, ...] = (),
+        take: str | None = None,
     ) -> Session:
         """Begin a session with the next frame, or `pre_roll_s` earlier if the ring reaches so far.
 
@@ -103,6 +104,7 @@ class Recorder:
             subject=subject,
             notes=notes,
             tags=tags,
+            take=take,
             missed_slots_at_start=node.present.missed_slots,
             clock=following.clock_at_start(node, part),
         )

@@ -21,6 +21,7 @@ from service.server.screens.fan_out import Hub
 from service.server.screens.views import Counted, NodeView, SessionView
 from service.server.settling import Settling
 from service.server.streams import ServerStream
+from service.server.takes import Takes
 from service.server_clock import utc_ns
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
@@ -96,6 +97,7 @@ class Server:
             )
             self.settling = Settling(self.sessions, self.nodes, self._ask_again, exact=exact)
             self.recorder = Recorder(self.sessions, self.nodes, self.settling)
+            self.takes = Takes(self.recorder, self.sessions, self.nodes)
         except FootTileError:
             self.folder.close()
             raise

@@ -80,7 +80,7 @@ def taken_up(
         started_t_ns=begin_t_ns,
         stopped_t_ns=session.stopped_t_ns,
         continues=session.id,
-        **{field: getattr(session, field) for field in ("subject", "notes", "tags")},
+        **{field: getattr(session, field) for field in ("subject", "notes", "tags", "take")},
     )
     return session.model_copy(update=update), further
 

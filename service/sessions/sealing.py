@@ -37,7 +37,9 @@ def seal(sources: Sources, folder: Path, ledger: Ledger) -> Session:
     count = duration_ns = earlier_ns = part_begin_ns = 0
     notes: dict[str, object] = {
         **sources.notes,
-        "session": session.model_dump(mode="json", include=_IN_FILE),
+        "session": session.model_dump(
+            mode="json", include=_IN_FILE | ({"take"} if session.take else set())
+        ),
         "ledger": ledger.model_dump(mode="json"),
     }
     last_part = -1

@@ -126,6 +126,8 @@ class Session(_Record):
     """By boot_id, of parts that ended because the node went away."""
     given_up: bool = False
     """A person has given up the frames that are still to come."""
+    take: str | None = None
+    """Id of the take in which it was recorded together with other nodes."""
     continues: str | None = None
     """Id of the session that this one continues, with other tiles."""
     problem: str | None = None

@@ -44,10 +44,9 @@ class SessionPage(Page[SessionView]):
     )
 
 
-class StartSession(_Body):
-    """What to record."""
+class Describe(_Body):
+    """What people say of what is to be recorded."""
 
-    node: str = Field(examples=["demo"])
     name: Name = Field(examples=["mud, third trial"])
     pre_roll_s: Annotated[float, Field(ge=0, le=600, allow_inf_nan=False, strict=True)] = Field(
         default=0.0, description="Begin so much earlier, as far as the server still has it."
@@ -55,6 +54,12 @@ class StartSession(_Body):
     subject: Name | None = None
     notes: Text = ""
     tags: Tags = ()
+
+
+class StartSession(Describe):
+    """What to record."""
+
+    node: str = Field(examples=["demo"])
 
 
 class ChangeSession(_Body):
@@ -150,11 +155,19 @@ async def list_sessions(
     q: Annotated[
         str | None, Query(max_length=200, description="Text in name, subject, notes, tag or node.")
     ] = None,
+    take: Annotated[
+        str | None, Query(max_length=100, description="Only those of this take.")
+    ] = None,
 ) -> SessionPage:
     """A page of sessions."""
     before = None if cursor is None else _key_of(cursor)
     listed = server.sessions.newest_first(before)
-    found = (s for s in listed if q is None or _mentions(s, q.casefold()))
+    found = (
+        session
+        for session in listed
+        if (take is None or session.take == take)
+        and (q is None or _mentions(session, q.casefold()))
+    )
     page = list(islice(found, limit))
     more = next(found, None) is not None
     return SessionPage(

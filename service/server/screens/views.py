@@ -281,6 +281,9 @@ class SessionView(View):
     subject: str
     notes: str
     tags: list[str]
+    take: str | None = Field(
+        description="The take in which it was recorded together with other nodes."
+    )
     scene: str
     calibration_id: str | None
     absolute_scale: Literal["measured", "assumed"] | None

@@ -1,0 +1,152 @@
+"""A take: several nodes recorded together, one session each, found again by its id.
+
+It has no file of its own: each session says of which take it is, and a take is its sessions. What
+fails on one node is said of that node and keeps no other one from being recorded.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from devices.errors import FootTileError, StateError, UnknownError
+from service.server.book import SessionBook
+from service.server.nodes import ServerNodes
+from service.server.recorder import Recorder
+from service.server_clock import utc_ns
+from storage.sessions.folder import Session
+
+TAKE_ID = re.compile(r"[0-9a-f]{12}")
+
+
+@dataclass
+class Take:
+    """A take, or what came of something that was done to all of it."""
+
+    id: str
+    sessions: list[Session] = field(default_factory=list)
+    """One of each node, but for nodes that came back with other tiles."""
+    failed: dict[str, str] = field(default_factory=dict)
+    """By node why it was not done there."""
+
+
+class Takes:
+    """Records, marks and stops several nodes together.
+
+    Args:
+        recorder: starts and stops.
+        book: has all sessions.
+        nodes: all there are.
+    """
+
+    def __init__(self, recorder: Recorder, book: SessionBook, nodes: ServerNodes) -> None:
+        self._recorder = recorder
+        self._book = book
+        self._nodes = nodes
+
+    def start(
+        self,
+        name: str,
+        nodes: Sequence[str] | None = None,
+        *,
+        pre_roll_s: float = 0.0,
+        subject: str = "",
+        notes: str = "",
+        tags: tuple[str, ...] = (),
+    ) -> Take:
+        """Begin a session on each node, with the same name.
+
+        Args:
+            name: of each session.
+            nodes: which; None: all that are connected.
+            pre_roll_s: begin so much earlier.
+            subject: of each session.
+            notes: of each session.
+            tags: of each session.
+
+        Raises:
+            StateError: it could be recorded on none.
+        """
+        if nodes is None:
+            nodes = sorted(node.name for node in self._nodes if node.connected)
+        take = Take(secrets.token_hex(6))
+        for node in dict.fromkeys(nodes):
+            try:
+                session = self._recorder.start(
+                    node,
+                    name,
+                    pre_roll_s=pre_roll_s,
+                    subject=subject,
+                    notes=notes,
+                    tags=tags,
+                    take=take.id,
+                )
+            except FootTileError as error:
+                take.failed[node] = str(error)
+            else:
+                take.sessions.append(session)
+        if not take.sessions:
+            raise StateError(
+                "no node is connected" if not take.failed else _in_words(take.failed),
+                remedy="Record when a node is connected and sends",
+            )
+        return take
+
+    def get(self, take_id: str) -> Take:
+        """Its sessions as they are now, by node; not those in the trash.
+
+        Raises:
+            UnknownError: there is no session of this take.
+        """
+        found = [one for one in self._book.newest_first() if one.take == take_id]
+        if not TAKE_ID.fullmatch(take_id) or not found:
+            raise UnknownError(f"no take {take_id[:80]!r}")
+        return Take(take_id, sorted(found, key=lambda one: (one.node, one.started_t_ns)))
+
+    def stop(self, take_id: str) -> Take:
+        """Stop all of its sessions that are being recorded.
+
+        Raises:
+            UnknownError: no such take.
+            StateError: none of them is.
+        """
+        return self._for_each(take_id, lambda one: self._recorder.stop(one.id))
+
+    def mark(self, take_id: str, label: str, t_ns: int | None, event_id: str | None = None) -> Take:
+        """Note an event in all of its sessions that are being recorded, at one instant.
+
+        Raises:
+            UnknownError: no such take.
+            StateError: none of them is.
+        """
+        t_ns = utc_ns() if t_ns is None else t_ns
+        event_id = event_id or secrets.token_hex(6)
+        return self._for_each(take_id, lambda one: self._book.mark(one.id, label, t_ns, event_id))
+
+    def _for_each(self, take_id: str, do: Callable[[Session], object]) -> Take:
+        take = self.get(take_id)
+        running = [one for one in take.sessions if one.state == "recording"]
+        if not running:
+            raise StateError(
+                f"take {take_id} was stopped already",
+                expected="one of which a session is recording",
+            )
+        for session in running:
+            try:
+                do(session)
+            except FootTileError as error:
+                take.failed[session.node] = str(error)
+        done = [one for one in running if one.node not in take.failed]
+        if not done:
+            raise StateError(_in_words(take.failed))
+        return Take(take_id, [self._book.get(one.id) for one in done], take.failed)
+
+
+def _in_words(failed: dict[str, str]) -> str:
+    return "; ".join(_once(failed.values()))
+
+
+def _once(texts: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(texts))
