@@ -9,7 +9,7 @@ compiled function, and what is remembered stays in records that it writes to.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,7 @@ from service.estimation.ladder.state import at_rest
 from service.estimation.ladder.taken import take
 from service.estimation.ladder.upper import BORNE, BOUND_SIGMAS, bear
 from service.estimation.models import denoise
-from service.estimation.records import Record, Records
+from service.estimation.records import Columns, Record, Records, as_bytes
 
 _COP_MASKED = int(EstimateStatus.COP_MASKED)
 _AFTER_SATURATION = int(EstimateStatus.AFTER_SATURATION)
@@ -103,6 +103,40 @@ class Estimator:
         if self._scene["due"][0] == self._scene["end"][0]:
             return None
         return _estimates(_finish(self._laws, self._scene, self._tiles, self._room))
+
+    def kept(self) -> Columns:
+        """All that it remembers, for another one to go on with; records as their bytes."""
+        return {name: as_bytes(column).copy() for name, column in self._memory().items()}
+
+    @classmethod
+    def going_on(cls, plan: EstimationPlan, kept: Columns) -> Self:
+        """One that goes on with what another has kept: both together give the bits of one.
+
+        Args:
+            plan: the other's.
+            kept: by it, in this very version.
+
+        Raises:
+            ValueError: it is of another plan; compiled code would read beside it.
+        """
+        new = cls(plan)
+        rows = len(kept["t_mono_ns"])
+        new._room = make_room(max(ROWS_LEAST, rows), len(new._tiles))
+        new._scene["end"] = rows
+        for name, column in new._memory().items():
+            memory, given = as_bytes(column), kept[name]
+            if (given.dtype, given.shape) != (memory.dtype, memory.shape):
+                raise ValueError(f"{name} is {given.dtype}{given.shape}, not {memory.shape}")
+            memory[...] = given
+        due, read, end = (int(new._scene[mark][0]) for mark in ("due", "read", "end"))
+        if not 0 <= due <= read <= end == rows:
+            raise ValueError(f"its rows are {due}, {read}, {end} of {rows}")
+        return new
+
+    def _memory(self) -> Columns:
+        end = int(self._scene["end"][0])
+        room = {name: column[:end] for name, column in self._room._asdict().items()}
+        return {"scene": self._scene, "tiles": self._tiles, **room}
 
     def _make_room(self, more: int) -> None:
         scene = self._scene[0]

@@ -14,6 +14,7 @@ Records = npt.NDArray[np.void]
 """One record for every tile, or a single one; (n,)."""
 Record = Any
 """One of them within compiled code, which reads and writes its fields as attributes."""
+Columns = dict[str, npt.NDArray[Any]]
 
 
 def record_type(fields: list[Any]) -> np.dtype[np.void]:
@@ -31,3 +32,10 @@ def records(dtype: np.dtype[np.void], n: int, **columns: Any) -> Records:
     for name, values in columns.items():
         made[name] = values
     return made
+
+
+def as_bytes(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Records as the bytes that they are, (n, ...); what is no record as it is. Not copied."""
+    if column.dtype.names is None:
+        return column
+    return column.view(np.uint8).reshape(*column.shape, column.dtype.itemsize)

@@ -7,11 +7,12 @@ frames they are about.
 
 from __future__ import annotations
 
+import json
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from itertools import chain
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +59,25 @@ class EstimateRun:
         self._estimator = Estimator(plan)
         self._held: deque[tuple[FrameBatch, Extra]] = deque()
 
+    def kept(self) -> Columns:
+        """What it remembers, and the frames that still wait for their look-ahead."""
+        held: Columns = {}
+        if self._held:
+            frames = FrameBatch.concatenate([frames for frames, _ in self._held])
+            held = {f"held/{name}": column for name, column in vars(frames).items()}
+            for name in self._held[0][1]:
+                held[f"with/{name}"] = np.concatenate([extra[name] for _, extra in self._held])
+        return {f"run/{name}": c for name, c in self._estimator.kept().items()} | held
+
+    @classmethod
+    def going_on(cls, plan: EstimationPlan, kept: Columns) -> Self:
+        """One that goes on with what another has kept, as `Estimator.going_on`."""
+        new = cls(plan)
+        new._estimator = Estimator.going_on(plan, _under("run/", kept))
+        if held := _under("held/", kept):
+            new._held.append((FrameBatch(**held), _under("with/", kept)))
+        return new
+
     def feed(self, frames: FrameBatch, extra: Extra) -> Iterator[tuple[FrameBatch, Columns]]:
         """Take the next frames; return those whose estimates are due, in order.
 
@@ -95,6 +115,10 @@ class EstimateStream:
         self.tare: Tare | None = None
         self._info = info
         self._options = options
+        self._run: EstimateRun | None = None
+        self._over = 0
+        """So many changes of the tare have been."""
+        self._last_t_mono_ns = 0
         # Refuse now what would fail later: unknown models, tiles without calibration.
         if options.tare_s is not None and not 0 <= options.tare_s[0] < options.tare_s[1]:
             raise UsageError(
@@ -105,15 +129,43 @@ class EstimateStream:
         self.plan_of(Tare(nothing, nothing, nothing, nothing, 0, 0.0, 0.0, 0, "interval"))
 
     def run(
-        self, pieces: Iterable[tuple[FrameBatch, Extra]]
+        self, pieces: Iterable[tuple[FrameBatch, Extra]], *, ends: bool = True
     ) -> Iterator[tuple[FrameBatch, Columns]]:
         """Frames with their extra columns and estimates, rounded, in order, every frame once.
+
+        Args:
+            pieces: the next frames.
+            ends: no more frames will come; else `kept` has those that wait for their look-ahead.
 
         Raises:
             TareError: no tare can be found.
         """
-        for frames, columns in self._estimated(pieces):
+        for frames, columns in self._estimated(iter(pieces), ends=ends):
             yield frames, self.rounding.rounded(columns)
+
+    def kept(self) -> Columns:
+        """All that it remembers, for another one to go on with.
+
+        Raises:
+            TareError: no frame has come yet, so there is no tare.
+        """
+        if self.plan is None or self._run is None:
+            raise TareError("the recording has no frames")
+        said = [self.plan.tare.as_dict(), self._over, self._last_t_mono_ns]
+        return {"stream": np.array(json.dumps(said)), **self._run.kept()}
+
+    def go_on(self, kept: Columns) -> None:
+        """Go on with what another stream of the same array and options has kept.
+
+        Raises:
+            ValueError: it is of another one.
+        """
+        tare, self._over, self._last_t_mono_ns = json.loads(str(kept["stream"]))
+        first = Tare.from_dict(tare, tiles=len(self._info.tiles))
+        self._begin(self._options.tares[0] if self._options.tares else first)
+        tares = (first, *self._options.tares[1:])
+        self.tare = tares[self._over]
+        self._run = EstimateRun.going_on(self.plan_of(self.tare), kept)
 
     def find_tare(self, pieces: Iterable[tuple[FrameBatch, Extra]]) -> Tare:
         """The tare that `run` would find in a recording; read is no more of it than that takes.
@@ -124,30 +176,24 @@ class EstimateStream:
         return self._find_tare([frames for frames, _ in self._until_tare(iter(pieces))])
 
     def _estimated(
-        self, pieces: Iterable[tuple[FrameBatch, Extra]]
+        self, pieces: Iterator[tuple[FrameBatch, Extra]], *, ends: bool
     ) -> Iterator[tuple[FrameBatch, Columns]]:
-        pieces = iter(pieces)
-        changes = deque(self._options.tares[1:])
-        if self._options.tares:
-            self.plan = self.plan_of(self._options.tares[0])
-        else:
-            taken = self._until_tare(pieces)
-            self.plan = self.plan_of(self._find_tare([frames for frames, _ in taken]))
-            pieces = chain(taken, pieces)
-        if not self._options.exact:
-            self.rounding = Rounding.of(chain([self.plan], map(self.plan_of, changes)))
-        run = EstimateRun(self.plan)
-        self.tare = self.plan.tare
-        last_t_mono_ns = 0
+        run = self._run
+        if run is None:
+            if self._options.tares:
+                run = self._begin(self._options.tares[0])
+            else:
+                taken = self._until_tare(pieces)
+                run = self._begin(self._find_tare([frames for frames, _ in taken]))
+                pieces = chain(taken, pieces)
         for frames, extra in pieces:
             rest, rest_of = frames, extra
             if not len(rest):
                 continue
-            if int(rest.t_mono_ns[0]) < last_t_mono_ns:  # the node was switched on again
+            if int(rest.t_mono_ns[0]) < self._last_t_mono_ns:  # the node was switched on again
                 yield from run.finish()
-            last_t_mono_ns = int(rest.t_mono_ns[-1])
-            while changes and int(rest.t_ns[-1]) > changes[0].t_ns:
-                tare = changes.popleft()
+            self._last_t_mono_ns = int(rest.t_mono_ns[-1])
+            while (tare := self._next_tare()) is not None and int(rest.t_ns[-1]) > tare.t_ns:
                 at = int(np.searchsorted(rest.t_ns, tare.t_ns, side="right"))
                 if at:
                     head = {name: v[:at] for name, v in rest_of.items()}
@@ -155,11 +201,25 @@ class EstimateStream:
                     rest = rest.rows(at, len(rest))
                     rest_of = {name: v[at:] for name, v in rest_of.items()}
                 yield from run.finish()
-                run = EstimateRun(self.plan_of(tare))
+                self._run = run = EstimateRun(self.plan_of(tare))
                 self.tare = tare
+                self._over += 1
             if len(rest):
                 yield from run.feed(rest, rest_of)
-        yield from run.finish()
+        if ends:
+            yield from run.finish()
+
+    def _begin(self, tare: Tare) -> EstimateRun:
+        self.plan = self.plan_of(tare)
+        if not self._options.exact:
+            later = map(self.plan_of, self._options.tares[1:])
+            self.rounding = Rounding.of(chain([self.plan], later))
+        self._run, self.tare = EstimateRun(self.plan), tare
+        return self._run
+
+    def _next_tare(self) -> Tare | None:
+        later = self._options.tares[1 + self._over :]
+        return later[0] if later else None
 
     def _until_tare(
         self, pieces: Iterator[tuple[FrameBatch, Extra]]
@@ -198,6 +258,11 @@ class EstimateStream:
         if first.frame_status[0] & FrameStatus.LEAD:
             return any(not (frames.frame_status & FrameStatus.LEAD).all() for frames, _ in taken)
         return since_ns > RECOGNISE_WITHIN_NS
+
+
+def _under(prefix: str, kept: Columns) -> Columns:
+    """What is kept under a prefix, without it."""
+    return {n.removeprefix(prefix): column for n, column in kept.items() if n.startswith(prefix)}
 
 
 def _paired(

@@ -25,11 +25,12 @@ from devices.frames import NOT_READ, FrameBatch
 from devices.temperature import hold_temperature
 from service.estimation.estimate import Estimator
 from service.estimation.estimates import EstimateStatus
+from service.estimation.ladder.chosen import MODELS
 from service.estimation.ladder.plan import make_plan
 from service.estimation.tare.unloaded import take_tare
 from tests.builders.arrays import COUNT_KPA, DATA_SHEET_CHIP, FORUM_CHIP, array_at, make_servo
-from tests.builders.calibrations import make_calibration, make_tare, newton_tile
-from tests.builders.estimates import estimate, newton_plan
+from tests.builders.calibrations import make_calibration, make_effects, make_tare, newton_tile
+from tests.builders.estimates import estimate, joined, newton_plan
 from tests.builders.frames import assert_same_bits, loaded_frames
 from tests.service.estimation.feet import SQUARE, held, wild_frames
 
@@ -82,6 +83,43 @@ def test_time_may_begin_anywhere(start_ns: int) -> None:
     t_ns = start_ns + 2_000_000 * np.arange(30, dtype=np.int64)
     frames = loaded_frames(forces_n, t_mono_ns=t_ns, t_ns=t_ns)
     assert estimate(plan, frames).contact.tolist() == [0] * 10 + [1] * 10 + [0] * 10
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    cuts=st.sets(st.integers(1, 2999), min_size=1, max_size=5),
+    seed=st.integers(0, 9),
+    lag_ms=st.sampled_from([0.0, 20.0, 3000.0]),
+    models=st.sampled_from([("unwrap", "static"), tuple(m for m in MODELS if m != "ambient")]),
+)
+def test_one_that_goes_on_with_what_another_has_kept_gives_the_bits_of_one(
+    cuts: set[int], seed: int, lag_ms: float, models: tuple[str, ...]
+) -> None:
+    info = array_at(SQUARE, servo=make_servo())
+    known = [newton_tile(serial, effects=make_effects()) for serial in info.serials]
+    plan = newton_plan(info, models=models, lag_ms=lag_ms, tiles=known)
+    frames = wild_frames(3000, 4, seed)
+    estimator, found = Estimator(plan), []
+    for begin, end in pairwise([0, *sorted(cuts), 3000]):
+        estimator = Estimator.going_on(plan, estimator.kept())
+        found.append(estimator.step(frames.rows(begin, end)))
+    last = estimator.finish()
+    assert_same_bits(joined(found if last is None else [*found, last]), estimate(plan, frames))
+
+
+def test_what_is_of_another_plan_is_refused_before_compiled_code_reads_it() -> None:
+    plan, wider = newton_plan(array_at(SQUARE)), newton_plan(array_at((*SQUARE, (0.3, 0.0, 0.0))))
+    estimator = Estimator(plan)
+    estimator.step(wild_frames(50, 4, 1))
+    kept = estimator.kept()
+    with pytest.raises(ValueError, match="tiles is uint8"):
+        Estimator.going_on(wider, kept)
+    with pytest.raises(ValueError, match="rows is uint8"):
+        Estimator.going_on(plan, kept | {"rows": kept["rows"][:-1]})
+    scene = np.zeros_like(kept["scene"])
+    scene[:] = 0xFF
+    with pytest.raises(ValueError, match="its rows are -1"):
+        Estimator.going_on(plan, kept | {"scene": scene})
 
 
 # --- steps and states -----------------------------------------------------------------------------

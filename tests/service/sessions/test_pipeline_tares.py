@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from devices.errors import TareError
 from devices.frames import FrameBatch
 from service.estimation.tare.tare import Tare
 from service.sessions.pipeline import EstimateStream, notes_of
@@ -153,3 +156,54 @@ def test_what_comes_after_a_restart_knows_nothing_of_what_was_before() -> None:
     _, _, alone = run(cut(second, []), tares=tares)
     assert both["contact"][59] == 1
     same({name: values[60:] for name, values in both.items()}, alone)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    cuts=st.sets(st.integers(1, 239), max_size=12),
+    handed=st.sets(st.integers(1, 239), max_size=4),
+    instants=st.lists(st.integers(-10, 250), max_size=3).map(sorted),
+    lag_ms=st.sampled_from([0.0, 10.0, 5000.0]),
+)
+def test_a_stream_that_goes_on_with_what_others_have_kept_gives_the_bits_of_one(
+    cuts: set[int], handed: set[int], instants: list[int], lag_ms: float
+) -> None:
+    first, second = (
+        frames(hopping(120, loaded_from=60), lead=60),
+        frames(hopping(120, loaded_from=9)),
+    )
+    batch = FrameBatch.concatenate([first, later_part(second, 10**9)])  # switched on again
+    tares = tuple(taken_at(2_000_000 * at, 3.0 * number) for number, at in enumerate(instants))
+    _, frames_once, once = run(cut(batch, []), lag_ms=lag_ms, tares=tares)
+    if not tares:  # a tare is looked for until it is there, whoever asks for less
+        handed = {at for at in handed if at > 60}
+    stream, found, given = EstimateStream(array(), options(lag_ms=lag_ms, tares=tares)), [], 0
+    pieces = cut(batch, sorted(cuts | handed))
+    for at in [*sorted(handed), 240]:
+        rows = given
+        some: list[Piece] = []
+        while rows < at:
+            some.append(pieces.pop(0))
+            rows += len(some[-1][0])
+        given = rows
+        found += list(stream.run(some, ends=at == 240))
+        if at != 240:
+            kept = through_a_file(stream.kept())
+            stream = EstimateStream(array(), options(lag_ms=lag_ms, tares=tares))
+            stream.go_on(kept)
+    joined = FrameBatch.concatenate([batch for batch, _ in found])
+    assert joined.is_same(frames_once)
+    same({name: np.concatenate([c[name] for _, c in found]) for name in found[0][1]}, once)
+
+
+def through_a_file(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **kept)
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as read:
+        return dict(read)
+
+
+def test_what_nobody_has_begun_cannot_be_kept() -> None:
+    with pytest.raises(TareError, match="no frames"):
+        EstimateStream(array(), options()).kept()
