@@ -35,7 +35,7 @@ from service.offline.archive.jobs import Job, begin_worker, run_job
 from service.offline.archive.places import sessions_in
 from service.offline.archive.plan import Spread, outcomes
 from service.offline.archive.tasks import EstimateTask, Task, VerifyTask
-from service.offline.estimate import estimate_session
+from service.offline.estimate.session import estimate_session
 from service.offline.processes import spread as over_processes
 from storage.sessions.folder import FRAMES_NAME, SessionFolder
 from tests.service.offline.archive.clusters import Cluster
@@ -158,8 +158,10 @@ def overhead(a: argparse.Namespace, work: Path) -> list[str]:
         for place in places:
             out = folder / place.name
             out.mkdir()
-            options = {**vars(ESTIMATE), "remark": str}
-            estimate_session(Path(place.frames), out / FRAMES_NAME, **options)
+            file = Path(place.frames)
+            estimate_session(
+                file, out / FRAMES_NAME, ESTIMATE, remark=lambda _: None, is_judged=False
+            )
 
     def as_jobs(folder: Path) -> None:
         for place in places:

@@ -38,7 +38,8 @@ from side_by_side import in_turns, note, spread, table
 
 from service.api.app import make_app
 from service.estimation import OFFLINE_LAG_MS
-from service.offline.estimate import Estimated, estimate_session
+from service.offline.estimate.request import EstimateRequest
+from service.offline.estimate.session import Estimated, estimate_session
 from service.server.server import Server
 from storage.file_hash import sha256_of
 from storage.formats.sealed import export_file
@@ -151,17 +152,15 @@ def by_export(path: Path, start_s: float) -> Values:
 def by_estimate(path: Path, start_s: float) -> Estimated:
     """What `foottile estimate` does."""
     with tempfile.TemporaryDirectory() as folder:
-        return estimate_session(
-            path,
-            Path(folder) / "out.parquet",
+        request = EstimateRequest(
             calibration="paper-eq2-shape",
             models=("unwrap", "static"),
             lag_ms=OFFLINE_LAG_MS,
             scene=None,
             tare_s=(0.0, 1.0),
             part=Slice(start_s, start_s + SECONDS),
-            remark=lambda _: None,
         )
+        return estimate_session(path, Path(folder) / "out.parquet", request, remark=lambda _: None)
 
 
 def _column(content: bytes) -> Values:

@@ -93,7 +93,7 @@ def estimate_command(
     from service.estimation.asked import SEEN
     from service.offline.archive.places import is_remote
     from service.offline.archive.tasks import EstimateTask
-    from service.offline.estimate import estimate_session
+    from service.offline.estimate.session import estimate_session
     from storage.formats.slice import Slice
 
     task = EstimateTask(
@@ -122,7 +122,7 @@ def estimate_command(
         result = estimate_session(
             session / FRAMES_NAME if session.is_dir() else session,
             path,
-            **vars(task),
+            task,
             remark=remark,
         )
     plan = result.plan

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from devices.errors import UsageError
-from devices.scene.file import Scene
 from service.estimation.calibration import Calibration
 from service.offline.archive.staging import claims_of, frames_of, identity_of_file, staged_file
+from service.offline.estimate.request import EstimateRequest
 from service.offline.export import ExportOptions, export_session
 from service.plain_json import plain
 from storage.checked_json import with_check
@@ -61,16 +61,9 @@ class Task(Protocol):
 
 
 @dataclass(frozen=True)
-class EstimateTask:
+class EstimateTask(EstimateRequest):
     """Estimates a session again; the result is a session's folder as the source was."""
 
-    calibration: str | Calibration | None
-    models: tuple[str, ...] | None
-    lag_ms: float
-    scene: Scene | None
-    tare_s: tuple[float, float] | None
-    part: Slice = _ALL
-    exact: bool = False
     command: ClassVar[str] = "estimate"
 
     def options(self) -> dict[str, Any]:
@@ -85,22 +78,11 @@ class EstimateTask:
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
         """As for any task."""
-        from service.offline.estimate import estimate_session
+        from service.offline.estimate.session import estimate_session
 
         frames, remarks = frames_of(source), list[str]()
         out = work / FRAMES_NAME
-        made = estimate_session(
-            frames,
-            out,
-            calibration=self.calibration,
-            models=self.models,
-            lag_ms=self.lag_ms,
-            scene=self.scene,
-            tare_s=self.tare_s,
-            part=self.part,
-            exact=self.exact,
-            remark=remarks.append,
-        )
+        made = estimate_session(frames, out, self, remark=remarks.append, is_judged=False)
         if source.is_dir() and self.part.is_all:
             _complete(source, work)
         return {

@@ -79,7 +79,7 @@ def test_ctrl_c_is_said_and_leaves_no_file_and_no_process(
         ("service.offline.export.export_file", "export s.parquet --format csv --out x.csv"),
         ("storage.verify.data.verify", "verify ."),
         ("service.sessions.recover.recover", "recover data"),
-        ("service.offline.estimate.estimate_session", "estimate s.parquet --out x.parquet"),
+        ("service.offline.estimate.session.estimate_session", "estimate s.parquet --out x.parquet"),
         ("service.offline.doctor.diagnose", "doctor --bus emulated"),
         ("service.client.Client.sessions", "sessions"),
         ("service.client.Client.pull", "pull 20200101T000000Z-000000 --out x"),

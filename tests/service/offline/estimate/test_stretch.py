@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, TareError, UsageError
-from service.offline.estimate import Estimated, estimate_session
-from service.offline.stretch import LEAST_S, TIMES, since, warm_up_s
+from service.offline.estimate.request import EstimateRequest
+from service.offline.estimate.session import Estimated, estimate_session
+from service.offline.estimate.stretch import LEAST_S, TIMES, since, warm_up_s
 from storage.formats.slice import Slice
 from storage.schema import ESTIMATES
 from storage.sessions.file import SessionWriter
@@ -56,9 +57,9 @@ def estimated(source: Path, out: Path, part: Slice, **changes: Any) -> Estimated
         "scene": None,
         "tare_s": None,
         "exact": True,
-        "remark": lambda _: None,
     }
-    return estimate_session(source, out, part=part, **asked | changes)
+    request = EstimateRequest(part=part, **asked | changes)
+    return estimate_session(source, out, request, remark=lambda _: None)
 
 
 def columns_of(path: Path) -> dict[str, np.ndarray]:

@@ -9,7 +9,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from service.offline.estimate import estimate_session
+from service.offline.estimate.request import EstimateRequest
+from service.offline.estimate.session import estimate_session
 from service.sessions.pipeline import EstimateStream
 from service.sessions.stances import stances_of_session
 from storage.formats.export import content_of, export
@@ -33,17 +34,15 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def estimated(source: Path, out: Path, *, exact: bool = False) -> SessionReader:
-    estimate_session(
-        source,
-        out,
+    request = EstimateRequest(
         calibration=None,
         models=("static", "denoise"),
         lag_ms=100.0,
         scene=None,
         tare_s=None,
         exact=exact,
-        remark=lambda _: None,
     )
+    estimate_session(source, out, request, remark=lambda _: None)
     return SessionReader(out)
 
 

@@ -1,0 +1,1 @@
+"""A session estimated again: all of it, some seconds, or piece after piece in turns."""

@@ -1,0 +1,148 @@
+"""What a request to estimate means for a session: its array, calibration, models and tares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, get_args
+
+from devices.errors import CalibrationError, FileFormatError, TareError, UsageError
+from devices.frames import ArrayInfo
+from devices.scene.emulated import Family
+from devices.scene.file import Scene
+from service.estimation.calibration import Calibration
+from service.estimation.tare.tare import Tare
+from service.offline.calibrations import BENCH, find_calibration
+from service.offline.estimate.request import EstimateRequest
+from service.sessions.pipeline import EstimateOptions
+from storage.schema import MILL, PARTS, TRUTH
+from storage.sessions.reader import SessionReader
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The same for a session.
+
+    Attributes:
+        info: its array, with tiles where they are wanted.
+        options: of the estimate.
+        kept: columns of the session, besides frames, that stay as they are.
+    """
+
+    info: ArrayInfo
+    options: EstimateOptions
+    kept: tuple[str, ...]
+
+
+def prepared(
+    session: SessionReader, request: EstimateRequest, remark: Callable[[str], None]
+) -> Prepared:
+    """What a request means for a session.
+
+    Raises:
+        FootTileError: scene or calibration are not usable with it.
+    """
+    scene, info = request.scene, _placed(session.info, request.scene)
+    options = EstimateOptions(
+        calibration=_calibration(session, scene, request.calibration, remark),
+        models=request.models or (scene.models if scene else info.models),
+        lag_ms=request.lag_ms,
+        tare_s=request.tare_s,
+        tares=_recorded_tares(session) if request.tare_s is None else (),
+        exact=request.exact,
+    )
+    kept = tuple(c.name for c in (*PARTS, *TRUTH, *MILL) if session.has(c.name))
+    return Prepared(info, options, kept)
+
+
+def _recorded_tares(session: SessionReader) -> tuple[Tare, ...]:
+    """Tares that were taken while the session was recorded, oldest first."""
+    recorded = session.notes.get("tares", [])
+    tiles = len(session.info.tiles)
+    try:
+        return tuple(Tare.from_dict(content, tiles=tiles) for content in recorded)
+    except (TareError, TypeError) as error:
+        raise FileFormatError(
+            f"its tares are not readable: {error}",
+            where=str(session.path),
+            remedy="Name an unloaded interval with --tare-s BEGIN,END",
+        ) from error
+
+
+def _placed(info: ArrayInfo, scene: Scene | None) -> ArrayInfo:
+    """The array with its tiles where the scene says they are."""
+    if scene is None:
+        return info
+    places = {tile.serial: tile for tile in scene.tile}
+    if set(places) != set(info.serials):
+        raise UsageError(
+            f"scene {scene.name!r} has the tiles {', '.join(sorted(places))}, "
+            f"the session {', '.join(sorted(info.serials))}",
+            remedy="Name the scene it was recorded with",
+        )
+    tiles = tuple(
+        tile.model_copy(
+            update={
+                name: getattr(places[tile.serial], name)
+                for name in ("x_m", "y_m", "z_m", "reference")
+            }
+        )
+        for tile in info.tiles
+    )
+    return info.model_copy(update={"tiles": tiles})
+
+
+def _calibration(
+    session: SessionReader,
+    scene: Scene | None,
+    wanted: str | Calibration | None,
+    remark: Callable[[str], None],
+) -> Calibration:
+    notes = session.notes
+    where = str(session.path)
+    serials = [tile.serial for tile in session.info.tiles if not tile.reference]
+    if isinstance(wanted, Calibration):
+        for serial in serials:
+            wanted.of(serial)
+        return wanted
+    inside = None
+    if "calibration" in notes:
+        try:
+            inside = Calibration.model_validate(notes["calibration"])
+        except ValueError as error:
+            if wanted is None:
+                raise FileFormatError(
+                    f"its calibration is not readable: {error}", where=where
+                ) from error
+    if inside is not None and wanted in (None, inside.id):
+        return inside
+    name = wanted or (scene.calibration if scene is not None else None)
+    if name is None:
+        raise CalibrationError(
+            "no calibration: the session brings none and none was named",
+            where=where,
+            remedy="Add --calibration FILE, or --scene with a scene that names one",
+        )
+    if name == BENCH and "parts_seed" not in notes:
+        # The emulated bench would press an emulated tile of the same serial: plausible and wrong.
+        raise CalibrationError(
+            "the emulated bench knows emulated tiles only, and this session is of real ones",
+            where=where,
+            remedy="Press the tiles on a real bench and run `foottile calibrate`",
+        )
+    return find_calibration(
+        name,
+        serials,
+        parts_seed=int(notes.get("parts_seed", 0)),
+        family=_family(notes),
+        progress=remark,
+    )
+
+
+def _family(notes: Mapping[str, Any]) -> Family:
+    """Of the emulated parts of a session; those of before there was another are the usual ones."""
+    scene = notes.get("scene")
+    emulation = scene.get("emulation") if isinstance(scene, dict) else None
+    named = emulation.get("family") if isinstance(emulation, dict) else None
+    families: tuple[Family, ...] = get_args(Family)
+    return next((family for family in families if family == named), "default")

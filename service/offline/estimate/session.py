@@ -1,0 +1,174 @@
+"""A sealed session in, the same session with new estimates out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+
+from devices.errors import FileFormatError, UsageError
+from devices.frames import ArrayInfo
+from service.estimation.asked import Asking
+from service.estimation.ladder.plan import EstimationPlan
+from service.offline.estimate.prepared import Prepared, prepared
+from service.offline.estimate.request import EstimateRequest
+from service.offline.estimate.stretch import Piece, Stretch, since, stretch_of
+from service.offline.findings import Findings, FindingsOf
+from service.sessions.pipeline import EstimateOptions, EstimateStream, notes_of
+from service.sessions.stances import StancesBeside
+from storage.file_hash import sha256_of
+from storage.formats.slice import Slice
+from storage.schema import TRUTH
+from storage.sessions.file import SessionWriter
+from storage.sessions.folder import FRAMES_NAME
+from storage.sessions.frame_order import in_order
+from storage.sessions.reader import SessionReader
+
+_OF_THE_WHOLE = frozenset({"session", "ledger"})
+"""Notes of a session that its part cannot keep: it has other frames."""
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """What came of it.
+
+    Attributes:
+        frames: how many.
+        plan: what their estimates begin with.
+        findings: stances, and errors against the truth; empty if nobody asked.
+        asked: models that it asks for and that were not named, with the newtons expected of each;
+            likewise.
+    """
+
+    frames: int
+    plan: EstimationPlan
+    findings: Findings = field(default_factory=Findings)
+    asked: Mapping[str, float] = field(default_factory=dict)
+
+
+def estimate_session(
+    source: Path,
+    out: Path,
+    request: EstimateRequest,
+    *,
+    remark: Callable[[str], None],
+    is_judged: bool = True,
+) -> Estimated:
+    """Estimate a session.
+
+    Args:
+        source: the session.
+        out: the session to write; may be the same file if all of it is estimated.
+        request: how.
+        remark: told what is worth knowing.
+        is_judged: look at what came of it, which takes as long again.
+
+    Raises:
+        FootTileError: the session, scene, calibration or tare is not usable, or no frame is in
+            the part; `out` is untouched.
+    """
+    part = request.part
+    if not part.is_all and out.exists() and out.samefile(source):
+        raise UsageError(
+            f"--out {str(out)!r} is the session itself, of which a part would be left",
+            expected="another file",
+        )
+    with SessionReader(source, only_slices=not part.is_all) as session:
+        what = prepared(session, request, remark)
+        notes, stretch = session.notes, Stretch()
+        if not part.is_all:
+            options, stretch = _of_part(session, what.info, what.options, part)
+            notes, what = _notes_of_part(session, part, stretch), replace(what, options=options)
+        stream = EstimateStream(what.info, what.options)
+        judged = _Judged(what) if is_judged else None
+        ordered = in_order(session.batches(*what.kept, groups=stretch.groups), where=str(source))
+        given = stretch.given(stream.run(stretch.needed(ordered)))
+        watched = given if judged is None else judged.watched(given, stream)
+        frames = write_estimated(out, what, notes, stream, watched, remark)
+    if not frames or stream.plan is None:
+        said = "the session has no frames" + ("" if part.is_all else " in that time")
+        raise FileFormatError(said, where=str(source))
+    if judged is None:
+        return Estimated(frames, stream.plan)
+    return Estimated(frames, stream.plan, *judged.finish(stream.plan))
+
+
+def write_estimated(
+    out: Path,
+    what: Prepared,
+    notes: Mapping[str, object],
+    stream: EstimateStream,
+    pieces: Iterable[Piece],
+    remark: Callable[[str], None],
+) -> int:
+    """Write frames with their estimates, and in a session's folder their stances beside them.
+
+    Args:
+        out: the file.
+        what: what they are.
+        notes: of the session.
+        stream: has the plan by the time that the first piece is there.
+        pieces: all of them.
+        remark: told what could not be written beside them.
+
+    Returns:
+        How many frames there were; of none no file is written.
+
+    Raises:
+        FootTileError: from `pieces`, or the file cannot be written.
+    """
+    left = iter(pieces)
+    first = next(left, None)
+    if first is None:
+        return 0
+    assert stream.plan is not None  # noqa: S101  # what it gives was made with it
+    notes = {**notes, **notes_of(stream.plan, stream.rounding, what.options.tares)}
+    stances, frames = StancesBeside(), 0
+    with SessionWriter(out, what.info, notes) as writer:
+        for batch, extra in chain((first,), left):
+            writer.append(batch, extra)
+            frames += len(batch)
+            stances.feed(batch.seq, batch.t_ns, extra)
+    if out.name == FRAMES_NAME:  # in a session's folder
+        stances.write(out.parent, sha256_of(out))
+        if stances.problem is not None:
+            remark(stances.problem)
+    return frames
+
+
+class _Judged:
+    """Looks at frames with estimates as they pass."""
+
+    def __init__(self, what: Prepared) -> None:
+        self._found = FindingsOf(judging=all(c.name in what.kept for c in TRUTH))
+        self._asking = Asking(what.info, what.options.calibration, what.options.models)
+
+    def watched(self, pieces: Iterable[Piece], stream: EstimateStream) -> Iterator[Piece]:
+        for batch, extra in pieces:
+            self._found.feed(batch, extra)
+            if stream.tare is not None:
+                self._asking.feed(stream.tare, batch, extra["contact"] == 1)
+            yield batch, extra
+
+    def finish(self, plan: EstimationPlan) -> tuple[Findings, Mapping[str, float]]:
+        return self._found.finish(plan), self._asking.finish()
+
+
+def _of_part(
+    session: SessionReader, info: ArrayInfo, options: EstimateOptions, part: Slice
+) -> tuple[EstimateOptions, Stretch]:
+    """Options with the tares in force in a part, as in the whole session, and what is read."""
+    stream, tares = EstimateStream(info, options), options.tares
+    if not tares:
+        ordered = in_order(session.batches(), where=str(session.path))
+        tares = (stream.find_tare(ordered),)
+    stretch = stretch_of(session, part, stream.plan_of(tares[0]))
+    return replace(options, tare_s=None, tares=since(tares, stretch.from_ns)), stretch
+
+
+def _notes_of_part(session: SessionReader, part: Slice, stretch: Stretch) -> dict[str, object]:
+    """The session's, without what is true only of all of it."""
+    notes = {name: said for name, said in session.notes.items() if name not in _OF_THE_WHOLE}
+    seconds = {"start_s": part.start_s, "end_s": part.end_s, "warm_up_s": stretch.warm_up_s}
+    return {**notes, "part_of": {**session.identity, **seconds}}
