@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -35,7 +36,9 @@ from service.offline.archive.jobs import Job, begin_worker, run_job
 from service.offline.archive.places import sessions_in
 from service.offline.archive.plan import Spread, outcomes
 from service.offline.archive.tasks import EstimateTask, Task, VerifyTask
+from service.offline.estimate.request import PIECE_FRAMES
 from service.offline.estimate.session import estimate_session
+from service.offline.processes import GoesOn
 from service.offline.processes import spread as over_processes
 from storage.sessions.folder import FRAMES_NAME, SessionFolder
 from tests.service.offline.archive.clusters import Cluster
@@ -165,7 +168,8 @@ def overhead(a: argparse.Namespace, work: Path) -> list[str]:
 
     def as_jobs(folder: Path) -> None:
         for place in places:
-            assert run_job(Job(place, ESTIMATE, str(folder))).state == "made"
+            assert not isinstance(made := run_job(Job(place, ESTIMATE, str(folder))), GoesOn)
+            assert made.state == "made"
 
     def in_folder(way: Callable[[Path], None]) -> None:
         with tempfile.TemporaryDirectory(dir=work) as folder:
@@ -225,25 +229,25 @@ def long(a: argparse.Namespace, work: Path) -> list[str]:
         folder, session_id = SessionFolder(data / "sessions"), ID.format(0)
         once = lengthened(emulated(4, 20.0), 60.0 * minutes)
         sealed(once, folder, session_id, data / "journals")
-        note(f"{minutes:g} minutes")
-        told = subprocess.run(
-            [sys.executable, __file__, "--estimate", folder.path(session_id)],
-            check=True,
-            capture_output=True,
-            text=True,
-        )
-        rows.append((f"{minutes:g}", *told.stdout.split()))
-    return table(("minutes", "greatest resident set, MB", "CPU s", "wall s"), rows, 0)
+        for way, piece_frames in (("one", sys.maxsize), ("of a million frames", PIECE_FRAMES)):
+            note(f"{minutes:g} minutes, pieces: {way}")
+            command = ("--estimate", folder.path(session_id), "--piece-frames", str(piece_frames))
+            told = subprocess.run(
+                [sys.executable, __file__, *command], check=True, capture_output=True, text=True
+            )
+            rows.append((f"{minutes:g}", way, *told.stdout.split()))
+    return table(("minutes", "pieces", "greatest resident set, MB", "CPU s", "wall s"), rows, 0)
 
 
-def estimate(session: Path) -> None:
+def estimate(session: Path, piece_frames: int) -> None:
     """Body of the process whose memory is measured, once what is compiled is loaded."""
     warm_up()
     begin_worker()
     begin, before = time.perf_counter(), cpu_s()
     with tempfile.TemporaryDirectory() as out:
-        (job,) = jobs(session, ESTIMATE, out)
-        outcome = run_job(job)
+        (job,) = jobs(session, replace(ESTIMATE, piece_frames=piece_frames), out)
+        while isinstance(outcome := run_job(job), GoesOn):
+            pass
     assert outcome.state == "made", outcome.reason
     spent, took = cpu_s() - before, time.perf_counter() - begin
     tell_greatest()
@@ -269,13 +273,14 @@ def main() -> None:
     parser.add_argument("--archives", type=int, nargs="+", default=[10, 1_000, 10_000])
     parser.add_argument("--minutes", type=float, nargs="+", default=[5.0, 60.0, 180.0])
     parser.add_argument("--estimate", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--piece-frames", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--client", type=Path, help=argparse.SUPPRESS)
     a = parser.parse_args()
     if a.client is not None:
         client(a.client)
         return
     if a.estimate is not None:
-        estimate(a.estimate)
+        estimate(a.estimate, a.piece_frames)
         return
     for name in a.only:
         with tempfile.TemporaryDirectory() as work:

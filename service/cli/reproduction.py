@@ -149,7 +149,9 @@ def _mill(run: _Run) -> tuple[tuple[DomeFound, ...], Calibration | None]:
     serials = () if options.quick else _serials()
     tasks: list[Dome | str] = [*options.domes, *serials]
     work = partial(_pressed, seed=options.seed, parts_seed=options.parts_seed)
-    for number, (task, found) in enumerate(spread(work, tasks, min(options.jobs, len(tasks))), 1):
+    results: Iterator[tuple[Dome | str, DomeFound | Calibration | Exception]]
+    results = spread(work, tasks, min(options.jobs, len(tasks)))
+    for number, (task, found) in enumerate(results, 1):
         name = task if isinstance(task, str) else task.name
         run.tell(f"mill: {number} of {len(tasks)} tiles pressed, the last one {name}")
         if isinstance(found, Exception):

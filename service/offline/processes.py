@@ -21,6 +21,12 @@ from devices.errors import WorkerLostError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+
+
+class GoesOn:
+    """Result of a task that is done in part: it is given again, to whoever is free."""
+
+
 LOSSES_MAX = 3
 """A task that so many processes have died over is given up."""
 _PATIENCE_S = 5.0
@@ -33,7 +39,7 @@ def cores() -> int:
 
 
 def spread(
-    work: Callable[[Task], Result],
+    work: Callable[[Task], Result | GoesOn],
     tasks: Iterable[Task],
     jobs: int,
     *,
@@ -45,13 +51,15 @@ def spread(
 
     Args:
         work: a function of a module, that raises nothing it expects.
-        tasks: what to call it with.
+        tasks: what to call it with; with one that goes on again and again.
         jobs: so many processes at the same time; 1: in this one.
         begin: a function of a module, called in every process first.
     """
     if jobs == 1:
         for task in tasks:
-            yield task, work(task)
+            while isinstance(result := work(task), GoesOn):
+                pass
+            yield task, result
         return
     pool = _Pool(work, jobs, begin)
     left, again = iter(tasks), deque[tuple[Task, int]]()
@@ -78,7 +86,10 @@ def spread(
                         yield task, _lost(losses + 1, code)
                     continue
                 pool.idle.append(worker)
-                yield task, result
+                if isinstance(result, GoesOn):
+                    again.append((task, 0))
+                else:
+                    yield task, result
     finally:
         pool.end(worker for worker, _, _ in under_way.values())
 
@@ -123,7 +134,7 @@ class _Worker:
 
 class _Pool(Generic[Task, Result]):
     def __init__(
-        self, work: Callable[[Task], Result], jobs: int, begin: Callable[[], None] | None
+        self, work: Callable[[Task], Result | GoesOn], jobs: int, begin: Callable[[], None] | None
     ) -> None:
         self.idle: list[_Worker] = []
         self._work, self._begin = work, begin

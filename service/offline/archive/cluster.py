@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import platform
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from importlib.metadata import PackageNotFoundError, version
@@ -18,10 +19,12 @@ from typing import Any, TypeVar
 
 from devices.errors import LinkError, UsageError, WorkerLostError, needs_extra
 from devices.words import printable
+from service.offline.processes import GoesOn
 from service.version import exact_software
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+_NONE: Any = object()
 _CONNECT_S = 15.0
 _NUMBERS = ("numpy", "numba", "pyarrow")
 """Of other versions they may give other numbers."""
@@ -39,13 +42,14 @@ def versions() -> dict[str, str]:
 
 
 def spread_over_cluster(
-    work: Callable[[Task], Result], tasks: Iterable[Task], *, address: str
+    work: Callable[[Task], Result | GoesOn], tasks: Iterable[Task], *, address: str
 ) -> Iterator[tuple[Task, Result | Exception]]:
     """Every task with its result as it is finished, or with the error that its worker raised.
 
     Args:
         work: a function of a module, that raises nothing it expects.
-        tasks: what to call it with; no more are taken than are under way.
+        tasks: what to call it with; no more are taken than are under way. With one that goes on
+            it is called again, by any worker.
         address: of the scheduler, as tcp://host:8786.
 
     Raises:
@@ -68,13 +72,12 @@ def spread_over_cluster(
             raise _away(address, error) from error
         _check(client.run(versions, on_error="return"))
         under_way: dict[str, Task] = {}
-        done, left, goes_on = dask.as_completed(loop=client.loop), iter(tasks), True
+        done, left = dask.as_completed(loop=client.loop), iter(tasks)
+        again = deque[Task]()
         while True:
-            while goes_on and len(under_way) < _threads(client, address):
-                try:
-                    task = next(left)
-                except StopIteration:
-                    goes_on = False
+            while len(under_way) < _threads(client, address):
+                task = again.popleft() if again else next(left, _NONE)
+                if task is _NONE:
                     break
                 future = client.submit(work, task, pure=False)
                 under_way[future.key] = task
@@ -83,7 +86,7 @@ def spread_over_cluster(
                 return
             future = next(done)
             task = under_way.pop(future.key)
-            result: Result | Exception
+            result: Result | GoesOn | Exception
             if future.status == "finished":
                 result = future.result()
             elif future.status == "error":
@@ -93,7 +96,10 @@ def spread_over_cluster(
             else:
                 raise _away(address, f"a task is {future.status}")
             future.release()
-            yield task, result
+            if isinstance(result, GoesOn):
+                again.append(task)
+            else:
+                yield task, result
 
 
 def _threads(client: Any, address: str) -> int:
@@ -116,6 +122,8 @@ def _check(found: dict[str, Any]) -> None:
     """Refuse workers that may give other numbers than this client."""
     ours = versions()
     for worker, theirs in found.items():
+        if isinstance(theirs, OSError):
+            continue  # it is gone; one that comes back is asked by the job
         if theirs != ours:
             differ = (
                 ", ".join(

@@ -8,17 +8,22 @@ from __future__ import annotations
 import json
 import logging
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
 
 from devices.errors import FootTileError, StateError, UsageError
+from service.offline.archive.pieces import Pieces
 from service.offline.archive.places import Place, is_remote
 from service.offline.archive.results import Note, Results, files_in
 from service.offline.archive.staging import identity, staged
-from service.offline.archive.tasks import Task
+from service.offline.archive.tasks import LongTask, Task
 from service.offline.archive.workspace import SYSTEM, workspace
+from service.offline.processes import GoesOn
 from service.version import exact_software
 
 log = logging.getLogger("foottile.archive")
@@ -65,8 +70,8 @@ def begin_worker() -> None:
     pa.set_cpu_count(1)
 
 
-def run_job(job: Job) -> Outcome:
-    """Do a job, unless its result is there.
+def run_job(job: Job) -> Outcome | GoesOn:
+    """Do a job, unless its result is there; of a long session one piece.
 
     Raises:
         UsageError: this worker is of another version than the client.
@@ -78,13 +83,13 @@ def run_job(job: Job) -> Outcome:
         )
     name, where = job.place.name, job.place.where
     try:
-        state, facts = _done(job)
+        done = _done(job)
     except FootTileError as error:
         return failed(job, str(error))
     except Exception as error:  # one session may not hold up all others
         log.exception("%s: this is a bug", where)
         return failed(job, f"this is a bug: {type(error).__name__}: {error}")
-    return Outcome(name, where, state, facts)
+    return done if isinstance(done, GoesOn) else Outcome(name, where, *done)
 
 
 def failed(job: Job, reason: str) -> Outcome:
@@ -92,7 +97,7 @@ def failed(job: Job, reason: str) -> Outcome:
     return Outcome(job.place.name, job.place.where, "failed", reason=reason)
 
 
-def _done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]]:
+def _done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]] | GoesOn:
     task, place = job.task, job.place
     if job.out is None:
         with staged(place) as source, workspace(SYSTEM) as work:
@@ -118,11 +123,29 @@ def _done(job: Job) -> tuple[Literal["made", "there"], dict[str, Any]]:
                 where=place.where,
                 remedy="Name another --out for it, or delete that result",
             )
-    with staged(place) as source, results.made(place.name, task.command) as work:
-        facts = plain(task.run(source, work))
-        files = files_in(work)
+    pieces = None
+    with staged(place) as source:
+        if isinstance(task, LongTask) and task.is_long(source):
+            pieces = Pieces(job.out, place.name, asked.key)
+            with pieces.folder(task.PIECES) as folder:
+                if task.make_piece(source, folder):
+                    return GoesOn()
+            with pieces.folder() as folder:
+                made = _made(results, place.name, task, partial(task.join, source, folder))
+        else:
+            made = _made(results, place.name, task, partial(task.run, source))
+    facts, files = made
     results.keep(place.name, replace(asked, files=files, facts=facts))
+    if pieces is not None:
+        pieces.forget()
     return "made", facts
+
+
+def _made(
+    results: Results, name: str, task: Task, run: Callable[[Path], dict[str, Any]]
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    with results.made(name, task.command) as work:
+        return plain(run(work)), files_in(work)
 
 
 def _check_target(place: Place, out: str) -> None:

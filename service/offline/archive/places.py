@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import glob
 import os
+import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, BinaryIO, cast
 from urllib.parse import urlsplit
 
@@ -25,6 +27,7 @@ from storage.sessions.folder import FRAMES_NAME, SESSION_ID
 
 _EXPECTED = "a session, a folder of sessions, a data folder, a glob of these, or a URI of one"
 _S3_ATTEMPTS = 6
+_BLOCK = 1 << 20
 """Of a request that a store refuses or breaks off; they wait longer and longer, 3 s in all."""
 _S3_CONNECT_S = 10.0
 
@@ -131,6 +134,35 @@ def read_error(where: str, error: OSError) -> FileFormatError | StorageError:
     return StorageError(
         f"cannot be read: {text}", where=where, remedy="Try again", errno=error.errno
     )
+
+
+def upload(where: str, content: bytes | Path) -> None:
+    """Put a file into a store: bytes, or what is in a file here.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    filesystem, path = opened(where)
+    with storing(where), filesystem.open_output_stream(path) as sink:
+        if isinstance(content, bytes):
+            sink.write(content)
+        else:
+            with content.open("rb") as source:
+                shutil.copyfileobj(source, sink, _BLOCK)
+
+
+@contextmanager
+def storing(where: str) -> Iterator[None]:
+    """What a place says when it cannot be written to is a `StorageError`."""
+    try:
+        yield
+    except StorageError:
+        raise
+    except OSError as error:
+        text = printable(" ".join(str(error).split()))[:300]
+        raise StorageError(
+            f"cannot be written: {text}", where=where, remedy="Try again", errno=error.errno
+        ) from error
 
 
 def sizes_in(where: str) -> dict[str, int]:

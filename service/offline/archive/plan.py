@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 
 from devices.errors import WorkerLostError
 from service.offline.archive.jobs import Job, Outcome, failed, run_job
+from service.offline.processes import GoesOn
 
 Spread = Callable[
-    [Callable[[Job], Outcome], Iterable[Job]], Iterator[tuple[Job, Outcome | Exception]]
+    [Callable[[Job], Outcome | GoesOn], Iterable[Job]], Iterator[tuple[Job, Outcome | Exception]]
 ]
 LISTED_MAX = 20
 """So many failures are kept to be shown; the report has all."""

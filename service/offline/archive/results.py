@@ -6,18 +6,18 @@ nothing, and a job that was broken off is done again. A store keeps objects whol
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from devices.errors import FileFormatError, StorageError
-from devices.words import printable
-from service.offline.archive.places import is_remote, opened, read_bytes, sizes_in
+from devices.errors import FileFormatError
+from service.offline.archive.pieces import PIECES_NAME
+from service.offline.archive.places import is_remote, opened, read_bytes, sizes_in, storing, upload
 from service.offline.archive.workspace import SYSTEM, remove_stale_workspaces, workspace
 from storage.checked_json import checked, with_check
 from storage.durable import (
@@ -54,6 +54,12 @@ class Note:
     files: Mapping[str, Mapping[str, Any]]
     facts: Mapping[str, Any]
 
+    @property
+    def key(self) -> str:
+        """The same for what is made from the same in the same way."""
+        said = json.dumps([self.command, self.software, self.input_sha256, self.options])
+        return hashlib.sha256(said.encode()).hexdigest()[:16]
+
     def is_of(self, other: Note) -> bool:
         """Were both made from the same, in the same way?"""
         return (self.software, self.input_sha256, self.options) == (
@@ -80,7 +86,7 @@ class Results:
         if note is None:
             return None
         filesystem, path = opened(f"{self.out}/{name}")
-        with _storing(self.out):
+        with storing(self.out):
             infos = filesystem.get_file_info([f"{path}/{file}" for file in note.files])
         sizes = [file["bytes"] for file in note.files.values()]
         return note if [info.size for info in infos] == sizes else None
@@ -105,7 +111,7 @@ class Results:
         text = with_check(json.dumps(vars(note), indent=1).encode())
         where = f"{self.out}/{name}/{_note_name(note.command)}"
         if self.is_remote:
-            self._upload(where, text)
+            upload(where, text)
             return
         with storage_errors(Path(where)):
             temporary = temporary_of(Path(where))
@@ -128,13 +134,14 @@ class Results:
         """All workers have ended."""
         if not self.is_remote:
             remove_stale_workspaces(Path(self.out) / _WORK)
-            with suppress(OSError):
-                (Path(self.out) / _WORK).rmdir()
+            for name in (_WORK, PIECES_NAME):
+                with suppress(OSError):
+                    (Path(self.out) / name).rmdir()
 
     def put_file(self, name: str, path: Path) -> None:
         """Put a file beside the results."""
         if self.is_remote:
-            self._upload(f"{self.out}/{name}", path)
+            upload(f"{self.out}/{name}", path)
 
     def _read(self, name: str, command: str) -> Note | None:
         where = f"{self.out}/{name}/{_note_name(command)}"
@@ -149,7 +156,7 @@ class Results:
         files = sorted(path for path in work.iterdir() if path.is_file())
         if self.is_remote:
             for path in files:
-                self._upload(f"{target}/{path.name}", path)
+                upload(f"{target}/{path.name}", path)
             return
         with storage_errors(Path(target)):
             Path(target).mkdir(parents=True, exist_ok=True)
@@ -167,19 +174,10 @@ class Results:
             return
         old = self._read(name, command)
         filesystem, path = opened(f"{self.out}/{name}")
-        with _storing(f"{self.out}/{name}"):
+        with storing(f"{self.out}/{name}"):
             filesystem.delete_file(f"{path}/{_note_name(command)}")
             for file in there.intersection(old.files if old is not None else ()):
                 filesystem.delete_file(f"{path}/{file}")
-
-    def _upload(self, where: str, content: bytes | Path) -> None:
-        filesystem, path = opened(where)
-        with _storing(where), filesystem.open_output_stream(path) as sink:
-            if isinstance(content, bytes):
-                sink.write(content)
-            else:
-                with content.open("rb") as source:
-                    shutil.copyfileobj(source, sink, 1 << 20)
 
 
 def files_in(work: Path) -> dict[str, dict[str, Any]]:
@@ -193,16 +191,3 @@ def files_in(work: Path) -> dict[str, dict[str, Any]]:
 
 def _note_name(command: str) -> str:
     return f"{command}.made.json"
-
-
-@contextmanager
-def _storing(where: str) -> Iterator[None]:
-    try:
-        yield
-    except StorageError:
-        raise
-    except OSError as error:
-        text = printable(" ".join(str(error).split()))[:300]
-        raise StorageError(
-            f"cannot be written: {text}", where=where, remedy="Try again", errno=error.errno
-        ) from error

@@ -77,7 +77,7 @@ def staged(place: Place) -> Iterator[Path]:
     with workspace(SYSTEM) as work:
         if place.is_file:
             path = work / f"{place.name}.parquet"
-            _copied(place.where, path)
+            copied(place.where, path)
             yield path
             return
         folder = work / place.name
@@ -85,7 +85,7 @@ def staged(place: Place) -> Iterator[Path]:
         names = sorted(sizes_in(place.where))
         if not names:
             raise FileFormatError("there is no such session", where=place.where)
-        hashes = {name: _copied(f"{place.where}/{name}", folder / name) for name in names}
+        hashes = {name: copied(f"{place.where}/{name}", folder / name) for name in names}
         stated = claims_of(folder).content.get("sha256")
         if stated is not None and hashes.get(FRAMES_NAME, stated) != stated:
             raise DamagedFileError(
@@ -113,7 +113,7 @@ def staged_file(where: str) -> Iterator[Path]:
     else:
         with workspace(SYSTEM) as work:
             path = work / where.rpartition("/")[2]
-            _copied(where, path)
+            copied(where, path)
             yield path
 
 
@@ -160,7 +160,7 @@ def side_by_side(
         yield from pool.map(work, each)
 
 
-def _copied(where: str, path: Path) -> str:
+def copied(where: str, path: Path) -> str:
     """Copy a file here; its hash."""
     hash_ = hashlib.sha256()
     with reading(where) as source, storage_errors(path), path.open("wb") as file:

@@ -9,12 +9,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from devices.errors import UsageError
 from service.estimation.calibration import Calibration
 from service.offline.archive.staging import claims_of, frames_of, identity_of_file, staged_file
-from service.offline.estimate.request import EstimateRequest
+from service.offline.estimate.request import PIECE_FRAMES, EstimateRequest
 from service.offline.export import ExportOptions, export_session
 from service.plain_json import plain
 from storage.checked_json import with_check
@@ -29,6 +29,7 @@ from storage.verify.data import verdict_of, verify
 
 if TYPE_CHECKING:
     from service.offline.comparison import CompareOptions
+    from service.offline.estimate.session import Estimated
 
 _BESIDE = (EVENTS_NAME, CLOCK_NAME, LEDGER_NAME, PULLED_EVENTS_NAME)
 
@@ -60,17 +61,51 @@ class Task(Protocol):
         """
 
 
+@runtime_checkable
+class LongTask(Task, Protocol):
+    """A task that does a long session in pieces, one after the other."""
+
+    PIECES: ClassVar[tuple[str, ...]]
+    """Endings of the files that the next piece needs of those before."""
+
+    def is_long(self, source: Path) -> bool:
+        """Is it worth more than one piece?"""
+
+    def make_piece(self, source: Path, folder: Path) -> bool:
+        """Make the next piece.
+
+        Args:
+            source: as for `run`.
+            folder: of the pieces; gets this one.
+
+        Returns:
+            Whether there was one left.
+
+        Raises:
+            FootTileError: as for `run`.
+        """
+
+    def join(self, source: Path, folder: Path, work: Path) -> dict[str, Any]:
+        """As `run`, of what is in the folder of the pieces."""
+
+
 @dataclass(frozen=True)
 class EstimateTask(EstimateRequest):
-    """Estimates a session again; the result is a session's folder as the source was."""
+    """Estimates a session again; the result is a session's folder as the source was.
 
+    Attributes:
+        piece_frames: a longer session is done in pieces of so many; makes no difference to it.
+    """
+
+    piece_frames: int = PIECE_FRAMES
     command: ClassVar[str] = "estimate"
+    PIECES: ClassVar[tuple[str, ...]] = ("json", "npz")
 
     def options(self) -> dict[str, Any]:
         """As for any task."""
         named = self.calibration
         return {
-            **vars(self),
+            **{name: value for name, value in vars(self).items() if name != "piece_frames"},
             "calibration": named.id if isinstance(named, Calibration) else named,
             "scene": None if self.scene is None else self.scene.model_dump(mode="json"),
             "part": vars(self.part),
@@ -83,6 +118,33 @@ class EstimateTask(EstimateRequest):
         frames, remarks = frames_of(source), list[str]()
         out = work / FRAMES_NAME
         made = estimate_session(frames, out, self, remark=remarks.append, is_judged=False)
+        return self._finished(source, work, made, remarks)
+
+    def is_long(self, source: Path) -> bool:
+        """As for any long task."""
+        from service.offline.estimate.pieces import has_pieces
+
+        return has_pieces(frames_of(source), self, self.piece_frames)
+
+    def make_piece(self, source: Path, folder: Path) -> bool:
+        """As for any long task."""
+        from service.offline.estimate.pieces import make_piece
+
+        return make_piece(
+            frames_of(source), folder, self, piece_frames=self.piece_frames, remark=lambda _: None
+        )
+
+    def join(self, source: Path, folder: Path, work: Path) -> dict[str, Any]:
+        """As for any long task."""
+        from service.offline.estimate.pieces import join_pieces
+
+        remarks, out = list[str](), work / FRAMES_NAME
+        made = join_pieces(frames_of(source), folder, out, self, remark=remarks.append)
+        return self._finished(source, work, made, remarks)
+
+    def _finished(
+        self, source: Path, work: Path, made: Estimated, remarks: list[str]
+    ) -> dict[str, Any]:
         if source.is_dir() and self.part.is_all:
             _complete(source, work)
         return {

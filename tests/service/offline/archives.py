@@ -9,10 +9,11 @@ import numpy as np
 from service.sessions.sealing import seal
 from service.sessions.sources import Sources
 from storage.journal.journal import Journal
+from storage.sessions.file import SessionWriter
 from storage.sessions.folder import Event, Part, Session, SessionFolder
 from storage.sessions.ledger import StreamState, ledger_of
 from tests.builders.arrays import PERIOD_NS, UTC_NS
-from tests.service.sessions.pieces import array, calibration, frames
+from tests.service.sessions.pieces import array, calibration, frames, hopping
 
 IDS = tuple(f"20260101T00000{number}Z-00000{number}" for number in range(6))
 HOP = 50
@@ -81,3 +82,11 @@ def recording(data: Path, number: int) -> Path:
     folder = SessionFolder(data / "sessions")
     folder.save(session_of(number, "mud", "recording"))
     return folder.path(IDS[number])
+
+
+def long_session(path: Path) -> Path:
+    """A file of three row groups, a minute each, with a lead."""
+    batch = frames(hopping(9000, loaded_from=200), lead=200, period_ns=20_000_000)
+    with SessionWriter(path, array(50.0), {}) as writer:
+        writer.append(batch, {})
+    return path

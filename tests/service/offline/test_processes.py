@@ -9,13 +9,26 @@ import pytest
 
 from devices.errors import WorkerLostError
 from service.offline.processes import spread
-from tests.service.offline.archive.workers import killed_at_two, killed_once, raising, squared
+from tests.service.offline.archive.workers import (
+    counted,
+    killed_at_two,
+    killed_once,
+    raising,
+    squared,
+)
 
 pytestmark = pytest.mark.process
 
 
 def test_every_task_comes_with_its_result() -> None:
     assert dict(spread(squared, range(20), 3)) == {n: n * n for n in range(20)}
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_task_that_goes_on_is_given_again_until_it_has_ended(tmp_path: Path, jobs: int) -> None:
+    tasks = [tmp_path / "2", tmp_path / "0", tmp_path / "3"]
+    found = dict(spread(counted, tasks, jobs))
+    assert found == {path: int(path.name) + 1 for path in tasks}
 
 
 def test_no_more_tasks_are_taken_than_there_are_processes() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,15 +12,16 @@ import pytest
 
 from devices.errors import LinkError, UsageError, WorkerLostError
 from service.offline.archive.cluster import spread_over_cluster
-from service.offline.archive.jobs import Job
+from service.offline.archive.jobs import Job, run_job
 from service.offline.archive.places import sessions_in
 from service.offline.archive.plan import outcomes
 from service.offline.archive.results import Results
 from service.offline.archive.tasks import EstimateTask
-from service.offline.processes import spread
+from service.offline.processes import GoesOn, spread
 from tests.service.offline.archive.clusters import Cluster
-from tests.service.offline.archive.workers import killed_at_two, raising, squared
-from tests.service.offline.archives import IDS
+from tests.service.offline.archive.workers import counted, killed_at_two, raising, squared
+from tests.service.offline.archives import IDS, long_session
+from tests.service.sessions.pieces import calibration
 
 pytestmark = [pytest.mark.process, pytest.mark.slow]
 COPIES = 10
@@ -70,6 +72,38 @@ def test_a_worker_that_is_killed_costs_nothing_and_results_are_those_of_one_proc
     assert contents(out) == contents(tmp_path / "alone")
     Results(str(out)).end()
     assert not (out / ".work").exists()
+
+
+def test_a_long_session_goes_from_worker_to_worker_and_a_killed_one_costs_its_piece(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    (tmp_path / "raw").mkdir()
+    for number in range(2):
+        long_session(tmp_path / "raw" / f"t{number}.parquet")
+    task = replace(STATIC, calibration=calibration())
+    places = list(sessions_in([f"{tmp_path}/raw/*.parquet"]))
+    pieces = [Job(p, replace(task, piece_frames=1), str(tmp_path / "out")) for p in places]
+    for job in pieces:
+        assert isinstance(run_job(job), GoesOn)  # begun here, gone on with there
+    cluster.add_worker()
+    states = []
+    for outcome in outcomes(pieces, partial(spread_over_cluster, address=cluster.address)):
+        if not states:
+            cluster.workers[-2].kill()
+        states.append(outcome.state)
+    assert states in (["made", "made"], ["made", "there"])  # it may have had no time to tell
+    for outcome in outcomes(
+        [Job(p, task, str(tmp_path / "alone")) for p in places], partial(spread, jobs=1)
+    ):
+        assert outcome.state == "made"
+    assert contents(tmp_path / "out") == contents(tmp_path / "alone")
+    assert list((tmp_path / "out" / ".pieces").iterdir()) == []
+
+
+def test_a_task_that_goes_on_is_called_again(cluster: Cluster, tmp_path: Path) -> None:
+    tasks = [tmp_path / "2", tmp_path / "0"]
+    found = dict(spread_over_cluster(counted, tasks, address=cluster.address))
+    assert found == {tmp_path / "2": 3, tmp_path / "0": 1}
 
 
 def test_no_more_tasks_are_taken_than_are_under_way(cluster: Cluster) -> None:

@@ -19,11 +19,13 @@ from service.offline.archive.query import ask
 from service.offline.archive.results import Results
 from service.offline.archive.tasks import EstimateTask, ExportTask, Task, VerifyTask
 from service.offline.export import ExportOptions
-from service.offline.processes import spread
+from service.offline.processes import GoesOn, spread
 from storage.verify.data import verdict_of, verify
-from tests.service.offline.archives import IDS, recording
+from tests.service.offline.archives import IDS, long_session, recording
+from tests.service.sessions.pieces import calibration
 
 ESTIMATE = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
+STATIC = replace(ESTIMATE, calibration=calibration())
 CSV = ExportTask(ExportOptions("csv"))
 
 
@@ -35,6 +37,10 @@ def ran(task: Task, place: Path | str, out: Path | str | None) -> dict[str, Outc
 
 def states(found: dict[str, Outcome]) -> set[str]:
     return {outcome.state for outcome in found.values()}
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(out)): p.read_bytes() for p in out.glob("*/*") if p.is_file()}
 
 
 def stamps(out: Path) -> dict[str, tuple[int, int]]:
@@ -52,6 +58,47 @@ def test_a_result_that_is_there_is_not_made_again(archive: Path, tmp_path: Path)
     assert states(again) == {"there"}
     assert stamps(out) == before
     assert {n: o.facts for n, o in again.items()} == {n: o.facts for n, o in first.items()}
+
+
+def test_a_long_session_is_done_in_pieces_by_whoever_is_free_and_is_the_same(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "raw").mkdir()
+    long = long_session(tmp_path / "raw" / "long.parquet")
+    whole = ran(STATIC, long, tmp_path / "whole")
+    in_pieces = replace(STATIC, piece_frames=1)
+    given = list[str]()
+
+    def seen(job: Job) -> Outcome | GoesOn:
+        done = run_job(job)
+        there = sorted(path.name for path in (tmp_path / "out" / ".pieces").rglob("*.json"))
+        given.append(" ".join(there) if isinstance(done, GoesOn) else done.state)
+        return done
+
+    (job,) = [Job(found, in_pieces, str(tmp_path / "out")) for found in sessions_in([str(long)])]
+    ((_, outcome),) = spread(seen, [job], 1)
+    assert given == ["0000.json", "0000.json 0001.json", "0000.json 0001.json 0002.json", "made"]
+    assert isinstance(outcome, Outcome)
+    assert outcome.facts == whole["long"].facts
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+    Results(str(tmp_path / "out")).end()
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["long"]
+
+
+def test_pieces_of_other_options_are_not_taken_and_go_with_the_result(tmp_path: Path) -> None:
+    (tmp_path / "raw").mkdir()
+    long = long_session(tmp_path / "raw" / "long.parquet")
+    in_pieces, out = replace(STATIC, piece_frames=1), str(tmp_path / "out")
+    (place,) = sessions_in([str(long)])
+    for lag_ms in (100.0, 100.0, 50.0):
+        assert isinstance(run_job(Job(place, replace(in_pieces, lag_ms=lag_ms), out)), GoesOn)
+    folders = {path.name for path in (tmp_path / "out" / ".pieces" / "long").iterdir()}
+    assert len(folders) == 2
+    found = ran(replace(in_pieces, lag_ms=50.0), long, out)
+    assert found["long"].state == "made"
+    assert not (tmp_path / "out" / ".pieces" / "long").exists()
+    ran(replace(STATIC, lag_ms=50.0), long, tmp_path / "whole")
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
 def test_a_result_of_other_options_or_another_input_is_made_anew(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -14,14 +15,15 @@ import pytest
 from devices.errors import FileFormatError
 from service.offline.archive import places
 from service.offline.archive.finding import find_sessions
-from service.offline.archive.jobs import Job, Outcome
+from service.offline.archive.jobs import Job, Outcome, run_job
 from service.offline.archive.places import sessions_in
 from service.offline.archive.plan import outcomes
 from service.offline.archive.query import ask
 from service.offline.archive.tasks import EstimateTask, Task, VerifyTask
-from service.offline.processes import spread
+from service.offline.processes import GoesOn, spread
 from tests.service.offline.archive.stores import BUCKET, BadWay, Store
-from tests.service.offline.archives import IDS
+from tests.service.offline.archives import IDS, long_session
+from tests.service.sessions.pieces import calibration
 
 pytestmark = pytest.mark.slow
 STATIC = EstimateTask(calibration=None, models=("static",), lag_ms=100.0, scene=None, tare_s=None)
@@ -57,6 +59,25 @@ def test_sessions_of_a_store_are_worked_on_and_results_put_back(
     assert {each.state for each in again.values()} == {"there"}
     one = ran(VerifyTask(), None, f"{out}/{IDS[2]}", f"{out}/{IDS[3]}/frames.parquet")
     assert [each.facts["verdict"] for each in one.values()] == ["complete", "complete"]
+
+
+def test_pieces_of_a_long_session_are_in_the_store_until_it_is_there(
+    store: Store, tmp_path: Path
+) -> None:
+    (tmp_path / "raw").mkdir()
+    long = long_session(tmp_path / "raw" / "long.parquet")
+    store.put(tmp_path / "raw", "long")
+    task, out = replace(STATIC, calibration=calibration()), f"s3://{BUCKET}/estimated"
+    (place,) = sessions_in([f"s3://{BUCKET}/long/long.parquet"])
+    job = Job(place, replace(task, piece_frames=1), out)
+    assert isinstance(run_job(job), GoesOn)
+    (found,) = outcomes([job], partial(spread, jobs=1))
+    assert found.state == "made", found.reason
+    ran(task, str(tmp_path / "out"), str(long))
+    there = store.content("estimated/long")
+    assert there["frames.parquet"] == (tmp_path / "out" / "long" / "frames.parquet").read_bytes()
+    with pytest.raises(FileNotFoundError):
+        store.content("estimated/.pieces/long")
 
 
 def test_a_result_in_a_store_of_which_an_object_is_gone_is_made_again(store: Store) -> None:
