@@ -86,7 +86,7 @@ def test_a_long_session_goes_from_worker_to_worker_and_a_killed_one_costs_its_pi
     for job in pieces:
         assert isinstance(run_job(job), GoesOn)  # begun here, gone on with there
     cluster.add_worker()
-    states = []
+    states = list[str]()
     for outcome in outcomes(pieces, partial(spread_over_cluster, address=cluster.address)):
         if not states:
             cluster.workers[-2].kill()
