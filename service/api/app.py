@@ -19,6 +19,7 @@ from service.api.routes import (
     access,
     array,
     clock,
+    comparisons,
     data,
     health,
     login,
@@ -114,6 +115,7 @@ def make_app(
         array,
         stances,
         overview,
+        comparisons,
     ):
         api.include_router(module.router)
     app.include_router(api)

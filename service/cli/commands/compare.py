@@ -23,9 +23,6 @@ from service.cli.reference_options import (
 )
 from service.cli.result_folder import result_folder
 
-COMPARISONS = "comparisons"
-"""In a session's folder: what it was compared with, a folder for each reference."""
-
 
 @needs_extra("server", "`foottile compare`")
 def compare_command(
@@ -42,8 +39,9 @@ def compare_command(
     out: Annotated[
         str | None,
         typer.Option(
-            help="Folder for compare.json, compare.md and compare.png; default: with the session, "
-            "in comparisons/ and the reference's name. Of many sessions each has a folder in it."
+            help="Folder for compare.json, compare.md, compare.png and series.parquet; default: "
+            "with the session, in comparisons/ and the reference's name. Of many sessions each has "
+            "a folder in it."
         ),
     ] = None,
     columns: ColumnsOfReference = None,
@@ -145,7 +143,7 @@ def compare_command(
         print_json(done.content)
     else:
         say(done.text)
-        say(f"{folder}: compare.json, compare.md, compare.png")
+        say(f"{folder}: compare.json, compare.md, compare.png, series.parquet")
     for line in done.missed:
         remark(f"limit missed: {line}")
     if done.missed:
@@ -159,6 +157,7 @@ def kept_with(source: Path, reference: Path) -> Path:
         UsageError: the session is a file by itself.
     """
     from storage.sessions.claims import SESSION_NAME
+    from storage.sessions.comparisons import COMPARISONS
 
     if not (source.parent / SESSION_NAME).is_file():
         raise UsageError(

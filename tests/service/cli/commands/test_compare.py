@@ -88,7 +88,10 @@ def test_without_a_folder_it_is_kept_with_the_session(
     (folder / "session.json").write_text("{}")
     assert run("compare", folder, *asked).code == 0
     kept = folder / "comparisons" / "plate"
-    assert {path.name for path in kept.iterdir()} == {"compare.json", "compare.md", "compare.png"}
+    assert {path.name for path in kept.iterdir()} == {
+        *("compare.json", "compare.md", "compare.png"),
+        "series.parquet",
+    }
     assert read_checked(kept / "compare.json").is_proven
 
 

@@ -1,0 +1,216 @@
+"""What `foottile compare` found of a session: figures, and the reference at any zoom."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from anyio import CapacityLimiter, to_thread
+from fastapi import APIRouter, Query, Response
+from pydantic import BaseModel, Field
+from starlette.concurrency import run_in_threadpool
+
+from devices.errors import FileFormatError, StateError, UnknownError, UsageError
+from service.api.routes.access import SecondsQuery, ServerState, problems
+from service.server.server import Server
+from service.sessions.comparison_series import bins_of_series
+from service.sessions.overview import POINTS_MAX
+from storage.formats.slice import Slice
+from storage.schema import Array
+from storage.sessions.comparisons import (
+    SERIES_NAME,
+    comparison_of,
+    comparisons_of,
+    read_report,
+    read_series,
+)
+from storage.sessions.folder import Session
+
+router = APIRouter(prefix="/sessions", tags=["sessions"])
+
+T = TypeVar("T")
+
+_ONE_AT_A_TIME = CapacityLimiter(1)
+"""A series is read whole: of several that are asked for one after the other is."""
+_PROBLEMS = problems(
+    _404="No such session or comparison, or nothing was recorded.",
+    _409="A session is compared when it is sealed.",
+    _422="The comparison's files are damaged, or the slice ends before it begins.",
+)
+
+
+class ComparisonView(BaseModel):
+    """One comparison in the list."""
+
+    name: str = Field(description="Of its reference.")
+    problem: str | None = Field(description="Why it cannot be read; null: it can.")
+    is_of_these_frames: bool | None = Field(
+        description="False: the session's frames were others then; null: it does not say."
+    )
+    missed: list[str] = Field(description="Limits that were missed, in words.")
+
+
+class ComparisonsView(BaseModel):
+    """What a session was compared with."""
+
+    items: list[ComparisonView]
+
+
+class ReportView(ComparisonView):
+    """What a comparison found (docs/compare.md)."""
+
+    is_proven: bool = Field(description="False: an older version wrote it, without a hash.")
+    has_series: bool = Field(description="There is what was compared, frame by frame.")
+    report: dict[str, Any] = Field(description="The content of `compare.json`.")
+
+
+class SeriesQuery(SecondsQuery):
+    """Which time, and how finely."""
+
+    points: Annotated[int, Field(ge=1, le=POINTS_MAX)] = Field(
+        default=1000, description="Bins at the most, but for those that gaps break."
+    )
+
+
+class SeriesView(BaseModel):
+    """The reference in bins of consecutive frames, as overviews are; what is not known is null."""
+
+    session_id: str
+    begin_t_ns: int = Field(description="t_ns of the first frame of the session.")
+    duration_s: float = Field(description="From its first frame to its last.")
+    frames_in_bin: int = Field(description="1: each bin is a frame.")
+    columns: dict[str, list[float | int | None]]
+
+
+@router.get(
+    "/{session_id}/comparisons",
+    operation_id="listComparisons",
+    summary="What it was compared with",
+    responses=problems(_404="No such session.", _409="Its files are damaged."),
+)
+async def list_comparisons(session_id: str, server: ServerState) -> ComparisonsView:
+    """Comparisons that `foottile compare` has kept with the session, by name."""
+    session = server.sessions.get(session_id)
+    return ComparisonsView(items=await run_in_threadpool(_listed, session, server))
+
+
+@router.get(
+    "/{session_id}/comparisons/{name}",
+    operation_id="getComparison",
+    summary="A comparison",
+    responses=_PROBLEMS,
+)
+async def comparison(session_id: str, name: str, server: ServerState) -> ReportView:
+    """Alignment, figures with their intervals, trials and limits."""
+    session = server.sessions.get(session_id)
+    return await run_in_threadpool(_clear, partial(_report, session, name, server))
+
+
+@router.get(
+    "/{session_id}/comparisons/{name}/series",
+    operation_id="getComparisonSeries",
+    summary="The reference at any zoom",
+    response_model=SeriesView,
+    responses=_PROBLEMS,
+)
+async def series(
+    session_id: str, name: str, query: Annotated[SeriesQuery, Query()], server: ServerState
+) -> Response:
+    """Least and greatest of the reference, and of ours less that, aligned in time."""
+    session = server.sessions.get(session_id)
+    if session.state != "sealed":
+        raise StateError(f"session {session_id} is {session.state}", remedy="Stop it")
+    make = partial(_clear, partial(_series, session, name, query, server))
+    content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
+    return Response(content, media_type="application/json")
+
+
+def _clear(make: Callable[[], T]) -> T:
+    """Files of people, which may be of any content: what is wrong with one is no fault of ours."""
+    try:
+        return make()
+    except FileFormatError as error:
+        raise UsageError(str(error)) from error
+
+
+def _listed(session: Session, server: Server) -> list[ComparisonView]:
+    folders = comparisons_of(server.sessions.folder.path(session.id))
+    frames = _frames_hash(session, server) if folders else None
+    found = []
+    for name, folder in folders.items():
+        try:
+            found.append(_view(frames, name, read_report(folder).content))
+        except FileFormatError as error:
+            found.append(
+                ComparisonView(name=name, problem=str(error), is_of_these_frames=None, missed=[])
+            )
+    return found
+
+
+def _frames_hash(session: Session, server: Server) -> object:
+    """As the frames state it now; None: there are none that can be read."""
+    try:
+        with server.sessions.frames(session.id, only_slices=True) as reader:
+            return reader.identity["file_sha256"]
+    except FileFormatError:
+        return None
+
+
+def _view(frames: object, name: str, content: dict[str, Any]) -> ComparisonView:
+    of = content["session"].get("file_sha256")
+    missed = content.get("missed")
+    return ComparisonView(
+        name=name,
+        problem=None,
+        is_of_these_frames=of == frames if isinstance(of, str) and frames is not None else None,
+        missed=[str(line) for line in missed] if isinstance(missed, list) else [],
+    )
+
+
+def _report(session: Session, name: str, server: Server) -> ReportView:
+    folder = comparison_of(server.sessions.folder.path(session.id), name)
+    read = read_report(folder)
+    return ReportView(
+        **_view(_frames_hash(session, server), name, read.content).model_dump(),
+        is_proven=read.is_proven,
+        has_series=(folder / SERIES_NAME).is_file(),
+        report={key: value for key, value in read.content.items() if key != "session"}
+        | {"reference": Path(str(read.content["reference"])).name},
+    )
+
+
+def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> bytes:
+    table = read_series(comparison_of(server.sessions.folder.path(session.id), name))
+    if table is None:
+        raise UnknownError(
+            f"the comparison with {name!r} has no series",
+            remedy="An older version made it, or it is too long: compare again",
+        )
+    with server.sessions.frames(session.id, only_slices=True) as reader:
+        begin_ns, end_ns = reader.span_ns()
+    part = Slice(query.start_s, query.end_s)
+    bins, size = bins_of_series(table, begin_ns, part, query.points)
+    times = {
+        f"t_{which}_s": (bins.pop(f"t_{which}_ns") - begin_ns) * 1e-9 for which in ("first", "last")
+    }
+    content = {
+        "session_id": session.id,
+        "begin_t_ns": begin_ns,
+        "duration_s": (end_ns - begin_ns) * 1e-9,
+        "frames_in_bin": size,
+        "columns": {column: _plain(values) for column, values in (times | bins).items()},
+    }
+    return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _plain(values: Array) -> list[Any]:
+    """As JSON has it, to a millionth of SI units; instants as they are."""
+    if values.dtype == np.float32:
+        values = np.round(values.astype(np.float64), 6)
+    plain: list[Any] = values.tolist()
+    return [None if isinstance(value, float) and math.isnan(value) else value for value in plain]

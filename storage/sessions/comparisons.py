@@ -1,0 +1,156 @@
+"""What a session was compared with: a folder for each reference, beside the session's frames.
+
+`compare.json` has the figures, `compare.md` and `compare.png` are for people, and `series.parquet`
+has frame by frame what was compared. Names of folders are those of references, so they are looked
+up among those that there are, and never made into a path.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from devices.errors import DamagedFileError, StorageError, UnknownError
+from storage.checked_json import read_checked
+from storage.checked_table import read_table, write_table
+from storage.schema import Column
+
+COMPARISONS = "comparisons"
+"""In a session's folder: what it was compared with, a folder for each reference."""
+REPORT_NAME = "compare.json"
+SERIES_NAME = "series.parquet"
+
+_F32 = pa.float32()
+ROWS_MAX = 2_500_000
+"""Of a series: more would not be read at once (`storage.durable.BYTES_MAX`)."""
+
+SERIES = (
+    Column("t_ns", pa.int64(), "ns", "of our frame"),
+    Column("grf_n", _F32, "N", "ours"),
+    Column("reference_grf_n", _F32, "N", "of the reference at our frame; less its zero if asked"),
+    Column("reference_cop_x_m", _F32, "m", "of the reference where it bears load, forward"),
+    Column("reference_cop_y_m", _F32, "m", "likewise, to the left"),
+)
+"""What was compared: our frames at which the reference is known, in the order of time."""
+
+SCHEMA = pa.schema(
+    [column.field(column.name, column.type, nullable=column.type == _F32) for column in SERIES]
+)
+
+
+@dataclass(frozen=True)
+class Report:
+    """What `compare.json` holds.
+
+    Attributes:
+        content: by name (docs/compare.md).
+        is_proven: it has the hash that it states.
+    """
+
+    content: dict[str, Any]
+    is_proven: bool
+
+
+def comparisons_of(session: Path) -> dict[str, Path]:
+    """Folders of what a session was compared with, by the reference's name, in their order.
+
+    Args:
+        session: its folder.
+
+    Raises:
+        StorageError: it cannot be read now.
+    """
+    try:
+        found = sorted((session / COMPARISONS).iterdir())
+        # What points elsewhere is none of the session's.
+        return {path.name: path for path in found if path.is_dir() and not path.is_symlink()}
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    except OSError as error:
+        raise StorageError(
+            f"cannot be read: {error.strerror}",
+            where=str(session / COMPARISONS),
+            errno=error.errno,
+        ) from error
+
+
+def comparison_of(session: Path, name: str) -> Path:
+    """The folder of one comparison.
+
+    Raises:
+        UnknownError: there is none of this name.
+        StorageError: it cannot be read now.
+    """
+    found = comparisons_of(session)
+    if name not in found:
+        raise UnknownError(
+            f"the session was not compared with {name!r}",
+            expected=", ".join(found) or "a comparison: it was compared with nothing",
+            remedy="`foottile compare` does that",
+        )
+    return found[name]
+
+
+def read_report(folder: Path) -> Report:
+    """What a comparison found.
+
+    Raises:
+        DamagedFileError: `compare.json` is not there, or not what was written.
+        StorageError: it cannot be read now.
+    """
+    path = folder / REPORT_NAME
+    try:
+        read = read_checked(path)
+    except FileNotFoundError as error:
+        raise DamagedFileError("the comparison has no report", where=str(path)) from error
+    content = json.loads(read.text)
+    wanted = {"reference": str, "session": dict, "figures": dict, "alignment": dict, "notes": list}
+    if not isinstance(content, dict) or not all(
+        isinstance(content.get(name), kind) for name, kind in wanted.items()
+    ):
+        raise DamagedFileError(
+            "is no report of a comparison",
+            where=str(path),
+            expected=", ".join(wanted),
+            remedy="Compare again",
+        )
+    return Report(content, read.is_proven)
+
+
+def write_series(path: Path, table: pa.Table) -> None:
+    """Write `series.parquet`, in place of the one that is there.
+
+    Args:
+        path: of the file.
+        table: of `SCHEMA`.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    write_table(path, table)
+
+
+def read_series(folder: Path) -> pa.Table | None:
+    """What was compared, frame by frame; None: an older version wrote none.
+
+    Raises:
+        DamagedFileError: it is not what was written.
+        StorageError: it cannot be read now.
+    """
+    path = folder / SERIES_NAME
+    try:
+        read = read_table(path)
+    except FileNotFoundError:
+        return None
+    if not read.is_proven or not read.table.schema.remove_metadata().equals(SCHEMA):
+        raise DamagedFileError(
+            "is no series of a comparison",
+            where=str(path),
+            expected="columns " + ", ".join(SCHEMA.names) + ", with a hash",
+            remedy="Compare again",
+        )
+    return read.table
