@@ -384,6 +384,8 @@ def test_without_estimates_raw_counts_are_plotted(raw: Recording, open_page: Ope
     plots = settled(page)
     expect(plots).to_have_attribute("data-panels", "tile-0 tile-1")
     expect(page.locator("#summary")).to_contain_text("these are raw counts")
+    expect(page.locator("#replay-lag")).to_contain_text("no forces: the node had no calibration")
+    expect(page.locator("#replay-foot")).to_be_hidden()
     page.keyboard.press("ArrowRight")
     expect(page.locator("#readout [data-key=tile-1]")).to_contain_text(
         re.compile("4[67][0-9] counts")
@@ -422,13 +424,16 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
         settled(page)
         page.locator("#overlay-card").scroll_into_view_if_needed()  # all that it ever loads
         expect(page.locator("#overlay-legend")).to_contain_text("mean")
+        received.wait_for("/data")
         assert len(received.bytes_of) > 15
         numbers = ("/overview", "/stances/overlay")
         bins = sum(
             size for url, size in received.bytes_of.items() if url.split("?")[0].endswith(numbers)
         )
         assert 0 < bins < 300_000
-        assert received.bytes_in_all - bins < 100_000, received.bytes_of
+        frames = sum(size for url, size in received.bytes_of.items() if "/data" in url)
+        assert 0 < frames < 300_000
+        assert received.bytes_in_all - bins - frames < 100_000, received.bytes_of
     node = FakeNode(walk.running, "weighed")
     node.connect()
     node.tared()

@@ -12,10 +12,12 @@ export class Refusal extends Error {
   }
 }
 
+const JSON_TYPE = "application/json";
+
 /** Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. `stop` takes it back. */
-export async function call(method, path, body, stop = null) {
-  const headers = { Accept: "application/json" };
-  if (body !== undefined) headers["Content-Type"] = "application/json";
+export async function call(method, path, body, stop = null, type = JSON_TYPE) {
+  const headers = { Accept: type };
+  if (body !== undefined) headers["Content-Type"] = JSON_TYPE;
   let response;
   try {
     response = await fetch(PREFIX + path, {
@@ -27,10 +29,11 @@ export async function call(method, path, body, stop = null) {
     const slow = error.name === "TimeoutError";
     throw new Refusal(slow ? "The server did not answer within 10 s." : "The server cannot be reached.", 0);
   }
-  const answer = response.status === 204 ? null : await response.json().catch(() => null);
+  const read = response.ok && type !== JSON_TYPE ? response.text() : response.json();
+  const answer = response.status === 204 ? null : await read.catch(() => null);
   if (response.ok) return answer;
   const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
-  if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop);
+  if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop, type);
   throw new Refusal(String(detail), response.status);
 }
 
@@ -51,6 +54,9 @@ export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/array`
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
 export const overview = (session, query, stop) =>
   call("GET", `/sessions/${id(session)}/overview?${new URLSearchParams(query)}`, undefined, stop);
+/** Some seconds of a session's frames, as CSV. */
+export const samples = (session, query) =>
+  call("GET", `/sessions/${id(session)}/data?${new URLSearchParams({ format: "csv", marks: "false", ...query })}`, undefined, null, "text/csv");
 export const changeSession = (session, changes) => call("PATCH", `/sessions/${id(session)}`, changes);
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/seal`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);

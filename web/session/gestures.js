@@ -6,7 +6,7 @@ const WHEEL_STEP = 0.0018;
 
 /**
  * @typedef {object} Meaning
- * @property {(px: number) => void} point the cursor is here
+ * @property {(px: number, hovering?: boolean) => void} point the cursor is here
  * @property {(fromPx: number, toPx: number) => void} choosing a stretch is being chosen
  * @property {(fromPx: number, toPx: number) => void} choose it is chosen; equal: never mind
  * @property {(factor: number, px: number) => void} zoom
@@ -38,7 +38,7 @@ export function listen(box, means) {
     const px = place(event);
     const before = down.get(event.pointerId);
     if (before === undefined) {
-      if (event.pointerType === "mouse") means.point(px);
+      if (event.pointerType === "mouse") means.point(px, true);
       return;
     }
     down.set(event.pointerId, px);

@@ -12,6 +12,7 @@ import { Numbers } from "./numbers.js";
 import { savePicture } from "./picture.js";
 import { Plots } from "./plots.js";
 import { Readout, drawSummary } from "./readout.js";
+import { Replay } from "./replay.js";
 import { Stances, placed } from "./stances.js";
 import * as views from "./view.js";
 
@@ -28,6 +29,10 @@ export class Plotted {
     this.stances = new Stances((index) => this.goTo(index));
     this.marks = new Marks(session.id, (timeS) => this.goToMark(timeS), () => this.draw());
     this.loader = new Loader(session.id, (bins) => this.take(bins), (error) => notice(error.message, { bad: true }));
+    this.replay = new Replay({
+      at: () => this.cursorS ?? this.view.from, go: (timeS) => this.cursorTo(timeS),
+      changed: () => this.draw(), failed: (error) => notice(error.message, { bad: true }),
+    });
     this.cursorS = null;
     this.drawing = 0;
   }
@@ -43,14 +48,17 @@ export class Plotted {
     this.plots.show(whole);
     const tiles = whole.serials.length;
     byId("as-heat").hidden = tiles < 2 || tiles > 32;
+    this.replay.open(this.session.id, whole);
     this.listen();
     this.draw();
     // What may be missing holds no plot up.
     const none = (error) => { if (!(error instanceof api.Refusal)) throw error; return null; };
-    const [stances, events, clock] = await Promise.all([
+    const [array, stances, events, clock] = await Promise.all([
+      api.arrayOf(this.session.id).catch(none),
       whole.estimated ? api.listStances(this.session.id).catch(none) : null,
       api.listEvents(this.session.id).catch(none), api.clockOf(this.session.id).catch(none),
     ]);
+    if (array) this.replay.dress(array);
     this.plots.stances = placed(stances ?? [], whole.beginNs);
     this.stances.show(this.plots.stances);
     quietly(() => this.showOverlay());
@@ -72,7 +80,7 @@ export class Plotted {
     const time = (px) => plots.timeAt(px, this.view);
     const scale = () => (this.view.to - this.view.from) / plots.plotWidth;
     listen(byId("plots"), {
-      point: (px) => this.point(time(px)),
+      point: (px, hovering = false) => { if (!hovering || !this.replay.playing.going) this.point(time(px)); },
       choosing: (from, to) => { this.chosen = [time(from), time(to)]; this.draw(); },
       choose: (from, to) => {
         this.chosen = null;
@@ -130,15 +138,12 @@ export class Plotted {
     this.draw();
   }
 
-  /** To the next bin at the cursor; the view follows. */
-  walk(by) {
-    const bins = this.plots.best(this.view);
-    const from = this.cursorS ?? this.middle;
-    const i = Math.min(bins.count - 1, Math.max(0, bins.at(from) + by));
-    this.cursorS = bins.first[i];
+  /** The cursor is here; where it leaves the view, that follows by as much as is seen of it. */
+  cursorTo(timeS) {
+    this.cursorS = timeS;
     const { view } = this;
-    const beyond = Math.max(0, this.cursorS - view.to) - Math.max(0, view.from - this.cursorS);
-    if (beyond) this.show(views.moved(view, beyond + Math.sign(beyond) * 0.1 * (view.to - view.from), this.durationS));
+    const beyond = Math.max(0, timeS - view.to) - Math.max(0, view.from - timeS);
+    if (beyond) this.show(views.moved(view, beyond + Math.sign(beyond) * 0.9 * (view.to - view.from), this.durationS));
     else this.draw();
   }
 
@@ -170,8 +175,9 @@ export class Plotted {
     const acts = {
       "+": () => this.zoom(1 / KEY_ZOOM), "=": () => this.zoom(1 / KEY_ZOOM), "-": () => this.zoom(KEY_ZOOM),
       "[": () => this.step(-1), "]": () => this.step(1),
-      ArrowLeft: () => this.walk(event.shiftKey ? -10 : -1), ArrowRight: () => this.walk(event.shiftKey ? 10 : 1),
+      ArrowLeft: () => this.replay.walk(-1, event.shiftKey), ArrowRight: () => this.replay.walk(1, event.shiftKey),
     };
+    if (!onButton) acts[" "] = () => this.replay.toggle();
     if (event.target.closest?.("#stances-scroll, .scroll")) { // there they scroll the table
       delete acts.ArrowLeft;
       delete acts.ArrowRight;
@@ -217,15 +223,20 @@ export class Plotted {
     box.dataset.settled = String(!this.loader.busy);
     drawSummary(bins, view, byId("summary"));
     const sentence = this.readout.draw(bins, this.cursorS === null ? -1 : bins.at(this.cursorS), plots.panels);
-    const timeS = this.cursorS ?? this.middle;
-    box.setAttribute("aria-valuemin", "0");
-    box.setAttribute("aria-valuemax", this.durationS.toFixed(3));
-    box.setAttribute("aria-valuenow", timeS.toFixed(3));
-    box.setAttribute("aria-valuetext", sentence || byId("summary").textContent);
+    this.replay.draw();
+    if (!this.replay.playing.going) this.tellCursor(sentence); // sixty times a second nobody can hear
     byId("as-heat").setAttribute("aria-pressed", String(plots.panels.some((panel) => panel.kind === "heat")));
     setText(byId("mark-at"), `${this.cursorS === null ? "in the middle of the view" : "at the cursor"}`);
     this.drawLinks();
     this.numbers.draw(view, plots.panels);
+  }
+
+  tellCursor(sentence) {
+    const box = byId("plots");
+    box.setAttribute("aria-valuemin", "0");
+    box.setAttribute("aria-valuemax", this.durationS.toFixed(3));
+    box.setAttribute("aria-valuenow", (this.cursorS ?? this.middle).toFixed(3));
+    box.setAttribute("aria-valuetext", sentence || byId("summary").textContent);
   }
 
   /** Downloads of what is in view. */

@@ -1,0 +1,54 @@
+// Time that goes on while a session is played: by the display's clock, at some speed. Knows no data.
+
+export const SPEEDS = [0.1, 0.25, 1, 4];
+const LEAP_MOST_MS = 250; // the display stood still: nobody has seen what would have been shown
+const CALM_MS = 500; // between pictures, where less motion was asked for
+
+export class Playing {
+  /**
+   * @param {object} on
+   * @param {() => number} on.at where the cursor is, in seconds
+   * @param {() => number} on.end where the session ends
+   * @param {() => boolean} on.ready are the next frames there?
+   * @param {(timeS: number) => void} on.go
+   * @param {() => void} on.changed it began, or ended
+   */
+  constructor(on) {
+    this.on = on;
+    this.speed = 1;
+    this.request = 0;
+    this.calm = matchMedia("(prefers-reduced-motion: reduce)");
+  }
+
+  get going() { return this.request !== 0; }
+
+  toggle() {
+    if (this.going) this.stop();
+    else this.start();
+  }
+
+  start() {
+    if (this.on.at() >= this.on.end()) this.on.go(0);
+    this.lastMs = null;
+    this.request = requestAnimationFrame((nowMs) => this.tick(nowMs));
+    this.on.changed();
+  }
+
+  stop() {
+    cancelAnimationFrame(this.request);
+    this.request = 0;
+    this.on.changed();
+  }
+
+  tick(nowMs) {
+    this.request = requestAnimationFrame((next) => this.tick(next));
+    const sinceMs = nowMs - (this.lastMs ?? nowMs);
+    if (this.calm.matches && this.lastMs !== null && sinceMs < CALM_MS) return;
+    this.lastMs = nowMs;
+    if (!sinceMs || !this.on.ready()) return;
+    const leapMs = Math.min(sinceMs, this.calm.matches ? 2 * CALM_MS : LEAP_MOST_MS);
+    const toS = Math.min(this.on.end(), this.on.at() + this.speed * leapMs * 1e-3);
+    this.on.go(toS);
+    if (toS >= this.on.end()) this.stop();
+  }
+}
