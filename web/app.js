@@ -9,6 +9,7 @@
 
 import { Link } from "./common/link.js";
 import { look } from "./common/login.js";
+import { inSunlight } from "./common/sunlight.js";
 import { byId, el, setText } from "./common/text.js";
 import { Actions } from "./live/actions.js";
 import { Bars } from "./live/bars.js";
@@ -19,8 +20,10 @@ import { History } from "./live/history.js";
 import { Marks } from "./live/marks.js";
 import { Notes } from "./live/notes.js";
 import { Pause } from "./live/pause.js";
+import { Range } from "./live/range.js";
 import { Status } from "./live/status.js";
 import { Tares } from "./live/tares.js";
+import { TileTraces } from "./live/tile_traces.js";
 import { Trace } from "./live/trace.js";
 import { Sessions } from "./sessions/list.js";
 import { Trash } from "./sessions/trash.js";
@@ -41,10 +44,14 @@ const state = {
   serverNowMs: () => Date.now() + state.serverAheadMs,
 };
 
-const bars = new Bars(() => { state.fresh = true; });
-const foot = new Foot();
-foot.resized = () => { state.fresh = true; };
+inSunlight(byId("sun"));
+const again = () => { state.fresh = true; };
+const range = new Range(byId("range"), again);
+const bars = new Bars(again, range);
+const foot = new Foot(range);
+foot.resized = again;
 const trace = new Trace(() => past.want());
+const tileTraces = new TileTraces(range, again);
 const past = new History(trace.points, () => state.node?.boot_id);
 const pause = new Pause(() => {
   state.fresh = true;
@@ -215,11 +222,12 @@ function draw() {
   if (state.fresh) {
     state.fresh = false;
     const { frame, nowMs: shownMs } = pause.held ?? { frame: state.frame, nowMs };
-    bars.draw(node, frame, shownMs);
+    if (!tileTraces.shown) bars.draw(node, frame, shownMs);
     foot.draw(node, frame);
     drawGrf(node, frame);
   }
-  trace.draw(nowMs, status.live);
+  const drawn = trace.draw(nowMs, status.live);
+  if (drawn) tileTraces.draw(node, drawn, nowMs, bars.unit);
 }
 
 setText(byId("start-command"), `foottile node --scene FILE --server ${location.origin}`);

@@ -48,13 +48,13 @@ def test_a_warning_says_since_when_and_why_and_stays_open(
         note = page.locator("#notes li", has_text="does not answer")
         expect(note.locator("time")).to_have_text(re.compile(r" since \d\d:\d\d:\d\d$"))
         expect(note.get_by_text("Tile S0 (mux 0x70 channel 0) does not answer.")).to_be_visible()
-        since = note.locator("time").inner_text()
+        since = note.locator("time").text_content()
         note.get_by_text("why?").click()
         expect(note.locator("p")).to_contain_text("what it bears is not known")
         tell(scripted, "tile S0 (mux 0x70 channel 0) does not answer", "another trouble")
         expect(page.locator("#notes")).to_contain_text("Another trouble.")
         expect(note.locator("p")).to_be_visible()
-        assert note.locator("time").inner_text() == since
+        assert note.locator("time").text_content() == since
         assert complaints(page) == []
         page.reload()
         expect(note.locator("time")).to_contain_text("or before")

@@ -23,6 +23,13 @@ function spacing(tiles, up) {
   return Number.isFinite(least) ? least : 0.014;
 }
 
+/** Do squares as wide as the distance of neighbours lie beside each other, as on a grid? */
+export function isGrid(tiles) {
+  const pitch = spacing(tiles, (tile) => tile.y_m);
+  const beside = (a, b) => Math.max(Math.abs(a.x_m - b.x_m), Math.abs(a.y_m - b.y_m)) > 0.98 * pitch;
+  return isPlan(tiles) && tiles.every((a, i) => tiles.slice(0, i).every((b) => beside(a, b)));
+}
+
 export class FootLayout {
   /**
    * @param {Tile[]} tiles
@@ -33,8 +40,9 @@ export class FootLayout {
    * @param {number} [box.basePx] from the lower edge to the sole, seen from the side
    * @param {boolean} [box.turns] a servo rolls it about the ankle
    * @param {boolean} [box.toesUp] from above, forward is up and not to the right
+   * @param {number} [box.margin] around the outermost tiles, in distances of neighbours
    */
-  constructor(tiles, { widthPx, heightPx, roomPx, basePx = 74, turns = false, toesUp = false }) {
+  constructor(tiles, { widthPx, heightPx, roomPx, basePx = 74, turns = false, toesUp = false, margin: around = 0.9 }) {
     this.plan = isPlan(tiles);
     this.toesUp = this.plan && toesUp;
     const up = (tile) => (this.plan ? tile.y_m : tile.z_m);
@@ -44,7 +52,7 @@ export class FootLayout {
     this.pitch = spacing(tiles, up);
     /** From the rearmost tile to the foremost, in metres. */
     this.span = front - back;
-    const margin = 0.9 * this.pitch;
+    const margin = around * this.pitch;
     // Rolling by 10 degrees about the ankle must stay in the picture.
     const roll = !this.plan && turns ? Math.abs(low) * Math.sin(0.17) : 0;
     const spanX = front - back + 2 * (margin + roll);

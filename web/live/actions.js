@@ -25,6 +25,12 @@ export class Actions {
     this.field("session-name", "record");
     document.addEventListener("keydown", (event) => this.shortcut(event));
     const bar = byId("actions");
+    byId("fields").addEventListener("click", () => {
+      const open = bar.dataset.fields !== "true";
+      bar.dataset.fields = String(open);
+      byId("fields").setAttribute("aria-expanded", String(open));
+      if (open) byId("session-name").focus();
+    });
     new ResizeObserver(() => document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`)).observe(bar);
   }
 

@@ -1,7 +1,8 @@
 // One bar per tile, with the span of the summarised frames, so that no peak hides between messages.
 
 import { byId, el, number, plain, setData, setText } from "../common/text.js";
-import { FAULT_STATES, fullScale, hasFullScale, readTile, unitOf } from "./tile.js";
+import { Range } from "./range.js";
+import { FAULT_STATES, hasFullScale, readTile, unitOf } from "./tile.js";
 
 const BELOW_ZERO = 0.1; // room below the zero line, as a share of full scale
 const PEAK_HOLD_MS = 1000; // a peak of one message would be gone in 33 ms
@@ -11,8 +12,10 @@ const UNIT_KEY = "foottile.unit";
 const share = (value, scale) => Math.min(0.993, Math.max(0.007, (value / scale + BELOW_ZERO) / (1 + BELOW_ZERO)));
 
 export class Bars {
-  constructor(onUnit) {
+  /** @param {() => void} onUnit @param {Range} [range] up to which value the bars go */
+  constructor(onUnit, range = new Range()) {
     this.list = byId("bars");
+    this.range = range;
     this.cells = [];
     this.key = "";
     this.onUnit = onUnit;
@@ -54,7 +57,7 @@ export class Bars {
     const widthPx = this.list.clientWidth;
     const compact = count > MOST_UPRIGHT;
     let columns;
-    if (compact) columns = widthPx >= 640 ? 8 : 4;
+    if (compact) columns = widthPx >= 440 ? 8 : 4;
     else {
       const rows = Math.ceil((count * 40) / Math.max(widthPx, 1));
       columns = Math.ceil(count / Math.max(rows, 1));
@@ -67,16 +70,19 @@ export class Bars {
 
   draw(node, frame, nowMs) {
     this.fit(node);
-    this.cells.forEach((cell, i) => drawCell(cell, readTile(node, i, frame, this.unit), nowMs));
+    this.range.see(node, frame, nowMs);
+    this.cells.forEach((cell, i) => {
+      setScale(cell, this.range.of(cell.tile, cell.unit), this.range.automatic);
+      drawCell(cell, readTile(node, i, frame, this.unit), nowMs);
+    });
   }
 }
 
 function makeCell(tile, unitChosen) {
   const unit = unitOf(tile, unitChosen);
-  const scale = fullScale(tile, unit);
   const part = (cls) => el("i", { cls });
   const cell = {
-    scale, unit, peak: null, peakUntilMs: 0,
+    tile, unit, scale: null, peak: null, peakUntilMs: 0,
     fill: part("fill"), band: part("band"), line: part("line"), tick: part("peak"), zero: part("zero"),
     says: el("span", { cls: "says" }),
     value: el("span", { cls: "value", text: "–" }),
@@ -91,11 +97,19 @@ function makeCell(tile, unitChosen) {
     el("span", { cls: "number" }, cell.value, el("span", { cls: "unit", text: ` ${unit}` })),
     cell.sigma);
   if (tile.reference) cell.root.dataset.reference = "true";
-  else if (hasFullScale(tile, unit)) {
-    cell.root.querySelector(".scale").append(number(scale, scale < 100 ? 1 : 0), el("span", { cls: "unit", text: ` ${unit}` }));
-  }
-  cell.root.style.setProperty("--zero", String(share(0, scale)));
+  cell.scaleText = cell.root.querySelector(".scale");
   return cell;
+}
+
+/** The value at the end of the track, which a tile of unknown range has only in an automatic range. */
+function setScale(cell, scale, automatic) {
+  if (cell.scale === scale && cell.automatic === automatic) return;
+  cell.scale = scale;
+  cell.automatic = automatic;
+  cell.root.style.setProperty("--zero", String(share(0, scale)));
+  if (cell.tile.reference) return;
+  const said = automatic || hasFullScale(cell.tile, cell.unit);
+  cell.scaleText.replaceChildren(...(said ? [number(scale, scale < 100 && !automatic ? 1 : 0), el("span", { cls: "unit", text: ` ${cell.unit}` })] : []));
 }
 
 function drawCell(cell, reading, nowMs) {

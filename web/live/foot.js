@@ -1,33 +1,34 @@
-// The foot from the side (line of tiles) or from above (grid), with forces, COP and its uncertainty.
+// The foot as a picture: tiles coloured by force, from the side (a line of tiles) or from above with the
+// toes up (a heat map, if they lie on a grid), with the centre of pressure.
 
-import { whyNot } from "./grf.js";
-import { ESTIMATE, FRAME } from "../common/bits.js";
-import { FootLayout, isPlan } from "../common/foot_layout.js";
+import { FRAME } from "../common/bits.js";
+import { FootLayout, isGrid, isPlan } from "../common/foot_layout.js";
+import { shadeOf, shadesOf } from "../common/heat.js";
+import { place, svg } from "../common/svg.js";
 import { byId, number, setData, setText } from "../common/text.js";
+import { Cop, LOW_PX } from "./cop.js";
+import { Range } from "./range.js";
 import { FAULT_STATES, readTile } from "./tile.js";
 
-const Z95 = 1.96;
-const MM = 1000;
-const SVG = "http://www.w3.org/2000/svg";
-
-function svg(tag, attributes = {}, text = null) {
-  const element = document.createElementNS(SVG, tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  if (text !== null) element.textContent = text;
-  return element;
-}
-
-function place(element, attributes) {
-  for (const [name, value] of Object.entries(attributes)) {
-    element.setAttribute(name, typeof value === "number" ? value.toFixed(2) : value);
-  }
-}
+const SIDE_PX = 42; // beside a foot from above: the legend to its left, where the toes are to its right
+const NUMBERS_FROM_PX = 26; // of a square, for a number in it
 
 export class Foot {
-  constructor() {
+  /** @param {Range} [range] up to which force the colours go */
+  constructor(range = new Range()) {
     this.root = byId("foot");
+    this.range = range;
     this.key = "";
-    new ResizeObserver(() => { this.key = ""; this.resized?.(); }).observe(this.root);
+    new ResizeObserver(() => this.anew()).observe(this.root);
+    for (const what of ["(prefers-color-scheme: dark)", "(prefers-contrast: more)"]) {
+      matchMedia(what).addEventListener("change", () => this.anew());
+    }
+    document.addEventListener("foottile-colours", () => this.anew());
+  }
+
+  anew() {
+    this.key = "";
+    this.resized?.();
   }
 
   fit(node) {
@@ -36,7 +37,9 @@ export class Foot {
     this.key = key;
     this.tiles = node?.tiles ?? [];
     this.plan = isPlan(this.tiles);
-    setText(byId("foot-title"), this.plan ? "Centre of pressure, from above" : "Centre of pressure, from the side");
+    this.grid = isGrid(this.tiles);
+    setData(this.root, "grid", String(this.grid));
+    setText(byId("foot-title"), this.plan ? "Foot from above" : "Foot from the side");
     this.build(Boolean(node?.servo));
   }
 
@@ -44,53 +47,82 @@ export class Foot {
     const widthPx = this.root.clientWidth || 400;
     const heightPx = this.root.clientHeight || 260;
     this.root.setAttribute("viewBox", `0 0 ${widthPx} ${heightPx}`);
-    this.layout = new FootLayout(this.tiles, { widthPx, heightPx, turns, roomPx: this.plan ? 30 : 110 });
-
-    this.turning = svg("g");
-    this.ground = svg("line", { class: "ground", x1: 0, x2: widthPx });
-    const parts = this.plan ? [] : [this.ground];
-    if (!this.plan) this.turning.append(svg("path", { class: "sole", d: this.layout.sole() }));
+    this.shades = shadesOf(this.root);
+    this.layout = new FootLayout(this.tiles, this.plan
+      ? { widthPx: widthPx - 2 * SIDE_PX, heightPx, roomPx: 6, toesUp: true, margin: this.grid ? 0.56 : 0.75 }
+      : { widthPx, heightPx, turns, ...(heightPx < LOW_PX ? { roomPx: 88, basePx: 66 } : { roomPx: 128, basePx: 98 }) });
+    this.turning = svg("g", this.plan ? { transform: `translate(${SIDE_PX} 0)` } : {});
+    this.turning.append(this.plan ? this.outline() : svg("path", { class: "sole", d: this.layout.sole() }));
     this.marks = this.tiles.map((tile, i) => this.mark(tile, i));
-    this.copBar = svg("path", { class: "cop-span" });
-    this.copEllipse = svg("ellipse", { class: "cop-area" });
-    this.copMark = svg("path", { class: "cop-mark" });
-    this.copHalo = svg("path", { class: "cop-halo" });
-    this.turning.append(this.copHalo, this.copEllipse, this.copBar, this.copMark);
-    parts.push(this.turning);
-    parts.push(svg("text", { class: "hint", x: widthPx - 8, y: 18, "text-anchor": "end" }, "forward →"));
-    this.root.replaceChildren(...parts);
+    this.cop = new Cop(this.layout);
+    this.turning.append(...this.cop.parts);
+    this.ground = svg("line", { class: "ground", x1: 0, x2: widthPx });
+    const hint = this.plan
+      ? [svg("text", { class: "hint", x: widthPx - 4, y: 18, "text-anchor": "end" }, "↑"), svg("text", { class: "hint", x: widthPx - 4, y: 34, "text-anchor": "end" }, "toes")]
+      : [svg("text", { class: "hint", x: widthPx - 8, y: 18, "text-anchor": "end" }, "forward →"), this.ground];
+    this.root.replaceChildren(...hint, this.legend(heightPx), this.turning);
+  }
+
+  /** Around the tiles from above. */
+  outline() {
+    const { points, pitch, scale } = this.layout;
+    const around = 0.54 * pitch * scale;
+    const [left, top] = [Math.min(...points.map(({ x }) => x)) - around, Math.min(...points.map(({ y }) => y)) - around];
+    const [right, bottom] = [Math.max(...points.map(({ x }) => x)) + around, Math.max(...points.map(({ y }) => y)) + around];
+    return svg("rect", { class: "sole", x: left, y: top, width: right - left, height: bottom - top, rx: 8 });
+  }
+
+  /** Which colour is which force. */
+  legend(heightPx) {
+    const group = svg("g", { class: "heat-legend" });
+    const [x, top, long] = [4, 24, Math.max(40, Math.min(120, heightPx / 3))];
+    const step = long / this.shades.length;
+    this.shades.forEach(({ fill }, i) => group.append(svg("rect", {
+      x, y: (top + long - (i + 1) * step).toFixed(2), width: 10, height: (step + 0.5).toFixed(2), fill,
+    })));
+    this.top = svg("text", { class: "hint", x, y: 16 });
+    group.append(svg("rect", { class: "frame", x, y: top, width: 10, height: long }), this.top, svg("text", { class: "hint", x: x + 15, y: top + long }, "0"));
+    return group;
   }
 
   mark(tile, i) {
     const { x, y } = this.layout.points[i];
-    const r = this.layout.radiusPx;
+    const cell = this.layout.pitch * this.layout.scale;
+    const r = this.grid ? 0.46 * cell : this.layout.radiusPx;
     const group = svg("g", { class: "mark" });
-    const dome = svg("circle", { class: "dome", cx: x, cy: y, r });
+    const dome = this.grid
+      ? svg("rect", { class: "dome", x: x - r, y: y - r, width: 2 * r, height: 2 * r, rx: 0.12 * cell })
+      : svg("circle", { class: "dome", cx: x, cy: y, r });
     const cross = svg("path", { class: "cross", d: `M${x - r} ${y - r}L${x + r} ${y + r}M${x - r} ${y + r}L${x + r} ${y - r}` });
-    const force = this.plan ? svg("circle", { class: "force", cx: x, cy: y, r: 0 }) : svg("path", { class: "arrow" });
-    group.append(dome, force, cross);
-    if (r >= 13) group.append(svg("text", { class: "name", x, y: y + 4, "text-anchor": "middle" }, tile.serial));
-    group.append(svg("title", {}, tile.serial));
+    const arrow = svg("path", { class: "arrow" });
+    const says = svg("text", { class: "name", x, y: y + 4, "text-anchor": "middle" }, this.grid ? "" : tile.serial);
+    group.append(dome, arrow, cross, svg("title", {}, tile.serial));
+    if (r >= 13) group.append(says);
     this.turning.append(group);
-    return { group, force };
+    setData(group, "reference", String(Boolean(tile.reference)));
+    return { group, dome, arrow, says: this.grid && cell >= NUMBERS_FROM_PX ? says : null, name: says };
   }
 
   draw(node, frame) {
     this.fit(node);
+    this.range.see(node, frame, performance.now());
+    const most = this.range.ofAll;
+    setText(this.top, `${number(most, most < 10 && most % 1 ? 1 : 0)} N`);
     this.drawAngle(node, frame);
-    this.marks.forEach(({ group, force }, i) => {
-      const reading = readTile(node, i, frame, "N");
-      const fault = FAULT_STATES.has(reading.state);
-      setData(group, "state", fault ? "fault" : reading.state);
-      const tile = this.tiles[i];
-      setData(group, "reference", String(Boolean(tile.reference)));
-      const full = tile.full_scale_n ?? 30;
-      const part = reading.state === "saturated" ? 1
-        : tile.reference || reading.value === null ? 0 : Math.max(0, Math.min(1, reading.value / full));
-      if (this.plan) place(force, { r: Math.sqrt(part) * this.layout.radiusPx });
-      else this.drawArrow(force, i, part);
-    });
-    this.drawCop(node, frame);
+    this.marks.forEach((mark, i) => this.drawTile(mark, i, readTile(node, i, frame, "N"), most));
+    this.cop.draw(node, frame);
+  }
+
+  drawTile({ group, dome, arrow, says, name }, i, reading, most) {
+    const fault = FAULT_STATES.has(reading.state);
+    setData(group, "state", fault ? "fault" : reading.state);
+    const known = reading.value !== null && !this.tiles[i].reference;
+    const share = reading.state === "saturated" ? 1 : known ? Math.max(0, reading.value / most) : 0;
+    const { fill, ink } = known ? shadeOf(this.shades, share) : { fill: "none", ink: "" };
+    place(dome, { fill });
+    place(name, { fill: known ? ink : "currentColor" });
+    if (says) setText(says, known ? number(reading.value, 0) : reading.bound ? `≥${reading.bound}` : "");
+    if (!this.plan) this.drawArrow(arrow, i, Math.min(1, share));
   }
 
   drawArrow(path, i, part) {
@@ -105,42 +137,7 @@ export class Foot {
     const to = { x: from.x + n.x * length, y: from.y + n.y * length };
     const head = Math.min(9, length);
     const side = (sign) => `${to.x - n.x * head - sign * n.y * 0.6 * head} ${to.y - n.y * head + sign * n.x * 0.6 * head}`;
-    place(path, { d: `M${from.x} ${from.y}L${to.x} ${to.y}M${side(1)}L${to.x} ${to.y}L${side(-1)}` });
-  }
-
-  drawCop(node, frame) {
-    const note = byId("cop");
-    const x = frame?.cop_x_m ?? null;
-    const shown = x !== null;
-    for (const part of [this.copMark, this.copHalo, this.copBar, this.copEllipse]) part.setAttribute("visibility", shown ? "visible" : "hidden");
-    const sigma = frame?.cop_sigma_x_m ?? null;
-    setData(note, "xM", shown ? x.toFixed(6) : "");
-    setData(note, "sigmaM", shown && sigma !== null ? sigma.toFixed(6) : "");
-    if (!shown) return setText(note, `no COP: ${whyNoCop(node, frame)}`);
-
-    const say = (name, value, s) => `${name} ${number(value * MM)}${s === null ? "" : ` ± ${number(Z95 * s * MM)}`} mm`;
-    const { layout } = this;
-    const halfPx = Z95 * (sigma ?? 0) * layout.scale;
-    if (this.plan) {
-      const y = frame.cop_y_m ?? 0;
-      const sigmaY = frame.cop_sigma_y_m ?? null;
-      setText(note, `COP ${say("x", x, sigma)}, ${say("y", y, sigmaY)} (95 %)`);
-      const { x: px, y: py } = layout.at(x, y);
-      const area = { cx: px, cy: py, rx: Math.max(3, halfPx), ry: Math.max(3, Z95 * (sigmaY ?? 0) * layout.scale) };
-      place(this.copEllipse, area);
-      // Cross hairs outside the ellipse: a small uncertainty must stay visible too.
-      const d = hairs(px, py, area.rx, area.ry);
-      place(this.copHalo, { d });
-      return place(this.copMark, { d });
-    }
-    setText(note, `COP ${say("x", x, sigma)} (95 %)`);
-    const px = layout.at(x, 0).x;
-    const below = layout.radiusPx + 8;
-    const py = (at) => layout.lineAt(at) + below;
-    const [a, b] = [px - halfPx, px + halfPx];
-    const line = layout.order.map((i) => layout.points[i].x).filter((at) => at > a && at < b).map((at) => `L${at} ${py(at) + 25}`).join("");
-    place(this.copBar, { d: `M${a} ${py(a) + 18}V${py(a) + 32}M${a} ${py(a) + 25}${line}L${b} ${py(b) + 25}M${b} ${py(b) + 18}V${py(b) + 32}` });
-    return place(this.copMark, { d: `M${px} ${py(px) - 4}l8 15h-16z` });
+    return place(path, { d: `M${from.x} ${from.y}L${to.x} ${to.y}M${side(1)}L${to.x} ${to.y}L${side(-1)}` });
   }
 
   drawAngle(node, frame) {
@@ -156,22 +153,8 @@ export class Foot {
     const turn = node.servo && angle !== null ? angle : 0;
     const { layout } = this;
     const { x: cx, y: cy } = layout.at(0, 0); // the ankle
-    this.turning.setAttribute("transform", `rotate(${((turn * 180) / Math.PI).toFixed(3)} ${cx.toFixed(2)} ${cy.toFixed(2)})`);
+    place(this.turning, { transform: `rotate(${((turn * 180) / Math.PI).toFixed(2)} ${cx.toFixed(2)} ${cy.toFixed(2)})` });
     const lowest = Math.max(...layout.points.map((p) => cy + (p.x - cx) * Math.sin(turn) + (p.y - cy) * Math.cos(turn)));
     place(this.ground, { y1: lowest + layout.radiusPx, y2: lowest + layout.radiusPx });
   }
-}
-
-/** A dot in the middle and four strokes around an ellipse. */
-const hairs = (x, y, rx, ry) => `M${x} ${y}h.1M${x - rx - 14} ${y}h10M${x + rx + 4} ${y}h10M${x} ${y - ry - 14}v10M${x} ${y + ry + 4}v10`;
-
-function whyNoCop(node, frame) {
-  if (!frame) return "waiting for data";
-  const bits = frame.estimate_status ?? 0;
-  if (!node.tare || node.tare.undone) return "not tared";
-  if (!node.calibration) return "no calibration";
-  if (bits & (ESTIMATE.TILE_MISSING | ESTIMATE.SATURATED)) return whyNot(node, frame);
-  if (frame.contact === false) return "no contact";
-  if (bits & ESTIMATE.COP_MASKED) return "too uncertain";
-  return "not determined";
 }

@@ -2,7 +2,7 @@
 
 import { ESTIMATE, FRAME, TILE } from "../common/bits.js";
 import { lossesInWords } from "../common/losses.js";
-import { byId, el, localTime, number, roughly, setText } from "../common/text.js";
+import { byId, el, localTime, number, roughly, setData, setText } from "../common/text.js";
 import { whyOf } from "./why.js";
 
 const HOLD_MS = 3000;
@@ -29,6 +29,12 @@ export class Notes {
     this.list = byId("notes");
     this.seenMs = new Map(); // text of a flag -> when it was last set
     this.items = new Map(); // of what is said -> its element
+    this.more = byId("notes-more");
+    this.unfolded = false;
+    this.more.addEventListener("click", () => {
+      this.unfolded = !this.unfolded;
+      this.fold();
+    });
     this.beganMs = performance.now(); // what is there at first may have been there before
     this.belowShare = 0; // of the last half second's messages
   }
@@ -73,7 +79,17 @@ export class Notes {
     // What stands stays: it may be open, or have the focus.
     for (const old of [...this.list.children]) if (!wanted.includes(old)) old.remove();
     wanted.forEach((one, i) => { if (this.list.children[i] !== one) this.list.insertBefore(one, this.list.children[i] ?? null); });
+    this.fold();
     setText(byId("facts"), node ? facts(node, frame, serverNowMs) : "");
+  }
+
+  /** Many in one line with a count: what is measured stays where it is. */
+  fold() {
+    const more = this.items.size - 1;
+    setData(this.list, "folded", String(more > 0 && !this.unfolded));
+    this.more.hidden = more < 1;
+    this.more.setAttribute("aria-expanded", String(this.unfolded));
+    setText(this.more, this.unfolded ? "Only the first" : `${more} more`);
   }
 }
 

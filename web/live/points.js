@@ -23,6 +23,7 @@ export class Points {
   /** A live message. */
   add(frame, nowMs) {
     const point = pointOf(frame);
+    point.tiles = frame; // of each tile: only live messages have it
     const last = this.all.at(-1);
     if (last && (point.seq <= last.seq || point.timeS <= last.timeS)) this.clear(); // the node restarted
     // The smallest delay seen is the steadiest clock: jitter of the network must not shake the line.

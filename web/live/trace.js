@@ -33,7 +33,13 @@ export class Trace {
       onWindow();
     });
     new ResizeObserver(() => this.resize()).observe(this.canvas);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.colours = null; this.drawnMs = 0; });
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.recolour());
+    document.addEventListener("foottile-colours", () => this.recolour());
+  }
+
+  recolour() {
+    this.colours = null;
+    this.drawnMs = 0;
   }
 
   clear() {
@@ -82,13 +88,14 @@ export class Trace {
     return { top: 5 * this.stepN, bottom: -0.6 * this.stepN < 1.03 * low ? -0.6 * this.stepN : -this.stepN };
   }
 
+  /** Drawn if it is time to: what of, else null. */
   draw(nowMs, live) {
-    if (!this.canvas.width || !this.canvas.height) return;
+    if (!this.canvas.width || !this.canvas.height) return null;
     if (devicePixelRatio !== this.ratio) this.resize(); // moved to another screen
     const boxPx = this.canvas.width / this.ratio - LEFT_PX - RIGHT_PX;
     const everyMs = this.held ? Infinity
       : this.still.matches ? 200 : (500 * this.windowS) / Math.max(boxPx * this.ratio, 1);
-    if (this.drawnMs && this.coloursLive === live && nowMs - this.drawnMs < everyMs) return;
+    if (this.drawnMs && this.coloursLive === live && nowMs - this.drawnMs < everyMs) return null;
     this.drawnMs = nowMs;
     if (!this.colours || this.coloursLive !== live) this.readColours(live);
     const { context, ratio, colours, windowS } = this;
@@ -139,6 +146,7 @@ export class Trace {
     }
     context.restore();
     setData(byId("trace-legend"), "bound", String(someBound));
+    return { points, endS, windowS, live };
   }
 
   /** A bound: the force is on its line or anywhere in the stripes above. */
@@ -180,6 +188,7 @@ export class Trace {
     context.font = "600 13px system-ui, sans-serif";
     context.textBaseline = "middle";
     context.textAlign = "right";
+    const isLow = y(0) - y(top / 5) < 15;
     for (let i = 0; i <= 5; i++) {
       const n = (top / 5) * i;
       const row = crisp(y(n));
@@ -189,6 +198,7 @@ export class Trace {
       context.moveTo(box.left, row);
       context.lineTo(box.right, row);
       context.stroke();
+      if (isLow && i % 5 && i !== 3) continue; // no room for each of them
       context.fillStyle = colours.text;
       if (i === 5) context.fillText(`${n} N`, box.left - 5, row + 3);
       else context.fillText(String(n), box.left - 5, row);

@@ -1,0 +1,121 @@
+// The centre of pressure on the foot: where it is, its 95 % region, and where it was in the last seconds.
+
+import { ESTIMATE } from "../common/bits.js";
+import { place, svg } from "../common/svg.js";
+import { byId, number, setData, setText } from "../common/text.js";
+import { whyNot } from "./grf.js";
+
+const Z95 = 1.96;
+const MM = 1000;
+const TRAIL_S = 2;
+/** A picture that is lower has little room under the foot. */
+export const LOW_PX = 220;
+const PARTS = 4; // of the trail, each paler than the one after it
+const GAP_S = 0.25; // the trail is not drawn across a longer one
+
+export class Cop {
+  /** @param {import("../common/foot_layout.js").FootLayout} layout */
+  constructor(layout) {
+    this.layout = layout;
+    this.span = svg("path", { class: "cop-span" });
+    this.area = svg("ellipse", { class: "cop-area" });
+    this.mark = svg("path", { class: "cop-mark" });
+    this.halo = svg("path", { class: "cop-halo" });
+    this.trail = Array.from({ length: PARTS }, (_, i) => svg("path", { class: "cop-trail", opacity: ((i + 1) / PARTS).toFixed(2) }));
+    this.parts = [...this.trail, this.halo, this.area, this.span, this.mark];
+    this.past = [];
+    /** From the side the past lies below the present. */
+    this.fallsPx = layout.heightPx < LOW_PX ? 8 : 22;
+  }
+
+  draw(node, frame) {
+    const note = byId("cop");
+    const x = frame?.cop_x_m ?? null;
+    const shown = x !== null;
+    this.follow(frame);
+    for (const part of [this.mark, this.halo, this.span, this.area]) place(part, { visibility: shown ? "visible" : "hidden" });
+    const sigma = frame?.cop_sigma_x_m ?? null;
+    setData(note, "xM", shown ? x.toFixed(6) : "");
+    setData(note, "sigmaM", shown && sigma !== null ? sigma.toFixed(6) : "");
+    if (!shown) return setText(note, `no COP: ${whyNoCop(node, frame)}`);
+    return this.layout.plan ? this.drawPlan(frame, note) : this.drawSide(frame, note);
+  }
+
+  drawPlan(frame, note) {
+    const { cop_x_m: x, cop_sigma_x_m: sigmaX = null, cop_sigma_y_m: sigmaY = null } = frame;
+    const y = frame.cop_y_m ?? 0;
+    setText(note, `COP ${say("x", x, sigmaX)}, ${say("y", y, sigmaY)} (95 %)`);
+    const at = this.layout.at(x, y);
+    const halfPx = (sigma) => Math.max(3, Z95 * (sigma ?? 0) * this.layout.scale);
+    const [across, along] = this.layout.toesUp ? [sigmaY, sigmaX] : [sigmaX, sigmaY];
+    const area = { cx: at.x, cy: at.y, rx: halfPx(across), ry: halfPx(along) };
+    place(this.area, area);
+    // Cross hairs outside the ellipse: a small uncertainty must stay visible too.
+    const d = hairs(at.x, at.y, area.rx, area.ry);
+    place(this.halo, { d });
+    place(this.mark, { d });
+  }
+
+  drawSide(frame, note) {
+    const { layout } = this;
+    const { cop_x_m: x, cop_sigma_x_m: sigma = null } = frame;
+    setText(note, `COP ${say("x", x, sigma)} (95 %)`);
+    const px = layout.at(x, 0).x;
+    const halfPx = Z95 * (sigma ?? 0) * layout.scale;
+    const [a, b] = [px - halfPx, px + halfPx];
+    const y = (at) => this.below(at);
+    const line = layout.order.map((i) => layout.points[i].x).filter((at) => at > a && at < b).map((at) => `L${at} ${y(at) + 19}`).join("");
+    place(this.span, { d: `M${a} ${y(a) + 12}V${y(a) + 26}M${a} ${y(a) + 19}${line}L${b} ${y(b) + 19}M${b} ${y(b) + 12}V${y(b) + 26}` });
+    place(this.mark, { d: `M${px} ${y(px) - 6}l8 15h-16z` });
+  }
+
+  /** Under the line of tiles. */
+  below(xPx) {
+    return this.layout.lineAt(xPx) + this.layout.radiusPx + 10;
+  }
+
+  /** Where it was, oldest first, by the clock of the frames: a picture that is played back has it, too. */
+  follow(frame) {
+    const { past, layout } = this;
+    const nowS = timeOf(frame);
+    if (nowS === null) past.length = 0;
+    else if (past.at(-1)?.timeS !== nowS) {
+      if (past.length && nowS < past.at(-1).timeS) past.length = 0;
+      past.push({ timeS: nowS, x: frame.cop_x_m ?? null, y: frame.cop_y_m ?? 0 });
+      while (past[0].timeS < nowS - TRAIL_S) past.shift();
+    }
+    const paths = Array.from({ length: PARTS }, () => []);
+    past.forEach((one, i) => {
+      const before = past[i - 1];
+      if (one.x === null || !before || before.x === null || one.timeS - before.timeS > GAP_S) return;
+      const age = (nowS - one.timeS) / TRAIL_S;
+      paths[Math.min(PARTS - 1, Math.floor((1 - age) * PARTS))].push(`M${this.placeOf(before, nowS)}L${this.placeOf(one, nowS)}`);
+    });
+    this.trail.forEach((part, i) => place(part, { d: paths[i].join("") }));
+    setData(layout.plan ? this.area : this.span, "trail", String(past.length));
+  }
+
+  placeOf(one, nowS) {
+    const at = this.layout.at(one.x, one.y);
+    const y = this.layout.plan ? at.y : this.below(at.x) + 30 + ((nowS - one.timeS) / TRAIL_S) * this.fallsPx;
+    return `${at.x.toFixed(1)} ${y.toFixed(1)}`;
+  }
+}
+
+const timeOf = (frame) => (!frame ? null : Number.isFinite(frame.t_ns) ? frame.t_ns / 1e9 : frame.timeS ?? null);
+
+const say = (name, value, sigma) => `${name} ${number(value * MM)}${sigma === null ? "" : ` ± ${number(Z95 * sigma * MM)}`} mm`;
+
+/** A dot in the middle and four strokes around an ellipse. */
+const hairs = (x, y, rx, ry) => `M${x} ${y}h.1M${x - rx - 14} ${y}h10M${x + rx + 4} ${y}h10M${x} ${y - ry - 14}v10M${x} ${y + ry + 4}v10`;
+
+function whyNoCop(node, frame) {
+  if (!frame) return "waiting for data";
+  const bits = frame.estimate_status ?? 0;
+  if (!node.tare || node.tare.undone) return "not tared";
+  if (!node.calibration) return "no calibration";
+  if (bits & (ESTIMATE.TILE_MISSING | ESTIMATE.SATURATED)) return whyNot(node, frame);
+  if (frame.contact === false) return "no contact";
+  if (bits & ESTIMATE.COP_MASKED) return "too uncertain";
+  return "not determined";
+}
