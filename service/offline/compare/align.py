@@ -4,7 +4,7 @@ The lag is found coarsely by cross-correlation, then all four together by robust
 narrower and narrower windows. Landings, where plate and foot ring each in its own way, count less:
 the loss is the pseudo-Huber one. Residuals are ours, `ours - scale (reference - offset)`: noise of
 what stands on the right would make the scale too small, and a reference is the better of the two.
-Intervals are those of `jackknife`. In them is what our foot may get wrong in the same way in every
+Intervals are those of `blocks`. In them is what our foot may get wrong in the same way in every
 stance, if it states its uncertainty: as if all of that went one way, and as phases of the load
 contradict one another.
 """
@@ -20,7 +20,7 @@ from scipy.special import fdtri
 
 from devices.arrays import Bools, Floats, Ints
 from devices.errors import ComparisonError
-from service.offline.compare.jackknife import (
+from service.offline.compare.blocks import (
     Estimate,
     Spread,
     memory_of,

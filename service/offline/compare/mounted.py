@@ -22,7 +22,7 @@ from devices.arrays import Bools, Floats
 from devices.errors import CalibrationError
 from service.estimation.effects import Parameter
 from service.offline.compare.align import ROBUST
-from service.offline.compare.jackknife import NORMAL_95, Estimate, over_phases, spread_of
+from service.offline.compare.blocks import NORMAL_95, Estimate, over_phases, spread_of
 from service.offline.compare.pairs import Pairs
 
 GAIN_SIGMA_MAX = 0.05

@@ -13,7 +13,7 @@ from devices.arrays import Bools, Floats, Times
 from service.estimation.stances import GATHERED
 from service.offline.accuracy import GRF_FROM_N
 from service.offline.compare.align import Alignment
-from service.offline.compare.jackknife import Estimate, mean_of
+from service.offline.compare.blocks import Estimate, mean_of
 from service.offline.compare.signals import Signal
 
 COMPARED = ("seq", "t_ns", *GATHERED, "cop_y_m", "cop_sigma_x_m", "cop_sigma_y_m")

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from service.offline.accuracy import PHASES
 from service.offline.compare.align import Alignment
+from service.offline.compare.blocks import Estimate
 from service.offline.compare.clocks import ClockLag
 from service.offline.compare.errors import Errors
-from service.offline.compare.jackknife import Estimate
 from service.offline.compare.pairs import Pairs
 from service.offline.compare.trials import OverTrials
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from devices.emulation.plates import force_plate, pressure_plate
 from devices.emulation.plates.underfoot import VERTICAL
-from service.offline.compare.jackknife import Estimate
+from service.offline.compare.blocks import Estimate
 from service.offline.compare.trials import OverTrials, over_trials
 from service.offline.comparison import CompareOptions, Comparison, compare_session
 from service.offline.reproduce.setups import FORCE_PLATE, Setup

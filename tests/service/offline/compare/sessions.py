@@ -8,7 +8,7 @@ import numpy as np
 
 from devices.arrays import Floats
 from service.offline.compare.align import Alignment
-from service.offline.compare.jackknife import Estimate
+from service.offline.compare.blocks import Estimate
 from service.offline.compare.pairs import Reference
 from service.offline.compare.signals import Signal
 

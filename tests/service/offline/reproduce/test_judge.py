@@ -12,7 +12,7 @@ import pytest
 from devices.scene.file import load_scene
 from service.estimation import OFFLINE_LAG_MS
 from service.offline.calibrations import find_calibration
-from service.offline.compare.jackknife import Estimate
+from service.offline.compare.blocks import Estimate
 from service.offline.reproduce.judge import Check, Judged, judge
 from service.offline.reproduce.setups import POPPY, ROLLING, Setup
 from service.offline.simulate import SimulateOptions, simulate

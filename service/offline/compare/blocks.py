@@ -1,14 +1,16 @@
-"""Intervals that are true where residuals are correlated: by leaving out one block after the other.
+"""Intervals that are true where residuals are correlated: by how much blocks of time differ.
 
 Residuals of a force follow one another: what rubber has left, what averaging smooths, what a plate
 rings by. Counting each as new would give intervals several times too narrow. Blocks of time that
-are much longer than this memory are as good as independent, and how far an answer moves when one of
-them is left out says how uncertain it is, whatever is in it (delete-a-group jackknife; of a robust
-fit to first order, from its scores and its curvature).
+are much longer than this memory are as good as independent, and how far each pulls an answer says
+how uncertain it is, whatever is in it: the sandwich of cluster-robust regression, of a robust fit
+to first order, from its scores and its curvature. What a block tells of its own residuals is put
+back (CR2 of Bell and McCaffrey, Survey Methodology 28, 2002, p. 169): leaving blocks out, the
+jackknife, puts back too much where few tell most, as three stances do.
 
 What a model of rubber gets wrong in the same way in every stance, no block of time can show. It
-shows where phases of the load contradict one another: the same is done with them, the rise and the
-fall of a load, each low and high, of all stances together (`over_phases`).
+shows where phases of the load contradict one another: how far the answer moves without one of the
+rise and the fall of a load, each low and high, of all stances together (`over_phases`).
 """
 
 from __future__ import annotations
@@ -25,6 +27,8 @@ BLOCKS = 20
 BLOCKS_MIN = 8
 MEMORIES = 5.0
 """A block is so many times longer than the residuals' memory."""
+SHARE_MAX = 0.999
+"""Of what a block alone tells, the rest is noise of rounding."""
 SHARED_MAX = 0.5
 """No variance is more than doubled for what blocks share."""
 
@@ -150,17 +154,16 @@ def spread_of(jacobian: Floats, score: Floats, curvature: Floats, samples: Ints)
     normals, slopes = _by_group(jacobian, score, curvature, block)
     whole = normals.sum(axis=0)
     inverse = np.linalg.pinv(whole, hermitian=True)
-    moved = _moved(normals, slopes)
+    pulls = _pulls(normals, slopes)
     share = np.einsum("ij,bjk,ki->bi", inverse, normals, inverse)
     with np.errstate(divide="ignore", invalid="ignore"):
         even = share.sum(axis=0) ** 2 / (share**2).sum(axis=0)
-    centred = moved - moved.mean(axis=0)
     # Blocks side by side share what residuals remember across their edge: half a memory of each.
     length = (samples[-1] - samples[0] + 1) / blocks
     shared = np.array([memory_of(column) for column in scores.T]) / (2.0 * length)
     wider = 1.0 / np.sqrt(1.0 - np.minimum(shared, SHARED_MAX))
     return Spread(
-        covariance=(blocks - 1) / blocks * (centred.T @ centred) * np.outer(wider, wider),
+        covariance=(pulls.T @ pulls) * np.outer(wider, wider),
         dof=np.clip(np.nan_to_num(even, nan=1.0), 1.0, blocks - 1.0),
         blocks=blocks,
         own=np.zeros_like(whole),
@@ -216,6 +219,20 @@ def _moved(normals: Floats, slopes: Floats) -> Floats:
             for normal, slope in zip(normals, slopes, strict=True)
         ]
     )
+
+
+def _pulls(normals: Floats, slopes: Floats) -> Floats:
+    """By how much each block pulls a fit, (g, p), as if it had had no part in it (CR2)."""
+    size, axes = np.linalg.eigh(normals.sum(axis=0))
+    # Of a parameter that nothing determines nothing is known; the fit says so elsewhere.
+    known = size > size[-1] * len(size) * np.finfo(np.float64).eps
+    root = (axes[:, known] / np.sqrt(size[known])) @ axes[:, known].T
+    pulls = []
+    for normal, slope in zip(normals, slopes, strict=True):
+        share, along = np.linalg.eigh(root @ normal @ root)
+        back = along / np.sqrt(1.0 - np.minimum(share, SHARE_MAX))
+        pulls.append(root @ (back @ along.T) @ root @ slope)
+    return np.stack(pulls)
 
 
 def mean_of(values: Floats, samples: Ints) -> Estimate:
