@@ -29,6 +29,7 @@ from service.api.routes import (
     stances,
     takes,
     trash,
+    zips,
 )
 from service.api.routes.ingest import ingest
 from service.api.routes.live import live
@@ -107,6 +108,7 @@ def make_app(
         health,
         login,
         nodes,
+        zips,  # before a session of that name
         sessions,
         takes,
         trash,

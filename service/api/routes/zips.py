@@ -1,0 +1,83 @@
+"""Several sealed sessions as one download."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Response
+from fastapi.responses import StreamingResponse
+from starlette.concurrency import iterate_in_threadpool
+
+from devices.errors import StateError, UnknownError, UsageError
+from service.api.routes.access import ServerState, present, problems
+from storage.formats.zipped import Sealed, zipped
+from storage.sessions.folder import FRAMES_NAME, Session
+
+router = APIRouter(prefix="/sessions", tags=["data"])
+
+IDS_MAX = 1000
+"""As many as the head of a request has room for."""
+
+
+@router.get(
+    "/zip",
+    operation_id="zipSessions",
+    summary="Download several as one zip file",
+    response_class=Response,
+    responses={
+        200: {"description": "The files of each, in a folder.", "content": {"application/zip": {}}},
+        **problems(
+            _404="No such session.",
+            _409="One is not sealed yet, or its files are damaged.",
+            _422="No ids, or too many.",
+        ),
+    },
+)
+async def zip_sessions(
+    ids: Annotated[
+        str,
+        Query(max_length=24 * IDS_MAX, description=f"With commas between; {IDS_MAX} at most."),
+    ],
+    server: ServerState,
+) -> StreamingResponse:
+    """Their files as they are, made while it is sent: a folder each, as `foottile verify` takes it.
+
+    A session that is damaged or deleted on the way breaks the download off; what was sent until
+    then opens as no zip file.
+    """
+    names = list(dict.fromkeys(name.strip() for name in ids.split(",") if name.strip()))
+    if not 1 <= len(names) <= IDS_MAX:
+        raise UsageError(f"{len(names)} sessions", expected=f"ids of 1 to {IDS_MAX}")
+    chosen = [
+        _sealed(server.sessions.get(name), server.sessions.folder.path(name)) for name in names
+    ]
+    pieces = zipped(chosen)
+
+    async def body() -> AsyncIterator[bytes]:
+        try:
+            async for piece in iterate_in_threadpool(pieces):
+                if piece:
+                    yield piece
+        finally:
+            pieces.close()  # who asked may have gone: files are not left open
+
+    name = names[0] if len(names) == 1 else f"foottile-{len(names)}-sessions"
+    headers = {
+        "Content-Disposition": f'attachment; filename="{name}.zip"',
+        "Cache-Control": "private, no-store",
+    }
+    return StreamingResponse(body(), headers=headers, media_type="application/zip")
+
+
+def _sealed(session: Session, folder: Path) -> Sealed:
+    if session.state != "sealed":
+        raise StateError(
+            f"session {session.id} is {session.state}, and a zip file is of sealed ones",
+            remedy="Stop it, or leave it out",
+        )
+    if session.sha256 is None:
+        raise UnknownError(f"session {session.id}: {session.problem}")
+    present(folder / FRAMES_NAME)
+    return Sealed(folder, session.sha256)
