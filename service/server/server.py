@@ -23,6 +23,7 @@ from service.server.settling import Settling
 from service.server.streams import ServerStream
 from service.server.takes import Takes
 from service.server_clock import utc_ns
+from service.sessions.so_far import SoFars
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
 from storage.sessions.folder import Session, SessionFolder
@@ -101,6 +102,8 @@ class Server:
         except FootTileError:
             self.folder.close()
             raise
+        self.so_fars = SoFars()
+        """What those who look at a session that is not sealed are shown."""
         self.links: dict[str, Link] = {}
         self._counts: dict[str, Counted] = {}
         """What screens were told last, by session."""

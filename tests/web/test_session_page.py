@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -19,6 +18,7 @@ from tests.service.fake_node import FakeNode, Play
 from tests.service.recording import Recording
 from tests.service.running import Running
 from tests.waiting import PATIENCE_S
+from tests.web.conftest import wait_until
 from tests.web.received import Received
 from tests.web.scripted import Scripted
 from tests.web.test_accessible import complaints
@@ -392,7 +392,7 @@ def test_without_estimates_raw_counts_are_plotted(raw: Recording, open_page: Ope
     )
 
 
-def test_a_session_that_is_recorded_says_so_and_turns_into_plots_when_it_is_sealed(
+def test_a_session_is_shown_while_it_is_recorded_and_as_it_was_sealed_afterwards(
     scripted: Scripted, open_page: OpenPage
 ) -> None:
     with Play(scripted.node):
@@ -400,16 +400,27 @@ def test_a_session_that_is_recorded_says_so_and_turns_into_plots_when_it_is_seal
         page = open_page(scripted.url)
         page.click('#sessions [data-part="open"]')
         expect(page.locator("#message")).to_contain_text("still being recorded")
+        expect(page.locator("#message")).to_contain_text("provisional")
+        settled(page)
+        wait_until(lambda: summary(page, "frames") >= 100, "the first frames")
+        before = summary(page, "frames")
+        wait_until(lambda: summary(page, "frames") > before, "more of them")
+        expect(page.locator("#replay-lag")).to_contain_text("Provisional forces")
+        expect(page.locator("#download-parquet")).to_be_hidden()
         scripted.running.http.post(f"{session.url}/events", json={"label": "a stone"})
-        expect(page.locator("#message")).to_contain_text("a stone")
-        expect(page.locator("#plots-card")).to_be_hidden()
+        expect(page.locator("#marks-list")).to_contain_text("a stone")
+        page.keyboard.press("ArrowRight")
+        expect(page.locator("#grf")).not_to_have_attribute("data-value", "")
         assert complaints(page) == []
-        time.sleep(0.3)
         session.stop()
         session.sealed()
     expect(page.locator("#message")).to_be_hidden()
+    expect(page.locator("body")).to_have_attribute("data-state", "sealed")
     settled(page)
     assert summary(page, "frames") == session.now()["frames"]
+    assert summary(page, "missing") == 0
+    expect(page.locator("#replay-lag")).to_contain_text("as they are stored")
+    expect(page.locator("#download-parquet")).to_be_visible()
     page.click("#back")
     expect(page.locator("#sessions")).to_contain_text("now")
 
@@ -433,7 +444,7 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
         assert 0 < bins < 300_000
         frames = sum(size for url, size in received.bytes_of.items() if "/data" in url)
         assert 0 < frames < 300_000
-        assert received.bytes_in_all - bins - frames < 100_000, received.bytes_of
+        of_page = {url: size for url, size in received.bytes_of.items() if "/api/" not in url}
     node = FakeNode(walk.running, "weighed")
     node.connect()
     node.tared()
@@ -445,6 +456,8 @@ def test_each_page_is_small_as_sent_and_the_live_page_does_not_carry_the_other(
         expect(page.locator("#sessions")).to_contain_text("walk")
         received.wait_for("/recent")
         assert received.bytes_in_all < 120_000, received.bytes_of
+        more = {url: size for url, size in of_page.items() if url not in received.bytes_of}
+        assert 0 < sum(more.values()) < 100_000, more
         assert not [u for u in received.bytes_of if "/session/" in u or "session.css" in u]
     node.close()
 

@@ -19,6 +19,7 @@ export class Marks {
     this.beginNs = beginNs;
     this.offset = offset;
     this.unmeasured = false;
+    this.placed = [];
     for (const event of events) this.place(event);
     this.draw();
   }

@@ -1,9 +1,9 @@
-// The page of one session: asks for it, and for as long as it is not sealed says so; then plots.
+// The page of one session: asks for it, and plots what there is; for as long as it is not sealed, again and again.
 
 import * as api from "../common/api.js";
 import { enter } from "../common/login.js";
 import { quietly } from "../common/notices.js";
-import { byId, el, localTime, duration, setText } from "../common/text.js";
+import { byId, setText } from "../common/text.js";
 import { plainState } from "../sessions/state.js";
 import { drawHeader } from "./header.js";
 import { Plotted } from "./plotted.js";
@@ -27,16 +27,19 @@ async function look() {
   }
   document.title = `${session.name} – FootTile`;
   drawHeader(session);
+  plotted ??= new Plotted(session);
   if (session.state !== "sealed") {
+    say(session.state === "recording" ? "Being recorded" : "Not sealed yet", [WHY[session.state] ?? session.problem ?? "", plainState(session)[1]].join(" ").trim());
+    byId("message").dataset.small = "true";
+    // Before its first frames there is nothing to plot.
+    await plotted.load(session).catch((error) => { if (!(error instanceof api.Refusal)) throw error; });
     document.body.dataset.state = session.state;
-    await waiting(session);
     setTimeout(look, AGAIN_MS);
     return;
   }
   byId("message").hidden = true;
   try {
-    plotted ??= new Plotted(session);
-    await plotted.load();
+    await plotted.load(session);
     document.body.dataset.state = "sealed";
   } catch (error) {
     if (!(error instanceof api.Refusal)) throw error;
@@ -46,27 +49,17 @@ async function look() {
   }
 }
 
-function say(title, text, ...more) {
+function say(title, text) {
   byId("message").hidden = false;
+  delete byId("message").dataset.small;
   setText(byId("message-title"), title);
   setText(byId("message-text"), text);
-  byId("message-more").replaceChildren(...more);
 }
 
 const WHY = {
-  recording: "This session is still being recorded. Its plots appear here by themselves when it has been stopped and sealed.",
-  pending: "This session has been stopped, and something of it is still with its node. Its plots appear here by themselves when that has come.",
-  sealing: "This session is being written. Its plots appear here in a moment.",
+  recording: "This session is still being recorded: what is shown is provisional until it is sealed.",
+  pending: "This session has been stopped, and something of it is still with its node. What is shown is provisional.",
+  sealing: "This session is being written. What is shown is provisional for a moment yet.",
 };
-
-/** What is known of a session that is not sealed yet: how far it is, and its marks. */
-async function waiting(session) {
-  const marks = session.marks ? (await api.listEvents(session.id).catch(() => null))?.items ?? [] : [];
-  const more = [el("p", { text: `${session.frames.toLocaleString("en-GB")} frames in ${duration(session.duration_s)} so far. ${plainState(session)[1]}`.trim() })];
-  if (marks.length) {
-    more.push(el("p", { text: "Marks:" }), el("ul", {}, ...marks.map((mark) => el("li", { text: `${localTime(new Date(mark.t_ns / 1e6))} ${mark.label}` }))));
-  }
-  say(session.state === "recording" ? "Being recorded" : "Not sealed yet", WHY[session.state] ?? session.problem ?? "", ...more);
-}
 
 enter().then(() => quietly(look));

@@ -18,6 +18,7 @@ import * as views from "./view.js";
 
 const KEY_ZOOM = 1.5;
 const SETTLED_MS = 250;
+const COLOURS_AT = 9; // in what is compared to know whether something has to be drawn
 
 export class Plotted {
   constructor(session) {
@@ -37,25 +38,46 @@ export class Plotted {
     this.drawing = 0;
   }
 
-  async load() {
-    byId("plots-card").hidden = false; // its width says how finely to ask
+  /** Draws what there is; again for as long as the session grows, and once it is sealed. */
+  async load(session) {
+    const first = !this.view;
+    const sealed = session.state === "sealed";
+    if (first) byId("plots-card").hidden = false; // its width says how finely to ask
     const whole = await this.loader.whole(byId("plots").clientWidth).catch((error) => {
-      byId("plots-card").hidden = true;
+      if (first) byId("plots-card").hidden = true;
       throw error;
     });
+    const grown = this.session.marks !== session.marks || whole.estimated !== this.plots.whole?.estimated;
+    this.session = session;
+    this.takeWhole(whole);
+    if (first) this.listen();
+    this.draw();
+    if (first || sealed || grown) await this.loadBeside(whole, sealed);
+  }
+
+  takeWhole(whole) {
+    const all = this.view && views.isWhole(this.view, this.durationS);
     this.durationS = whole.durationS;
-    this.view = views.fromLink(location.search, this.durationS);
+    if (!this.view) this.view = views.fromLink(location.search, this.durationS);
+    else this.view = all ? views.whole(this.durationS) : views.clamped(this.view, this.durationS);
     this.plots.show(whole);
+    this.plots.heat = null;
+    if (!whole.provisional) { // what was asked for before is of something else
+      this.plots.detail = null;
+      this.loader.asked = null;
+    }
     const tiles = whole.serials.length;
     byId("as-heat").hidden = tiles < 2 || tiles > 32;
+    byId("download-parquet").hidden = whole.provisional;
     this.replay.open(this.session.id, whole);
-    this.listen();
-    this.draw();
-    // What may be missing holds no plot up.
+  }
+
+  /** What may be missing holds no plot up. */
+  async loadBeside(whole, sealed) {
     const none = (error) => { if (!(error instanceof api.Refusal)) throw error; return null; };
     const [array, stances, events, clock] = await Promise.all([
       api.arrayOf(this.session.id).catch(none),
-      whole.estimated ? api.listStances(this.session.id).catch(none) : null,
+      whole.estimated && sealed ? api.listStances(this.session.id).catch(none) : null,
       api.listEvents(this.session.id).catch(none), api.clockOf(this.session.id).catch(none),
     ]);
     if (array) this.replay.dress(array);
@@ -209,11 +231,11 @@ export class Plotted {
     box.dataset.whole = String(views.isWhole(view, this.durationS));
     box.dataset.from = view.from.toFixed(4);
     box.dataset.to = view.to.toFixed(4);
-    const drawnKey = [view.from, view.to, plots.width, plots.detail, plots.marks.length, plots.stances.length, plots.asHeat,
+    const drawnKey = [view.from, view.to, plots.width, plots.whole, plots.detail, plots.marks.length, plots.stances.length, plots.asHeat,
       this.stances.current, plots.colours, devicePixelRatio];
     if (drawnKey.some((one, i) => one !== this.drawnKey?.[i])) {
       plots.draw(view, this.stances.current);
-      drawnKey[8] = plots.colours;
+      drawnKey[COLOURS_AT] = plots.colours;
       this.drawnKey = drawnKey;
       drawLegend(plots);
     }

@@ -8,6 +8,7 @@ const SLICE_LEAST_S = 0.05;
 const KEPT = 48; // slices: eight megabytes at most
 const AT_ONCE = 3; // questions to the server
 const AGAIN_MS = 2000; // after one that was refused
+const UNSETTLED_S = 1; // at the end of a session that is still recorded: estimates look ahead
 const APART_S = 0.1; // a frame further away than this is not that of an instant
 
 const BY_TILE = ["status", "force_n", "force_sigma_n", "gauge_kpa"];
@@ -81,6 +82,13 @@ export class Samples {
     this.notBeforeMs = 0; // after a refusal
   }
 
+  /** The session has grown: what was its end is asked for again. */
+  grow(whole) {
+    const settled = this.numberOf(this.whole.durationS - UNSETTLED_S);
+    for (const number of [...this.slices.keys()]) if (number >= settled) this.slices.delete(number);
+    this.whole = whole;
+  }
+
   /**
    * The frame of an instant: the nearest one, unless it is too far away.
    * @returns {{known: boolean, frame: object | null}} not known: it is on its way
@@ -147,7 +155,7 @@ export class Samples {
     const kept = this.slices.get(number);
     if (kept) return Promise.resolve(kept);
     const asked = this.ask(number).then((slice) => {
-      this.slices.set(number, slice);
+      if (this.slices.get(number) === asked) this.slices.set(number, slice); // else it has grown meanwhile
       this.tell.come();
       return slice;
     }, (error) => {

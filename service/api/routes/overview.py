@@ -14,7 +14,7 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from devices.errors import StateError, UnknownError, UsageError
+from devices.errors import UnknownError, UsageError
 from service.api.encoding import packed, takes_gzip
 from service.api.routes.access import SecondsQuery, ServerState, has_it, problems
 from service.server.server import Server
@@ -54,6 +54,10 @@ class OverviewView(BaseModel):
     duration_s: float = Field(description="From the first frame to the last.")
     frames_in_bin: int = Field(description="1: each bin is a frame.")
     serials: list[str] = Field(description="Of the tiles, in the order of the columns.")
+    provisional: bool = Field(
+        description="It is not sealed yet: frames may still come between these, and tares follow."
+    )
+    behind: bool = Field(description="There are more frames already: ask again.")
     columns: dict[str, list[float | int | None]]
 
 
@@ -67,7 +71,7 @@ class OverviewView(BaseModel):
         304: {"description": "It is what If-None-Match names."},
         **problems(
             _404="No such session, or nothing was recorded.",
-            _409="The overview is made when the session is sealed.",
+            _409="It has no frames yet, or they are damaged.",
             _422="No such column, or a slice that ends before it begins.",
         ),
     },
@@ -82,18 +86,18 @@ async def overview(
 ) -> Response:
     """Least and greatest of every column in each of some bins, so that no peak hides.
 
-    At full zoom each bin is a frame. What it costs does not depend on the session's length.
+    At full zoom each bin is a frame. What it costs does not depend on the session's length. Of a
+    session that is not sealed it is what there is so far, `provisional`: some ten thousand bins,
+    of ever more frames the longer it is.
     """
     session = server.sessions.get(session_id)
-    if session.state != "sealed":
-        raise StateError(
-            f"session {session_id} is {session.state}, and its overview is made when it is sealed",
-            remedy="Stop it",
-        )
-    if session.sha256 is None:
+    if session.state == "sealed" and session.sha256 is None:
         raise UnknownError(f"session {session_id}: {session.problem}")
     as_arrow = _ARROW in accept
     as_gzip = not as_arrow and takes_gzip(accept_encoding)
+    if session.sha256 is None:
+        return await _so_far(session, query, server, as_arrow=as_arrow, as_gzip=as_gzip)
+    server.so_fars.forget(session_id)
     asked = f"{session.sha256}|{query.model_dump_json()}|{as_arrow}|{as_gzip}|{SOFTWARE}"
     tag = hashlib.sha256(asked.encode()).hexdigest()
     headers = {"ETag": f'"{tag}"', "Cache-Control": "private, no-cache"}
@@ -108,6 +112,23 @@ async def overview(
     return Response(content, headers=headers, media_type=media_type)
 
 
+async def _so_far(
+    session: Session, query: OverviewQuery, server: Server, *, as_arrow: bool, as_gzip: bool
+) -> Response:
+    sources = server.recorder.sources(session.id)
+    part = Slice(query.start_s, query.end_s)
+
+    def make() -> bytes:
+        so_far = server.so_fars.taken(sources)
+        seen, serials = so_far.seen(part, query.points), list(sources.info.serials)
+        said = {"provisional": True, "behind": so_far.is_behind}
+        return _written(session, seen, serials, said, query, as_arrow=as_arrow, as_gzip=as_gzip)
+
+    content = await to_thread.run_sync(make, limiter=_ONE_AT_A_TIME)
+    headers = {"Cache-Control": "no-store"} | ({"Content-Encoding": "gzip"} if as_gzip else {})
+    return Response(content, headers=headers, media_type=_ARROW if as_arrow else "application/json")
+
+
 def _content(
     session: Session, query: OverviewQuery, server: Server, *, as_arrow: bool, as_gzip: bool
 ) -> bytes:
@@ -116,6 +137,20 @@ def _content(
     with server.sessions.frames(session.id, only_slices=True) as reader:
         seen = overview_of_session(reader, part, query.points, frames_sha256=session.sha256)
         serials = list(reader.info.serials)
+    said = {"provisional": False, "behind": False}
+    return _written(session, seen, serials, said, query, as_arrow=as_arrow, as_gzip=as_gzip)
+
+
+def _written(
+    session: Session,
+    seen: Seen,
+    serials: list[str],
+    said: dict[str, bool],
+    query: OverviewQuery,
+    *,
+    as_arrow: bool,
+    as_gzip: bool,
+) -> bytes:
     columns = _chosen(_in_seconds(seen), query.columns)
     about = {
         "session_id": session.id,
@@ -123,6 +158,7 @@ def _content(
         "duration_s": (seen.end_ns - seen.begin_ns) * 1e-9,
         "frames_in_bin": seen.frames_in_bin,
         "serials": serials,
+        **said,
     }
     if not as_arrow:
         content = {**about, "columns": {name: _plain(values) for name, values in columns.items()}}

@@ -155,7 +155,7 @@ def test_what_cannot_be_shown_is_said(hopped: Recording, tared: FakeNode) -> Non
     assert_refused(http.get(f"{hopped.url}/overview", params=late), 422, "ends at 1 s")
     assert asked(hopped, start_s=500)["columns"]["t_first_s"] == []
     recording = tared.record()
-    assert_refused(http.get(f"{recording.url}/overview"), 409, "is recording")
+    assert_refused(http.get(f"{recording.url}/overview"), 409, "no frames yet")
     gone = "/sessions/20200101T000000Z-000000/overview"
     assert_refused(http.get(gone), 404, "20200101T000000Z-000000")
 

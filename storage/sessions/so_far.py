@@ -1,0 +1,90 @@
+"""Bins of a session that goes on: never more than so many, and the coarser the longer it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from storage.schema import Array
+from storage.sessions.pyramid import FACTOR, Bins, bins_of_frames, joined, merged, starts_of
+
+MOST = 16_384
+"""Bins that are kept: of eight tiles 154 bytes each, of 64 tiles 658."""
+_PENDING = 1024
+"""Frames that are merged at a time."""
+
+
+class BinsSoFar:
+    """Gathers consecutive frames into at most `most` bins, which stand for ever more frames.
+
+    Attributes:
+        frames_in_bin: how many frames a bin stands for: 1, these are the frames themselves.
+        frames: that were taken.
+    """
+
+    def __init__(self, most: int = MOST) -> None:
+        self.frames_in_bin = 1
+        self.frames = 0
+        self._most = most
+        self._bins: list[Bins] = []
+        self._pending: list[Bins] = []
+        self._before: tuple[int, int] | None = None
+        """Part and number of the last frame."""
+
+    def feed(self, frames: Mapping[str, Array]) -> None:
+        """Take the next frames: `storage.sessions.pyramid.frame_columns`, and `part`."""
+        if not len(frames["seq"]):
+            return
+        part = int(frames["part"][0])
+        before = self._before[1] if self._before is not None and self._before[0] == part else None
+        self._before = int(frames["part"][-1]), int(frames["seq"][-1])
+        self._pending.append(bins_of_frames(frames, before))
+        self.frames += len(frames["seq"])
+        if sum(_length(piece) for piece in self._pending) >= max(_PENDING, self.frames_in_bin):
+            self._close_full()
+
+    def bins(self) -> Bins | None:
+        """All there are by now, the last one perhaps not full; None: no frame came."""
+        rest = [self._merged(joined(self._pending))] if self._pending else []
+        pieces = [*self._bins, *rest]
+        return joined(pieces) if pieces else None
+
+    def _merged(self, frames: Bins) -> Bins:
+        return frames if self.frames_in_bin == 1 else merged(frames, self.frames_in_bin)
+
+    def _close_full(self) -> None:
+        """Merge the frames that are waiting, but for those of a bin that is not full yet."""
+        frames = joined(self._pending)
+        last = int(starts_of(frames["part"], self.frames_in_bin)[-1])
+        end = len(frames["part"])
+        full = end if end - last == self.frames_in_bin else last
+        self._pending = [_rows(frames, full, end)] if full < end else []
+        if full:
+            self._bins.append(self._merged(_rows(frames, 0, full)))
+        if sum(map(_length, self._bins)) > self._most:
+            self._bins = [merged(joined(self._bins), FACTOR)]
+            self.frames_in_bin *= FACTOR
+
+
+def thinned(bins: Bins, begin_ns: int | None, end_ns: int | None, most: int) -> tuple[Bins, int]:
+    """Bins of some time, merged until they are no more than `most`; of each how many were."""
+    rows = np.ones(_length(bins), dtype=np.bool_)
+    if begin_ns is not None:
+        rows &= bins["t_last_ns"] >= begin_ns
+    if end_ns is not None:
+        rows &= bins["t_first_ns"] < end_ns
+    found, count = {name: values[rows] for name, values in bins.items()}, 1
+    while _length(found) > most:
+        found, count = merged(found, FACTOR), count * FACTOR
+        if count > len(rows):  # parts of a bin each
+            break
+    return found, count
+
+
+def _rows(bins: Bins, begin: int, end: int) -> Bins:
+    return {name: values[begin:end].copy() for name, values in bins.items()}
+
+
+def _length(bins: Bins) -> int:
+    return len(bins["part"])
