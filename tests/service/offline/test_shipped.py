@@ -1,0 +1,83 @@
+"""Calibrations that come with the program: of every tile of a built-in scene, and not out of date.
+
+`FOOTTILE_WRITE_BENCH=1 sh scripts/test tests/service/offline/test_shipped.py` makes them anew.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from devices.scene.file import builtin_scenes, load_scene
+from service.estimation.calibration import Calibration, TileCalibration
+from service.offline import calibrations
+from service.offline.calibrations import BENCH, SHIPPED, find_calibration
+
+TILES = sorted(
+    {
+        tile.serial
+        for name in builtin_scenes()
+        if (scene := load_scene(name)).calibration == BENCH
+        for tile in scene.tile
+        if not tile.reference
+    }
+)
+
+
+def refuse(message: str) -> None:
+    pytest.fail(f"a first start waits: {message}")
+
+
+def pressed(serial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calibration:
+    """A tile on the bench, as if none had come with the program."""
+    monkeypatch.setattr(calibrations, "SHIPPED", tmp_path / "nothing")
+    return find_calibration(BENCH, [serial], cache=tmp_path / "cache")
+
+
+@pytest.mark.skipif("FOOTTILE_WRITE_BENCH" not in os.environ, reason="writes them")
+def test_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for serial in TILES:
+        pressed(serial, tmp_path, monkeypatch)
+    shutil.rmtree(SHIPPED, ignore_errors=True)
+    shutil.copytree(tmp_path / "cache", SHIPPED)
+
+
+def test_no_built_in_scene_waits_for_the_mill(tmp_path: Path) -> None:
+    assert [f"T0{number}" for number in range(1, 9)] == TILES
+    find_calibration(BENCH, TILES, cache=tmp_path, progress=refuse)
+    assert list(tmp_path.iterdir()) == []
+    assert len(list(SHIPPED.iterdir())) == len(TILES)  # none is left of a version before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "serial", [TILES[0], *(pytest.param(each, marks=pytest.mark.soak) for each in TILES[1:])]
+)
+def test_pressed_anew_a_tile_is_as_it_was(
+    serial: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = find_calibration(BENCH, [serial], cache=tmp_path / "empty").tiles[0]
+    (anew,) = pressed(serial, tmp_path, monkeypatch).tiles
+    (numbers, words), (as_numbers, as_words) = map(told, (shipped, anew))
+    assert as_words == words
+    assert as_numbers == pytest.approx(numbers, rel=1e-6, abs=1e-12)
+
+
+def told(tile: TileCalibration) -> tuple[dict[str, float], dict[str, object]]:
+    """Its numbers, and all else, by where they are."""
+    left: list[tuple[str, object]] = [("", tile.model_dump())]
+    numbers, words = dict[str, float](), dict[str, object]()
+    while left:
+        name, value = left.pop()
+        if isinstance(value, dict):
+            left += [(f"{name}/{key}", each) for key, each in value.items()]
+        elif isinstance(value, list | tuple):
+            left += [(f"{name}/{i}", each) for i, each in enumerate(value)]
+        elif isinstance(value, float):
+            numbers[name] = value
+        else:
+            words[name] = value
+    return numbers, words
