@@ -3,6 +3,7 @@
 import { Bars } from "../live/bars.js";
 import { Foot } from "../live/foot.js";
 import { drawGrf } from "../live/grf.js";
+import { Range } from "../live/range.js";
 import { byId, el, number, setData, setText } from "../common/text.js";
 import { timeWords } from "./overlay.js";
 import { Playing, SPEEDS } from "./playing.js";
@@ -68,9 +69,10 @@ export class Replay {
     // Estimated frames have a tare and a calibration, whatever is known of these.
     this.node = { ...array, tare: {}, calibration: array.calibration ?? {} };
     const again = () => { this.shown = null; this.on.changed(); };
-    this.foot ??= new Foot();
+    this.range ??= new Range(byId("range"), again);
+    this.foot ??= new Foot(this.range);
     this.foot.resized = again;
-    this.bars ??= new Bars(again);
+    this.bars ??= new Bars(again, this.range);
     again();
   }
 

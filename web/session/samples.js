@@ -47,6 +47,7 @@ function frameOf({ timeS, columns }, row, tiles) {
   // A lower bound is a force without an uncertainty.
   frame.saturated = frame.force_n.map((force, i) => force !== null && frame.force_sigma_n[i] === null);
   frame.contact = frame.contact === null ? null : Boolean(frame.contact);
+  [frame.force_max_n, frame.gauge_max_kpa] = [frame.force_n, frame.gauge_kpa]; // of this frame alone
   frame.timeS = timeS[row];
   return frame;
 }
