@@ -136,6 +136,10 @@ def make_app(
     async def index(request: Request) -> Response:
         return await page.get_response("index.html", request.scope)
 
+    @app.get("/nodes", include_in_schema=False)
+    async def nodes_page(request: Request) -> Response:
+        return await page.get_response("nodes.html", request.scope)
+
     @app.get("/sessions/{session_id}", include_in_schema=False)
     async def session_page(session_id: str, request: Request) -> Response:  # it asks for it itself
         return await page.get_response("session.html", request.scope)

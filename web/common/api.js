@@ -46,6 +46,9 @@ export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares
 export const startSession = (node, name) => call("POST", "/sessions", { node, name });
 export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
 export const markEvent = (session, event) => call("POST", `/sessions/${id(session)}/events`, event);
+export const startTake = (name) => call("POST", "/takes", { name });
+export const stopTake = (take) => call("POST", `/takes/${id(take)}/stop`);
+export const markTake = (take, event) => call("POST", `/takes/${id(take)}/events`, event);
 export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
 export const listEvents = (session) => call("GET", `/sessions/${id(session)}/events`);
 export const listStances = (session) => call("GET", `/sessions/${id(session)}/stances`);

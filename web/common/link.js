@@ -9,8 +9,9 @@ const PING_EVERY_MS = 1000;
 const SILENT_AFTER_MS = 5000; // no message at all, although a heartbeat comes each second
 
 export class Link {
-  /** `onMessage(message)` per message, `onChange()` when the link opens or closes. */
-  constructor({ onMessage, onChange }) {
+  /** `onMessage(message)` per message, `onChange()` when the link opens or closes; `rateHz`: of frames. */
+  constructor({ onMessage, onChange, rateHz = 30 }) {
+    this.rateHz = rateHz;
     this.onMessage = onMessage;
     this.onChange = onChange;
     this.open = false;
@@ -33,7 +34,7 @@ export class Link {
     this.retry = null;
     if (keptOut()) await letIn();
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    const socket = new WebSocket(`${scheme}://${location.host}/api/v1/live?rate_hz=30`, "foottile.v1");
+    const socket = new WebSocket(`${scheme}://${location.host}/api/v1/live?rate_hz=${this.rateHz}`, "foottile.v1");
     this.socket = socket;
     this.startedMs = performance.now();
     this.heardMs = this.startedMs;

@@ -7,7 +7,9 @@ import { byId, setText } from "../common/text.js";
 const AGAIN_MS = 2000;
 
 export class Marks {
-  constructor() {
+  /** `post(id, event)` gives a mark to the server: of a session, or of a take. */
+  constructor(post = api.markEvent) {
+    this.post = post;
     this.waiting = [];
     this.sending = false;
     setInterval(() => this.send(), AGAIN_MS);
@@ -16,7 +18,7 @@ export class Marks {
     });
   }
 
-  /** Mark these sessions at an instant of the server's clock, in milliseconds. */
+  /** Mark these sessions, or takes, at an instant of the server's clock, in milliseconds. */
   async add(sessions, label, serverMs) {
     const waitingMark = (session) => ({
       session,
@@ -37,7 +39,7 @@ export class Marks {
       while (this.waiting.length) {
         const mark = this.waiting[0];
         try {
-          await api.markEvent(mark.session.id, mark.event);
+          await this.post(mark.session.id, mark.event);
           made.push(mark);
         } catch (error) {
           if (!(error instanceof api.Refusal)) throw error;

@@ -1,0 +1,155 @@
+// One node among others: is it live, what does it bear, how good is its link, what is recorded on it.
+
+import { duration, el, number, plain, roughly, setData, setText } from "../common/text.js";
+import { whyNot } from "../live/grf.js";
+import { plainState } from "../sessions/state.js";
+import { SmallFoot } from "./small_foot.js";
+
+const FROZEN_AFTER_MS = 600;
+const BEHIND_S = 0.5; // what is on its way in good order is not behind
+const SLOW = 0.9;
+const NOTES_MOST = 3;
+const NODE_KEY = "foottile.node"; // the one that the page of one node shows
+
+export class Card {
+  constructor(name) {
+    this.node = null;
+    this.frame = null;
+    this.frameMs = null;
+    this.beat = null;
+    this.fresh = false;
+    this.refused = ""; // why the last take does not have it
+    this.session = null; // the newest that is, or was, recorded on it while this page is open
+    const link = el("a", { href: "/", text: name, title: "Show this node by itself" });
+    link.addEventListener("click", () => {
+      try { localStorage.setItem(NODE_KEY, name); } catch { /* private window */ }
+    });
+    const part = (tag, cls) => el(tag, { cls });
+    this.state = part("span", "state");
+    this.bound = part("span", "bound");
+    this.value = part("span", "value");
+    this.unit = el("span", { cls: "unit", text: "N" });
+    this.sigma = part("span", "sigma");
+    this.contact = part("span", "contact");
+    const canvas = el("canvas", { cls: "node-foot", role: "img", "aria-label": `Tiles of ${name} shaded by force, and the centre of pressure` });
+    this.foot = new SmallFoot(canvas);
+    const facts = el("dl", { cls: "node-facts" });
+    this.facts = Object.fromEntries(["Frames/s", "Lost", "Behind"].map((title) => {
+      const value = el("dd");
+      const row = el("div", {}, el("dt", { text: title }), value);
+      facts.append(row);
+      return [title, { row, value }];
+    }));
+    this.notes = part("ul", "node-notes");
+    this.told = part("p", "node-session");
+    this.element = el("li", { cls: "node", "data-node": name },
+      el("div", { cls: "node-head" }, el("h2", {}, link), this.state),
+      el("div", { cls: "node-grf" }, el("p", {}, this.bound, this.value, " ", this.unit), this.contact, this.sigma),
+      canvas, el("div", { cls: "node-more" }, facts, this.notes, this.told));
+  }
+
+  take(node) {
+    if (this.node && this.node.boot_id !== node.boot_id) this.frame = this.frameMs = this.beat = null; // it restarted
+    this.node = node;
+    this.fresh = true;
+  }
+
+  see(frame) {
+    this.frame = frame;
+    this.frameMs = performance.now();
+    this.fresh = true;
+  }
+
+  isLive(nowMs) {
+    return this.frameMs !== null && nowMs - this.frameMs <= FROZEN_AFTER_MS;
+  }
+
+  /** The foot, when there is something new of it. */
+  draw() {
+    if (!this.fresh || !this.node) return;
+    this.fresh = false;
+    this.foot.draw(this.node, this.frame);
+  }
+
+  /** All that is text; `linkOpen`: is the server there? */
+  write(nowMs, serverNowMs, linkOpen) {
+    const { node, frame } = this;
+    const live = linkOpen && this.isLive(nowMs);
+    setData(this.element, "live", String(live));
+    const [word, cls] = this.stateInWords(live, nowMs, serverNowMs, linkOpen);
+    setText(this.state, word);
+    if (this.state.className !== `state ${cls}`) this.state.className = `state ${cls}`;
+
+    const grf = Number.isFinite(frame?.grf_n) ? frame.grf_n : null;
+    const atLeast = grf === null && Number.isFinite(frame?.grf_at_least_n) ? Math.max(0, Math.floor(frame.grf_at_least_n * 10) / 10) : null;
+    setText(this.bound, atLeast === null ? "" : "at least ");
+    setText(this.value, number(grf ?? atLeast ?? NaN));
+    setData(this.value, "value", plain(grf));
+    this.unit.hidden = grf === null && atLeast === null;
+    const assumed = node.calibration?.absolute_scale === "assumed" ? ", assumed scale" : "";
+    setText(this.sigma, grf === null ? whyNot(node, frame)
+      : Number.isFinite(frame.grf_sigma_n) ? `± ${number(1.96 * frame.grf_sigma_n)} N (95 %)${assumed}` : "");
+    const contact = frame?.contact ?? null;
+    setText(this.contact, contact === null ? "" : contact ? "contact" : "flight");
+
+    this.writeFacts(node);
+    this.writeNotes(node);
+    this.writeSession();
+  }
+
+  stateInWords(live, nowMs, serverNowMs, linkOpen) {
+    if (live) return ["live", "live"];
+    if (linkOpen && !this.node.connected) return ["away", "away"];
+    const sinceMs = this.frameMs !== null ? nowMs - this.frameMs
+      : this.node.last_seen_t_ns ? serverNowMs - this.node.last_seen_t_ns / 1e6 : null;
+    return [sinceMs === null ? "no data yet" : `no data for ${roughly(sinceMs / 1000)}`, "away"];
+  }
+
+  writeFacts(node) {
+    const beat = this.beat ?? {};
+    const fact = (title, text, bad) => {
+      setText(this.facts[title].value, text);
+      setData(this.facts[title].value, "bad", String(bad));
+    };
+    const rateHz = node.connected ? beat.rate_hz ?? node.rate_hz : null;
+    const of = rateHz !== null && rateHz <= node.nominal_rate_hz ? ` of ${number(node.nominal_rate_hz)}` : "";
+    fact("Frames/s", `${number(rateHz ?? NaN)}${of}`, rateHz !== null && rateHz < SLOW * node.nominal_rate_hz);
+    const lost = beat.lost_frames ?? node.lost_frames ?? 0;
+    const missed = beat.missed_slots ?? node.missed_slots ?? 0;
+    fact("Lost", `${lost.toLocaleString("en-GB")}, ${missed.toLocaleString("en-GB")} not taken`, lost > 0 || missed > 0);
+    const behind = beat.backlog_frames ?? node.backlog_frames ?? 0;
+    this.facts.Behind.row.hidden = behind < BEHIND_S * (node.nominal_rate_hz || 400);
+    fact("Behind", `${behind.toLocaleString("en-GB")} frames`, false);
+  }
+
+  writeNotes(node) {
+    const all = [
+      node.storage_problem, node.calibration_problem, node.tare_problem, ...(node.tare_warnings ?? []), ...(node.troubles ?? []),
+    ].filter(Boolean);
+    const shown = all.slice(0, NOTES_MOST);
+    if (all.length > NOTES_MOST) shown.push(`and ${all.length - NOTES_MOST} more: they are on its own page`);
+    const key = JSON.stringify([this.refused, shown]);
+    if (key === this.notesKey) return;
+    this.notesKey = key;
+    const items = shown.map((text) => el("li", { text }));
+    if (this.refused) items.unshift(el("li", { cls: "refused", text: `Not recorded: ${this.refused}` }));
+    this.notes.replaceChildren(...items);
+  }
+
+  writeSession() {
+    const { session } = this;
+    const recording = session?.state === "recording";
+    setData(this.element, "recording", String(recording));
+    if (!session) return;
+    const [short, long] = plainState(session);
+    const key = JSON.stringify([session.id, session.name, short, long, recording ? Math.floor(session.duration_s) : session.frames, session.marks]);
+    if (key === this.sessionKey) return;
+    this.sessionKey = key;
+    const marks = session.marks ? `, ${session.marks} mark${session.marks === 1 ? "" : "s"}` : "";
+    const frames = `${session.frames.toLocaleString("en-GB")} frames`;
+    const said = recording ? `recording, ${duration(Math.floor(session.duration_s))}` : `${short}, ${frames}`;
+    this.told.replaceChildren(
+      el("a", { href: `/sessions/${encodeURIComponent(session.id)}`, text: session.name || session.id }), ` ${said}${marks}`,
+      ...(long && !recording ? [el("span", { cls: "why", text: ` ${long}` })] : []));
+  }
+}

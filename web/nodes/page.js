@@ -1,0 +1,117 @@
+// The page of all nodes: a card for each, and what is recorded on all of them together.
+
+import { Link } from "../common/link.js";
+import { look } from "../common/login.js";
+import { inSunlight } from "../common/sunlight.js";
+import { byId, setText } from "../common/text.js";
+import { Card } from "./card.js";
+import { Takes } from "./take.js";
+
+const RATE_HZ = 10; // a glance at many, and a phone's battery
+const EVERY_MS = 200;
+
+const cards = new Map(); // by name of the node
+const recordings = new Map(); // by id of the session
+let serverAheadMs = 0;
+
+const takes = new Takes({
+  recordings,
+  cannotRecord: () => (!link.open ? "The server cannot be reached." : [...cards.values()].some(({ node }) => node.connected) ? "" : "No node is connected."),
+  serverNowMs: () => Date.now() + serverAheadMs,
+  onSession: takeSession,
+  onRefused: (failed) => cards.forEach((card, name) => { card.refused = failed[name] ?? ""; }),
+});
+
+const handlers = {
+  hello(message) {
+    const names = new Set((message.nodes ?? []).map((node) => node.node));
+    for (const name of cards.keys()) if (!names.has(name)) cards.delete(name);
+    (message.nodes ?? []).forEach(takeNode);
+    recordings.clear();
+    (message.recording ?? []).forEach(takeSession);
+    arrange();
+    takes.marks.send(); // the server is back
+    look(); // and may know us no more
+  },
+  node({ node }) {
+    const isNew = !cards.has(node.node);
+    takeNode(node);
+    if (isNew) arrange();
+  },
+  session: ({ session }) => takeSession(session),
+  counted: ({ sessions }) => Object.entries(sessions).forEach(([id, counted]) => {
+    const session = recordings.get(id);
+    if (session) takeSession({ ...session, ...counted });
+  }),
+  deleted: ({ session_id: id }) => {
+    recordings.delete(id);
+    for (const card of cards.values()) if (card.session?.id === id) card.session = null;
+  },
+  heartbeat: ({ nodes }) => cards.forEach((card, name) => { card.beat = nodes?.[name] ?? null; }),
+  frame: (frame) => cards.get(frame.node)?.see(frame),
+};
+
+const link = new Link({
+  rateHz: RATE_HZ,
+  onMessage(message) {
+    if (Number.isFinite(message.t_ns) && ["hello", "heartbeat", "pong"].includes(message.type)) {
+      serverAheadMs = message.t_ns / 1e6 + (link.roundTripMs ?? 0) / 2 - Date.now();
+    }
+    if (Object.hasOwn(handlers, message.type)) handlers[message.type](message);
+  },
+  onChange: () => {},
+});
+
+function takeNode(node) {
+  if (!cards.has(node.node)) cards.set(node.node, new Card(node.node));
+  cards.get(node.node).take(node);
+}
+
+function takeSession(session) {
+  if (session.state === "recording") recordings.set(session.id, session);
+  else recordings.delete(session.id);
+  const card = cards.get(session.node);
+  if (!card) return;
+  const shown = card.session;
+  // Of several the one that is being recorded is shown, else the newest that this page has heard of.
+  const running = [...recordings.values()].filter((one) => one.node === session.node).sort((a, b) => b.started_t_ns - a.started_t_ns)[0];
+  if (running) card.session = running;
+  else if (!shown || shown.id === session.id || session.started_t_ns >= shown.started_t_ns) card.session = session;
+}
+
+/** Cards in the order of their names. */
+function arrange() {
+  const names = [...cards.keys()].sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
+  byId("cards").replaceChildren(...names.map((name) => cards.get(name).element));
+}
+
+function write() {
+  const nowMs = performance.now();
+  const all = [...cards.values()];
+  for (const card of all) card.write(nowMs, Date.now() + serverAheadMs, link.open);
+  const live = link.open ? all.filter((card) => card.isLive(nowMs)).length : 0;
+  setText(byId("summary"), all.length ? `${live} of ${all.length} live` : "");
+  byId("no-nodes").hidden = Boolean(all.length) || !link.open;
+  const down = byId("link-down");
+  down.hidden = link.open || !link.socket && !all.length;
+  setText(down, link.open ? "" : `Link to the server is down${link.closeReason ? ` (${link.closeReason})` : ""}; trying again.`);
+  takes.draw();
+}
+
+function draw() {
+  requestAnimationFrame(draw);
+  for (const card of cards.values()) card.draw();
+}
+
+function recolour() {
+  for (const card of cards.values()) {
+    card.foot.recolour();
+    card.fresh = true;
+  }
+}
+document.addEventListener("foottile-colours", recolour);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
+inSunlight();
+setInterval(write, EVERY_MS);
+write();
+draw();

@@ -1,0 +1,141 @@
+// A foot as large as a stamp: tiles shaded by their force, and the centre of pressure. On a canvas, for there are many.
+
+import { FootLayout, isPlan } from "../common/foot_layout.js";
+import { shadeOf, shadesOf } from "../common/heat.js";
+import { FAULT_STATES, readTile } from "../live/tile.js";
+
+const Z95 = 1.96;
+
+export class SmallFoot {
+  /** @param {HTMLCanvasElement} canvas */
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.context = canvas.getContext("2d");
+    this.key = "";
+    this.colours = null;
+    this.layout = null;
+    new ResizeObserver(() => { this.key = ""; }).observe(canvas);
+  }
+
+  /** The colours of the page have changed. */
+  recolour() {
+    this.colours = null;
+  }
+
+  fit(node) {
+    const { canvas } = this;
+    if (!node.tiles.length) return;
+    const ratio = devicePixelRatio || 1;
+    const key = JSON.stringify([node.tiles, Boolean(node.servo), canvas.clientWidth, canvas.clientHeight, ratio]);
+    if (key === this.key) return;
+    this.key = key;
+    this.widthPx = canvas.clientWidth;
+    this.heightPx = canvas.clientHeight;
+    canvas.width = Math.round(this.widthPx * ratio);
+    canvas.height = Math.round(this.heightPx * ratio);
+    this.ratio = ratio;
+    const { widthPx, heightPx } = this;
+    const room = isPlan(node.tiles) ? { roomPx: 8 } : { roomPx: 0.4 * heightPx, basePx: 0.4 * heightPx }; // for the COP, below
+    const box = { widthPx, heightPx, ...room, turns: Boolean(node.servo), toesUp: true };
+    this.layout = new FootLayout(node.tiles, box);
+    this.sole = !this.layout.plan ? new Path2D(this.layout.sole()) : null;
+  }
+
+  readColours() {
+    const style = getComputedStyle(this.canvas);
+    const colour = (name) => style.getPropertyValue(name).trim();
+    this.colours = {
+      text: colour("--text"), track: colour("--track"), edge: colour("--edge"), warn: colour("--warn-line"),
+      bad: colour("--bad-line"), badFill: colour("--bad"), cop: colour("--cop"), panel: colour("--panel"),
+      shades: shadesOf(this.canvas),
+    };
+  }
+
+  draw(node, frame) {
+    this.fit(node);
+    const { context, layout } = this;
+    if (!this.widthPx || !layout) return;
+    if (!this.colours) this.readColours();
+    context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    context.clearRect(0, 0, this.widthPx, this.heightPx);
+    context.save();
+    if (!layout.plan && node.servo && Number.isFinite(frame?.angle_rad)) {
+      const ankle = layout.at(0, 0);
+      context.translate(ankle.x, ankle.y);
+      context.rotate(frame.angle_rad); // clockwise: the tiles in front come down
+      context.translate(-ankle.x, -ankle.y);
+    }
+    if (this.sole) this.stroke(this.sole, this.colours.edge, 1.5, this.colours.track);
+    node.tiles.forEach((tile, i) => this.drawTile(node, tile, i, frame));
+    this.drawCop(frame);
+    context.restore();
+  }
+
+  drawTile(node, tile, i, frame) {
+    const { context, colours } = this;
+    const { x, y } = this.layout.points[i];
+    const r = Math.max(3, this.layout.radiusPx);
+    const { state, value } = readTile(node, i, frame, "N");
+    const fault = FAULT_STATES.has(state);
+    const full = tile.full_scale_n > 0 ? tile.full_scale_n : 30;
+    const share = state === "saturated" ? 1 : tile.reference || value === null ? 0 : value / full;
+    context.fillStyle = fault ? colours.badFill : shadeOf(colours.shades, share).fill;
+    context.strokeStyle = fault ? colours.bad : state === "saturated" ? colours.warn : colours.text;
+    context.lineWidth = state === "saturated" ? 3 : r < 8 ? 0.75 : 1.5; // small ones would be all line
+    context.setLineDash(tile.reference || !["ok", "saturated"].includes(state) ? [3, 3] : []);
+    context.beginPath();
+    context.arc(x, y, r, 0, 2 * Math.PI);
+    context.fill();
+    context.stroke();
+    context.setLineDash([]);
+    if (!fault) return;
+    context.beginPath();
+    for (const side of [-1, 1]) {
+      context.moveTo(x - r, y - side * r);
+      context.lineTo(x + r, y + side * r);
+    }
+    context.stroke();
+  }
+
+  /** Under the line of tiles as an arrow with its 95 % bar; from above as a cross in its ellipse. */
+  drawCop(frame) {
+    if (!Number.isFinite(frame?.cop_x_m)) return;
+    const { context, colours, layout } = this;
+    context.strokeStyle = colours.cop;
+    context.fillStyle = colours.cop;
+    context.lineWidth = 2;
+    const half = (sigma_m) => Z95 * (Number.isFinite(sigma_m) ? sigma_m : 0) * layout.scale;
+    context.beginPath();
+    if (layout.plan) {
+      const { x, y } = layout.at(frame.cop_x_m, frame.cop_y_m ?? 0);
+      const [across, along] = [frame.cop_sigma_y_m, frame.cop_sigma_x_m].map((sigma_m) => Math.max(4, half(sigma_m)));
+      context.ellipse(x, y, across, along, 0, 0, 2 * Math.PI); // toes are up
+      context.stroke();
+      context.beginPath();
+      context.arc(x, y, 3, 0, 2 * Math.PI);
+      context.fill();
+      return;
+    }
+    const { x } = layout.at(frame.cop_x_m, 0);
+    const y = layout.lineAt(x) + layout.radiusPx + 4;
+    context.moveTo(x, y);
+    const long = Math.min(11, 0.09 * this.heightPx);
+    context.lineTo(x - 0.55 * long, y + long);
+    context.lineTo(x + 0.55 * long, y + long);
+    context.fill();
+    const [a, b] = [x - half(frame.cop_sigma_x_m), x + half(frame.cop_sigma_x_m)];
+    context.beginPath();
+    context.moveTo(a, y + long + 3);
+    context.lineTo(b, y + long + 3);
+    context.stroke();
+  }
+
+  stroke(path, colour, width, fill) {
+    const { context } = this;
+    context.fillStyle = fill;
+    context.fill(path);
+    context.strokeStyle = colour;
+    context.lineWidth = width;
+    context.stroke(path);
+  }
+}

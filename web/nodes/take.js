@@ -1,0 +1,134 @@
+// Record, mark and stop all: one request to the server, which says of each node what became of it.
+
+import * as api from "../common/api.js";
+import { mayPress } from "../common/login.js";
+import { notice } from "../common/notices.js";
+import { byId, duration, localTime, setData, setText } from "../common/text.js";
+import { Marks } from "../live/marks.js";
+
+const KEYS = { r: "record-all", m: "mark-all", s: "stop-all" };
+
+export class Takes {
+  /**
+   * @param {object} page
+   * @param {Map<string, object>} page.recordings sessions that are being recorded, by id
+   * @param {() => string} page.cannotRecord why not now, or nothing
+   * @param {() => number} page.serverNowMs
+   * @param {(session: object) => void} page.onSession takes every session an answer brings
+   * @param {(failed: Object<string, string>) => void} page.onRefused takes what nodes a take lacks, and why
+   */
+  constructor(page) {
+    this.page = page;
+    this.busy = new Set();
+    this.markedOn = 0; // nodes, of the newest mark; 0 if it failed on one
+    this.marks = new Marks(async (id, event) => {
+      const take = await api.markTake(id, event);
+      this.markedOn = this.told(take, "not marked") ? take.sessions.length : 0;
+    });
+    this.does = { "record-all": () => this.record(), "mark-all": () => this.mark(), "stop-all": () => this.stop() };
+    for (const id of Object.keys(this.does)) byId(id).addEventListener("click", () => this.run(id));
+    for (const [field, id] of [["take-name", "record-all"], ["take-label", "mark-all"]]) {
+      byId(field).addEventListener("keydown", (event) => {
+        if (event.isComposing || !["Enter", "Escape"].includes(event.key)) return;
+        if (event.key === "Escape") event.target.value = "";
+        event.target.blur();
+        if (event.key === "Enter") this.run(id);
+      });
+    }
+    document.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
+      if (event.target.closest?.("input, dialog") || !KEYS[event.key]) return;
+      event.preventDefault();
+      this.run(KEYS[event.key]);
+    });
+    const bar = byId("take-bar");
+    new ResizeObserver(() => document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`)).observe(bar);
+  }
+
+  /** The newest take of which something is being recorded: its id and these sessions; or null. */
+  running() {
+    const taken = [...this.page.recordings.values()].filter((session) => session.take);
+    if (!taken.length) return null;
+    const newest = taken.reduce((a, b) => (b.started_t_ns > a.started_t_ns ? b : a));
+    return { id: newest.take, name: newest.name, sessions: taken.filter((session) => session.take === newest.take) };
+  }
+
+  /** Do something once at a time, and say what came of it. */
+  async run(id) {
+    const button = byId(id);
+    if (!mayPress()) {
+      notice("this login may look, and not press. “viewer”, beside the title, says more.", { bad: true });
+      return;
+    }
+    if (button.disabled || this.busy.has(id)) {
+      if (id === "record-all") notice(this.running() ? "Stop what is being recorded first." : this.page.cannotRecord(), { bad: true });
+      else notice("Nothing is being recorded on all nodes: press Record all first.", { bad: true });
+      return;
+    }
+    this.busy.add(id);
+    button.setAttribute("aria-busy", "true");
+    try {
+      await this.does[id]();
+    } catch (error) {
+      if (!(error instanceof api.Refusal)) throw error;
+      notice(error.message, { bad: true });
+    } finally {
+      this.busy.delete(id);
+      button.removeAttribute("aria-busy");
+      this.draw();
+    }
+  }
+
+  async record() {
+    const field = byId("take-name");
+    const name = field.value.trim() || localTime(new Date());
+    const take = await api.startTake(name);
+    field.value = "";
+    this.page.onRefused(take.failed);
+    if (this.told(take, "not recorded")) notice(`Recording “${name}” on ${nodes(take.sessions.length)}.`);
+    if (document.activeElement === document.body) byId("stop-all").focus();
+  }
+
+  async mark() {
+    const pressedMs = this.page.serverNowMs();
+    const field = byId("take-label");
+    const label = field.value.trim() || "mark";
+    field.value = "";
+    const made = await this.marks.add([this.running()], label, pressedMs);
+    if (made.length && this.markedOn) notice(`Marked “${label}” on ${nodes(this.markedOn)}.`);
+  }
+
+  async stop() {
+    const take = await api.stopTake(this.running().id);
+    this.page.onRefused({}); // what was said of this take is over
+    if (!this.told(take, "not stopped")) return;
+    const open = take.sessions.filter((session) => session.state === "pending").length;
+    notice(`Stopped on ${nodes(take.sessions.length)}.${open ? ` ${open === 1 ? "One completes" : `${open} complete`} when the last frames have come.` : ""}`);
+    if (document.activeElement === document.body) byId("record-all").focus();
+  }
+
+  /** Take over what an answer brings; says where it was not done. Returns whether it was done everywhere. */
+  told(take, what) {
+    take.sessions.forEach(this.page.onSession);
+    const failed = Object.entries(take.failed);
+    if (failed.length) notice(`${failed.map(([node, why]) => `${node} is ${what}: ${why}`).join(". ")}`, { bad: true });
+    return !failed.length;
+  }
+
+  draw() {
+    const take = this.running();
+    const why = take ? "" : this.page.cannotRecord();
+    byId("record-all").disabled = Boolean(take || why);
+    byId("stop-all").disabled = byId("mark-all").disabled = !take;
+    setData(byId("take-bar"), "running", String(Boolean(take)));
+    byId("take-text").hidden = !take;
+    if (take) {
+      const longest = Math.max(...take.sessions.map((session) => session.duration_s));
+      setText(byId("take-running"), `“${take.name}” on ${nodes(take.sessions.length)}, ${duration(Math.floor(longest))}`);
+    }
+    byId("take-why").hidden = !why;
+    setText(byId("take-why"), why ? `Record all waits: ${why[0].toLowerCase()}${why.slice(1)}` : "");
+  }
+}
+
+const nodes = (count) => `${count} node${count === 1 ? "" : "s"}`;
