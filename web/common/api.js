@@ -53,6 +53,11 @@ export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
 export const listEvents = (session) => call("GET", `/sessions/${id(session)}/events`);
 export const listStances = (session) => call("GET", `/sessions/${id(session)}/stances`);
 export const stancesOverlay = (session) => call("GET", `/sessions/${id(session)}/stances/overlay`);
+export const listComparisons = (session) => call("GET", `/sessions/${id(session)}/comparisons`);
+export const getComparison = (session, name) => call("GET", `/sessions/${id(session)}/comparisons/${id(name)}`);
+export const comparisonSeries = (session, name, query, stop) =>
+  call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${new URLSearchParams(query)}`, undefined, stop);
+export const newestSessions = (limit) => call("GET", `/sessions?limit=${limit}`);
 export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/array`);
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
 export const overview = (session, query, stop) =>

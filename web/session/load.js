@@ -1,6 +1,5 @@
 // Asks the server for bins of what is in view; a question that is out of date is taken back.
 
-import * as api from "../common/api.js";
 import { Bins } from "./bins.js";
 
 const WAIT_MS = 60; // a wheel turns on: only where it stops is asked for
@@ -12,9 +11,12 @@ export const pointsFor = (widthPx, tiles) =>
   Math.round(Math.max(50, Math.min(0.6 * widthPx, VALUES_MOST / (20 + 3 * tiles), 2000)));
 
 export class Loader {
-  /** @param {string} id @param {(bins: Bins) => void} onBins @param {(error: Error) => void} onError */
-  constructor(id, onBins, onError) {
-    this.id = id;
+  /**
+   * @param {(query: object, stop?: AbortSignal) => Promise<object>} question
+   * @param {(bins: Bins) => void} onBins @param {(error: Error) => void} onError
+   */
+  constructor(question, onBins, onError) {
+    this.question = question;
     this.onBins = onBins;
     this.onError = onError;
     this.asked = null; // what the newest answer or question is about
@@ -24,8 +26,16 @@ export class Loader {
   }
 
   async whole(widthPx) {
-    const answer = await api.overview(this.id, { points: pointsFor(widthPx, 8) });
+    const answer = await this.question({ points: pointsFor(widthPx, 8) });
     return new Bins(answer, { from: -Infinity, to: Infinity });
+  }
+
+  /** What was asked for is out of date. */
+  forget() {
+    clearTimeout(this.timer);
+    this.stopping?.abort();
+    this.stopping = this.asked = null;
+    this.busy = false;
   }
 
   /** Bins of a view, soon: none are asked for if `best` has the frames themselves already. */
@@ -46,7 +56,7 @@ export class Loader {
     const margin = MARGIN * (view.to - view.from);
     const covers = { from: Math.max(0, view.from - margin), to: view.to + margin };
     try {
-      const answer = await api.overview(this.id, {
+      const answer = await this.question({
         points: pointsFor(widthPx * (1 + 2 * MARGIN), best.serials.length), start_s: covers.from, end_s: covers.to,
       }, stopping.signal);
       if (stopping.signal.aborted) return;

@@ -18,6 +18,7 @@ const TITLE_PX = 19; // above a plot; a tile's name is in its own
  * @property {number} [factor] from the column's unit to the one shown
  * @property {boolean} [force] stretches in which forces are doubtful are shown over it
  * @property {boolean} [zero] zero is always in sight
+ * @property {boolean} [besideOnly] its numbers are of what is beside the session
  * @property {number} height
  * @property {number} head room above it, for its title
  * @property {number} [tile]
@@ -26,15 +27,22 @@ const TITLE_PX = 19; // above a plot; a tile's name is in its own
 /**
  * @param {import("./bins.js").Bins} bins of the whole session
  * @param {boolean | null} asHeat tiles as colours; null: by their number
+ * @param {import("./beside.js").Beside | null} [beside]
  * @returns {Panel[]}
  */
-export function panelsOf(bins, asHeat) {
+export function panelsOf(bins, asHeat, beside = null) {
   const tiles = bins.serials;
   const panels = [];
   if (bins.estimated) {
     panels.push({
       key: "grf", title: "Ground reaction force", unit: "N", kind: "series", columns: ["grf_n_min", "grf_n_max"],
       band: ["grf_low_n_min", "grf_high_n_max"], bound: "grf_at_least_n_max", force: true, zero: true, height: FORCE_PX, head: TITLE_PX,
+    });
+  }
+  if (bins.estimated && beside?.columns.difference) {
+    panels.push({
+      key: "difference", title: `Ours less ${beside.name}`, unit: "N", kind: "series", columns: beside.columns.difference,
+      besideOnly: true, zero: true, height: PLACE_PX, head: TITLE_PX,
     });
   }
   const [stem, unit] = bins.estimated ? ["force_n", "N"] : ["padc", "counts"];

@@ -4,8 +4,9 @@ import { coloursOf, crisp, decimalsOf, fit, hatching, ticks, whenColoursChange }
 import { byId, number, setData } from "../common/text.js";
 import { KINDS, stretchesOf } from "./flags.js";
 import { HEAD_PX, drawMarks, drawStances, drawTime } from "./overlay.js";
+import { drawTiles } from "./heat.js";
 import { panelsOf } from "./panels.js";
-import { drawBand, drawBound, drawHeat, drawSeries } from "./series.js";
+import { drawBand, drawBound, drawSeries } from "./series.js";
 
 const AXIS_PX = 26;
 const FOOT_PX = 6;
@@ -13,7 +14,7 @@ const ROOM_PX = 240; // of the window, for what is above and below the plots
 const RIGHT_PX = 12;
 const FONT = "600 12px system-ui, sans-serif";
 const NAMES = [
-  "page", "text", "soft", "edge", "grid", "series", "interval", "stance", "contact", "warn-line", "bad-line", "cop",
+  "page", "text", "soft", "edge", "grid", "series", "other", "interval", "stance", "contact", "warn-line", "bad-line", "cop",
   "heat-0", "heat-1", "heat-2", "heat-3",
 ];
 const CONTACT = 2;
@@ -27,6 +28,7 @@ export class Plots {
     this.detail = null;
     this.marks = [];
     this.stances = [];
+    this.beside = null; // drawn over it
     this.asHeat = null;
     this.panels = [];
     this.drawn = []; // where each panel is, and its scale
@@ -37,7 +39,7 @@ export class Plots {
   /** @param {import("./bins.js").Bins} whole */
   show(whole) {
     this.whole = whole;
-    this.panels = panelsOf(whole, this.asHeat);
+    this.panels = panelsOf(whole, this.asHeat, this.beside);
     setData(this.box, "panels", this.panels.map((panel) => panel.key).join(" "));
   }
 
@@ -119,8 +121,9 @@ export class Plots {
       const factor = panel.factor ?? 1;
       const key = panel.group ?? panel.key;
       const scale = scales.get(key) ?? { low: panel.zero ? 0 : Infinity, high: panel.zero ? 0 : -Infinity };
-      for (const [low, high] of [panel.columns, panel.band].filter(Boolean)) {
-        const found = bins.extremes(low, high, begin, end);
+      const own = panel.besideOnly ? [] : [panel.columns, panel.band].filter(Boolean);
+      const all = own.map(([low, high]) => bins.extremes(low, high, begin, end));
+      for (const found of [...all, this.beside?.extremes(panel.key, view)]) {
         if (!found) continue;
         scale.low = Math.min(scale.low, found.low * factor);
         scale.high = Math.max(scale.high, found.high * factor);
@@ -141,13 +144,13 @@ export class Plots {
     const { colours } = this;
     context.textBaseline = "middle";
     let y = null;
-    if (panel.kind === "heat") this.drawTiles(context, panel, box, view, x);
+    if (panel.kind === "heat") drawTiles(this, context, panel, box, view, x);
     else {
       const factor = panel.factor ?? 1;
       const shown = (value) => box.bottom - ((value - scale.low) / (scale.high - scale.low)) * (box.bottom - box.top);
       y = (value) => shown(value * factor);
       this.drawScale(context, box, scale, shown);
-      for (const [bins, from, to] of this.layers(view)) {
+      for (const [bins, from, to] of panel.besideOnly ? [] : this.layers(view)) {
         const [begin, end] = bins.within({ from, to });
         context.save();
         context.beginPath();
@@ -161,9 +164,21 @@ export class Plots {
         if (panel.bound) drawBound(context, bins, b, e, x, y, panel.bound, colours["warn-line"]);
         context.restore();
       }
+      this.drawBeside(context, panel, box, view, x, y);
     }
     this.drawTitle(context, panel, box);
     return y;
+  }
+
+  drawBeside(context, panel, box, view, x, y) {
+    if (!this.beside?.columns[panel.key]) return;
+    context.save();
+    context.beginPath();
+    context.rect(box.left, box.top - 3, box.right - box.left, box.bottom - box.top + 6);
+    context.clip();
+    context.globalAlpha = panel.besideOnly ? 1 : 0.7; // ours stays in sight where both are the same
+    this.beside.draw(context, panel.key, view, x, y, panel.besideOnly ? this.colours.text : this.colours.other);
+    context.restore();
   }
 
   drawTitle(context, panel, box) {
@@ -212,42 +227,6 @@ export class Plots {
       const left = Math.floor(x(bins.first[i]));
       context.fillRect(left, box.bottom + 1, Math.max(1, Math.ceil(x(bins.edge(i))) - left), 4);
     }
-  }
-
-  drawTiles(context, panel, box, view, x) {
-    const { colours, whole } = this;
-    const inner = box;
-    const counts = !whole.estimated;
-    const names = whole.serials.map((_, i) => (counts ? `padc_${i}_min` : `force_n_${i}_max`));
-    this.heat ??= heatRange(whole, counts);
-    const stops = ["heat-0", "heat-1", "heat-2", "heat-3"].map((name) => colours[name]);
-    const rows = names.length;
-    const rowPx = (inner.bottom - inner.top) / rows;
-    for (const [bins, from, to] of this.layers(view)) {
-      const [begin, end] = bins.within({ from, to });
-      const part = { ...inner, left: x(from), right: x(to) };
-      drawHeat(context, bins, begin, end, x, part, { names, ...this.heat, stops });
-    }
-    context.strokeStyle = colours.edge;
-    context.lineWidth = 1;
-    context.strokeRect(crisp(inner.left), crisp(inner.top), inner.right - inner.left - 1, inner.bottom - inner.top);
-    context.fillStyle = colours.text;
-    context.textAlign = "right";
-    context.textBaseline = "middle";
-    const every = Math.max(1, Math.ceil(13 / rowPx));
-    for (let i = 0; i < rows; i += every) context.fillText(whole.serials[i], inner.left - 6, inner.top + (i + 0.5) * rowPx);
-    // What the colours mean, at the right of the title.
-    const bar = { left: inner.right - 130, right: inner.right - 60, top: box.top - 14, bottom: box.top - 4 };
-    const blend = context.createLinearGradient(bar.left, 0, bar.right, 0);
-    stops.forEach((stop, i) => blend.addColorStop(i / (stops.length - 1), stop));
-    context.fillStyle = blend;
-    context.fillRect(bar.left, bar.top, bar.right - bar.left, bar.bottom - bar.top);
-    context.strokeRect(crisp(bar.left), crisp(bar.top), bar.right - bar.left, bar.bottom - bar.top);
-    context.fillStyle = colours.text;
-    const decimals = counts || this.heat.high >= 20 ? 0 : 1;
-    context.fillText(number(this.heat.low, decimals), bar.left - 5, bar.top + 5);
-    context.textAlign = "left";
-    context.fillText(`${number(this.heat.high, decimals)} ${counts ? "" : panel.unit}`, bar.right + 5, bar.top + 6);
   }
 
   pattern(context, colour, way) {
@@ -314,8 +293,8 @@ export class Plots {
     context.stroke();
     if (i < 0) return;
     for (const { panel, y } of this.drawn) {
-      const value = y && bins.columns[panel.columns[1]][i];
-      if (value === null) continue;
+      const value = y && bins.columns[panel.columns[1]]?.[i];
+      if (value === null || value === undefined) continue;
       context.fillStyle = this.colours.text;
       context.strokeStyle = this.colours.page;
       context.beginPath();
@@ -324,19 +303,4 @@ export class Plots {
       context.stroke();
     }
   }
-}
-
-/** Of the whole session, so that a colour means the same at every zoom. */
-function heatRange(bins, counts) {
-  let [low, high] = [Infinity, -Infinity];
-  bins.serials.forEach((_, i) => {
-    const stem = `${counts ? "padc" : "force_n"}_${i}`;
-    const found = bins.extremes(`${stem}_min`, `${stem}_max`, 0, bins.count);
-    if (!found) return;
-    low = Math.min(low, found.low);
-    high = Math.max(high, found.high);
-  });
-  if (!Number.isFinite(low)) return { low: 0, high: 1 };
-  if (counts) return low < high ? { low: high, high: low } : { low: high + 1, high };
-  return { low: 0, high: Math.max(high, 0.1) };
 }

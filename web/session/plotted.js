@@ -29,7 +29,8 @@ export class Plotted {
     this.numbers = new Numbers(session.id);
     this.stances = new Stances((index) => this.goTo(index));
     this.marks = new Marks(session.id, (timeS) => this.goToMark(timeS), () => this.draw());
-    this.loader = new Loader(session.id, (bins) => this.take(bins), (error) => notice(error.message, { bad: true }));
+    this.loader = new Loader(
+      (query, stop) => api.overview(session.id, query, stop), (bins) => this.take(bins), (error) => notice(error.message, { bad: true }));
     this.replay = new Replay({
       at: () => this.cursorS ?? this.view.from, go: (timeS) => this.cursorTo(timeS),
       changed: () => this.draw(), failed: (error) => notice(error.message, { bad: true }),
@@ -88,6 +89,25 @@ export class Plotted {
     this.marks.show(events?.items ?? [], whole.beginNs, offset);
     this.plots.marks = this.marks.placed;
     this.draw();
+    if (sealed) quietly(() => this.showCompare(offset));
+  }
+
+  /** What may be drawn beside it: its modules come when somebody asks, or a reference is there already. */
+  async showCompare(offset) {
+    const none = (error) => { if (!(error instanceof api.Refusal)) throw error; return { items: [] }; };
+    const references = (await api.listComparisons(this.session.id).catch(none)).items;
+    const open = async () => {
+      byId("compare").hidden = true;
+      const { Compare } = await import("./compare.js");
+      await new Compare(this.session, this, offset, references).begin();
+    };
+    const asked = new URLSearchParams(location.search);
+    if (references.length || asked.has("with") || asked.has("against")) return open();
+    byId("compare").hidden = false;
+    byId("compare").addEventListener("click", () => quietly(async () => {
+      await open();
+      byId("beside").focus();
+    }));
   }
 
   /** Stances one upon another: its modules come only where there are stances. */
@@ -139,7 +159,7 @@ export class Plotted {
     // Not at every turn of a wheel: browsers allow few changes of the address in some time.
     clearTimeout(this.linking);
     this.linking = setTimeout(() => {
-      history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS));
+      history.replaceState(null, "", location.pathname + views.toLink(this.view, this.durationS, location.search));
     }, SETTLED_MS);
     this.draw();
   }
@@ -217,6 +237,12 @@ export class Plotted {
     this.draw();
   }
 
+  /** What is beside it is another, or has moved. */
+  redraw() {
+    this.drawnKey = null;
+    this.draw();
+  }
+
   draw() {
     this.drawing ||= requestAnimationFrame(() => {
       this.drawing = 0;
@@ -241,10 +267,13 @@ export class Plotted {
     }
     plots.drawCursor(view, this.cursorS, this.chosen);
     this.loader.want(view, plots.plotWidth, plots.best(view));
+    plots.beside?.want(view, plots.plotWidth);
     const bins = plots.best(view);
-    box.dataset.settled = String(!this.loader.busy);
+    box.dataset.settled = String(!this.loader.busy && !plots.beside?.loader.busy);
+    plots.beside?.tell(view, box);
     drawSummary(bins, view, byId("summary"));
-    const sentence = this.readout.draw(bins, this.cursorS === null ? -1 : bins.at(this.cursorS), plots.panels);
+    const sentence = this.readout.draw(bins, this.cursorS === null ? -1 : bins.at(this.cursorS), plots.panels,
+      this.cursorS === null ? [] : plots.beside?.readings(view, this.cursorS));
     this.replay.draw();
     if (!this.replay.playing.going) this.tellCursor(sentence); // sixty times a second nobody can hear
     byId("as-heat").setAttribute("aria-pressed", String(plots.panels.some((panel) => panel.kind === "heat")));

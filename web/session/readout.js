@@ -74,8 +74,8 @@ export class Readout {
   }
 
   /** @returns {string} the same in a sentence, for who hears the page */
-  draw(bins, i, panels) {
-    const readings = i < 0 ? [] : readingsOf(bins, i, panels);
+  draw(bins, i, panels, beside = []) {
+    const readings = i < 0 ? [] : [...readingsOf(bins, i, panels), ...beside];
     const flags = i < 0 ? [] : flagsInWords(bins, i);
     byId("readout-hint").hidden = i >= 0;
     for (const key of this.cells.keys()) {

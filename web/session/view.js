@@ -43,9 +43,15 @@ export function fromLink(search, durationS) {
   return from < to ? clamped({ from, to }, durationS) : whole(durationS);
 }
 
-/** "?from=1.25&to=2.5", or nothing for the whole session. */
-export function toLink(view, durationS) {
-  if (isWhole(view, durationS)) return "";
+/** "?from=1.25&to=2.5", or nothing for the whole session; what else the address asks for stays. */
+export function toLink(view, durationS, search = "") {
+  const fields = new URLSearchParams(search);
+  fields.delete("from");
+  fields.delete("to");
   const text = (value) => String(Number(value.toFixed(4)));
-  return `?from=${text(view.from)}&to=${text(view.to)}`;
+  if (!isWhole(view, durationS)) {
+    fields.set("from", text(view.from));
+    fields.set("to", text(view.to));
+  }
+  return fields.size ? `?${fields}` : "";
 }

@@ -1,0 +1,112 @@
+// What is drawn over the plots of a session: another session, or a reference, at this session's time.
+
+import { number, setData } from "../common/text.js";
+import { Bins } from "./bins.js";
+import { Loader } from "./load.js";
+import { drawSeries } from "./series.js";
+
+const NEAR_S = 0.05; // further away from an instant a number is not one of it
+
+/** @typedef {import("./view.js").View} View */
+
+export class Beside {
+  /**
+   * @param {object} how
+   * @param {string} how.name for the legend
+   * @param {Record<string, [string, string]>} how.columns least and greatest, by the panel they are drawn in
+   * @param {(query: object, stop?: AbortSignal) => Promise<object>} how.ask for bins, in its own time
+   * @param {() => void} how.onChange
+   * @param {(error: Error) => void} how.onError
+   */
+  constructor({ name, columns, ask, onChange, onError }) {
+    this.name = name;
+    this.columns = columns;
+    this.ask = ask;
+    this.shiftS = 0; // this session's time less its own
+    this.detail = null;
+    this.loader = new Loader((query, stop) => this.asked(query, stop), (bins) => {
+      this.detail = bins;
+      onChange();
+    }, onError);
+  }
+
+  async begin(widthPx) {
+    this.answer = await this.ask({ points: Math.max(50, Math.round(widthPx / 2)) });
+    this.durationS = this.answer.duration_s;
+    this.move(0);
+  }
+
+  /** Moved by so many seconds against this session. */
+  move(shiftS) {
+    this.shiftS = shiftS;
+    this.detail = null;
+    this.loader.forget();
+    this.whole = new Bins(shifted(this.answer, shiftS), { from: -Infinity, to: Infinity });
+  }
+
+  /** In its own time; of what it does not reach to nobody has to be asked. */
+  async asked({ points, start_s: startS, end_s: endS }, stop) {
+    const [begin, end] = [startS - this.shiftS, endS - this.shiftS];
+    if (end <= 0 || begin > this.durationS) return shifted(emptied(this.answer), this.shiftS);
+    return shifted(await this.ask({ points, start_s: Math.max(0, begin), end_s: end }, stop), this.shiftS);
+  }
+
+  /** @param {View} view */
+  best(view) { return this.detail?.contains(view) ? this.detail : this.whole; }
+
+  want(view, widthPx) { this.loader.want(view, widthPx, this.best(view)); }
+
+  extremes(key, view) {
+    const columns = this.columns[key];
+    const bins = this.best(view);
+    return columns ? bins.extremes(...columns, ...bins.within(view)) : null;
+  }
+
+  draw(context, key, view, x, y, colour) {
+    const columns = this.columns[key];
+    if (!columns) return;
+    const bins = this.best(view);
+    const [begin, end] = bins.within(view);
+    drawSeries(context, bins, Math.max(0, begin - 1), Math.min(bins.count, end + 1), x, y, columns, colour);
+  }
+
+  /**
+   * Its force at an instant, as the readout shows numbers.
+   * @returns {[string, string, string][]}
+   */
+  readings(view, timeS) {
+    const bins = this.best(view);
+    const i = bins.at(timeS);
+    if (i < 0 || !this.columns.grf) return [];
+    const there = timeS >= bins.first[i] - NEAR_S && timeS <= bins.edge(i) + NEAR_S;
+    const [low, high] = this.columns.grf.map((name) => bins.columns[name][i]);
+    const value = !there || low === null || high === null ? "–" : low === high ? `${number(high)} N` : `${number(low)} to ${number(high)} N`;
+    return [["beside", this.name, value]];
+  }
+
+  /** Its numbers in view, for whoever reads them from the page. */
+  tell(view, box) {
+    const bins = this.best(view);
+    const [begin, end] = bins.within(view);
+    const found = this.extremes("grf", view);
+    setData(box, "besideMin", found ? String(found.low) : "");
+    setData(box, "besideMax", found ? String(found.high) : "");
+    setData(box, "besideFirstS", end > begin ? String(bins.first[begin]) : "");
+    setData(box, "besideLastS", end > begin ? String(bins.last[end - 1]) : "");
+  }
+}
+
+const shifted = (answer, byS) => ({
+  ...answer,
+  serials: answer.serials ?? [],
+  columns: {
+    part: answer.columns.t_first_s.map(() => 0), // a comparison has none
+    ...answer.columns,
+    t_first_s: answer.columns.t_first_s.map((timeS) => timeS + byS),
+    t_last_s: answer.columns.t_last_s.map((timeS) => timeS + byS),
+  },
+});
+
+const emptied = (answer) => ({
+  ...answer, frames_in_bin: 1, columns: Object.fromEntries(Object.keys(answer.columns).map((name) => [name, []])),
+});

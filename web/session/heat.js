@@ -1,0 +1,57 @@
+// Forces of many tiles as colours: a row for each, and what the colours mean.
+
+import { crisp } from "../common/axes.js";
+import { number } from "../common/text.js";
+import { drawHeat } from "./series.js";
+
+const STOPS = ["heat-0", "heat-1", "heat-2", "heat-3"];
+
+/** @param {import("./plots.js").Plots} plots */
+export function drawTiles(plots, context, panel, box, view, x) {
+  const { colours, whole } = plots;
+  const counts = !whole.estimated;
+  const names = whole.serials.map((_, i) => (counts ? `padc_${i}_min` : `force_n_${i}_max`));
+  plots.heat ??= heatRange(whole, counts);
+  const stops = STOPS.map((name) => colours[name]);
+  const rows = names.length;
+  const rowPx = (box.bottom - box.top) / rows;
+  for (const [bins, from, to] of plots.layers(view)) {
+    const [begin, end] = bins.within({ from, to });
+    drawHeat(context, bins, begin, end, x, { ...box, left: x(from), right: x(to) }, { names, ...plots.heat, stops });
+  }
+  context.strokeStyle = colours.edge;
+  context.lineWidth = 1;
+  context.strokeRect(crisp(box.left), crisp(box.top), box.right - box.left - 1, box.bottom - box.top);
+  context.fillStyle = colours.text;
+  context.textAlign = "right";
+  context.textBaseline = "middle";
+  const every = Math.max(1, Math.ceil(13 / rowPx));
+  for (let i = 0; i < rows; i += every) context.fillText(whole.serials[i], box.left - 6, box.top + (i + 0.5) * rowPx);
+  // What the colours mean, at the right of the title.
+  const bar = { left: box.right - 130, right: box.right - 60, top: box.top - 14, bottom: box.top - 4 };
+  const blend = context.createLinearGradient(bar.left, 0, bar.right, 0);
+  stops.forEach((stop, i) => blend.addColorStop(i / (stops.length - 1), stop));
+  context.fillStyle = blend;
+  context.fillRect(bar.left, bar.top, bar.right - bar.left, bar.bottom - bar.top);
+  context.strokeRect(crisp(bar.left), crisp(bar.top), bar.right - bar.left, bar.bottom - bar.top);
+  context.fillStyle = colours.text;
+  const decimals = counts || plots.heat.high >= 20 ? 0 : 1;
+  context.fillText(number(plots.heat.low, decimals), bar.left - 5, bar.top + 5);
+  context.textAlign = "left";
+  context.fillText(`${number(plots.heat.high, decimals)} ${counts ? "" : panel.unit}`, bar.right + 5, bar.top + 6);
+}
+
+/** Of the whole session, so that a colour means the same at every zoom. */
+function heatRange(bins, counts) {
+  let [low, high] = [Infinity, -Infinity];
+  bins.serials.forEach((_, i) => {
+    const stem = `${counts ? "padc" : "force_n"}_${i}`;
+    const found = bins.extremes(`${stem}_min`, `${stem}_max`, 0, bins.count);
+    if (!found) return;
+    low = Math.min(low, found.low);
+    high = Math.max(high, found.high);
+  });
+  if (!Number.isFinite(low)) return { low: 0, high: 1 };
+  if (counts) return low < high ? { low: high, high: low } : { low: high + 1, high };
+  return { low: 0, high: Math.max(high, 0.1) };
+}
