@@ -258,6 +258,10 @@ class StateError(FootTileError):
     """What is asked for does not fit the present state: recording already, node away."""
 
 
+class ChangedError(StateError):
+    """Somebody else has changed it meanwhile."""
+
+
 class WorkerLostError(StateError):
     """Processes that worked on a task were killed, again and again."""
 

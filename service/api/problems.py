@@ -15,6 +15,7 @@ from starlette.responses import Response
 from starlette.routing import Match, Mount
 
 from devices.errors import (
+    ChangedError,
     FolderGoneError,
     FootTileError,
     StateError,
@@ -31,6 +32,7 @@ _METHODS = ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT")
 
 _STATUS: tuple[tuple[type[FootTileError], HTTPStatus], ...] = (
     (UnknownError, HTTPStatus.NOT_FOUND),
+    (ChangedError, HTTPStatus.PRECONDITION_FAILED),
     (StateError, HTTPStatus.CONFLICT),
     (TareError, HTTPStatus.CONFLICT),
     (FolderGoneError, HTTPStatus.SERVICE_UNAVAILABLE),

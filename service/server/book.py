@@ -5,13 +5,14 @@ Those that were deleted are in the `Trash`, and can be had back until it is empt
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import shutil
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from devices.errors import StateError, StorageError, UnknownError
+from devices.errors import ChangedError, StateError, StorageError, UnknownError
 from service.server.index import Age, SessionIndex
 from service.server_clock import utc_ns
 from service.sessions.restore import restore
@@ -200,14 +201,22 @@ class SessionBook:
         """Replace what is known of a session in memory; its next change is written to disk."""
         self._sessions.put(session)
 
-    def change(self, session_id: str, **changes: object) -> Session:
+    def change(self, session_id: str, *, only_if: str | None = None, **changes: object) -> Session:
         """Change what people say of a session: name, subject, notes, tags.
+
+        Args:
+            session_id: of the session.
+            only_if: only if `said_of` it is still this; None: whatever it is.
+            changes: by name.
 
         Raises:
             UnknownError: no such session.
+            ChangedError: what people say of it is not this any more.
             StorageError: it cannot be written down.
         """
-        return self.keep(self.get(session_id).model_copy(update=changes))
+        session = self.get(session_id)
+        _expect(only_if, said_of(session), f"session {session_id}")
+        return self.keep(session.model_copy(update=changes))
 
     def mark(
         self, session_id: str, label: str, t_ns: int | None, event_id: str | None = None
@@ -231,6 +240,42 @@ class SessionBook:
             write_events(session, self.folder.path(session_id))
         return event
 
+    def change_mark(
+        self, session_id: str, event_id: str, *, only_if: str | None = None, **changes: object
+    ) -> Event:
+        """Rename or move an event; arguments as for `change`.
+
+        Raises:
+            UnknownError: no such session or event.
+            ChangedError: it is not this any more.
+            StorageError: it cannot be written down.
+        """
+        event = self._marked(session_id, event_id, only_if)
+        changed = event.model_copy(update=changes)
+        events = self.get(session_id).events
+        self._keep_marks(session_id, tuple(changed if e.id == event_id else e for e in events))
+        return changed
+
+    def remove_mark(self, session_id: str, event_id: str, *, only_if: str | None = None) -> None:
+        """Take an event away; arguments and errors as for `change_mark`."""
+        self._marked(session_id, event_id, only_if)
+        events = self.get(session_id).events
+        self._keep_marks(session_id, tuple(event for event in events if event.id != event_id))
+
+    def _marked(self, session_id: str, event_id: str, only_if: str | None) -> Event:
+        for event in self.get(session_id).events:
+            if event.id == event_id:
+                _expect(only_if, mark_of(event), f"mark {event.label!r} of session {session_id}")
+                return event
+        raise UnknownError(
+            f"session {session_id} has no mark {event_id[:40]!r}", remedy="It may have been removed"
+        )
+
+    def _keep_marks(self, session_id: str, events: tuple[Event, ...]) -> None:
+        session = self.keep(self.get(session_id).model_copy(update={"events": events}))
+        if session.state == "sealed":
+            write_events(session, self.folder.path(session_id))
+
     def take_out(self, session: Session) -> None:
         """Move a session to the trash.
 
@@ -239,6 +284,28 @@ class SessionBook:
         """
         self.trash.take(session, self.folder)
         self._sessions.take(session.id)
+
+
+def said_of(session: Session) -> str:
+    """What people say of a session, as a short hash: it tells whether someone has changed it."""
+    return _hash(session.model_dump_json(include={"name", "subject", "notes", "tags"}))
+
+
+def mark_of(event: Event) -> str:
+    """An event, as a short hash."""
+    return _hash(event.model_dump_json())
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _expect(wanted: str | None, found: str, what: str) -> None:
+    if wanted is not None and wanted != found:
+        raise ChangedError(
+            f"{what} was changed by somebody else meanwhile",
+            remedy="Look at it as it is now, and change it again",
+        )
 
 
 def _in_words(unreadable: Mapping[str, str]) -> list[str]:

@@ -7,7 +7,7 @@ from http import HTTPStatus
 from itertools import islice
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Header, Query, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from service.api.routes.access import ServerState, problems, stored_table
@@ -22,12 +22,19 @@ SETTLE_S = 5.0
 """How long a stop waits for the sealed file before it answers."""
 
 _UNKNOWN = problems(_404="No such session.", _409="Its files are damaged.")
+_NO_EVENT = problems(_404="No such session or event.", _409="Its files are damaged.")
+_CHANGED = problems(_412="Somebody else has changed it: it is not what If-Match names.")
 _FULL = problems(_507="The data folder cannot be written.")
 
 Name = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200)]
 Text = Annotated[str, StringConstraints(max_length=10_000)]
 Tag = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=100)]
 Tags = Annotated[tuple[Tag, ...], Field(max_length=50)]
+
+
+IfMatch = Annotated[
+    str | None, Header(description="`said` of what is changed, as it was when you looked at it.")
+]
 
 
 class _Body(BaseModel):
@@ -80,6 +87,15 @@ class MarkEvent(_Body):
     )
     id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")] | None = Field(
         default=None, description="Your own, so that what is sent twice is marked once."
+    )
+
+
+class ChangeEvent(_Body):
+    """What is changed of an event; what is left out stays."""
+
+    label: Name | None = None
+    t_ns: Annotated[int, Field(ge=0, lt=2**63, strict=True)] | None = Field(
+        default=None, description="Server's UTC."
     )
 
 
@@ -192,12 +208,15 @@ async def get_session(session_id: str, server: ServerState) -> SessionView:
     "/{session_id}",
     operation_id="changeSession",
     summary="Rename or annotate",
-    responses={**_UNKNOWN, **_FULL},
+    responses={**_UNKNOWN, **_CHANGED, **_FULL},
 )
-async def change(session_id: str, body: ChangeSession, server: ServerState) -> SessionView:
+async def change(
+    session_id: str, body: ChangeSession, server: ServerState, if_match: IfMatch = None
+) -> SessionView:
     """Change name, subject, notes or tags; the sealed data does not change."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
-    return SessionView.of(server.sessions.change(session_id, **changes), server.recorder)
+    session = server.sessions.change(session_id, only_if=_tag(if_match), **changes)
+    return SessionView.of(session, server.recorder)
 
 
 @router.delete(
@@ -223,7 +242,42 @@ async def delete(session_id: str, server: ServerState) -> None:
 async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventView:
     """Note that something happened, now or at an instant."""
     event = server.sessions.mark(session_id, body.label, body.t_ns, body.id)
-    return EventView(**event.model_dump())
+    return EventView.of(event)
+
+
+@router.patch(
+    "/{session_id}/events/{event_id}",
+    operation_id="changeEvent",
+    summary="Rename or move a mark",
+    responses={**_NO_EVENT, **_CHANGED, **_FULL},
+)
+async def change_mark(
+    session_id: str,
+    event_id: str,
+    body: ChangeEvent,
+    server: ServerState,
+    if_match: IfMatch = None,
+) -> EventView:
+    """Change its label or its instant."""
+    changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
+    only_if = _tag(if_match)
+    return EventView.of(
+        server.sessions.change_mark(session_id, event_id, only_if=only_if, **changes)
+    )
+
+
+@router.delete(
+    "/{session_id}/events/{event_id}",
+    operation_id="deleteEvent",
+    summary="Remove a mark",
+    status_code=HTTPStatus.NO_CONTENT,
+    responses={**_NO_EVENT, **_CHANGED, **_FULL},
+)
+async def remove_mark(
+    session_id: str, event_id: str, server: ServerState, if_match: IfMatch = None
+) -> None:
+    """It is gone for good; the same `id` can be marked again."""
+    server.sessions.remove_mark(session_id, event_id, only_if=_tag(if_match))
 
 
 @router.get(
@@ -252,13 +306,19 @@ async def events(
     if format == "parquet":
         return stored_table(session, server.sessions.folder.path(session_id) / EVENTS_NAME)
     marked = sorted(session.events, key=lambda event: event.t_ns)
-    return Page(items=[EventView(**event.model_dump()) for event in marked])
+    return Page(items=[EventView.of(event) for event in marked])
 
 
 @router.get("/{session_id}/ledger", operation_id="getLedger", summary="Ledger", responses=_UNKNOWN)
 async def ledger(session_id: str, server: ServerState) -> Ledger:
     """What became of every frame: recorded, lost for a reason, or still with the node."""
     return server.recorder.ledger(session_id)
+
+
+def _tag(if_match: str | None) -> str | None:
+    """What is expected, of an `If-Match` with or without quotes; any is none."""
+    said = (if_match or "").strip().removeprefix("W/").strip('"')
+    return None if said in ("", "*") else said
 
 
 def _mentions(session: object, q: str) -> bool:

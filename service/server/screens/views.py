@@ -11,12 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from devices.frames import ArrayInfo, ServoInfo
 from service.estimation.tare.tare import TakenFrom, expected_shift_kpa, trend, warmer_k
+from service.server.book import mark_of, said_of
 from service.server.node import ServerNode
 from service.server.ranges import Ranges
 from service.server.recorder import Recorder
 from service.server.tare_keeper import AutoTare
 from service.sessions.tare_file import RecordedTare
-from storage.sessions.folder import Part, Session
+from storage.sessions.folder import Event, Part, Session
 
 T = TypeVar("T")
 
@@ -288,13 +289,17 @@ class SessionView(View):
     calibration_id: str | None
     absolute_scale: Literal["measured", "assumed"] | None
     problem: str | None = Field(description="What a person should know of it.")
+    said: str = Field(
+        description="Hash of name, subject, notes and tags; as `If-Match` it has a change refused "
+        "(412) if somebody else was quicker."
+    )
 
     @classmethod
     def of(cls, session: Session, recorder: Recorder) -> SessionView:
         """Of a session as it is now."""
         ledger = recorder.ledger_of(session)
         made = {"frames", "pending_frames", "lost", "tail_frames_max", "duration_s", "problem"}
-        made |= {"marks", "waits_for"}
+        made |= {"marks", "waits_for", "said"}
         content = session.model_dump(include=set(cls.model_fields) - made)
         return cls(
             **content | {"complete": "lossy" if ledger.lossy else ledger.complete},
@@ -303,6 +308,7 @@ class SessionView(View):
             waits_for=recorder.waits_for(session, ledger),
             lost=ledger.lost,
             marks=len(session.events),
+            said=said_of(session),
             tail_frames_max=ledger.unsynced_tail_max,
             problem=recorder.problem_of(session),
             duration_s=recorder.duration_s(session, ledger.recorded),
@@ -335,6 +341,12 @@ class EventView(View):
     id: str
     label: str
     t_ns: int = Field(description="Server's UTC.")
+    said: str = Field(description="Its hash, as that of a session: for `If-Match`.")
+
+    @classmethod
+    def of(cls, event: Event) -> EventView:
+        """As it is now."""
+        return cls(**event.model_dump(), said=mark_of(event))
 
 
 def tiles_of(info: ArrayInfo, ranges: Ranges | None) -> list[TileView]:
