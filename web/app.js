@@ -2,6 +2,7 @@
 //
 // common/    REST calls, the websocket, dialogs, notices, words and elements
 // live/      panels that draw the newest frame, and the buttons beside them
+// nodes/     the page of all nodes
 // sessions/  the list of recorded sessions, and the trash
 //
 // A panel is a class that owns one element of index.html; it is made here and handed what the
