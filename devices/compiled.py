@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import pickle
+import threading
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from types import CodeType, ModuleType
@@ -24,7 +25,26 @@ from numba.core import serialize
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 F = TypeVar("F", bound=Callable[..., Any])
+_asking = threading.local()
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+
+
+class NotKeptError(Exception):
+    """Machine code is not there yet; to compile it takes some ten seconds."""
+
+
+@contextlib.contextmanager
+def only_kept() -> Iterator[None]:
+    """Nothing is compiled in this thread while the block runs: what is not kept is an error.
+
+    Raises:
+        NotKeptError: something would have to be.
+    """
+    _asking.only_kept = True
+    try:
+        yield
+    finally:
+        _asking.only_kept = False
 
 
 def compiled(function: F) -> F:
@@ -68,11 +88,14 @@ class _Kept(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
-            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # likewise
+            kept = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]  # likewise
         except Exception:  # there is nothing that a garbled pickle may not raise
             with contextlib.suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]  # it is written again
-            return None
+            kept = None
+        if kept is None and getattr(_asking, "only_kept", False):
+            raise NotKeptError(self._name)
+        return kept
 
 
 class _Files(IndexDataCacheFile):

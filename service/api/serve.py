@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import socket
+import sys
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 
 import pyarrow as pa
 import uvicorn
@@ -14,8 +16,9 @@ from fastapi import FastAPI
 
 from service.api.doors import Bounds, Doors, open_files_max
 from service.api.protocols import DoorsConfig, Http, WebSocket, accept
-from service.estimation.warm import warm_up
+from service.estimation.warm import load_kept, warm_up, warming
 from service.link import MESSAGE_BYTES_MAX
+from service.server.server import Server
 
 _GRACE_S = 3
 
@@ -24,11 +27,13 @@ _GRACE_S = 3
 async def serving(
     app: FastAPI, listening: socket.socket, bounds: Bounds | None = None
 ) -> AsyncIterator[None]:
-    """Serve while the block runs; on a new machine the models are compiled before, in seconds."""
+    """Serve while the block runs; on a new machine the models are compiled meanwhile."""
     # Arrow's own pool keeps what any of its threads has used: 190 MB after 200 pictures of a
     # session of 3 h, and 56 with this one, in no more time.
     pa.set_memory_pool(pa.system_memory_pool())
-    await asyncio.to_thread(warm_up)
+    compiling = None
+    if not await asyncio.to_thread(load_kept):
+        compiling = asyncio.create_task(_compile_aside(app.state.server))
     bounds = bounds if bounds is not None else Bounds()
     config = DoorsConfig(
         app,
@@ -55,8 +60,39 @@ async def serving(
             task.result()
         yield
     finally:
+        if compiling is not None:  # first: what is being sealed waits for it
+            compiling.cancel()
+            await asyncio.gather(compiling, return_exceptions=True)
         server.should_exit = True
         await task
+
+
+_COMPILES = "from service.estimation.warm import warm_up; warm_up()"
+_NICENESS = 10
+
+
+async def _compile_aside(of: Server) -> None:
+    """Have the models compiled by a process that leaves time to all others, and load them.
+
+    Where nothing can be kept that was in vain: then they are compiled here, and all wait for it.
+    """
+    with warming():
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-c", _COMPILES),
+            stdin=asyncio.subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for us
+        )
+        try:
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
+            await process.wait()
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+        await asyncio.to_thread(warm_up)
+    for node in of.nodes:
+        of.tell_node(node)
 
 
 _NO_NEWS = (

@@ -1,13 +1,18 @@
-"""Has the models compiled before the first frames come.
+"""Has the models compiled before the first frames are estimated.
 
-On a new machine that takes some ten seconds, in which a server that has begun would not answer;
-later it is half a second, because the result is kept.
+On a new machine that takes some ten seconds, in which a server that compiled would not answer: so
+another process does it, and until then frames go without estimates (`is_warming`). Later it is half
+a second, because the result is kept.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
+from devices.compiled import NotKeptError, only_kept
 from devices.frames import (
     NO_SERVO_AGE,
     NO_SERVO_COUNTS,
@@ -34,6 +39,36 @@ from service.estimation.tare.tare import Tare
 
 _CHIP = (0x3ECE, 0xB3F9, 0xC517, 0x33C8)
 _FRAMES = 8
+
+
+WARMING = "The models are being compiled, once on this machine: until then pressures only."
+_under_way: set[object] = set()
+
+
+def is_warming() -> bool:
+    """Are the models still being compiled, so that an estimate would wait for that?"""
+    return bool(_under_way)
+
+
+@contextmanager
+def warming() -> Iterator[None]:
+    """They are, while the block runs."""
+    each = object()
+    _under_way.add(each)
+    try:
+        yield
+    finally:
+        _under_way.discard(each)
+
+
+def load_kept() -> bool:
+    """Warm up with what another process has compiled before; is all of it there?"""
+    try:
+        with only_kept():
+            warm_up()
+    except NotKeptError:
+        return False
+    return True
 
 
 def warm_up() -> None:

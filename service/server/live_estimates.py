@@ -12,6 +12,7 @@ from devices.arrays import Floats
 from devices.chips.compensation import Compensation
 from devices.errors import FootTileError, TareError
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
+from devices.temperature import hold_temperature
 from service.estimation.calibration import Calibration
 from service.estimation.foot import UNSEEN_NS
 from service.estimation.ladder.plan import make_plan
@@ -24,6 +25,7 @@ from service.estimation.tare.automatic import (
 )
 from service.estimation.tare.tare import Tare
 from service.estimation.tare.unloaded import TareFrames, take_tare
+from service.estimation.warm import is_warming
 from service.server.ranges import Ranges
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
 
@@ -103,6 +105,11 @@ class LiveEstimates:
         yield from left
         if self._run is None:
             yield frames, {}
+            return
+        if is_warming():
+            held, _ = hold_temperature(frames)
+            kpa = self._compensation.readable_kpa(held) - self._run.plan.tare.baseline_kpa
+            yield frames, {"gauge_kpa": kpa}
             return
         for due, columns in self._run.feed(frames, {}):
             self._note_contact(due, columns)

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from devices.errors import DamagedFramesError, FootTileError
+from service.estimation.warm import is_warming
 from service.server import following
 from service.server.book import SessionBook
 from service.server.following import is_all_here, is_unread, ledger_now, sources_now
@@ -27,6 +28,7 @@ from storage.sessions.folder import Session
 log = logging.getLogger("foottile.settling")
 
 _SEAL_AGAIN_S = 10.0
+_COMPILED_S = 0.1
 _UNREAD = "a journal of it cannot be read now, and is tried again: see what the server says of it"
 
 
@@ -159,6 +161,8 @@ class Settling:
 
     async def _seal(self, session_id: str) -> None:
         book = self._book
+        while is_warming():  # or it would compile here, and everything would wait for that
+            await asyncio.sleep(_COMPILED_S)
         try:
             session, folder = book.get(session_id), book.folder.path(session_id)
             node = self._nodes.get(session.node)

@@ -22,6 +22,7 @@ export class Bars {
     let kept = null;
     try { kept = localStorage.getItem(UNIT_KEY); } catch { /* private window */ }
     this.unit = kept === "kPa" ? "kPa" : "N";
+    this.shown = this.unit;
     byId("unit-kpa").addEventListener("click", () => this.choose("kPa"));
     byId("unit-n").addEventListener("click", () => this.choose("N"));
     this.showUnit();
@@ -43,10 +44,10 @@ export class Bars {
 
   /** Build the cells for the node's tiles; nothing happens while they stay the same. */
   fit(node) {
-    const key = JSON.stringify([this.unit, node?.node, node?.tiles]);
+    const key = JSON.stringify([this.shown, node?.node, node?.tiles]);
     if (key === this.key) return;
     this.key = key;
-    this.cells = (node?.tiles ?? []).map((tile) => makeCell(tile, this.unit));
+    this.cells = (node?.tiles ?? []).map((tile) => makeCell(tile, this.shown));
     this.list.replaceChildren(...this.cells.map((cell) => cell.root));
     this.arrange();
   }
@@ -69,14 +70,18 @@ export class Bars {
   }
 
   draw(node, frame, nowMs) {
+    this.shown = hasPressuresOnly(frame) ? "kPa" : this.unit;
     this.fit(node);
     this.range.see(node, frame, nowMs);
     this.cells.forEach((cell, i) => {
       setScale(cell, this.range.of(cell.tile, cell.unit), this.range.automatic);
-      drawCell(cell, readTile(node, i, frame, this.unit), nowMs);
+      drawCell(cell, readTile(node, i, frame, this.shown), nowMs);
     });
   }
 }
+
+/** Before the models are there no force is known: better pressures than nothing that moves. */
+const hasPressuresOnly = (frame) => Boolean(frame?.gauge_kpa?.some(Number.isFinite)) && !frame.force_n.some(Number.isFinite);
 
 function makeCell(tile, unitChosen) {
   const unit = unitOf(tile, unitChosen);

@@ -13,6 +13,7 @@ const WHY = [
   [/^The node is late/, "The computer on the robot could not ask the tiles in time. Some frames are not taken, and those that are have true times; less other work on it helps."],
   [/^No calibration/, "Pressure becomes force only by what was measured of each tile on a bench. Without that pressures are true, and newtons are not made up."],
   [/^Scale assumed/, "Shape and course of the calibration are measured, its newtons are taken from a typical tile. Compare forces with each other, not with a scale."],
+  [/^The models are being compiled/, "The server's models become machine code when it first runs on a machine, which takes most of a minute. Nothing is lost by that: what is recorded meanwhile has its forces when it is sealed."],
   [/^Not tared|^Tare lost/, "The zero of each tile is not known, since pressure of the air and temperature change it. Lift the foot off the ground and press Tare."],
   [/^Tare/, "The zero was taken a while ago or under other conditions, and has moved since. Forces may be off by that; lift the foot and press Tare."],
   [/^Lost/, "These frames were taken or should have been, and are gone for good. What is there is true, and a session says where it has such a gap."],

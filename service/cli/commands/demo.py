@@ -14,7 +14,7 @@ import typer
 
 from devices.errors import FootTileError, needs_extra
 from service.cli.commands.node import calibration_of
-from service.cli.commands.serve import PREPARING, announce
+from service.cli.commands.serve import announce
 from service.cli.options import (
     SECONDS_MAX,
     FootOptions,
@@ -123,7 +123,6 @@ async def _server(
     from service.server.server import Server
 
     server = Server(data)
-    remark(PREPARING)
     async with serving(make_app(server, logins=logins, urls=urls), listening):
         spare_what_is_loaded()
         yield server

@@ -107,14 +107,10 @@ async def _serve(settings: Settings) -> None:
         logins = Logins(token, is_private=settings.private)
         urls = urls_of(listening, settings.host)
         app = make_app(server, hosts=settings.allow_host, logins=logins, urls=urls)
-        remark(PREPARING)
         async with serving(app, listening, settings):
             spare_what_is_loaded()
             announce(urls, settings.data, logins, is_kept=not settings.token)
             await stop.wait()
-
-
-PREPARING = "preparing the models; on a new machine that takes some ten seconds"
 
 
 def announce(urls: list[str], data: Path, logins: Logins, *, is_kept: bool) -> None:
@@ -132,6 +128,7 @@ def announce(urls: list[str], data: Path, logins: Logins, *, is_kept: bool) -> N
     from service.api.address import KEPT_IN
     from service.api.logins import Right
     from service.api.routes.login import with_ticket
+    from service.estimation.warm import WARMING, is_warming
 
     token, has_screen = logins.token, sys.stdout.isatty()
     for url in urls:
@@ -139,6 +136,8 @@ def announce(urls: list[str], data: Path, logins: Logins, *, is_kept: bool) -> N
     if token and has_screen and reaches_others(urls[0]):
         show_code(with_ticket(urls[0], logins.tickets.new(Right.PRESS)))
     remark(f"data in {data}; Ctrl-C ends it")
+    if is_warming():
+        remark(WARMING)
     if not token:
         return
     where = f"$(cat {shlex.quote(str(data / KEPT_IN))})" if is_kept else '"$FOOTTILE_TOKEN"'

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from devices.frames import ArrayInfo, ServoInfo
 from service.estimation.tare.tare import TakenFrom, expected_shift_kpa, trend, warmer_k
 from service.server.book import mark_of, said_of
+from service.estimation.warm import WARMING, is_warming
 from service.server.node import ServerNode
 from service.server.ranges import Ranges
 from service.server.recorder import Recorder
@@ -238,7 +239,7 @@ class NodeView(View):
             lost=lost,
             backlog_frames=node.backlog_frames,
             missed_slots=node.present.missed_slots,
-            troubles=list(node.troubles),
+            troubles=[*node.troubles, *([WARMING] if is_warming() else [])],
             fault_counts=node.fault_counts,
             last_seq=node.last_seq,
             last_t_ns=node.last_t_ns,

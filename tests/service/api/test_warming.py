@@ -1,0 +1,103 @@
+"""A first start: while another process compiles, pressures come and nothing is lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from websockets.sync.client import connect
+
+import service.api.serve
+from service.estimation.warm import WARMING, is_warming
+from tests.service.fake_node import FakeNode, NodeOf
+from tests.service.running import ServeWith
+from tests.waiting import PATIENCE_S, until
+
+
+@pytest.fixture
+def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file; another process "compiles" until it is there."""
+    there = tmp_path / "compiled"
+    waits = f"while not p.Path({str(there)!r}).exists(): t.sleep(0.02)"
+    monkeypatch.setattr(service.api.serve, "load_kept", lambda: False)
+    monkeypatch.setattr(service.api.serve, "_COMPILES", f"import pathlib as p, time as t\n{waits}")
+    return there
+
+
+def shown(node: FakeNode) -> dict[str, object]:
+    """What a screen is shown of frames that come now."""
+    with node.running.socket("/api/v1/live?rate_hz=60") as live:
+        while True:
+            node.deliver(40, now=True)
+            message = json.loads(live.recv(timeout=PATIENCE_S))
+            while message["type"] != "frame":
+                message = json.loads(live.recv(timeout=PATIENCE_S))
+            return dict(message)
+
+
+def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
+    compiled: Path, serve_with: ServeWith, node_of: NodeOf
+) -> None:
+    running = serve_with()
+    node = node_of(running)
+    node.connect()
+    node.tared()
+    assert running.node()["troubles"] == [WARMING]
+    before = shown(node)
+    assert before["grf_n"] is None
+    assert before["force_n"] == [None, None]
+    assert before["gauge_kpa"] == pytest.approx([0.0, 0.0], abs=1.0)
+    session = node.record()
+    node.deliver(300, [20.0, 60.0])
+    running.http.post(f"/sessions/{session.id}/stop")
+    assert session.now()["state"] != "sealed"
+    compiled.touch()
+    until(lambda: not is_warming())
+    until(lambda: running.node()["troubles"] == [])
+    until(lambda: shown(node)["grf_n"] is not None)
+    until(lambda: session.now()["state"] == "sealed")
+    assert "grf_n" in pq.read_schema(session.folder / "frames.parquet").names
+
+
+def test_a_server_that_ends_meanwhile_ends_the_other_process(
+    compiled: Path, serve_with: ServeWith, tmp_path: Path
+) -> None:
+    serve_with()
+    assert is_warming()
+    # `serve_with` ends it, and fails if a task is left over.
+
+
+@pytest.mark.process
+@pytest.mark.soak
+def test_a_machine_on_which_nothing_was_compiled_has_pressures_at_once(tmp_path: Path) -> None:
+    nothing = {
+        "NUMBA_CACHE_DIR": str(tmp_path / "numba"),
+        "XDG_CACHE_HOME": str(tmp_path / "cache"),
+    }
+    command = [sys.executable, "-c", "from service.cli.main import main; main()", "demo"]
+    demo = subprocess.Popen(
+        [*command, "--port=0", f"--data={tmp_path / 'data'}"],
+        env={**os.environ, **nothing},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert demo.stdout is not None
+    try:
+        address = demo.stdout.readline().split()[-1].partition("#")[0].rstrip("/")
+        frames = list[dict[str, Any]]()
+        with connect(f"ws{address[4:]}/api/v1/live?rate_hz=10", proxy=None) as live:
+            while not frames or frames[-1]["grf_n"] is None:
+                message = json.loads(live.recv(timeout=PATIENCE_S))
+                frames += [message] if message["type"] == "frame" else []
+        pressures = [f for f in frames if f["grf_n"] is None and f["gauge_kpa"][0] is not None]
+        assert len(pressures) > 10
+    finally:
+        demo.terminate()
+        demo.wait(PATIENCE_S)
+        demo.stdout.close()
