@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from devices.frames import ArrayInfo, ServoInfo
 from service.estimation.tare.tare import TakenFrom, expected_shift_kpa, trend, warmer_k
-from service.server.book import mark_of, said_of
 from service.estimation.warm import WARMING, is_warming
+from service.server.book import mark_of, said_of
 from service.server.node import ServerNode
 from service.server.ranges import Ranges
 from service.server.recorder import Recorder
