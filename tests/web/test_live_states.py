@@ -38,7 +38,7 @@ def counted(page: Page, session: Recording) -> tuple[int, ...]:
     said = page.locator("#recordings .recording-text").inner_text()
     found = re.search(r"([\d,]+) frames", said)
     assert found is not None, said
-    listed = row_of(page, session).locator(".c-frames").inner_text()
+    listed = row_of(page, session).locator(".c-frames .taken").inner_text()
     here = [int(text.replace(",", "")) for text in (found[1], listed)]
     ledger = sum(part["recorded"] for part in session.ledger()["parts"])
     return (*here, session.now()["frames"], ledger)

@@ -29,8 +29,8 @@ export async function call(method, path, body, stop = null, type = JSON_TYPE) {
     const slow = error.name === "TimeoutError";
     throw new Refusal(slow ? "The server did not answer within 10 s." : "The server cannot be reached.", 0);
   }
-  const read = response.ok && type !== JSON_TYPE ? response.text() : response.json();
-  const answer = response.status === 204 ? null : await read.catch(() => null);
+  const read = () => (response.ok && type !== JSON_TYPE ? response.text() : response.json());
+  const answer = response.status === 204 ? null : await read().catch(() => null);
   if (response.ok) return answer;
   const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
   if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop, type);
@@ -71,8 +71,9 @@ export const deleteSession = (session) => call("DELETE", `/sessions/${id(session
 export const listTrash = () => call("GET", "/trash");
 export const restoreSession = (session) => call("POST", `/trash/${id(session)}/restore`);
 export const emptyTrash = () => call("DELETE", "/trash");
-export const listSessions = (cursor) =>
-  call("GET", `/sessions?limit=20${cursor ? `&cursor=${id(cursor)}` : ""}`);
+/** @param {{limit: number, cursor?: string, q?: string}} query */
+export const listSessions = (query) => call("GET", `/sessions?${new URLSearchParams(query)}`);
+export const zipAddress = (ids) => `${PREFIX}/sessions/zip?ids=${ids.map(id).join(",")}`;
 /** Of a download, with marks if there are any; Parquet without them is the sealed file itself. */
 export const dataAddress = (session, format, part = "") =>
   `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marks ? "&marks=true" : ""}${part}`;

@@ -1,13 +1,18 @@
-// The list of sessions: newest first, kept up to date by the link, more on request.
+// The list of sessions: newest first or as searched for, kept up to date by the link, more as one scrolls.
 
 import * as api from "../common/api.js";
 import { ask, edit } from "../common/dialogs.js";
 import { frames } from "../common/losses.js";
 import { notice, quietly } from "../common/notices.js";
-import { byId, bytes, duration, el, localTime, setText } from "../common/text.js";
+import { byId, el, setText } from "../common/text.js";
+import { Chosen } from "./chosen.js";
+import { counts, head, makeRow } from "./row.js";
 import { plainState } from "./state.js";
 
-const MOST = 500; // a page left open for weeks must not grow without end
+const MOST = 5000; // a page left open for weeks must not grow without end
+const [FIRST, MORE] = [20, 100]; // in an answer
+const AHEAD_PX = 800; // of the end of the list the next are asked for
+const TYPING_MS = 200;
 
 export class Sessions {
   /** `onSession(session)` takes what an answer brings, `onDeleted(id)` what was moved to the trash. */
@@ -15,38 +20,76 @@ export class Sessions {
     this.onSession = onSession;
     this.onDeleted = onDeleted;
     this.box = byId("sessions");
+    this.more = byId("sessions-more");
     this.sessions = new Map();
     this.rows = new Map();
+    this.keys = new WeakMap(); // session -> all that is said of it, to tell what changed
     this.cursor = null;
-    byId("sessions-more").addEventListener("click", () => this.load(this.cursor));
+    this.asked = 0;
+    this.since = null; // what was told of sessions while the newest are asked for: id -> session or null
+    this.q = "";
+    this.all = el("input", { type: "checkbox", "aria-label": "Choose all that are listed" });
+    this.head = head(this.all);
+    this.chosen = new Chosen({ all: this.all, onSession, onDeleted, shown: () => [...this.sessions.values()] });
+    this.more.addEventListener("click", () => this.load(this.cursor));
+    new IntersectionObserver(([one]) => { if (one.isIntersecting) this.load(this.cursor); }, { rootMargin: `${AHEAD_PX}px` }).observe(this.more);
+    const field = byId("sessions-search");
+    let typing = null;
+    field.addEventListener("input", () => {
+      clearTimeout(typing);
+      typing = setTimeout(() => this.search(field.value.trim()), TYPING_MS);
+    });
+  }
+
+  search(q) {
+    if (q === this.q) return;
+    this.q = q;
+    this.reload();
   }
 
   /** Load the newest page, or the one at `cursor`. Quiet: the link already says if the server is gone. */
   async load(cursor = null) {
+    if (cursor && this.loading === cursor) return [];
+    this.loading = cursor;
+    const number = cursor ? this.asked : ++this.asked;
+    const since = cursor ? this.since : this.since = new Map();
     let page;
     try {
-      page = await api.listSessions(cursor);
+      page = await api.listSessions({ limit: cursor ? MORE : FIRST, ...(cursor ? { cursor } : {}), ...(this.q ? { q: this.q } : {}) });
     } catch (error) {
       if (cursor) notice(error.message, { bad: true });
       return [];
+    } finally {
+      if (this.loading === cursor) this.loading = null;
     }
+    if (number !== this.asked) return []; // something else was searched for meanwhile
     const items = page?.items ?? [];
+    if (!cursor) {
+      this.sessions.clear();
+      this.since = null;
+    }
     for (const session of items) this.sessions.set(session.id, session);
-    if (cursor || this.cursor === null) this.cursor = page?.next_cursor ?? null;
+    for (const [id, session] of since ?? []) {
+      if (session) this.sessions.set(id, session);
+      else this.sessions.delete(id);
+    }
+    this.cursor = page?.next_cursor ?? null;
     this.draw();
     return items;
   }
 
   /** After a reconnection: the server may be another one, with other sessions. */
   reload() {
-    this.sessions.clear();
-    this.cursor = null;
     return this.load();
   }
 
   take(session) {
+    if (this.q && !mentions(session, this.q.toLowerCase())) return this.drop(session.id);
+    // An answer that the link has overtaken: what is sealed stays sealed.
+    if (this.sessions.get(session.id)?.state === "sealed" && session.state !== "sealed") return null;
+    this.since?.set(session.id, session);
     this.sessions.set(session.id, session);
-    this.draw();
+    return this.draw();
   }
 
   /** How far an unsealed session has come: in its place, so that its buttons stay as they are. */
@@ -57,80 +100,66 @@ export class Sessions {
     const shown = this.rows.get(id);
     if (plainState(now)[1] !== plainState(session)[1] || !shown) return this.take(now);
     this.sessions.set(id, now);
-    shown.key = JSON.stringify(now);
+    shown.key = this.keyOf(now);
     for (const [cls, text] of Object.entries(counts(now))) setText(shown.row.querySelector(`.${cls}`), text);
   }
 
   drop(id) {
-    this.sessions.delete(id);
-    this.draw();
+    this.since?.set(id, null);
+    if (this.sessions.delete(id)) this.draw();
+  }
+
+  keyOf(session) {
+    let key = this.keys.get(session);
+    if (key === undefined) this.keys.set(session, key = JSON.stringify(session));
+    return key;
   }
 
   draw() {
     const sorted = [...this.sessions.values()].sort((a, b) => b.started_t_ns - a.started_t_ns).slice(0, MOST);
     this.sessions = new Map(sorted.map((session) => [session.id, session]));
-    byId("sessions-more").hidden = this.cursor === null || sorted.length >= MOST;
+    this.more.hidden = this.cursor === null || sorted.length >= MOST;
+    this.chosen.draw();
     if (!sorted.length) {
       this.rows.clear();
       this.box.setAttribute("role", "group"); // a table has rows
-      this.box.replaceChildren(el("p", { cls: "none", text: "No sessions yet. Press Record to start one." }));
+      this.box.replaceChildren(el("p", { cls: "none", text: this.q ? `No session mentions “${this.q}”.` : "No sessions yet. Press Record to start one." }));
       return;
     }
     this.box.setAttribute("role", "table");
     const rows = new Map();
     for (const session of sorted) {
-      const key = JSON.stringify(session);
+      const key = this.keyOf(session);
       const old = this.rows.get(session.id);
-      rows.set(session.id, old?.key === key ? old : { key, row: this.row(session) });
+      rows.set(session.id, old?.key === key ? old : { key, row: makeRow(session, this.chosen.pick(session), this.buttons(session)) });
     }
+    const focused = document.activeElement;
+    const inside = this.box.contains(focused) ? [focused.closest("[data-session-id]")?.dataset.sessionId, focused.dataset.part] : null;
     this.rows = rows;
-    const wanted = [head(), ...[...rows.values()].map(({ row }) => row)];
-    wanted[0] = this.box.querySelector(".head") ?? wanted[0];
-    if (wanted.length !== this.box.children.length || wanted.some((row, i) => row !== this.box.children[i])) {
-      const focused = document.activeElement;
-      const inside = this.box.contains(focused) ? [focused.closest("[data-session-id]")?.dataset.sessionId, focused.dataset.part] : null;
-      this.box.replaceChildren(...wanted);
-      if (inside?.[0]) rows.get(inside[0])?.row.querySelector(`[data-part="${inside[1]}"]`)?.focus();
-    }
+    this.place([this.head, ...[...rows.values()].map(({ row }) => row)]);
+    if (inside?.[0] && !focused.isConnected) rows.get(inside[0])?.row.querySelector(`[data-part="${inside[1]}"]`)?.focus();
   }
 
-  row(session) {
-    const [short, long, weight] = plainState(session);
-    const name = el("a", {
-      cls: "session-name", text: session.name || session.id, "data-part": "open", href: `/sessions/${encodeURIComponent(session.id)}`,
-    });
-    const about = [session.subject, ...(session.tags ?? []).map((tag) => `#${tag}`), session.notes].filter(Boolean).join(" · ");
-    const nameCell = el("div", { cls: "c-name", role: "cell" }, name);
-    if (about) nameCell.append(el("span", { cls: "why about", text: about }));
-    const state = el("div", { cls: "c-state", role: "cell" }, el("span", { cls: `state ${weight}`, text: short }));
-    if (long) state.append(" ", el("span", { cls: "why", text: long }));
-    if (session.absolute_scale === "assumed") state.append(" ", el("span", { cls: "why", text: "Scale assumed." }));
-    const cell = (cls, label, text) => el("div", { cls, role: "cell", "data-label": label, text });
-    return el("div", { cls: "session", role: "row", "data-session-id": session.id, "data-state": session.state, "data-complete": String(session.complete) },
-      nameCell,
-      cell("c-start", "Started", localTime(new Date(session.started_t_ns / 1e6))),
-      cell("c-duration", "Duration", counts(session)["c-duration"]),
-      cell("c-frames", "Frames", counts(session)["c-frames"]),
-      cell("c-marks", "Marks", Number.isFinite(session.marks) ? String(session.marks) : "–"),
-      cell("c-size", "Size", bytes(session.bytes)),
-      state,
-      downloads(session),
-      this.buttons(session));
+  /** Only what is new or gone is touched: a thousand rows are not laid out again for one. */
+  place(wanted) {
+    const kept = new Set(wanted);
+    for (const old of [...this.box.children]) if (!kept.has(old)) old.remove();
+    wanted.forEach((row, i) => { if (this.box.children[i] !== row) this.box.insertBefore(row, this.box.children[i] ?? null); });
   }
 
   /** What can be done with a session in its present state. */
   buttons(session) {
-    const box = el("div", { cls: "c-do", role: "cell" });
+    const made = [];
     const add = (part, text, action) => {
       // Its name begins with what is seen: who speaks to the page says that.
       const button = el("button", { type: "button", cls: "small", text, "data-part": part, "aria-label": `${text}: ${session.name}` });
       button.addEventListener("click", () => quietly(() => action(this.sessions.get(session.id) ?? session)));
-      box.append(button);
+      made.push(button);
     };
     add("edit", "Edit", (now) => this.edit(now));
     if (session.state === "pending") add("seal", session.waits_for === "end" ? "Seal as it is" : "Seal without them", (now) => this.seal(now));
     if (session.state === "sealed" || session.state === "pending") add("delete", "Delete", (now) => this.delete(now));
-    return box;
+    return made;
   }
 
   async edit(session) {
@@ -160,28 +189,8 @@ export class Sessions {
   }
 }
 
-/** What changes while a session grows, by the class of its cell. */
-function counts(session) {
-  return {
-    "c-duration": duration(session.duration_s),
-    "c-frames": Number.isFinite(session.frames) ? session.frames.toLocaleString("en-GB") : "–",
-  };
-}
-
-function head() {
-  const row = el("div", { cls: "head", role: "row" });
-  for (const text of ["Name", "Started", "Duration", "Frames", "Marks", "Size", "State", "Download", "Actions"]) row.append(el("span", { role: "columnheader", text }));
-  return row;
-}
-
-function downloads(session) {
-  const box = el("div", { cls: "c-data", role: "cell" });
-  for (const [format, text] of [["parquet", "Parquet"], ["arrow", "Arrow"], ["csv", "CSV"]]) {
-    if (format === "parquet" && session.state !== "sealed") continue; // it exists only once sealed
-    box.append(el("a", {
-      href: api.dataAddress(session, format), download: "", text, "data-part": format,
-      "aria-label": `Download ${session.name} as ${text}`,
-    }));
-  }
-  return box;
+/** As the server searches. */
+function mentions(session, q) {
+  const said = [session.id, session.name, session.subject, session.notes, session.node, session.scene, ...(session.tags ?? [])];
+  return said.some((text) => text?.toLowerCase().includes(q));
 }

@@ -1,0 +1,90 @@
+// Several sessions chosen: downloaded as one zip file, or moved to the trash.
+
+import * as api from "../common/api.js";
+import { ask } from "../common/dialogs.js";
+import { notice, quietly } from "../common/notices.js";
+import { byId, bytes, el, setText } from "../common/text.js";
+
+const ZIP_MOST = 1000; // as many as the server takes
+
+const many = (count) => `${count} session${count === 1 ? "" : "s"}`;
+
+export class Chosen {
+  /** `all` is the box that chooses all of `shown()`; `onSession`, `onDeleted` as the list has them. */
+  constructor({ all, shown, onSession, onDeleted }) {
+    this.ids = new Set();
+    Object.assign(this, { all, shown, onSession, onDeleted });
+    all.addEventListener("change", () => {
+      this.ids = new Set(all.checked ? shown().map(({ id }) => id) : []);
+      for (const box of document.querySelectorAll("#sessions .session .c-pick input")) box.checked = all.checked;
+      this.draw();
+    });
+    byId("chosen-delete").addEventListener("click", () => quietly(() => this.delete()));
+    byId("chosen-none").addEventListener("click", () => {
+      all.checked = false;
+      all.dispatchEvent(new Event("change"));
+      all.focus();
+    });
+  }
+
+  /** The box in a session's row. */
+  pick(session) {
+    const box = el("input", { type: "checkbox", "data-part": "pick", "aria-label": `Choose ${session.name || session.id}` });
+    box.checked = this.ids.has(session.id);
+    box.addEventListener("change", () => {
+      if (box.checked) this.ids.add(session.id);
+      else this.ids.delete(session.id);
+      this.draw();
+    });
+    return box;
+  }
+
+  /** Those that are chosen and still listed. */
+  get sessions() {
+    return this.shown().filter(({ id }) => this.ids.has(id));
+  }
+
+  draw() {
+    const chosen = this.sessions;
+    const listed = this.shown().length;
+    this.all.checked = listed > 0 && chosen.length === listed;
+    this.all.indeterminate = chosen.length > 0 && chosen.length < listed;
+    byId("chosen").hidden = !chosen.length;
+    const sealed = chosen.filter(({ state }) => state === "sealed");
+    const size = sealed.reduce((sum, session) => sum + (session.bytes ?? 0), 0);
+    const left = chosen.length - sealed.length;
+    setText(byId("chosen-text"), `${chosen.length} chosen${left ? `, ${left} not sealed yet and not in a zip file` : ""}`);
+    const zip = byId("chosen-zip");
+    const can = sealed.length > 0 && sealed.length <= ZIP_MOST;
+    setText(zip, can ? `Download ${many(sealed.length)} as zip, ${bytes(size)}` : sealed.length ? `At most ${ZIP_MOST} in a zip file` : "Nothing to download");
+    if (can) zip.href = api.zipAddress(sealed.map(({ id }) => id));
+    else zip.removeAttribute("href");
+  }
+
+  async delete() {
+    const chosen = this.sessions.filter(({ state }) => state === "sealed" || state === "pending");
+    const left = this.sessions.length - chosen.length;
+    if (!chosen.length) return notice("What is being recorded cannot be deleted: stop it first.", { bad: true });
+    const sure = await ask(`Move ${many(chosen.length)} to the trash?`,
+      `They can be had back from there until it is emptied.${left ? ` ${many(left)} that ${left === 1 ? "is" : "are"} being recorded stay${left === 1 ? "s" : ""}.` : ""}`,
+      `Delete ${many(chosen.length)}`);
+    if (!sure) return null;
+    const gone = [];
+    try {
+      for (const session of chosen) {
+        await api.deleteSession(session.id);
+        gone.push(session.id);
+        this.ids.delete(session.id);
+        this.onDeleted(session.id);
+      }
+    } finally {
+      this.draw();
+      if (gone.length) notice(`${many(gone.length)} moved to the trash.`, { undo: () => quietly(() => this.restore(gone)) });
+    }
+    return null;
+  }
+
+  async restore(ids) {
+    for (const id of ids) this.onSession(await api.restoreSession(id));
+  }
+}
