@@ -14,9 +14,13 @@ export class Refusal extends Error {
 
 const JSON_TYPE = "application/json";
 
-/** Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. `stop` takes it back. */
-export async function call(method, path, body, stop = null, type = JSON_TYPE) {
+/**
+ * Call the API; resolves to the parsed answer (null for 204), rejects with a Refusal. `stop` takes it back;
+ * with `said` it is refused (412) if what is changed is not that any more.
+ */
+export async function call(method, path, body, stop = null, type = JSON_TYPE, said = null) {
   const headers = { Accept: type };
+  if (said !== null) headers["If-Match"] = `"${said}"`;
   if (body !== undefined) headers["Content-Type"] = JSON_TYPE;
   let response;
   try {
@@ -33,7 +37,7 @@ export async function call(method, path, body, stop = null, type = JSON_TYPE) {
   const answer = response.status === 204 ? null : await read().catch(() => null);
   if (response.ok) return answer;
   const detail = answer?.detail || answer?.title || `The server refused (${response.status}).`;
-  if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop, type);
+  if (response.status === 401 && await askToLogIn()) return call(method, path, body, stop, type, said);
   throw new Refusal(String(detail), response.status);
 }
 
@@ -59,13 +63,19 @@ export const comparisonSeries = (session, name, query, stop) =>
   call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${new URLSearchParams(query)}`, undefined, stop);
 export const newestSessions = (limit) => call("GET", `/sessions?limit=${limit}`);
 export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/array`);
+export const ledgerOf = (session) => call("GET", `/sessions/${id(session)}/ledger`);
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
 export const overview = (session, query, stop) =>
   call("GET", `/sessions/${id(session)}/overview?${new URLSearchParams(query)}`, undefined, stop);
 /** Some seconds of a session's frames, as CSV. */
 export const samples = (session, query) =>
   call("GET", `/sessions/${id(session)}/data?${new URLSearchParams({ format: "csv", marks: "false", ...query })}`, undefined, null, "text/csv");
-export const changeSession = (session, changes) => call("PATCH", `/sessions/${id(session)}`, changes);
+export const changeSession = (session, changes, said = null) =>
+  call("PATCH", `/sessions/${id(session)}`, changes, null, JSON_TYPE, said);
+export const changeMark = (session, mark, changes, said) =>
+  call("PATCH", `/sessions/${id(session)}/events/${id(mark)}`, changes, null, JSON_TYPE, said);
+export const removeMark = (session, mark, said) =>
+  call("DELETE", `/sessions/${id(session)}/events/${id(mark)}`, undefined, null, JSON_TYPE, said);
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/seal`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);
 export const listTrash = () => call("GET", "/trash");

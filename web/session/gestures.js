@@ -11,6 +11,9 @@ const WHEEL_STEP = 0.0018;
  * @property {(fromPx: number, toPx: number) => void} choose it is chosen; equal: never mind
  * @property {(factor: number, px: number) => void} zoom
  * @property {(byPx: number) => void} move
+ * @property {(px: number, py: number) => boolean} grab something is here that can be moved
+ * @property {(px: number) => void} drag it is moved here
+ * @property {(px: number | null) => void} drop it stays here; null: where it was
  * @property {() => void} all
  * @property {(event: KeyboardEvent) => boolean} key whether it meant something
  */
@@ -21,14 +24,21 @@ export function listen(box, means) {
   let fromPx = null; // of a stretch that is chosen with the mouse
   let lastTap = { atMs: -Infinity, px: 0 };
   let pinch = null;
+  let grabbedPx = null; // where something was taken hold of that can be moved
   const place = (event) => event.clientX - box.getBoundingClientRect().left;
 
   box.addEventListener("pointerdown", (event) => {
     if (event.pointerType === "mouse" && event.button !== 0) return;
     box.setPointerCapture(event.pointerId);
     down.set(event.pointerId, place(event));
+    const py = event.clientY - box.getBoundingClientRect().top;
+    if (down.size === 1 && means.grab(place(event), py)) {
+      grabbedPx = place(event);
+      return;
+    }
     if (down.size === 2) {
-      fromPx = null;
+      if (grabbedPx !== null) means.drop(null);
+      grabbedPx = fromPx = null;
       pinch = spanOf(down);
     } else if (event.pointerType === "mouse" && !event.shiftKey) fromPx = place(event);
     else means.point(place(event));
@@ -42,6 +52,10 @@ export function listen(box, means) {
       return;
     }
     down.set(event.pointerId, px);
+    if (grabbedPx !== null) {
+      if (Math.abs(px - grabbedPx) > CLICK_PX) means.drag(px);
+      return;
+    }
     if (pinch && down.size === 2) {
       const now = spanOf(down);
       means.move(pinch.middle - now.middle);
@@ -58,6 +72,13 @@ export function listen(box, means) {
     if (!down.has(event.pointerId)) return;
     const px = place(event);
     down.delete(event.pointerId);
+    if (grabbedPx !== null) {
+      const moved = event.type === "pointerup" && Math.abs(px - grabbedPx) > CLICK_PX;
+      grabbedPx = null;
+      means.drop(moved ? px : null);
+      if (event.type === "pointerup" && !moved) means.point(px);
+      return;
+    }
     if (pinch) {
       if (!down.size) pinch = null; // the other finger has not become a cursor
       return;

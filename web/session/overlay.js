@@ -76,6 +76,7 @@ export function drawMarks(plots, context, view, x, bottom) {
   context.textAlign = "left";
   context.textBaseline = "middle";
   let freeFrom = -Infinity;
+  plots.flags = [];
   for (const mark of plots.marks) {
     if (mark.timeS < view.from || mark.timeS > view.to) continue;
     const at = crisp(x(mark.timeS));
@@ -97,5 +98,12 @@ export function drawMarks(plots, context, view, x, bottom) {
     context.fillRect(left, 0, width, 16);
     context.fillStyle = colours.page;
     context.fillText(text, left + 5, 8.5);
+    plots.flags.push({ id: mark.id, left, right: left + width });
   }
+}
+
+/** The mark whose flag is at a place; null: there is none. @param {Plots} plots */
+export function flagAt(plots, px, py) {
+  const inside = (plots.flags ?? []).filter(({ left, right }) => py <= 20 && px >= left - 4 && px <= right + 4);
+  return inside.at(-1)?.id ?? null;
 }

@@ -1,17 +1,21 @@
 // The page of one session: asks for it, and plots what there is; for as long as it is not sealed, again and again.
 
 import * as api from "../common/api.js";
+import { edit } from "../common/dialogs.js";
 import { enter } from "../common/login.js";
-import { quietly } from "../common/notices.js";
+import { notice, quietly } from "../common/notices.js";
 import { byId, setText } from "../common/text.js";
 import { plainState } from "../sessions/state.js";
 import { drawHeader } from "./header.js";
+import { LedgerCard } from "./ledger.js";
 import { Plotted } from "./plotted.js";
 
 const AGAIN_MS = 1000;
 
 const id = decodeURIComponent(location.pathname.split("/").pop());
 let plotted = null;
+let now = null; // the session as it was last heard of
+const ledger = new LedgerCard();
 
 async function look() {
   let session;
@@ -27,6 +31,9 @@ async function look() {
   }
   document.title = `${session.name} – FootTile`;
   drawHeader(session);
+  now = session;
+  byId("edit").hidden = false;
+  ledger.show(session);
   plotted ??= new Plotted(session);
   if (session.state !== "sealed") {
     say(session.state === "recording" ? "Being recorded" : "Not sealed yet", [WHY[session.state] ?? session.problem ?? "", plainState(session)[1]].join(" ").trim());
@@ -48,6 +55,24 @@ async function look() {
     if (error.status === 0) setTimeout(look, 3 * AGAIN_MS);
   }
 }
+
+/** What people say of it. Who was overtaken by somebody else is told, and shown what they wrote. */
+async function change() {
+  const before = now;
+  const changes = await edit(before);
+  if (!changes) return;
+  try {
+    now = await api.changeSession(id, changes, before.said);
+  } catch (error) {
+    if (error.status !== 412) throw error;
+    notice(error.message, { bad: true });
+    now = await api.getSession(id);
+  }
+  document.title = `${now.name} – FootTile`;
+  drawHeader(now);
+}
+
+byId("edit").addEventListener("click", () => quietly(change));
 
 function say(title, text) {
   byId("message").hidden = false;

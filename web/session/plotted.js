@@ -9,6 +9,7 @@ import { drawLegend } from "./legend.js";
 import { Loader } from "./load.js";
 import { Marks } from "./marks.js";
 import { Numbers } from "./numbers.js";
+import { flagAt } from "./overlay.js";
 import { savePicture } from "./picture.js";
 import { Plots } from "./plots.js";
 import { Readout, drawSummary } from "./readout.js";
@@ -28,7 +29,10 @@ export class Plotted {
     this.readout = new Readout();
     this.numbers = new Numbers(session.id);
     this.stances = new Stances((index) => this.goTo(index));
-    this.marks = new Marks(session.id, (timeS) => this.goToMark(timeS), () => this.draw());
+    this.marks = new Marks(session.id, {
+      go: (timeS) => this.goToMark(timeS), cursor: () => this.cursorS,
+      changed: () => { this.plots.marks = this.marks.placed; this.draw(); },
+    });
     this.loader = new Loader(
       (query, stop) => api.overview(session.id, query, stop), (bins) => this.take(bins), (error) => notice(error.message, { bad: true }));
     this.replay = new Replay({
@@ -123,6 +127,9 @@ export class Plotted {
     const scale = () => (this.view.to - this.view.from) / plots.plotWidth;
     listen(byId("plots"), {
       point: (px, hovering = false) => { if (!hovering || !this.replay.playing.going) this.point(time(px)); },
+      grab: (px, py) => { const id = flagAt(plots, px, py); return id !== null && this.marks.grab(id); },
+      drag: (px) => this.marks.drag(time(px)),
+      drop: (px) => this.marks.drop(px === null ? null : time(px)),
       choosing: (from, to) => { this.chosen = [time(from), time(to)]; this.draw(); },
       choose: (from, to) => {
         this.chosen = null;
@@ -257,7 +264,7 @@ export class Plotted {
     box.dataset.whole = String(views.isWhole(view, this.durationS));
     box.dataset.from = view.from.toFixed(4);
     box.dataset.to = view.to.toFixed(4);
-    const drawnKey = [view.from, view.to, plots.width, plots.whole, plots.detail, plots.marks.length, plots.stances.length, plots.asHeat,
+    const drawnKey = [view.from, view.to, plots.width, plots.whole, plots.detail, this.marks.version, plots.stances.length, plots.asHeat,
       this.stances.current, plots.colours, devicePixelRatio];
     if (drawnKey.some((one, i) => one !== this.drawnKey?.[i])) {
       plots.draw(view, this.stances.current);

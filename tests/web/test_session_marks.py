@@ -1,0 +1,128 @@
+"""Marks and what people say of a session, changed on its page; also by two people at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.service.recording import Recording
+from tests.web.conftest import wait_until
+from tests.web.scripted import Scripted
+from tests.web.test_accessible import complaints
+
+pytestmark = pytest.mark.real_time
+
+OpenPage = Callable[..., Page]
+
+
+@pytest.fixture
+def session(scripted: Scripted) -> Recording:
+    """A sealed session with a mark in its middle."""
+    session = scripted.recorded("walk")
+    t_ns = session.column("t_ns")
+    clock = session.clock()["streams"][0]["stretches"][0]
+    middle = int(t_ns[len(t_ns) // 2]) + clock["offset_ns"]
+    answer = session.running.http.post(
+        f"{session.url}/events", json={"label": "a stone", "t_ns": middle}
+    )
+    assert answer.status_code == 201
+    return session
+
+
+def marks(session: Recording) -> list[dict[str, Any]]:
+    items: list[dict[str, Any]] = session.running.http.get(f"{session.url}/events").json()["items"]
+    return items
+
+
+def opened(session: Recording, open_page: OpenPage) -> Page:
+    page = open_page(f"{session.running.url}/sessions/{session.id}")
+    expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
+    expect(page.locator("#marks-list li")).to_have_count(len(marks(session)))
+    return page
+
+
+def test_a_mark_is_renamed_moved_to_the_cursor_dragged_and_removed(
+    session: Recording, open_page: OpenPage
+) -> None:
+    page = opened(session, open_page)
+    before = marks(session)[0]
+    page.click("#marks-list [aria-label='Change the mark a stone']")
+    assert complaints(page) == []
+    page.fill("#mark-label", "a boulder")
+    page.press("#mark-label", "Enter")
+    expect(page.locator("#marks-list")).to_contain_text("a boulder")
+    renamed = marks(session)[0]
+    assert (renamed["label"], renamed["t_ns"]) == ("a boulder", before["t_ns"])
+
+    page.keyboard.press("ArrowRight")  # the second frame
+    expect(page.locator("#readout")).not_to_have_attribute("data-time-s", "")
+    page.click("#marks-list [aria-label='Change the mark a boulder']")
+    page.click("#mark-to-cursor")
+    page.click("#mark-dialog [value=ok]")
+    wait_until(lambda: marks(session)[0]["t_ns"] != before["t_ns"], "the mark to move")
+    t_ns = session.column("t_ns")
+    offset_ns = session.clock()["streams"][0]["stretches"][0]["offset_ns"]
+    assert marks(session)[0]["t_ns"] - offset_ns == pytest.approx(int(t_ns[1]), abs=2e5)
+
+    page.locator("#plots").evaluate("(plots) => plots.scrollIntoView()")
+    box = page.locator("#plots").bounding_box()
+    assert box is not None
+    at_px = page.locator("#plots").evaluate("(plots) => plots.clientWidth < 600 ? 40 : 56")
+    moved = marks(session)[0]["t_ns"]
+    page.mouse.move(box["x"] + at_px + 12, box["y"] + 8)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 200, box["y"] + 8, steps=3)
+    page.mouse.up()
+    wait_until(lambda: marks(session)[0]["t_ns"] > moved, "the flag to be where it was let go")
+    dragged_s = (marks(session)[0]["t_ns"] - offset_ns - int(t_ns[0])) * 1e-9
+    shown = page.locator("#marks-list li").get_attribute("data-time-s")
+    assert float(shown or "nan") == pytest.approx(dragged_s, abs=1e-4)
+    assert page.locator("#plots").get_attribute("data-whole") == "true"
+
+    page.click("#marks-list [aria-label='Change the mark a boulder']")
+    page.click("#mark-dialog [value=remove]")
+    expect(page.locator("#marks-list li")).to_have_count(0)
+    assert marks(session) == []
+
+
+def test_what_people_say_is_changed_and_the_second_of_two_is_told(
+    session: Recording, open_page: OpenPage
+) -> None:
+    one, other = opened(session, open_page), opened(session, open_page)
+    one.click("#edit")
+    one.fill("#edit-notes", "slipped twice")
+    one.fill("#edit-tags", "wet, mud")
+    other.click("#edit")
+    one.click("#edit-dialog [value=ok]")
+    expect(one.locator("#about")).to_contain_text("slipped twice")
+    expect(one.locator("#about")).to_contain_text("#wet #mud")
+    assert session.now()["tags"] == ["wet", "mud"]
+    other.fill("#edit-notes", "all went well")
+    other.click("#edit-dialog [value=ok]")
+    expect(other.locator("#notices")).to_contain_text("changed by somebody else")
+    expect(other.locator("#about")).to_contain_text("slipped twice")
+    assert session.now()["notes"] == "slipped twice"
+
+    mark = marks(session)[0]
+    one.click("#marks-list [aria-label='Change the mark a stone']")
+    url = f"{session.url}/events/{mark['id']}"
+    assert session.running.http.patch(url, json={"label": "water"}).status_code == 200
+    one.fill("#mark-label", "sand")
+    one.press("#mark-label", "Enter")
+    expect(one.locator("#notices")).to_contain_text("changed by somebody else")
+    expect(one.locator("#marks-list")).to_contain_text("water")
+    assert marks(session)[0]["label"] == "water"
+
+
+def test_it_says_what_became_of_every_frame(session: Recording, open_page: OpenPage) -> None:
+    page = opened(session, open_page)
+    page.click("#ledger-card summary")
+    said = page.locator("#ledger")
+    now = session.now()
+    expect(said).to_contain_text(f"{now['frames']:,} frames are in it.")
+    expect(said).to_contain_text("none is lost")
+    expect(said).to_contain_text(now["sha256"])
+    assert complaints(page) == []
