@@ -85,6 +85,9 @@ def test_a_viewer_is_offered_nothing_and_the_server_refuses_it(
         )
         assert status == 403
         assert recorded(server) == ["by another one"]
+        page.evaluate("(url) => { location.href = url; }", address(server))  # in the same tab
+        expect(page.locator("#record")).to_be_visible()
+        expect(page.locator("#login")).to_be_hidden()
 
 
 def test_a_private_server_shows_nothing_before_a_login_and_says_when_that_has_ended(

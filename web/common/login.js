@@ -41,6 +41,13 @@ export async function enter() {
   draw();
 }
 
+// An address that differs in this part only, opened in the same tab, loads nothing by itself.
+addEventListener("hashchange", async () => {
+  if (!/[#&](ticket|token)=/.test(location.hash)) return;
+  await enter();
+  if (!refused) location.reload();
+});
+
 /** Ask the server who we are; while it is away nothing changes. */
 export async function look() {
   await ask("GET");
