@@ -12,6 +12,9 @@ from devices.errors import UnknownError
 from service.estimation.stance_overlay import OVERLAID, Overlay, StanceOverlay, evenly
 from storage.sessions.reader import SessionReader
 
+STANCES_MAX = 4000
+"""Of more stances than this so many are overlaid, evenly over the session: two seconds of work."""
+
 
 @dataclass(frozen=True)
 class SessionOverlay:
@@ -20,13 +23,15 @@ class SessionOverlay:
     Attributes:
         overlay: them.
         numbers: of the stances that are there one by one, in the order of its rows.
-        overlaid: how many stances mean and spread are of.
+        whole: how many stances could be overlaid.
+        overlaid: how many of them mean and spread are of: all, or `STANCES_MAX`.
         not_whole: how many are left out since they were not seen whole.
         too_short: how many are left out since they are one frame, and last no time.
     """
 
     overlay: Overlay
     numbers: tuple[int, ...]
+    whole: int
     overlaid: int
     not_whole: int
     too_short: int
@@ -54,7 +59,8 @@ def overlay_of_session(
             remedy="`foottile estimate` makes them",
         )
     whole = stances.filter(stances["is_whole"])
-    taken = whole.filter(pc.greater(whole["end_t_ns"], whole["begin_t_ns"]))
+    long = whole.filter(pc.greater(whole["end_t_ns"], whole["begin_t_ns"]))
+    taken = long.take(evenly(long.num_rows, STANCES_MAX))
     part, begin_ns, end_ns = (taken[name].to_numpy() for name in ("part", "begin_t_ns", "end_t_ns"))
     rows = evenly(taken.num_rows, curves)
     gathered = StanceOverlay(part, begin_ns, end_ns, points=points, rows=rows.tolist())
@@ -67,7 +73,8 @@ def overlay_of_session(
     return SessionOverlay(
         overlay,
         tuple(taken["number"].to_numpy()[overlay.rows].tolist()),
+        whole=long.num_rows,
         overlaid=taken.num_rows,
         not_whole=stances.num_rows - whole.num_rows,
-        too_short=whole.num_rows - taken.num_rows,
+        too_short=whole.num_rows - long.num_rows,
     )

@@ -42,15 +42,15 @@ function shown(value, unit, factor, fixed) {
 const between = (interval, unit, factor, fixed) =>
   (Array.isArray(interval) ? `${shown(interval[0], unit, factor, fixed)} to ${shown(interval[1], unit, factor, fixed)}` : "–");
 
-/** "250.1 ms (95 %: 249.7 to 250.5 ms)" */
-const certain = ({ value, interval_95: [low, high] }, unit, factor, decimals) =>
-  `${number(value * factor, decimals)} ${unit} (95 %: ${number(low * factor, decimals)} to ${number(high * factor, decimals)} ${unit})`;
+/** "250.1 ms of it (95 %: 249.7 to 250.5 ms)" */
+const certain = ({ value, interval_95: [low, high] }, unit, factor, decimals, of = "") =>
+  `${number(value * factor, decimals)} ${unit}${of} (95 %: ${number(low * factor, decimals)} to ${number(high * factor, decimals)} ${unit})`;
 
 function alignmentWords({ alignment, contact_n: contactN, trials_are: trialsAre, trials }) {
   const parts = [];
   const { lag_s: lag, scale, offset_in_flight_n: zero, offset_removed: removed } = alignment;
-  if (lag) parts.push(`Its clock is ${certain(lag, "ms", 1e3, 1)} ahead of the session's, which is taken off.`);
-  if (scale) parts.push(`One newton of it is ${certain(scale, "N", 1, 3)} of ours, which is not.`);
+  if (lag) parts.push(`Its clock is ${certain(lag, "ms", 1e3, 1, " ahead of the session's")}, which is taken off.`);
+  if (scale) parts.push(`One newton of it is ${certain(scale, "N", 1, 3, " of ours")}; nothing is scaled by that.`);
   if (zero) parts.push(`In flight it reads ${certain(zero, "N", 1, 2)}, ${removed ? "which is taken off" : "which is not taken off"}.`);
   if (known(contactN)) parts.push(`It bears load from ${shown(contactN, "N", 1)} on.`);
   if (trialsAre && trials) parts.push(`Trials: ${trialsAre}; ${trials.length} of them.`);

@@ -62,11 +62,12 @@ export class StanceOverlay {
   }
 
   sentence() {
-    const { overlaid, not_whole: cut, too_short: short, curves } = this.answer;
+    const { whole, overlaid, not_whole: cut, too_short: short, curves } = this.answer;
     const many = (n, what) => `${n.toLocaleString("en-GB")} ${what}${n === 1 ? "" : "s"}`;
     if (!overlaid) return "No stance was seen whole: there is nothing to lay one upon another.";
-    const parts = [`${many(overlaid, "whole stance")}, each from its first frame in contact to its last.`];
-    if (curves.length < overlaid) parts.push(`${curves.length} of them are drawn one by one, evenly over the session; mean and spread are of all.`);
+    const parts = [`${many(whole, "whole stance")}, each from its first frame in contact to its last.`];
+    const of = overlaid < whole ? `${overlaid.toLocaleString("en-GB")} that lie evenly as well` : "all";
+    if (curves.length < whole) parts.push(`${curves.length} of them are drawn one by one, evenly over the session; mean and spread are of ${of}.`);
     if (cut) parts.push(`${many(cut, "stance")} not seen whole ${cut === 1 ? "is" : "are"} left out.`);
     if (short) parts.push(`${many(short, "stance")} of a single frame ${short === 1 ? "is" : "are"} left out.`);
     if (overlaid === 1) parts.push("Of one stance there is no spread.");

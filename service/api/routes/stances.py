@@ -132,7 +132,10 @@ class OverlayView(BaseModel):
 
     session_id: str
     points: int
-    overlaid: int = Field(description="Stances of which mean and spread are.")
+    whole: int = Field(description="Stances that can be overlaid.")
+    overlaid: int = Field(
+        description="Of so many are mean and spread: of all, or 4000 evenly over the session."
+    )
     not_whole: int = Field(description="Left out, since they were not seen whole.")
     too_short: int = Field(description="Left out, since they are a single frame.")
     spread: dict[str, SpreadView] = Field(description="Of grf_n, cop_x_m and cop_y_m.")
@@ -199,6 +202,7 @@ def _overlay(session: Session, query: OverlayQuery, server: Server) -> bytes:
     content = {
         "session_id": session.id,
         "points": query.points,
+        "whole": found.whole,
         "overlaid": found.overlaid,
         "not_whole": found.not_whole,
         "too_short": found.too_short,

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import service.sessions.stance_overlay
 import service.sessions.stances
 from devices.errors import StorageError
 from service.estimation.stances import GATHERED, Stances, stances_of
@@ -184,13 +185,21 @@ def test_stances_one_upon_another_are_those_of_the_file(tared: FakeNode) -> None
     assert spread["count"] == [3] * 101
 
 
-def test_of_many_stances_some_are_there_one_by_one_and_the_mean_is_of_all(tared: FakeNode) -> None:
+def test_of_many_stances_some_are_there_one_by_one_and_the_mean_is_of_all(
+    tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
     session = hopped(tared)
     http, url = session.running.http, f"{session.url}/stances/overlay"
     answer = http.get(url, params={"curves": 1, "points": 11})
     found = answer.json()
     assert (found["points"], found["overlaid"], len(found["curves"])) == (11, 2, 1)
     assert found["spread"]["grf_n"]["count"] == [2] * 11
+    assert found["whole"] == 2
+    with monkeypatch.context() as patch:
+        patch.setattr(service.sessions.stance_overlay, "STANCES_MAX", 1)
+        fewer = http.get(url, params={"points": 11}).json()
+    assert (fewer["whole"], fewer["overlaid"], fewer["not_whole"]) == (2, 1, 0)
+    assert fewer["spread"]["grf_n"]["count"] == [1] * 11
     tag = answer.headers["etag"]
     again = http.get(url, params={"curves": 1, "points": 11}, headers={"If-None-Match": tag})
     assert again.status_code == 304
