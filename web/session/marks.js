@@ -128,7 +128,7 @@ export class Marks {
     byId("marks-list").replaceChildren(...this.placed.map((mark) => {
       const go = el("button", { type: "button", cls: "small", text: `${timeWords(mark.timeS, 0.01)}  ${mark.label}` });
       go.addEventListener("click", () => this.on.go(mark.timeS));
-      const edit = el("button", { type: "button", cls: "small", text: "✎", title: "Rename, move or remove", "aria-label": `Change the mark ${mark.label}` });
+      const edit = el("button", { type: "button", cls: "small presses", text: "✎", title: "Rename, move or remove", "aria-label": `Change the mark ${mark.label}` });
       edit.addEventListener("click", () => this.edit(mark));
       return el("li", { "data-time-s": mark.timeS.toFixed(6) }, go, edit);
     }));
