@@ -52,7 +52,7 @@ const bars = new Bars(again, range);
 const foot = new Foot(range);
 foot.resized = again;
 const trace = new Trace(() => past.want());
-const tileTraces = new TileTraces(range, again);
+const tileTraces = new TileTraces(range, () => { again(); trace.recolour(); });
 const past = new History(trace.points, () => state.node?.boot_id);
 const pause = new Pause(() => {
   state.fresh = true;

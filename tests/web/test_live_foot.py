@@ -212,7 +212,7 @@ def test_tiles_are_shown_as_traces_and_this_is_remembered(
         expect(page.locator(LIVE)).to_have_count(1)
         page.click("#as-traces")
         expect(page.locator("#bars")).to_be_hidden()
-        page.wait_for_function(f"({TRACED})() > 50")
+        page.wait_for_function(f"() => ({TRACED})() > 50")
         assert complaints(page) == []
         page.reload()
         expect(page.locator("#tile-traces")).to_be_visible()

@@ -6,6 +6,7 @@ import { runs } from "./points.js";
 import { unitOf } from "./tile.js";
 
 const KEY = "foottile.tiles-as";
+const EVERY_MS = 60; // many rows cost more than one
 const ROW_PX = 16; // less has no room for a trace
 const [LEFT_PX, RIGHT_PX] = [50, 10]; // as the trace of the force above
 
@@ -16,9 +17,11 @@ export class TileTraces {
     this.canvas = byId("tile-traces");
     this.context = this.canvas.getContext("2d");
     this.shown = false;
+    this.drawnMs = 0;
     try { this.shown = localStorage.getItem(KEY) === "traces"; } catch { /* private window */ }
     const choose = (shown) => {
       this.shown = shown;
+      this.drawnMs = 0;
       try { localStorage.setItem(KEY, shown ? "traces" : "bars"); } catch { /* private window */ }
       this.show();
       onChange();
@@ -37,7 +40,8 @@ export class TileTraces {
 
   /** @param {{points: object[], endS: number, windowS: number, live: boolean}} seen what the force is drawn of */
   draw(node, { points, endS, windowS, live }, nowMs, unitChosen) {
-    if (!this.shown) return;
+    if (!this.shown || nowMs - this.drawnMs < EVERY_MS) return;
+    this.drawnMs = nowMs;
     const { canvas, context } = this;
     const ratio = devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];

@@ -8,6 +8,7 @@ const TICKS_S = { 5: 1, 10: 1, 30: 5, 60: 10 };
 const WINDOW_KEY = "foottile.window";
 const STEPS_N = [1, 2, 3, 4, 5, 10, 15, 20, 30, 50, 100, 200, 500, 1000, 2000, 5000, 10000];
 const [LEFT_PX, RIGHT_PX] = [50, 10]; // of the axes
+const FRAME_MS = 30; // as often as there is something new
 const SHRINK_AFTER_MS = 4000; // a scale that follows every step of the robot cannot be read
 
 export class Trace {
@@ -94,7 +95,7 @@ export class Trace {
     if (devicePixelRatio !== this.ratio) this.resize(); // moved to another screen
     const boxPx = this.canvas.width / this.ratio - LEFT_PX - RIGHT_PX;
     const everyMs = this.held ? Infinity
-      : this.still.matches ? 200 : (500 * this.windowS) / Math.max(boxPx * this.ratio, 1);
+      : this.still.matches ? 200 : Math.max(FRAME_MS, (500 * this.windowS) / Math.max(boxPx * this.ratio, 1));
     if (this.drawnMs && this.coloursLive === live && nowMs - this.drawnMs < everyMs) return null;
     this.drawnMs = nowMs;
     if (!this.colours || this.coloursLive !== live) this.readColours(live);
