@@ -16,6 +16,7 @@ from service.estimation.foot.geometry import axes_rad
 from service.estimation.mounted import Mounted
 from service.offline.compare.mounted import Mount, fit_mount
 from service.offline.compare.pairs import Pairs
+from service.offline.compare.plausible import far_notes
 from service.offline.comparison import ANGLE, CompareOptions, Comparison, compare_session
 from storage.formats.reference import Stated
 from storage.sessions.reader import SessionReader
@@ -65,6 +66,12 @@ def calibrate_against(
     with SessionReader(path) as session:
         info, calibration = session.info, _calibration(session)
     comparison = compare_session(path, reference_path, asked)
+    if far := far_notes(comparison.alignment):
+        raise CalibrationError(
+            far[0],
+            where=str(reference_path),
+            remedy="Mend its units, or name the plate's recording of this very session",
+        )
     pairs = comparison.pairs
     if not pairs.removed:
         raise CalibrationError(

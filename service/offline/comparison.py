@@ -17,7 +17,7 @@ from service.offline.compare.align import Alignment, align
 from service.offline.compare.clocks import ClockLag, clock_notes
 from service.offline.compare.errors import Errors, errors_of
 from service.offline.compare.pairs import COMPARED, Columns, Pairs, Reference, pair
-from service.offline.compare.plausible import check_force_unit, cop_notes
+from service.offline.compare.plausible import check_force_unit, cop_notes, far_notes, gain_notes
 from service.offline.compare.signals import Signal
 from service.offline.compare.trials import Mark, trials_of
 from storage.formats.reference import ReferenceData, Stated, read_reference
@@ -60,7 +60,8 @@ class Comparison:
         serials: of the tiles.
         errors: by trial and over trials.
         trials_are: what a trial is.
-        notes: what a user should know.
+        notes: what a user should know of both recordings.
+        advice: what a user may do to learn more of the foot.
         options: as given.
     """
 
@@ -74,6 +75,7 @@ class Comparison:
     errors: Errors
     trials_are: str
     notes: tuple[str, ...]
+    advice: tuple[str, ...]
     options: CompareOptions
 
     def as_dict(self) -> dict[str, object]:
@@ -82,7 +84,7 @@ class Comparison:
         return {
             "session": self.session,
             "reference": self.reference,
-            "notes": self.notes,
+            "notes": (*self.notes, *self.advice),
             "alignment": {
                 "lag_s": alignment.lag_s,
                 "clock_lag_s": self.clock_lag,
@@ -135,7 +137,8 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
         contact_n=options.contact_n,
     )
     places_m = np.array([(tile.x_m, tile.y_m) for tile in tiles if not tile.reference])
-    notes += [*data.notes, *cop_notes(pairs, places_m), *_remarks(alignment, pairs, options)]
+    notes += [*data.notes, *cop_notes(pairs, places_m), *far_notes(alignment)]
+    notes += [*_remarks(alignment, pairs, options)]
     at_ns = int(t_ns[0]) + round(1e9 * alignment.at_s)
     by_clocks = None if data.epoch_ns is None else _clock_lag(path, reference_path, at_ns)
     notes += clock_notes(alignment, by_clocks)
@@ -156,6 +159,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
         ),
         trials_are=what,
         notes=tuple(notes),
+        advice=tuple(_advice(alignment, options)),
         options=options,
     )
 
@@ -267,9 +271,14 @@ def _remarks(alignment: Alignment, pairs: Pairs, options: CompareOptions) -> Seq
         notes.append("the reference is slower than ours: the frame nearest to each sample counts")
     if _any(pairs, EstimateStatus.ASSUMED_SCALE):
         notes.append("our newtons rest on an assumed scale: the calibration was not measured")
-    if options.reference_sigma_n is None:
-        notes.append("nothing is said of coverage: --reference-sigma-n was not given")
     return notes
+
+
+def _advice(alignment: Alignment, options: CompareOptions) -> list[str]:
+    if options.reference_sigma_n is not None:
+        return gain_notes(alignment)
+    said = "nothing is said of coverage: --reference-sigma-n was not given"
+    return [*gain_notes(alignment), said]
 
 
 def _any(pairs: Pairs, bit: EstimateStatus) -> bool:

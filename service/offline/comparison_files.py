@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import pyarrow as pa
 
 from service.offline.compare.pairs import Pairs
 from service.offline.compare.plot import plot_comparison
-from service.offline.compare.report import markdown
+from service.offline.compare.report import AT_LEAST, markdown
 from service.offline.comparison import CompareOptions, compare_session
 from service.plain_json import json_text
 from storage.checked_json import write_checked
@@ -24,6 +25,19 @@ from storage.sessions.comparisons import (
     SERIES_NAME,
     write_series,
 )
+
+_WANTING = {
+    **dict.fromkeys(("grf_coverage_95",), ": --reference-sigma-n says how true the reference is"),
+    **dict.fromkeys(
+        ("cop_coverage_x_95", "cop_coverage_y_95"),
+        ": --reference-cop-sigma-m says how true the reference's COP is",
+    ),
+    **dict.fromkeys(
+        ("cop_mean_m", "cop_p95_m", "cop_bias_x_m", "cop_bias_y_m", "cop_p95_about_mean_m"),
+        ": the reference states no centre of pressure under load",
+    ),
+}
+"""Of figures that are not always there, what they want."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +81,9 @@ def write_comparison(
     found = compare_session(source, reference, options)
     figures = found.errors.figures
     missed = tuple(
-        f"{name} is {figures[name].mean:.4g}, and was to be within {limit:g}"
+        said
         for name, limit in limits.items()
-        if not abs(figures[name].mean) <= limit
+        if (said := _missed(name, figures[name].mean, limit)) is not None
     )
     text = markdown(
         title,
@@ -78,7 +92,7 @@ def write_comparison(
         found.pairs,
         found.errors,
         found.trials_are,
-        found.notes,
+        (*found.notes, *found.advice),
     )
     png = plot_comparison(title, found.pairs, found.force_n, found.serials, found.errors)
     content = {**found.as_dict(), "limits": limits, "missed": missed}
@@ -110,3 +124,14 @@ def _series(pairs: Pairs) -> pa.Table:
         ],
         schema=SCHEMA,
     )
+
+
+def _missed(name: str, mean: float, limit: float) -> str | None:
+    """Why a limit is missed; None: it is kept."""
+    if math.isnan(mean):
+        return f"{name} is not known here, and was limited to {limit:g}{_WANTING.get(name, '')}"
+    if name in AT_LEAST:
+        kept, words = mean >= limit, "at least"
+    else:
+        kept, words = abs(mean) <= limit, "at most"
+    return None if kept else f"{name} is {mean:.4g}, and was to be {words} {limit:g}"

@@ -73,7 +73,8 @@ def compare_command(
         str | None,
         typer.Option(
             metavar="FIGURE=LIMIT,...",
-            help="Exit code 3 if the mean of a figure is beyond, as grf_mae_n=1,cop_p95_m=0.004.",
+            help="Exit code 3 if the mean of a figure is more, as grf_mae_n=1,cop_p95_m=0.004; of "
+            "coverage, R² and counts, if it is less.",
         ),
     ] = None,
     data: Annotated[

@@ -107,8 +107,11 @@ def block_of(scores: Floats, samples: Ints, weight: Floats) -> Ints:
     Returns:
         (n,), from 0; there are `BLOCKS_MIN` to `BLOCKS`.
     """
-    length = int(samples[-1] - samples[0]) + 1
-    least = MEMORIES * max(memory_of(column) for column in scores.T)
+    memory = max(1.0, *(memory_of(column) for column in scores.T))
+    # In a long rest beside a few stances nothing is told: counted is the time that does tell, as
+    # many memories of it as would tell as much if all told the same (Kish's effective size).
+    told = np.bincount(((samples - samples[0]) / memory).astype(np.intp), weight)
+    length, least = memory * told.sum() ** 2 / (told**2).sum(), MEMORIES * memory
     blocks = int(np.clip(length / least, BLOCKS_MIN, BLOCKS))
     least = min(least, length / blocks)
     told = np.cumsum(weight) / weight.sum()

@@ -241,6 +241,13 @@ def _refuse_doubtful(
 
 
 def _undetermined(what: Sequence[str]) -> CalibrationError:
+    if what[0].startswith("the foot") and len(what) == 1:
+        return CalibrationError(
+            f"the load does not determine {what[0]}",
+            expected="several stances under one foot, all of which say the same",
+            remedy="Record more stances; or calibrate from the part of the session that has them: "
+            "foottile estimate --start-s --end-s",
+        )
     return CalibrationError(
         f"the load does not determine {', '.join(what)}",
         expected="for a gain of each tile loads that go from tile to tile; for the shear tiles "

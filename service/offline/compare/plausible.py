@@ -15,6 +15,11 @@ NEAR = 3.0
 FEET = 10.0
 """A COP that travels over so many lengths of the foot is in another unit."""
 OUTSIDE_SHARE = 0.05
+SCALE_FAR = 2.0
+"""No gain of a mounted foot is further from one; a unit, or another foot, is."""
+OTHER_UNITS = {"kgf": 9.80665, "lbf": 4.44822}
+DRIFT_FAR_PPM = 500.0
+"""Clocks of crystals are within 100 ppm of one another."""
 RANGE = (5.0, 95.0)
 """Percentiles between which it travels."""
 
@@ -33,6 +38,33 @@ def check_force_unit(alignment: Alignment) -> None:
                 expected="about one",
                 remedy=f"Its unit may be {unit} instead: look at --units grf=",
             )
+
+
+def far_notes(alignment: Alignment) -> list[str]:
+    """What scale and drift say where no foot and no clock is that far off."""
+    notes, scale = [], alignment.scale.value
+    if not 1.0 / SCALE_FAR < scale < SCALE_FAR:
+        near = next((u for u, n in OTHER_UNITS.items() if n / 1.25 < scale < n * 1.25), None)
+        what = "its unit or its place may be another" if near is None else f"it may be in {near}"
+        notes.append(f"a newton of the reference is {scale:.3g} N of ours: {what}")
+    low_ppm, high_ppm = alignment.drift_ppm.interval_95
+    if low_ppm > DRIFT_FAR_PPM or high_ppm < -DRIFT_FAR_PPM:
+        notes.append(
+            f"the clocks differ by {alignment.drift_ppm.value:.0f} ppm, far more than clocks do: "
+            "is it the recording of this trial, and its time in seconds?"
+        )
+    return notes
+
+
+def gain_notes(alignment: Alignment) -> list[str]:
+    """What to do about a scale that is not one, and may be a foot's."""
+    low, high = alignment.scale.interval_95
+    if low <= 1.0 <= high or not 1.0 / SCALE_FAR < alignment.scale.value < SCALE_FAR:
+        return []
+    return [
+        f"a newton of the reference is {alignment.scale.value:.3f} N of ours: load may pass beside "
+        "the domes, or a gain is off; `foottile calibrate --against` fits a mounted foot"
+    ]
 
 
 def cop_notes(pairs: Pairs, places_m: Floats) -> list[str]:

@@ -39,6 +39,13 @@ FIGURES: Mapping[str, str] = {
     "cop_coverage_y_95": "COP, part within the 95 % interval along y",
 }
 """Every figure, and what it is."""
+AT_LEAST = frozenset(
+    {
+        *("grf_frames", "stances", "grf_r2", "grf_coverage_95"),
+        *("cop_coverage_x_95", "cop_coverage_y_95"),
+    }
+)
+"""Figures of which more is better: a limit is the least they may be, and of others the most."""
 
 
 def markdown(

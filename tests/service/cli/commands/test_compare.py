@@ -98,11 +98,14 @@ def test_without_a_folder_it_is_kept_with_the_session(
 def test_a_limit_that_is_missed_is_named_and_code_3_and_all_is_written(
     run: Run, session: Path, plate: Path, tmp_path: Path
 ) -> None:
-    asked = (*LAB, "--sign", "-", "--limits", "grf_mae_n=0.001,grf_r2=1")
+    limits = "grf_mae_n=0.001,grf_r2=0.9,stances=99"
+    asked = (*LAB, "--sign", "-", "--limits", limits)
     outcome = run("compare", session, "--reference", plate, *asked, "--out", "o")
     outcome.fails(3, "limit missed: grf_mae_n is ")
+    assert "was to be at most 0.001" in outcome.err
+    assert "was to be at least 99" in outcome.err  # of what is good, less is missed
     assert "grf_r2" not in outcome.err
-    assert len(json.loads((tmp_path / "o" / "compare.json").read_text())["missed"]) == 1
+    assert len(json.loads((tmp_path / "o" / "compare.json").read_text())["missed"]) == 2
 
 
 def test_what_the_reference_has_not_is_a_missed_limit_too(
@@ -110,7 +113,9 @@ def test_what_the_reference_has_not_is_a_missed_limit_too(
 ) -> None:
     force = ("--map", "time_s=Time,grf_n=Fz", "--units", "grf=N", "--sign", "-")
     asked = (*force, "--limits", "cop_p95_m=1", "--out", "o")
-    run("compare", session, "--reference", plate, *asked).fails(3, "cop_p95_m is nan")
+    run("compare", session, "--reference", plate, *asked).fails(
+        3, "cop_p95_m is not known here, and was limited to 1: the reference states no centre"
+    )
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.offline.compare.blocks import spread_of
+from service.offline.compare.blocks import block_of, spread_of
 
 
 @pytest.mark.parametrize("telling", [(0, 8000), (0, 700), (3000, 4500)])
@@ -24,3 +24,14 @@ def test_of_independent_noise_the_variance_is_the_textbooks(telling: tuple[int, 
         found += spread_of(design, residual, np.ones(n), np.arange(n)).covariance / draws
     expected = sigma**2 * np.linalg.inv(normal)
     np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.12)
+
+
+def test_a_long_rest_beside_three_stances_does_not_put_them_into_one_block() -> None:
+    rng, rest, stances = np.random.default_rng(3), 24_000, 4000
+    t = np.arange(stances + rest)
+    load = np.where(t < stances, np.abs(np.sin(3.0 * np.pi * t / stances)), 0.0)
+    weight = np.gradient(load) ** 2 / np.sum(np.gradient(load) ** 2) + 1.0 / len(t)
+    score = (load * np.sin(t / 150.0) + 0.1 * rng.normal(size=len(t)))[:, None]
+    block = block_of(score, t, weight)
+    assert len(np.unique(block[:stances])) >= 4
+    assert 8 <= block.max() + 1 <= 20

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from devices.errors import ComparisonError
+from service.offline.compare.blocks import Estimate
 from service.offline.compare.pairs import Pairs, pair
-from service.offline.compare.plausible import check_force_unit, cop_notes
+from service.offline.compare.plausible import check_force_unit, cop_notes, far_notes, gain_notes
 from tests.service.offline.compare.sessions import columns, half_sines, reference, same_clock
 
 FOOT_M = np.array([(0.02, 0.015), (0.02, -0.015), (-0.02, 0.015), (-0.02, -0.015)])
@@ -33,6 +34,35 @@ def test_a_scale_of_a_thousand_is_another_unit(scale: float, unit: str) -> None:
 def test_other_scales_are_for_the_user_to_judge(scale: float) -> None:
     aligned = same_clock()
     check_force_unit(replace(aligned, scale=replace(aligned.scale, value=scale)))
+
+
+@pytest.mark.parametrize(
+    ("scale", "says"),
+    [(9.9, "in kgf"), (4.4, "in lbf"), (2.5, "its unit or its place"), (0.3, "its unit or its")],
+)
+def test_a_scale_that_no_foot_has_is_said_with_the_unit_that_it_may_be(
+    scale: float, says: str
+) -> None:
+    aligned = same_clock()
+    wrong = replace(aligned, scale=replace(aligned.scale, value=scale))
+    (note,) = far_notes(wrong)
+    assert says in note
+    assert gain_notes(wrong) == []
+
+
+def test_clocks_that_differ_by_more_than_clocks_do_are_said() -> None:
+    aligned = same_clock()
+    drifting = replace(aligned, drift_ppm=Estimate(2963.0, 400.0, 8.0))
+    assert "2963 ppm" in far_notes(drifting)[0]
+    assert far_notes(replace(aligned, drift_ppm=Estimate(2963.0, 1500.0, 8.0))) == []
+    assert far_notes(replace(aligned, drift_ppm=Estimate(90.0, 1.0, 8.0))) == []
+
+
+def test_a_gain_that_is_not_one_points_to_the_calibration_of_a_mounted_foot() -> None:
+    aligned = same_clock()
+    assert gain_notes(replace(aligned, scale=Estimate(0.99, 0.02, 8.0))) == []
+    (note,) = gain_notes(replace(aligned, scale=Estimate(0.8, 0.02, 8.0)))
+    assert "calibrate --against" in note
 
 
 TRAVEL = np.linspace(-0.015, 0.015, len(FORCE_N))
