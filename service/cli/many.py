@@ -74,7 +74,7 @@ def run_many(
     """
     from service.offline.archive.jobs import Job
     from service.offline.archive.manifest import rows_in
-    from service.offline.archive.places import absolute, place_of, sessions_in
+    from service.offline.archive.places import absolute, no_session_in, place_of, sessions_in
 
     if (manifest is None) == (not places):
         raise UsageError(
@@ -87,9 +87,13 @@ def run_many(
     out = None if out is None else absolute(out)
 
     def found() -> Iterator[Place]:
-        if manifest is None:
-            return sessions_in(places or ())
-        return (place_of(row["session"]) for row in rows_in(manifest, {"session"}))
+        if manifest is not None:
+            return (place_of(row["session"]) for row in rows_in(manifest, {"session"}))
+        sessions = sessions_in(places or ())
+        first = next(sessions, None)
+        if first is None:
+            raise no_session_in(places or ())
+        return chain([first], sessions)
 
     return run_plan(
         (Job(place, task, out) for place in found()),
@@ -126,7 +130,7 @@ def run_plan(
     jobs = iter(jobs)
     first = next(jobs, None)
     if first is None:
-        raise UsageError("there is no session in these places")
+        raise UsageError("there is no row in the list of sessions")
     summary = Summary()
     results = None if out is None else Results(out)
     if results is not None:

@@ -52,7 +52,7 @@ def query_command(
     sealed yet, or damaged, are left out and named on stderr; the exit code is 3 then.
     """
     from service.offline.archive.finding import find_sessions
-    from service.offline.archive.places import is_remote
+    from service.offline.archive.places import is_data_folder, is_remote, no_session_in
     from service.offline.archive.query import ask
     from service.offline.archive.workspace import SYSTEM, workspace
 
@@ -68,6 +68,9 @@ def query_command(
         needs_mirror = any(is_remote(place) for place in asked)
         mirror = stack.enter_context(workspace(SYSTEM)) if needs_mirror else None
         archive = find_sessions(asked, mirror)
+        is_empty = not archive.sessions and not archive.left_out
+        if is_empty and not any(is_data_folder(place) for place in asked):
+            raise no_session_in(asked)
         answer = ask(archive, sql)
     if path is not None:
         _write(answer, path)

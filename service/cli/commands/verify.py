@@ -83,9 +83,13 @@ def verify_command(
 
 
 def _are_many(targets: list[str] | None, manifest: Path | None) -> bool:
-    """A single folder is one target, whatever is in it: it may be a data folder with journals."""
+    """A single place is one target, as a data folder with its journals is, or holds sessions."""
     if manifest is None and targets is not None and len(targets) == 1 and Path(targets[0]).exists():
-        return False
+        from service.offline.archive.places import is_data_folder, sessions_in
+
+        if not Path(targets[0]).is_dir() or is_data_folder(targets[0]):
+            return False
+        return not is_one(targets, None) and next(sessions_in(targets), None) is not None
     return not is_one(targets, manifest)
 
 

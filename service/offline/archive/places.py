@@ -26,6 +26,7 @@ from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME, SESSION_ID
 
 _EXPECTED = "a session, a folder of sessions, a data folder, a glob of these, or a URI of one"
+_OF_DATA = ("sessions", "journal")
 _S3_ATTEMPTS = 6
 _BLOCK = 1 << 20
 """Of a request that a store refuses or breaks off; they wait longer and longer, 3 s in all."""
@@ -85,6 +86,26 @@ def sessions_in(places: Iterable[str]) -> Iterator[Place]:
     """
     roots = [root for place in places for root in _roots(place)]
     return (session for root in roots for session in _inside(root))
+
+
+def no_session_in(places: Iterable[str]) -> UsageError:
+    """What is said of places in which no session is; lone files in their folders are named."""
+    folders = [root for place in places if not is_remote(place) for root in _roots(place)]
+    lone = [path for root in folders for path in sorted(glob.glob("*.parquet", root_dir=root))]
+    what = "there is no session in these places"
+    if not lone:
+        return UsageError(what, expected=_EXPECTED)
+    more = f" and {len(lone) - 1} more" if lone[1:] else ""
+    return UsageError(
+        f"{what}, but files by themselves: {printable(lone[0])}{more}",
+        expected=_EXPECTED,
+        remedy="Name the files, or a glob of them in quotes, where a command takes files",
+    )
+
+
+def is_data_folder(place: str) -> bool:
+    """Is it a server's or a node's folder, which may well have no session yet?"""
+    return any(_kind(f"{place.rstrip('/')}/{name}") == fs.FileType.Directory for name in _OF_DATA)
 
 
 def place_of(where: str) -> Place:

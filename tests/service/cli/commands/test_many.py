@@ -62,6 +62,9 @@ def test_many_sessions_are_estimated_each_into_its_folder(
     proof = run("verify", "out", "data", "--jobs", 1)
     assert proof.code == 0, proof.err
     assert "4 complete" in proof.out
+    alone = run("verify", "out", "--jobs", 1)
+    assert alone.code == 0, alone.err
+    assert "2 complete" in alone.out
 
 
 def test_what_failed_is_listed_with_its_reason_and_the_exit_code_is_3(

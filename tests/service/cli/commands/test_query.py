@@ -76,3 +76,21 @@ def test_what_cannot_be_asked_is_wrong_usage(run: Run, data: Path, words: tuple[
     done = run("query", words[0], *([data] if len(words) == 1 else words[1:]))
     done.fails(2)
     assert len(done.err.splitlines()) == 1
+
+
+def test_a_place_without_a_session_is_wrong_usage_and_names_lone_files(
+    run: Run, tmp_path: Path
+) -> None:
+    (tmp_path / "some").mkdir()
+    run("query", "SELECT 1 AS a", "some").fails(2, "there is no session in these places")
+    for name in ("a", "b"):
+        (tmp_path / "some" / f"{name}.parquet").write_bytes(b"PAR1")
+    said = "there is no session in these places, but files by themselves: a.parquet and 1 more"
+    run("query", "SELECT 1 AS a", "some").fails(2, said)
+    run("estimate", "some", "--out", "o").fails(2, said)
+
+
+def test_a_data_folder_without_a_session_yet_answers_with_nothing(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "data" / "sessions").mkdir(parents=True)
+    said = run("query", "SELECT count(*) AS n FROM sessions", "data", "--json").printed()
+    assert said["rows"] == [{"n": 0}]
