@@ -17,10 +17,17 @@ from service.offline.compare.align import Alignment, align
 from service.offline.compare.clocks import ClockLag, clock_notes
 from service.offline.compare.errors import Errors, errors_of
 from service.offline.compare.pairs import COMPARED, Columns, Pairs, Reference, pair
-from service.offline.compare.plausible import check_force_unit, cop_notes, far_notes, gain_notes
+from service.offline.compare.plausible import (
+    check_force_unit,
+    check_time_unit,
+    cop_notes,
+    far_notes,
+    gain_notes,
+)
 from service.offline.compare.signals import Signal
 from service.offline.compare.trials import Mark, trials_of
 from storage.formats.reference import ReferenceData, Stated, read_reference
+from storage.formats.reference_tables import is_session
 from storage.formats.sealed import marks_of
 from storage.formats.slice import Slice
 from storage.schema import NO_INSTANT
@@ -114,6 +121,13 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
         UsageError: a unit or sign of the reference is not stated.
         ComparisonError: the two cannot be compared.
     """
+    if is_session(reference_path) and not is_session(path):
+        raise FileFormatError(
+            f"it is not a session, and {reference_path.name} is one",
+            where=str(path),
+            expected="SESSION first, and what it is compared with behind --reference",
+            remedy="Were they swapped?",
+        )
     data = read_reference(reference_path, options.stated)
     with SessionReader(path) as session:
         columns, force_n = _columns(session)
@@ -127,6 +141,7 @@ def compare_session(path: Path, reference_path: Path, options: CompareOptions) -
     ours = Signal(
         (t_ns[known] - t_ns[0]) * 1e-9, columns["grf_n"][known], columns["grf_sigma_n"][known]
     )
+    check_time_unit(ours, reference.force)
     alignment = align(ours, reference.force, lag_range_s=options.lag_range_s)
     check_force_unit(alignment)
     pairs = pair(

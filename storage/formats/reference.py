@@ -37,6 +37,8 @@ SIGNS: Mapping[str, float] = {"+": 1.0, "-": -1.0}
 """What a force is under load."""
 
 NUMBER_MAX = 1e9
+TIME_MAX_S = 1e11
+"""Unix time is far below that in seconds, and beyond it in any other unit."""
 GAP_STEPS = 3.5
 TURNED = 2.0
 """A force that goes so many times further below zero than above it is negative under load."""
@@ -118,6 +120,12 @@ def read_reference(path: Path, stated: Stated) -> ReferenceData:
         raise FileFormatError(f"{len(time_s)} samples", where=where, expected="at least two")
     _check_time(time_s, where)
     notes = list(table.notes)
+    if abs(time_s[0]) >= NUMBER_MAX:
+        notes.append(
+            f"the reference's time begins at {time_s[0]:.3f} s, as Unix time does: the lag is to "
+            "its time since then"
+        )
+        time_s = time_s - time_s[0]
     known = np.isfinite(grf_n)
     if not known.any():
         raise FileFormatError("no sample has a force", where=where)
@@ -170,6 +178,7 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
         raise FileFormatError(
             f"no column {theirs!r} for {name} (it has {', '.join(table.names)[:200]})",
             where=table.where,
+            expected=table.form,
             remedy=f"Name it: --map {name}=COLUMN",
         )
     quantity = name.partition("_")[0]
@@ -181,12 +190,14 @@ def _column(table: Table, stated: Stated, name: str) -> Floats:
             remedy=f"Add --units {quantity}={'|'.join(FACTORS[quantity])}",
         )
     values = table.columns[theirs] * (FACTORS[quantity][unit] if unit is not None else 1.0)
-    bad = np.flatnonzero(np.abs(values) >= NUMBER_MAX)
+    greatest = TIME_MAX_S if quantity == "time" else NUMBER_MAX
+    bad = np.flatnonzero(np.abs(values) >= greatest)
     if len(bad):
         raise FileFormatError(
             f"column {theirs!r} is {values[bad[0]]:g} at sample {bad[0] + 1}",
             where=table.where,
-            expected=f"numbers below {NUMBER_MAX:g}",
+            expected=f"numbers below {greatest:g}",
+            remedy="State its unit, as --units time=ms" if quantity == "time" else "",
         )
     return -values if turned else values
 

@@ -28,6 +28,7 @@ NUMBERS_MAX = 50_000_000
 OURS = ("time_s", "grf_n", "fz_n", "cop_x_m", "cop_y_m")
 """Names that say unit and sign."""
 SESSION_KEY = b"foottile.format"
+CSV_FORM = "columns parted by commas, semicolons or tabs, a decimal point, names in the first line"
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Table:
         si: names of columns whose unit, and sign, the file says to be ours.
         epoch_ns: UTC of time zero; None: not known.
         notes: what a user should know.
+        form: what is expected of such a file, if files of its kind differ.
     """
 
     where: str
@@ -49,6 +51,7 @@ class Table:
     si: frozenset[str]
     epoch_ns: int | None = None
     notes: tuple[str, ...] = ()
+    form: str = ""
 
 
 def read_csv(path: Path, named: Collection[str]) -> Table:
@@ -68,9 +71,12 @@ def read_csv(path: Path, named: Collection[str]) -> Table:
         wanted = _wanted(names, named, where)
         convert = pyarrow.csv.ConvertOptions(include_columns=wanted)
         table = pyarrow.csv.read_csv(path, parse_options=parse, convert_options=convert)
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+    except OSError as error:
         raise FileFormatError(f"cannot be read: {error}", where=where) from error
-    return _of_arrow(table, names, where)
+    except (pa.ArrowException, UnicodeDecodeError) as error:
+        what = f"cannot be read: {error}"
+        raise FileFormatError(what, where=where, expected=CSV_FORM) from error
+    return _of_arrow(table, names, where, CSV_FORM)
 
 
 def read_parquet(path: Path, named: Collection[str]) -> Table:
@@ -99,12 +105,7 @@ def read_session(path: Path, named: Collection[str]) -> Table | None:
         FileFormatError: it is damaged, or has no such column.
     """
     where = str(path)
-    try:
-        check_file(path)
-        metadata = pq.read_schema(path).metadata or {}
-    except (OSError, pa.ArrowException) as error:
-        raise FileFormatError(f"cannot be read: {error}", where=where) from error
-    if SESSION_KEY not in metadata:
+    if not is_session(path):
         return None
     with SessionReader(path) as reader:
         single = [name for name in KNOWN if not KNOWN[name].per_tile and reader.has(name)]
@@ -117,6 +118,21 @@ def read_session(path: Path, named: Collection[str]) -> Table | None:
     columns = {name: values.astype(np.float64) for name, values in joined.items()}
     columns["time_s"] = (t_ns - t_ns[0]) * 1e-9
     return Table(where, tuple(single), columns, frozenset(columns), epoch_ns=int(t_ns[0]))
+
+
+def is_session(path: Path) -> bool:
+    """Is it a sealed session of ours, and no other kind of file?
+
+    Raises:
+        FileFormatError: it ends with .parquet, and cannot be read as that.
+    """
+    if path.suffix.lower() != ".parquet":
+        return False
+    try:
+        check_file(path)
+        return SESSION_KEY in (pq.read_schema(path).metadata or {})
+    except (OSError, pa.ArrowException) as error:
+        raise FileFormatError(f"cannot be read: {error}", where=str(path)) from error
 
 
 def read_opensim(path: Path, named: Collection[str]) -> Table:
@@ -154,7 +170,11 @@ def read_opensim(path: Path, named: Collection[str]) -> Table:
 def _wanted(names: Collection[str], named: Collection[str], where: str) -> list[str]:
     if len(set(names)) < len(names):
         twice = sorted({name for name in names if list(names).count(name) > 1})
-        raise FileFormatError(f"column {', '.join(twice)} is there twice", where=where)
+        raise FileFormatError(
+            f"column {', '.join(name or 'without a name' for name in twice)} is there twice",
+            where=where,
+            expected="a name of its own for each column",
+        )
     return [name for name in names if name in named or name in OURS]
 
 
@@ -167,7 +187,7 @@ def _check_size(numbers: int, where: str) -> None:
         )
 
 
-def _of_arrow(table: pa.Table, names: tuple[str, ...], where: str) -> Table:
+def _of_arrow(table: pa.Table, names: tuple[str, ...], where: str, form: str = "") -> Table:
     _check_size(table.num_rows * table.num_columns, where)
     columns = {}
     for name in table.column_names:
@@ -175,8 +195,9 @@ def _of_arrow(table: pa.Table, names: tuple[str, ...], where: str) -> Table:
             columns[name] = np.asarray(table[name].cast(pa.float64()).to_numpy(), dtype=np.float64)
         except pa.ArrowException as error:
             raise FileFormatError(
-                f"column {name!r} is not numeric: {error}", where=where
+                f"column {name!r} is not numeric: {error}", where=where, expected=form
             ) from error
     if "fz_n" in columns and "grf_n" not in columns:
         columns["grf_n"] = columns["fz_n"]
-    return Table(where, names, columns, frozenset(name for name in OURS if name in columns))
+    si = frozenset(name for name in OURS if name in columns)
+    return Table(where, names, columns, si, form=form)

@@ -121,9 +121,9 @@ def align(
     peaks = likely_lags(ours, reference, lag_range_s)
     if peaks is None:
         raise ComparisonError(
-            "the reference and the session do not overlap",
+            f"the reference and the session do not overlap{_within(lag_range_s)}",
             expected="at least half of the shorter one within the other, with a load in it",
-            remedy="Name the lags that can be with --lag-range-s",
+            remedy=_elsewhere(ours, reference, lag_range_s),
         )
     _check_alike(peaks, ours, reference, lag_range_s)
     best = _fit(ours, reference, peaks.best, peaks.step_s)
@@ -180,21 +180,40 @@ def _check_alike(
     if turned is not None and turned.best.correlation > max(
         CORRELATION_MIN, peaks.best.correlation
     ):
-        raise _wrong_sign()
+        raise _wrong_sign(_elsewhere(ours, reference, lag_range_s))
     if peaks.best.correlation >= CORRELATION_MIN:
         return
     raise ComparisonError(
         "the reference and our GRF do not resemble each other: correlation "
-        f"{peaks.best.correlation:.2f} at the best lag",
+        f"{peaks.best.correlation:.2f} at the best lag{_within(lag_range_s)}",
         expected=f"at least {CORRELATION_MIN:g}: the same load, of the same foot",
+        remedy=_elsewhere(ours, reference, lag_range_s),
     )
 
 
-def _wrong_sign() -> ComparisonError:
+def _within(lag_range_s: tuple[float, float] | None) -> str:
+    if lag_range_s is None:
+        return ""
+    return f" from {lag_range_s[0]:g} to {lag_range_s[1]:g} s (--lag-range-s)"
+
+
+def _elsewhere(ours: Signal, reference: Signal, lag_range_s: tuple[float, float] | None) -> str:
+    """Where a lag fits that the range leaves out; empty: nowhere."""
+    anywhere = None if lag_range_s is None else likely_lags(ours, reference, None)
+    if anywhere is None or anywhere.best.correlation < CORRELATION_MIN:
+        return ""
+    return (
+        f"Without --lag-range-s {anywhere.best.lag_s:.2f} s fits best, with correlation "
+        f"{anywhere.best.correlation:.2f}"
+    )
+
+
+def _wrong_sign(elsewhere: str = "") -> ComparisonError:
     return ComparisonError(
         "the reference's force falls where ours rises: its sign is turned",
         expected="the force of the ground on the foot, positive under load",
-        remedy="Give the other --sign; or it is the other foot's",
+        remedy="Give the other --sign; or it is the other foot's"
+        + (f". {elsewhere}" if elsewhere else ""),
     )
 
 

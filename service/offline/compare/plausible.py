@@ -8,8 +8,11 @@ from devices.arrays import Floats
 from devices.errors import ComparisonError
 from service.offline.compare.align import Alignment
 from service.offline.compare.pairs import Pairs
+from service.offline.compare.signals import Signal
 
 THOUSAND = 1000.0
+STEP_MIN_S = 0.3
+"""Between two samples of a reference whose unit of time is in doubt."""
 NEAR = 3.0
 """A scale within this factor of a thousand, or of a thousandth, is a wrong unit."""
 FEET = 10.0
@@ -22,6 +25,26 @@ DRIFT_FAR_PPM = 500.0
 """Clocks of crystals are within 100 ppm of one another."""
 RANGE = (5.0, 95.0)
 """Percentiles between which it travels."""
+
+
+def check_time_unit(ours: Signal, reference: Signal) -> None:
+    """Refuse a reference whose seconds are milliseconds, or less.
+
+    Raises:
+        ComparisonError: it is some thousand times as long, with samples too far apart to tell
+            steps: a long recording at a usual rate is none of these.
+    """
+    if reference.step_s < STEP_MIN_S:
+        return
+    times = float(np.ptp(reference.t_s) / np.ptp(ours.t_s))
+    for factor, unit in ((THOUSAND, "ms"), (THOUSAND**2, "us"), (THOUSAND**3, "ns")):
+        if factor / NEAR < times < factor * NEAR:
+            raise ComparisonError(
+                f"the reference is {np.ptp(reference.t_s):.4g} s long, {times:.0f} times the "
+                f"session, with a sample every {reference.step_s:.3g} s",
+                expected="about as long as the session",
+                remedy=f"Its time may be in {unit}: add --units time={unit}",
+            )
 
 
 def check_force_unit(alignment: Alignment) -> None:

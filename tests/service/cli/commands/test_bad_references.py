@@ -80,6 +80,12 @@ CASES: dict[str, tuple[Callable[[Rows], str], tuple[object, ...]]] = {
     "millinewtons": (_with(lambda t_s, force_n: (t_s, 1e3 * force_n)), ()),
     "the other sign": (_with(lambda t_s, force_n: (t_s, -force_n)), ()),
     "another time": (_with(lambda t_s, force_n: (t_s, force_n)), ("--lag-range-s", "500,600")),
+    "milliseconds as `time_s`": (_with(lambda t_s, force_n: (1e3 * t_s, force_n)), ()),
+    "Unix time": (_with(lambda t_s, force_n: (1.7e9 + t_s, force_n)), ()),
+    "Unix time in milliseconds": (_with(lambda t_s, force_n: (1e3 * (1.7e9 + t_s), force_n)), ()),
+    "decimal commas": (lambda rows: _text(*rows).replace(",", ";").replace(".", ","), ()),
+    "a line of units below the names": (lambda rows: _text(*rows).replace("\n", "\ns,N\n", 1), ()),
+    "a title above the names": (lambda rows: "Plate 1 of 2\n" + _text(*rows), ()),
     "another subject": (_with(_other), ()),
 }
 """By what is wrong: the file, and options."""

@@ -160,3 +160,18 @@ def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     asked = (*LAB, "--sign", "-", "--out", "o")
     run("compare", session, "--reference", plate, *asked).fails(2, "pip install 'foottile[plot]'")
+
+
+def test_a_session_in_the_place_of_its_reference_is_said_to_be_swapped(
+    run: Run, session: Path, plate: Path
+) -> None:
+    done = run("compare", plate, "--reference", session, "--out", "o")
+    done.fails(1, "plate.csv: it is not a session, and session.parquet is one", "swapped?")
+
+
+def test_a_range_of_lags_that_leaves_the_true_one_out_is_named_with_what_fits(
+    run: Run, session: Path, plate: Path
+) -> None:
+    asked = (*LAB, "--sign", "-", "--lag-range-s", "-0.2,0.1", "--out", "o")
+    said = "Without --lag-range-s 3.21 s fits best"
+    run("compare", session, "--reference", plate, *asked).fails(1, said)

@@ -10,7 +10,14 @@ import pytest
 from devices.errors import ComparisonError
 from service.offline.compare.blocks import Estimate
 from service.offline.compare.pairs import Pairs, pair
-from service.offline.compare.plausible import check_force_unit, cop_notes, far_notes, gain_notes
+from service.offline.compare.plausible import (
+    check_force_unit,
+    check_time_unit,
+    cop_notes,
+    far_notes,
+    gain_notes,
+)
+from service.offline.compare.signals import Signal
 from tests.service.offline.compare.sessions import columns, half_sines, reference, same_clock
 
 FOOT_M = np.array([(0.02, 0.015), (0.02, -0.015), (-0.02, 0.015), (-0.02, -0.015)])
@@ -28,6 +35,25 @@ def test_a_scale_of_a_thousand_is_another_unit(scale: float, unit: str) -> None:
     wrong = replace(aligned, scale=replace(aligned.scale, value=scale))
     with pytest.raises(ComparisonError, match=f"may be {unit}"):
         check_force_unit(wrong)
+
+
+def over(seconds: float, step_s: float) -> Signal:
+    t_s = np.arange(0.0, seconds, step_s)
+    return Signal(t_s, np.sin(t_s))
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e6, "us"), (1e9, "ns")])
+def test_a_reference_a_thousand_times_as_long_has_another_unit_of_time(
+    factor: float, unit: str
+) -> None:
+    theirs = over(8.0, 0.001)
+    longer = Signal(factor * theirs.t_s, theirs.force_n)
+    with pytest.raises(ComparisonError, match=f"--units time={unit}"):
+        check_time_unit(over(10.0, 0.002), longer)
+
+
+def test_a_long_recording_around_a_short_session_is_no_wrong_unit() -> None:
+    check_time_unit(over(2.0, 0.002), over(2000.0, 0.01))
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 9.81])
