@@ -205,10 +205,16 @@ def _progress(command: str, count: Callable[[], Iterator[Any]]) -> Iterator[Call
 
         def tell(outcome: Outcome) -> None:
             if outcome.state == "failed":
-                remark(printable(f"{outcome.place}: {outcome.reason}"))
+                remark(printable(_failure(outcome)))
             bar.advance(shown)
 
         yield tell
+
+
+def _failure(outcome: Outcome) -> str:
+    """Place and reason; a reason may begin with a file in that place."""
+    within = outcome.reason.startswith((f"{outcome.place}/", f"{outcome.place}: "))
+    return outcome.reason if within else f"{outcome.place}: {outcome.reason}"
 
 
 def _tell(summary: Summary, command: str, out: str | None, *, as_json: bool) -> None:
@@ -220,6 +226,6 @@ def _tell(summary: Summary, command: str, out: str | None, *, as_json: bool) -> 
         failed = f", {states['failed']} failed" if states["failed"] else ""
         say(f"{where}{command}: {', '.join(counts)}{failed}{'; ' if verdicts else ''}{verdicts}")
     for outcome in () if stderr.is_terminal else summary.failures:
-        remark(printable(f"{outcome.place}: {outcome.reason}"))
+        remark(printable(_failure(outcome)))
     if states["failed"] > len(summary.failures):
         remark(f"and {states['failed'] - len(summary.failures)} more, which the report lists")

@@ -67,6 +67,7 @@ def simulate_command(
     from service.estimation.ladder.chosen import check_models
     from service.offline.calibrations import find_calibration, with_tiles
     from service.offline.simulate import SimulateOptions, simulate
+    from service.rig.plates import injected_beside
     from service.sessions.pipeline import EstimateOptions
 
     the_scene = load_scene(scene)
@@ -106,10 +107,13 @@ def simulate_command(
             path,
             estimate if has_estimates else None,
         )
+    plates = foot.plates.by_name
     if as_json:
-        print_json(_as_json(result, path))
+        print_json({**_as_json(result, path), "plates": list(plates.values())})
     else:
         _print(result, path)
+        for name, file in plates.items():
+            say(f"{file}: the {name}; {injected_beside(file)}: what was injected into it")
     if result.missed_slots:
         raise typer.Exit(3)
 

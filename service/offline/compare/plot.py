@@ -41,11 +41,11 @@ def plot_comparison(
         MissingExtraError: matplotlib is not installed.
     """
     figure = new_figure(11.0, 13.5)
-    figure.suptitle(title, fontsize=11)
     grid = figure.add_gridspec(6, 2, height_ratios=(3, 1.2, 2.6, 2, 1.2, 3.2))
     over_time = [figure.add_subplot(grid[row, :]) for row in range(5)]
     rows = _shown(pairs)
     t_s = pairs.t_s[rows]
+    figure.suptitle(f"{title}\n{stretch(t_s, pairs.t_s)}", fontsize=11)
     _grf(over_time[0], over_time[1], pairs, rows)
     _tiles(over_time[2], t_s, force_n[rows], serials, pairs.reference_n[rows])
     _cop(over_time[3], over_time[4], pairs, rows)
@@ -64,6 +64,14 @@ def _shown(pairs: Pairs) -> Bools:
     both = np.flatnonzero(pairs.contact & (pairs.columns["contact"] == 1))
     begin_s = pairs.t_s[both[0]] - LEAD_S if len(both) else pairs.t_s[0]
     return np.asarray((pairs.t_s >= begin_s) & (pairs.t_s < begin_s + SHOWN_S))
+
+
+def stretch(shown_s: Floats, all_s: Floats) -> str:
+    """Which part of what was compared is drawn over time."""
+    shown, whole = (f"{s[0]:.1f} to {s[-1]:.1f} s" for s in (shown_s, all_s))
+    if len(shown_s) == len(all_s):
+        return f"over time: all that was compared, {whole}"
+    return f"over time: {shown}, of {whole} that were compared; below: all of them"
 
 
 def _grf(force: Axes, error: Axes, pairs: Pairs, rows: Bools) -> None:

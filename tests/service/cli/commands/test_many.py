@@ -73,6 +73,7 @@ def test_what_failed_is_listed_with_its_reason_and_the_exit_code_is_3(
     recording(data, 2)
     done = run("export", data, "--format", "csv", "--out", "out", "--jobs", 1)
     done.fails(3, f"{IDS[2]}: ", "it is recording, and not sealed yet")
+    assert all(line.count(str(data)) <= 1 for line in done.err.splitlines())
     assert "2 made, 0 there before, 1 failed" in done.out
     states = {line["name"]: line["state"] for line in report(tmp_path / "out", "export")}
     assert states == {IDS[0]: "made", IDS[1]: "made", IDS[2]: "failed"}
@@ -147,3 +148,13 @@ def test_a_client_that_was_killed_goes_on_where_it_was_and_the_end_is_the_same(
     assert run(*words, 1, "--out", "whole").code == 0
     assert contents(out) == contents(tmp_path / "whole")
     assert set(os.listdir(out)) == {*copies, "estimate.report.jsonl"}
+
+
+def test_the_path_of_a_file_that_failed_is_said_once(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "bad").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "bad" / f"{name}.parquet").write_bytes(b"PAR1, and no more")
+    done = run("estimate", "bad/*.parquet", "--out", "o", "--jobs", 1)
+    done.fails(3, "bad/a.parquet: ")
+    lines = [line for line in done.err.splitlines() if ".parquet" in line]
+    assert [line.count(".parquet") for line in lines] == [1, 1]
