@@ -17,6 +17,7 @@ import numpy as np
 from devices.errors import FootTileError, StateError
 from devices.frames import FrameBatch
 from service.estimation import OFFLINE_LAG_MS
+from service.estimation.warm import is_warming
 from service.sessions.overview import Seen
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateStream
 from service.sessions.sources import Sources
@@ -67,6 +68,9 @@ class SoFar:
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
         """
+        if self.is_estimated and is_warming():  # or it would compile here
+            self.is_behind = True
+            return
         begun_s = time.monotonic()
         if self._stream is not None and sources.tares != self._sources.tares:
             on = _stream(sources)

@@ -49,13 +49,15 @@ def test_until_models_are_compiled_screens_have_pressures_and_then_forces(
     node.connect()
     node.tared()
     assert running.node()["troubles"] == [WARMING]
+    session = node.record()
+    node.deliver(300, [20.0, 60.0])
+    so_far = running.http.get(f"/sessions/{session.id}/overview")
+    assert "has no frames yet" in so_far.json()["detail"]
+    session.stop()
     before = shown(node)
     assert before["grf_n"] is None
     assert before["force_n"] == [None, None]
     assert before["gauge_kpa"] == pytest.approx([0.0, 0.0], abs=1.0)
-    session = node.record()
-    node.deliver(300, [20.0, 60.0])
-    running.http.post(f"/sessions/{session.id}/stop")
     assert session.now()["state"] != "sealed"
     compiled.touch()
     until(lambda: not is_warming())
