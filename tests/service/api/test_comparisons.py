@@ -23,7 +23,7 @@ def compared(tared: FakeNode, tmp_path: Path) -> Recording:
     session = hopped(tared)
     plate = tmp_path / f"{NAME}.csv"
     write_plate(session, plate)
-    limits = "grf_mae_n=2,grf_r2=0.5"
+    limits = "grf_mae_n=2,grf_r2=0.9999"
     asked = ("--remove-offset", "--reference-sigma-n", "0.3", "--limits", limits)
     assert compare(session, plate, *asked) == 3
     return session
