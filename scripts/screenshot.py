@@ -95,6 +95,25 @@ def session(browser: Browser) -> None:
         save(page, "session")
 
 
+def nodes(browser: Browser) -> None:
+    """All nodes at once: two feet, both recorded."""
+    with demo("--scene", "rolling") as url, httpx.Client(base_url=f"{url}api/v1") as http:
+        other = subprocess.Popen(
+            [*COMMAND, "node", "--scene=standing", "--name=right", f"--server={url}"]
+        )
+        try:
+            while sum(bool(node["tare"]) for node in http.get("/nodes").json()["items"]) < 2:
+                time.sleep(0.2)
+            http.post("/takes", json={"name": "both feet, third trial"})
+            page = browser.new_page(viewport={"width": 1280, "height": 620})
+            page.goto(f"{url}nodes")
+            time.sleep(LOOK_S / 2)
+            save(page, "nodes")
+        finally:
+            other.terminate()
+            other.wait(30)
+
+
 def save(page: Page, name: str) -> None:
     """Write a picture, and say where."""
     path = FOLDER / f"{name}.png"
@@ -112,6 +131,7 @@ def main() -> None:
         browser = playwright.chromium.launch(executable_path=chromium, args=OPTIONS)
         live(browser)
         session(browser)
+        nodes(browser)
         browser.close()
 
 

@@ -48,9 +48,12 @@ TOES_UP = """async () => {
 }"""
 
 TRACED = """() => {
-  const { width, height } = document.querySelector("#tile-traces");
-  const context = document.querySelector("#tile-traces").getContext("2d");
-  const { data } = context.getImageData(width / 2, 0, width / 2, height);
+  const canvas = document.querySelector("#tile-traces");
+  const { width, height } = canvas;
+  // A copy: of one that is read again and again Chromium complains.
+  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  const { data } = copy.getImageData(width / 2, 0, width / 2, height);
   let blue = 0;
   for (let i = 0; i < data.length; i += 4) blue += data[i + 2] - data[i] > 60 && data[i + 3] > 100;
   return blue;
