@@ -69,6 +69,8 @@ async def serving(
 
 _COMPILES = "from service.estimation.warm import warm_up; warm_up()"
 _NICENESS = 10
+_COMPILES_S = 600.0
+"""Ten times what a slow machine takes: for a process that hangs nothing waits longer."""
 
 
 async def _compile_aside(of: Server) -> None:
@@ -85,7 +87,8 @@ async def _compile_aside(of: Server) -> None:
         try:
             with suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
-            await process.wait()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(process.wait(), _COMPILES_S)
         finally:
             if process.returncode is None:
                 process.kill()
