@@ -5,13 +5,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import asynccontextmanager
+from http import HTTPStatus
 from pathlib import Path
 
 from fastapi import APIRouter, FastAPI, Request, Response
+from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket
 
 from devices.errors import FootTileError
 from service.api import problems
+from service.api.described import DOCS_FILES, say_who_may, swagger_folder
 from service.api.guard import Guard
 from service.api.logins import Logins
 from service.api.page import PageFiles
@@ -22,6 +25,7 @@ from service.api.routes import (
     comparisons,
     data,
     health,
+    index,
     login,
     nodes,
     overview,
@@ -82,7 +86,7 @@ def make_app(
         version=SOFTWARE.rsplit(" ", 1)[1],
         description=_DESCRIPTION,
         openapi_url=f"{API}/openapi.json",
-        docs_url=None,  # its pages come from another host, which a field laptop does not reach
+        docs_url=None,  # its page comes from another host, which a field laptop does not reach
         redoc_url=None,
         lifespan=lifespan,
     )
@@ -104,6 +108,9 @@ def make_app(
             _503="There are too many connections, or the data folder is not there.",
         ),
     )
+    api.add_api_route(
+        "", index.index, operation_id="getIndex", summary="All routes", tags=["server"]
+    )
     for module in (
         health,
         login,
@@ -121,6 +128,7 @@ def make_app(
     ):
         api.include_router(module.router)
     app.include_router(api)
+    say_who_may(app)
 
     @app.websocket(LIVE_PATH)
     async def live_socket(socket: WebSocket) -> None:
@@ -133,7 +141,7 @@ def make_app(
     page = PageFiles(page_folder())
 
     @app.get("/", include_in_schema=False)
-    async def index(request: Request) -> Response:
+    async def live_page(request: Request) -> Response:
         return await page.get_response("index.html", request.scope)
 
     @app.get("/nodes", include_in_schema=False)
@@ -143,6 +151,18 @@ def make_app(
     @app.get("/sessions/{session_id}", include_in_schema=False)
     async def session_page(session_id: str, request: Request) -> Response:  # it asks for it itself
         return await page.get_response("session.html", request.scope)
+
+    @app.get("/docs", include_in_schema=False)
+    async def docs_page(request: Request) -> Response:
+        return await page.get_response("docs.html", request.scope)
+
+    swagger = PageFiles(swagger_folder())
+
+    @app.get("/docs/{name}", include_in_schema=False)
+    async def docs_file(name: str, request: Request) -> Response:
+        if name not in DOCS_FILES:
+            raise HTTPException(HTTPStatus.NOT_FOUND)
+        return await swagger.get_response(name, request.scope)
 
     app.mount("/static", page, name="static")
     app.add_middleware(Guard, hosts=tuple(hosts), logins=logins)

@@ -47,7 +47,9 @@ _VIEWER = (
     f"one that may press, on {_HERE}"
 )
 _NO_LOGIN = "For this no login is enough: it needs the server's token"
-_OPEN = re.compile(rf"/|/nodes|/sessions/[^/]+|/static/.*|{LOGIN_PATH}|/api/v1/ready")
+_OPEN = re.compile(
+    rf"/|/nodes|/docs(?:/[^/]+)?|/sessions/[^/]+|/static/.*|{LOGIN_PATH}|/api/v1/ready"
+)
 """What also a private server shows everybody: pages and files without data, how to get in, and for
 those who watch over its process whether it works."""
 _HOST = re.compile(r"(?:(?P<name>[A-Za-z0-9._-]+)|\[(?P<address>[0-9A-Fa-f:.]+)\])(?::[0-9]{1,5})?")
