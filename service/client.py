@@ -26,6 +26,7 @@ from storage.durable import (
 from storage.file_hash import sha256_of
 from storage.formats.export import Format
 from storage.formats.slice import Slice
+from storage.sessions.choice import Choice
 from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME
 from storage.verify.exported import verify_export
@@ -33,6 +34,25 @@ from storage.verify.exported import verify_export
 API = "/api/v1"
 _CHUNK = 1 << 20
 _PARQUET = b"PAR1"
+
+Query = dict[str, str | list[str]]
+
+
+def _query_of(choice: Choice) -> Query:
+    said = {
+        "node": list(choice.nodes),
+        "tag": list(choice.tags),
+        "take": choice.take,
+        "q": choice.q,
+        "from": choice.from_t_ns,
+        "to": choice.to_t_ns,
+        "complete": None if choice.complete is None else str(choice.complete).lower(),
+    }
+    return {
+        name: value if isinstance(value, list) else str(value)
+        for name, value in said.items()
+        if value not in (None, [])
+    }
 
 
 def refuse_data_folder(folder: Path) -> None:
@@ -96,16 +116,20 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self._http.close()
 
-    def sessions(self) -> list[dict[str, Any]]:
-        """All sessions, newest first.
+    def sessions(self, choice: Choice | None = None) -> list[dict[str, Any]]:
+        """Sessions, newest first.
+
+        Args:
+            choice: which; None: all.
 
         Raises:
             LinkError: the server does not answer, or not as one of ours.
         """
+        asked = {} if choice is None else _query_of(choice)
         found: list[dict[str, Any]] = []
         cursor: str | None = None
         while True:
-            query = {"limit": "500"} | ({"cursor": cursor} if cursor else {})
+            query = {"limit": "500", **asked} | ({"cursor": cursor} if cursor else {})
             page = self._get("/sessions", query)
             found += page["items"]
             cursor = page["next_cursor"]
@@ -312,7 +336,7 @@ class Client:
             ) from error
         write_whole(path, answer.content)
 
-    def _get(self, path: str, query: dict[str, str] | None = None) -> dict[str, Any]:
+    def _get(self, path: str, query: Query | None = None) -> dict[str, Any]:
         return self._content(self._answer(path, query))
 
     def _post(self, path: str, body: dict[str, Any] | None) -> dict[str, Any]:
@@ -333,7 +357,7 @@ class Client:
             raise LinkError("the answer is not a foottile server's", where=self.server)
         return content
 
-    def _answer(self, path: str, query: dict[str, str] | None) -> httpx.Response:
+    def _answer(self, path: str, query: Query | None) -> httpx.Response:
         try:
             return self._http.get(path, params=query)
         except httpx.HTTPError as error:

@@ -12,14 +12,21 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from devices.errors import ChangedError, StateError, StorageError, UnknownError
+from devices.errors import ChangedError, StateError, StorageError, UnknownError, UsageError
 from service.server.index import Age, SessionIndex
 from service.server_clock import utc_ns
 from service.sessions.restore import restore
 from storage.durable import storage_errors
 from storage.sessions.beside import write_events
 from storage.sessions.checked_files import CheckedFiles
-from storage.sessions.folder import DOOMED_PREFIX, FRAMES_NAME, Event, Session, SessionFolder
+from storage.sessions.folder import (
+    DOOMED_PREFIX,
+    FRAMES_NAME,
+    Asked,
+    Event,
+    Session,
+    SessionFolder,
+)
 from storage.sessions.reader import SessionReader
 
 log = logging.getLogger("foottile.book")
@@ -186,6 +193,35 @@ class SessionBook:
             raise UnknownError(f"no session {session_id!r}", remedy=remedy)
         return self._sessions[session_id]
 
+    def begun_by(self, asked: Asked | None) -> list[Session]:
+        """Sessions that this very request has begun before, oldest first.
+
+        Raises:
+            UsageError: its key came with another request.
+            StateError: what it began is in the trash.
+        """
+        if asked is None:
+            return []
+        found = [
+            session
+            for session in (*self.newest_first(), *self.trash.all())
+            if session.asked is not None and session.asked.key == asked.key
+        ]
+        for session in found:
+            if session.asked != asked:
+                raise UsageError(
+                    "this Idempotency-Key came with another request before, which began session "
+                    f"{session.id}",
+                    remedy="Make a new key for each recording, and send it again with the same "
+                    "request only",
+                )
+            if session.id in self.trash:
+                raise StateError(
+                    f"this request began session {session.id} before, which is in the trash",
+                    remedy="Restore it, or record with another Idempotency-Key",
+                )
+        return found[::-1]
+
     def keep(self, session: Session) -> Session:
         """Write a new or changed session to the disk, and report it.
 
@@ -215,7 +251,7 @@ class SessionBook:
             StorageError: it cannot be written down.
         """
         session = self.get(session_id)
-        _expect(only_if, said_of(session), f"session {session_id}")
+        expect(only_if, said_of(session), f"session {session_id}")
         return self.keep(session.model_copy(update=changes))
 
     def mark(
@@ -265,7 +301,7 @@ class SessionBook:
     def _marked(self, session_id: str, event_id: str, only_if: str | None) -> Event:
         for event in self.get(session_id).events:
             if event.id == event_id:
-                _expect(only_if, mark_of(event), f"mark {event.label!r} of session {session_id}")
+                expect(only_if, mark_of(event), f"mark {event.label!r} of session {session_id}")
                 return event
         raise UnknownError(
             f"session {session_id} has no mark {event_id[:40]!r}", remedy="It may have been removed"
@@ -300,7 +336,17 @@ def _hash(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _expect(wanted: str | None, found: str, what: str) -> None:
+def expect(wanted: str | None, found: str, what: str) -> None:
+    """Refuse to change what is not any more what somebody has seen.
+
+    Args:
+        wanted: hash of what was seen; None: whatever it is.
+        found: hash of what it is.
+        what: it is, in words.
+
+    Raises:
+        ChangedError: they differ.
+    """
     if wanted is not None and wanted != found:
         raise ChangedError(
             f"{what} was changed by somebody else meanwhile",

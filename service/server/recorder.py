@@ -15,7 +15,7 @@ from devices.errors import (
 )
 from service.link import ClockRow, StreamNumbers, Wanted
 from service.server import following
-from service.server.book import SessionBook
+from service.server.book import SessionBook, expect, said_of
 from service.server.following import ledger_now
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
@@ -24,7 +24,7 @@ from service.server_clock import utc_ns
 from service.sessions.begin import begun
 from service.sessions.sources import Sources
 from storage.intervals import NO_END, Intervals, with_open_ends
-from storage.sessions.folder import Ledger, Session
+from storage.sessions.folder import Asked, Completeness, Ledger, Session
 from storage.sessions.ledger import numbers_of
 
 log = logging.getLogger("foottile.recorder")
@@ -73,10 +73,12 @@ class Recorder:
         notes: str = "",
         tags: tuple[str, ...] = (),
         take: str | None = None,
+        asked: Asked | None = None,
     ) -> Session:
         """Begin a session with the next frame, or `pre_roll_s` earlier if the ring reaches so far.
 
-        Others may be recorded on the same node at the same time.
+        Others may be recorded on the same node at the same time. Whether it was `asked` for before
+        is for the caller to look up: `SessionBook.begun_by`.
 
         Raises:
             UnknownError: no such node.
@@ -105,6 +107,7 @@ class Recorder:
             notes=notes,
             tags=tags,
             take=take,
+            asked=asked,
             missed_slots_at_start=node.present.missed_slots,
             clock=following.clock_at_start(node, part),
         )
@@ -113,17 +116,15 @@ class Recorder:
     def stop(self, session_id: str) -> Session:
         """End a session at this instant; it is sealed as soon as all its frames are there.
 
+        One that was stopped before stays as it is: a stop that is sent again is the same stop.
+
         Raises:
             UnknownError: no such session.
-            StateError: it was stopped before.
             StorageError: that cannot be written down.
         """
         session = self._book.get(session_id)
         if session.state != "recording":
-            raise StateError(
-                f"session {session_id} was stopped already and is {session.state}",
-                expected="a session that is recording",
-            )
+            return session
         self._book.keep(following.stopped(session, self._nodes.find(session.node)))
         self._settling.settle()
         return self._book.get(session_id)
@@ -154,15 +155,21 @@ class Recorder:
         self._settling.settle()
         return self._book.get(session_id)
 
-    def discard(self, session_id: str) -> None:
+    def discard(self, session_id: str, *, only_if: str | None = None) -> None:
         """Move a session to the trash.
+
+        Args:
+            session_id: of the session.
+            only_if: only if `said_of` it is still this; None: whatever it is.
 
         Raises:
             UnknownError: no such session.
+            ChangedError: what people say of it is not this any more.
             StateError: it is being recorded, or sealed.
             StorageError: it cannot be moved.
         """
         session = self._book.get(session_id)
+        expect(only_if, said_of(session), f"session {session_id}")
         if session.state == "recording":
             raise StateError(f"session {session_id} is being recorded", remedy="Stop it first")
         if self._settling.is_sealing(session_id):
@@ -222,6 +229,10 @@ class Recorder:
     def ledger_of(self, session: Session) -> Ledger:
         """The same of a session that may be in the trash."""
         return ledger_now(session, self._nodes.find(session.node))
+
+    def completeness_of(self, session: Session) -> Completeness:
+        """What there is of a session, as of now."""
+        return self.ledger_of(session).completeness
 
     def problem_of(self, session: Session) -> str | None:
         """What a person should know of a session as it is now."""

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import re
 import secrets
-from collections.abc import Callable, Iterable, Sequence
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from devices.errors import FootTileError, StateError, UnknownError
@@ -16,8 +17,10 @@ from service.server.book import SessionBook
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
 from service.server_clock import utc_ns
-from storage.sessions.folder import Session
+from storage.sessions.folder import Asked, Session
 
+_FAILED_KEPT = 1000
+_NOT_THEN = "it could not be recorded when this take was begun"
 TAKE_ID = re.compile(r"[0-9a-f]{12}")
 
 
@@ -45,6 +48,8 @@ class Takes:
         self._recorder = recorder
         self._book = book
         self._nodes = nodes
+        self._failed: OrderedDict[str, dict[str, str]] = OrderedDict()
+        """What was said of the nodes that could not be recorded, by take, the newest last."""
 
     def start(
         self,
@@ -55,8 +60,12 @@ class Takes:
         subject: str = "",
         notes: str = "",
         tags: tuple[str, ...] = (),
+        asked: Asked | None = None,
     ) -> Take:
         """Begin a session on each node, with the same name.
+
+        What was asked for before is not begun again, nor is a node of it that could not be
+        recorded then: it would begin at another time.
 
         Args:
             name: of each session.
@@ -65,10 +74,14 @@ class Takes:
             subject: of each session.
             notes: of each session.
             tags: of each session.
+            asked: with which key; None: without.
 
         Raises:
             StateError: it could be recorded on none.
+            UsageError: the key came with another request before.
         """
+        if begun := self._book.begun_by(asked):
+            return self._begun(begun, nodes or ())
         if nodes is None:
             nodes = sorted(node.name for node in self._nodes if node.connected)
         take = Take(secrets.token_hex(6))
@@ -82,6 +95,7 @@ class Takes:
                     notes=notes,
                     tags=tags,
                     take=take.id,
+                    asked=asked,
                 )
             except FootTileError as error:
                 take.failed[node] = str(error)
@@ -92,7 +106,17 @@ class Takes:
                 "no node is connected" if not take.failed else _in_words(take.failed),
                 remedy="Record when a node is connected and sends",
             )
+        if asked is not None:
+            self._failed[take.id] = take.failed
+            while len(self._failed) > _FAILED_KEPT:
+                self._failed.popitem(last=False)
         return take
+
+    def _begun(self, begun: list[Session], nodes: Sequence[str]) -> Take:
+        take_id = str(begun[0].take)
+        recorded = {session.node for session in begun}
+        lacking = {node: _NOT_THEN for node in nodes if node not in recorded}
+        return Take(take_id, begun, dict(self._failed.get(take_id, lacking)))
 
     def get(self, take_id: str) -> Take:
         """Its sessions as they are now, by node; not those in the trash.
@@ -106,13 +130,19 @@ class Takes:
         return Take(take_id, sorted(found, key=lambda one: (one.node, one.started_t_ns)))
 
     def stop(self, take_id: str) -> Take:
-        """Stop all of its sessions that are being recorded.
+        """Stop all of its sessions that are being recorded; those that were stopped stay so.
 
         Raises:
             UnknownError: no such take.
-            StateError: none of them is.
+            StateError: none of them could be stopped.
         """
-        return self._for_each(take_id, lambda one: self._recorder.stop(one.id))
+        take = self.get(take_id)
+        for session in take.sessions:
+            try:
+                self._recorder.stop(session.id)
+            except FootTileError as error:
+                take.failed[session.node] = str(error)
+        return self._of_those_done(take, take.sessions)
 
     def mark(self, take_id: str, label: str, t_ns: int | None, event_id: str | None = None) -> Take:
         """Note an event in all of its sessions that are being recorded, at one instant.
@@ -123,9 +153,6 @@ class Takes:
         """
         t_ns = utc_ns() if t_ns is None else t_ns
         event_id = event_id or secrets.token_hex(6)
-        return self._for_each(take_id, lambda one: self._book.mark(one.id, label, t_ns, event_id))
-
-    def _for_each(self, take_id: str, do: Callable[[Session], object]) -> Take:
         take = self.get(take_id)
         running = [one for one in take.sessions if one.state == "recording"]
         if not running:
@@ -135,13 +162,16 @@ class Takes:
             )
         for session in running:
             try:
-                do(session)
+                self._book.mark(session.id, label, t_ns, event_id)
             except FootTileError as error:
                 take.failed[session.node] = str(error)
-        done = [one for one in running if one.node not in take.failed]
+        return self._of_those_done(take, running)
+
+    def _of_those_done(self, take: Take, tried: Iterable[Session]) -> Take:
+        done = [self._book.get(one.id) for one in tried if one.node not in take.failed]
         if not done:
             raise StateError(_in_words(take.failed))
-        return Take(take_id, [self._book.get(one.id) for one in done], take.failed)
+        return Take(take.id, done, take.failed)
 
 
 def _in_words(failed: dict[str, str]) -> str:

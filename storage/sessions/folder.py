@@ -32,6 +32,8 @@ DOOMED_PREFIX = ".deleted-"
 SESSION_ID = re.compile(r"[0-9]{8}T[0-9]{6}Z-[0-9a-f]{6}")
 
 State = Literal["recording", "pending", "sealing", "sealed"]
+Completeness = bool | Literal["lossy"]
+"""True: every frame is there; False: some may still come; "lossy": some never will."""
 
 
 class _Record(BaseModel):
@@ -69,6 +71,11 @@ class Ledger(_Record):
     """Slots in which the node took no frame; they never had a number."""
 
     @property
+    def completeness(self) -> Completeness:
+        """What there is of the session, in a word."""
+        return "lossy" if self.lossy else self.complete
+
+    @property
     def recorded(self) -> int:
         """Frames that are here."""
         return sum(part.recorded for part in self.parts)
@@ -96,6 +103,16 @@ class Event(_Record):
     label: str
     t_ns: int
     """In the server's UTC."""
+
+
+class Asked(_Record):
+    """With which key a recording was asked for, and what was asked: both as digests.
+
+    It is kept with what was begun: so the same request, sent again, finds that and begins no other.
+    """
+
+    key: str
+    request: str
 
 
 class Session(_Record):
@@ -128,6 +145,8 @@ class Session(_Record):
     """A person has given up the frames that are still to come."""
     take: str | None = None
     """Id of the take in which it was recorded together with other nodes."""
+    asked: Asked | None = None
+    """The `Idempotency-Key` of the request that began it, if it had one."""
     continues: str | None = None
     """Id of the session that this one continues, with other tiles."""
     problem: str | None = None

@@ -117,6 +117,20 @@ def test_what_is_searched_for_is_found_by_the_server(archive: Running, open_page
     expect(rows).to_have_count(20)
 
 
+def test_sessions_with_missing_frames_are_found_among_all(
+    archive: Running, open_page: OpenPage
+) -> None:
+    page = open_page(archive.url, 1280, 800)
+    rows = page.locator("#sessions .session")
+    expect(rows).to_have_count(20)
+    page.select_option("#sessions-complete", label="Frames missing")
+    expect(page.locator("#sessions")).to_have_text("No session is lacking frames.")
+    page.select_option("#sessions-complete", label="Complete")
+    page.fill("#sessions-search", "MUD")
+    expect(rows).to_have_count(10)
+    assert complaints(page) == []
+
+
 def searched(page: Page) -> None:
     """Only the ten that are called mud are listed."""
     page.fill("#sessions-search", "mud")

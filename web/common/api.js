@@ -81,7 +81,7 @@ export const deleteSession = (session) => call("DELETE", `/sessions/${id(session
 export const listTrash = () => call("GET", "/trash");
 export const restoreSession = (session) => call("POST", `/trash/${id(session)}/restore`);
 export const emptyTrash = () => call("DELETE", "/trash");
-/** @param {{limit: number, cursor?: string, q?: string}} query */
+/** @param {{limit: number, cursor?: string, q?: string, complete?: string}} query */
 export const listSessions = (query) => call("GET", `/sessions?${new URLSearchParams(query)}`);
 export const zipAddress = (ids) => `${PREFIX}/sessions/zip?ids=${ids.map(id).join(",")}`;
 /** Of a download, with marks if there are any; Parquet without them is the sealed file itself. */

@@ -27,7 +27,7 @@ export class Sessions {
     this.cursor = null;
     this.asked = 0;
     this.since = null; // what was told of sessions while the newest are asked for: id -> session or null
-    this.q = "";
+    this.wanted = {}; // as the server is asked
     this.all = el("input", { type: "checkbox", "aria-label": "Choose all that are listed" });
     this.head = head(this.all);
     this.chosen = new Chosen({ all: this.all, onSession, onDeleted, shown: () => [...this.sessions.values()] });
@@ -37,13 +37,17 @@ export class Sessions {
     let typing = null;
     field.addEventListener("input", () => {
       clearTimeout(typing);
-      typing = setTimeout(() => this.search(field.value.trim()), TYPING_MS);
+      typing = setTimeout(() => this.want("q", field.value.trim()), TYPING_MS);
     });
+    const whole = byId("sessions-complete");
+    whole.addEventListener("change", () => this.want("complete", whole.value));
   }
 
-  search(q) {
-    if (q === this.q) return;
-    this.q = q;
+  /** List only what has this; with an empty value whatever it is. */
+  want(what, value) {
+    if (value === (this.wanted[what] ?? "")) return;
+    if (value) this.wanted[what] = value;
+    else delete this.wanted[what];
     this.reload();
   }
 
@@ -55,7 +59,7 @@ export class Sessions {
     const since = cursor ? this.since : this.since = new Map();
     let page;
     try {
-      page = await api.listSessions({ limit: cursor ? MORE : FIRST, ...(cursor ? { cursor } : {}), ...(this.q ? { q: this.q } : {}) });
+      page = await api.listSessions({ limit: cursor ? MORE : FIRST, ...(cursor ? { cursor } : {}), ...this.wanted });
     } catch (error) {
       if (cursor) notice(error.message, { bad: true });
       return [];
@@ -84,7 +88,7 @@ export class Sessions {
   }
 
   take(session) {
-    if (this.q && !mentions(session, this.q.toLowerCase())) return this.drop(session.id);
+    if (!isWanted(session, this.wanted)) return this.drop(session.id);
     // An answer that the link has overtaken: what is sealed stays sealed.
     if (this.sessions.get(session.id)?.state === "sealed" && session.state !== "sealed") return null;
     this.since?.set(session.id, session);
@@ -123,7 +127,7 @@ export class Sessions {
     if (!sorted.length) {
       this.rows.clear();
       this.box.setAttribute("role", "group"); // a table has rows
-      this.box.replaceChildren(el("p", { cls: "none", text: this.q ? `No session mentions “${this.q}”.` : "No sessions yet. Press Record to start one." }));
+      this.box.replaceChildren(el("p", { cls: "none", text: none(this.wanted) }));
       return;
     }
     this.box.setAttribute("role", "table");
@@ -189,7 +193,18 @@ export class Sessions {
   }
 }
 
-/** As the server searches. */
+const MISSING = { true: "complete", lossy: "lacking frames", false: "not whole yet" };
+
+function none({ q, complete }) {
+  if (q) return `No session${complete ? ` that is ${MISSING[complete]}` : ""} mentions “${q}”.`;
+  return complete ? `No session is ${MISSING[complete]}.` : "No sessions yet. Press Record to start one.";
+}
+
+/** As the server chooses. */
+function isWanted(session, { q, complete }) {
+  return (!complete || String(session.complete) === complete) && (!q || mentions(session, q.toLowerCase()));
+}
+
 function mentions(session, q) {
   const said = [session.id, session.name, session.subject, session.notes, session.node, session.scene, ...(session.tags ?? [])];
   return said.some((text) => text?.toLowerCase().includes(q));

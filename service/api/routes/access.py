@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import Depends, Request
+from fastapi import Depends, Header, Request
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -14,7 +15,7 @@ from service.api.problems import MEDIA_TYPE, Problem
 from service.server.server import Server
 from storage.formats.export import MEDIA_TYPES
 from storage.formats.slice import SECONDS_MAX
-from storage.sessions.folder import Session
+from storage.sessions.folder import Asked, Session
 
 _SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}
 
@@ -80,3 +81,43 @@ def has_it(request: Request, tag: str) -> bool:
 
 
 ServerState = Annotated[Server, Depends(_server)]
+
+CHANGED = problems(_412="Somebody else has changed it: it is not what If-Match names.")
+FULL = problems(_507="The data folder cannot be written.")
+
+IfMatch = Annotated[
+    str | None, Header(description="`said` of what is changed, as it was when you looked at it.")
+]
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        description="Yours, new for each recording: the same request with the same key, sent "
+        "again, is answered with what the first one has begun, and begins nothing. It is kept with "
+        "what it began, for as long as that is.",
+        pattern=r"^[!-~]{1,200}$",
+        examples=["8e03978e-40d5-43dd-bc93-6894a57f9324"],
+    ),
+]
+
+
+def tag_of(if_match: str | None) -> str | None:
+    """What is expected, of an `If-Match` with or without quotes; any is none."""
+    said = (if_match or "").strip().removeprefix("W/").strip('"')
+    return None if said in ("", "*") else said
+
+
+def asked_with(key: str | None, what: str, body: BaseModel) -> Asked | None:
+    """A request as it is told from others; None: it came without a key.
+
+    Args:
+        key: its `Idempotency-Key`, with or without quotes.
+        what: it asks for.
+        body: as it was understood, so that how it is written does not matter.
+    """
+    if key is None:
+        return None
+    return Asked(key=_digest(key.strip('"')), request=_digest(f"{what} {body.model_dump_json()}"))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

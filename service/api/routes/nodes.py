@@ -5,10 +5,12 @@ from __future__ import annotations
 from http import HTTPStatus
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Header, Query
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.api.routes.access import ServerState, problems
+from service.api.routes.access import ServerState, problems, tag_of
+from service.server.book import expect
+from service.server.node import ServerNode
 from service.server.screens.picture import rounded
 from service.server.screens.recent import SECONDS_MAX
 from service.server.screens.spans import Span
@@ -65,6 +67,16 @@ class RecentView(View):
 
 _UNKNOWN = problems(_404="No such node.")
 
+InForce = Annotated[
+    str | None,
+    Header(description="Id of the tare in force when you looked: only if it still is."),
+]
+
+
+def _expect_in_force(node: ServerNode, if_match: str | None) -> None:
+    recorded = node.tares.in_force(node.info)
+    expect(tag_of(if_match), "" if recorded is None else recorded.id, f"the tare of {node.name!r}")
+
 
 @router.get("", operation_id="listNodes", summary="All nodes the server knows")
 async def list_nodes(server: ServerState) -> Page[NodeView]:
@@ -120,15 +132,25 @@ async def get_recent(
     status_code=HTTPStatus.CREATED,
     responses={
         **_UNKNOWN,
-        **problems(_409="The foot is loaded or moves, or the node is away.", _507="Disk full."),
+        **problems(
+            _409="The foot is loaded or moves, or the node is away.",
+            _412="Another tare is in force than If-Match names.",
+            _507="Disk full.",
+        ),
     },
 )
-async def tare(node: str, server: ServerState, request: TareRequest | None = None) -> TareView:
+async def tare(
+    node: str,
+    server: ServerState,
+    request: TareRequest | None = None,
+    if_match: InForce = None,
+) -> TareView:
     """Take the newest unloaded quarter of a second of the last ten seconds as the baseline.
 
     It may lie in a flight phase. The tare before is kept and comes back if this one is undone.
     """
     the_node = server.nodes.get(node)
+    _expect_in_force(the_node, if_match)
     recorded = the_node.take_tare(request.reason.strip() if request is not None else "")
     server.tell_node(the_node)
     return TareView.of(recorded)
@@ -149,13 +171,18 @@ async def list_tares(node: str, server: ServerState) -> TaresPage:
     operation_id="undoTare",
     summary="Undo a tare",
     status_code=HTTPStatus.NO_CONTENT,
-    responses=problems(_404="No such node, or no such tare that is not undone.", _507="Disk full."),
+    responses=problems(
+        _404="No such node, or no such tare that is not undone.",
+        _412="Another tare is in force than If-Match names.",
+        _507="Disk full.",
+    ),
 )
-async def undo_tare(node: str, tare_id: str, server: ServerState) -> None:
+async def undo_tare(node: str, tare_id: str, server: ServerState, if_match: InForce = None) -> None:
     """The tare before it is in force again; it stays in the history, marked.
 
     If it was an automatic one, no other is taken until one is taken by hand.
     """
     the_node = server.nodes.get(node)
+    _expect_in_force(the_node, if_match)
     the_node.tare_keeper.undo(tare_id)
     server.tell_node(the_node)

@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import re
 from http import HTTPStatus
-from itertools import islice
+from itertools import islice, takewhile
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from service.api.routes.access import ServerState, problems, stored_table
+from service.api.routes.access import (
+    CHANGED,
+    FULL,
+    IdempotencyKey,
+    IfMatch,
+    ServerState,
+    asked_with,
+    problems,
+    stored_table,
+    tag_of,
+)
 from service.server.screens.views import EventView, Page, SessionView
 from storage.formats.export import MEDIA_TYPES
 from storage.sessions.beside import EVENTS_NAME
+from storage.sessions.choice import Choice, completeness_of, instant_ns
 from storage.sessions.folder import Ledger
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
@@ -23,18 +34,11 @@ SETTLE_S = 5.0
 
 _UNKNOWN = problems(_404="No such session.", _409="Its files are damaged.")
 _NO_EVENT = problems(_404="No such session or event.", _409="Its files are damaged.")
-_CHANGED = problems(_412="Somebody else has changed it: it is not what If-Match names.")
-_FULL = problems(_507="The data folder cannot be written.")
 
 Name = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200)]
 Text = Annotated[str, StringConstraints(max_length=10_000)]
 Tag = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=100)]
 Tags = Annotated[tuple[Tag, ...], Field(max_length=50)]
-
-
-IfMatch = Annotated[
-    str | None, Header(description="`said` of what is changed, as it was when you looked at it.")
-]
 
 
 class _Body(BaseModel):
@@ -105,24 +109,39 @@ class ChangeEvent(_Body):
     summary="Start recording",
     status_code=HTTPStatus.CREATED,
     responses={
-        **problems(_404="No such node.", _409="It is away, or far behind."),
-        **_FULL,
+        **problems(
+            _404="No such node.",
+            _409="It is away, or far behind; or what this request began is in the trash.",
+            _422="Not as described, or the Idempotency-Key came with another request.",
+        ),
+        **FULL,
     },
 )
-async def start(body: StartSession, server: ServerState, response: Response) -> SessionView:
+async def start(
+    body: StartSession,
+    server: ServerState,
+    response: Response,
+    idempotency_key: IdempotencyKey = None,
+) -> SessionView:
     """Record a node from its next frame on, or from `pre_roll_s` earlier.
 
     Several sessions may be recorded on one node at a time; each is stopped by its own id.
     """
-    session = server.recorder.start(
-        body.node,
-        body.name,
-        pre_roll_s=body.pre_roll_s,
-        subject=body.subject or "",
-        notes=body.notes,
-        tags=body.tags,
-    )
-    server.tell_node(server.nodes.get(body.node))
+    asked = asked_with(idempotency_key, "session", body)
+    begun = server.sessions.begun_by(asked)
+    if begun:
+        session = begun[0]
+    else:
+        session = server.recorder.start(
+            body.node,
+            body.name,
+            pre_roll_s=body.pre_roll_s,
+            subject=body.subject or "",
+            notes=body.notes,
+            tags=body.tags,
+            asked=asked,
+        )
+        server.tell_node(server.nodes.get(body.node))
     response.headers["Location"] = f"/api/v1/sessions/{session.id}"
     return SessionView.of(session, server.recorder)
 
@@ -131,12 +150,13 @@ async def start(body: StartSession, server: ServerState, response: Response) -> 
     "/{session_id}/stop",
     operation_id="stopSession",
     summary="Stop recording",
-    responses={**_UNKNOWN, **problems(_409="It was stopped before."), **_FULL},
+    responses={**_UNKNOWN, **FULL},
 )
 async def stop(session_id: str, server: ServerState) -> SessionView:
     """End a session now and seal it; answers when that is done, or after five seconds.
 
-    If the node is away the session is `pending`, and completes when the node has come back.
+    One that was stopped before stays as it is: to stop twice is to stop once. If the node is away
+    the session is `pending`, and completes when the node has come back.
     """
     session = server.recorder.stop(session_id)
     node = server.nodes.find(session.node)  # its folder may be gone
@@ -151,7 +171,7 @@ async def stop(session_id: str, server: ServerState) -> SessionView:
     "/{session_id}/seal",
     operation_id="sealSession",
     summary="Seal without what is missing",
-    responses={**_UNKNOWN, **problems(_409="It is not pending."), **_FULL},
+    responses={**_UNKNOWN, **problems(_409="It is not pending."), **FULL},
 )
 async def seal(session_id: str, server: ServerState) -> SessionView:
     """Give up what a pending session waits for, because its node never comes back.
@@ -174,16 +194,48 @@ async def list_sessions(
     take: Annotated[
         str | None, Query(max_length=100, description="Only those of this take.")
     ] = None,
+    node: Annotated[
+        tuple[str, ...], Query(max_length=100, description="Only those of these nodes.")
+    ] = (),
+    tag: Annotated[
+        tuple[str, ...], Query(max_length=50, description="Only those that have all of these tags.")
+    ] = (),
+    from_: Annotated[
+        str | None,
+        Query(
+            alias="from",
+            max_length=40,
+            description="Only those started at this instant or later: ISO 8601, UTC if it names no "
+            "offset, or nanoseconds since 1970.",
+            examples=["2026-11-24T08:00:00Z"],
+        ),
+    ] = None,
+    to: Annotated[
+        str | None, Query(max_length=40, description="Only those started before this instant.")
+    ] = None,
+    complete: Annotated[
+        Literal["true", "false", "lossy"] | None,
+        Query(description="Only those that are complete, may still become so, or never will be."),
+    ] = None,
 ) -> SessionPage:
-    """A page of sessions."""
-    before = None if cursor is None else _key_of(cursor)
-    listed = server.sessions.newest_first(before)
-    found = (
-        session
-        for session in listed
-        if (take is None or session.take == take)
-        and (q is None or _mentions(session, q.casefold()))
+    """A page of sessions; those that are asked for fulfil all that is said."""
+    choice = Choice(
+        nodes=node,
+        tags=tag,
+        take=take,
+        q=q,
+        from_t_ns=None if from_ is None else instant_ns(from_, where="from"),
+        to_t_ns=None if to is None else instant_ns(to, where="to"),
+        complete=None if complete is None else completeness_of(complete, where="complete"),
     )
+    ends = [] if cursor is None else [_key_of(cursor)]
+    if choice.to_t_ns is not None:
+        ends.append((choice.to_t_ns, ""))
+    since_t_ns = choice.from_t_ns or 0
+    listed = server.sessions.newest_first(min(ends, default=None))
+    recent = takewhile(lambda session: session.started_t_ns >= since_t_ns, listed)
+    of = server.recorder.completeness_of
+    found = (session for session in recent if choice.takes(session, of))
     page = list(islice(found, limit))
     more = next(found, None) is not None
     return SessionPage(
@@ -208,14 +260,14 @@ async def get_session(session_id: str, server: ServerState) -> SessionView:
     "/{session_id}",
     operation_id="changeSession",
     summary="Rename or annotate",
-    responses={**_UNKNOWN, **_CHANGED, **_FULL},
+    responses={**_UNKNOWN, **CHANGED, **FULL},
 )
 async def change(
     session_id: str, body: ChangeSession, server: ServerState, if_match: IfMatch = None
 ) -> SessionView:
     """Change name, subject, notes or tags; the sealed data does not change."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
-    session = server.sessions.change(session_id, only_if=_tag(if_match), **changes)
+    session = server.sessions.change(session_id, only_if=tag_of(if_match), **changes)
     return SessionView.of(session, server.recorder)
 
 
@@ -224,11 +276,16 @@ async def change(
     operation_id="deleteSession",
     summary="Move to the trash",
     status_code=HTTPStatus.NO_CONTENT,
-    responses={**_UNKNOWN, **problems(_409="It is being recorded, or sealed."), **_FULL},
+    responses={
+        **_UNKNOWN,
+        **problems(_409="It is being recorded, or sealed."),
+        **CHANGED,
+        **FULL,
+    },
 )
-async def delete(session_id: str, server: ServerState) -> None:
+async def delete(session_id: str, server: ServerState, if_match: IfMatch = None) -> None:
     """It can be had back until the trash is emptied; its space is free only then."""
-    server.recorder.discard(session_id)
+    server.recorder.discard(session_id, only_if=tag_of(if_match))
     server.hub.notice({"type": "deleted", "session_id": session_id})
 
 
@@ -237,7 +294,7 @@ async def delete(session_id: str, server: ServerState) -> None:
     operation_id="markEvent",
     summary="Mark an event",
     status_code=HTTPStatus.CREATED,
-    responses={**_UNKNOWN, **_FULL},
+    responses={**_UNKNOWN, **FULL},
 )
 async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventView:
     """Note that something happened, now or at an instant."""
@@ -249,7 +306,7 @@ async def mark(session_id: str, body: MarkEvent, server: ServerState) -> EventVi
     "/{session_id}/events/{event_id}",
     operation_id="changeEvent",
     summary="Rename or move a mark",
-    responses={**_NO_EVENT, **_CHANGED, **_FULL},
+    responses={**_NO_EVENT, **CHANGED, **FULL},
 )
 async def change_mark(
     session_id: str,
@@ -260,7 +317,7 @@ async def change_mark(
 ) -> EventView:
     """Change its label or its instant."""
     changes = {n: v for n, v in body.model_dump(exclude_unset=True).items() if v is not None}
-    only_if = _tag(if_match)
+    only_if = tag_of(if_match)
     return EventView.of(
         server.sessions.change_mark(session_id, event_id, only_if=only_if, **changes)
     )
@@ -271,13 +328,13 @@ async def change_mark(
     operation_id="deleteEvent",
     summary="Remove a mark",
     status_code=HTTPStatus.NO_CONTENT,
-    responses={**_NO_EVENT, **_CHANGED, **_FULL},
+    responses={**_NO_EVENT, **CHANGED, **FULL},
 )
 async def remove_mark(
     session_id: str, event_id: str, server: ServerState, if_match: IfMatch = None
 ) -> None:
     """It is gone for good; the same `id` can be marked again."""
-    server.sessions.remove_mark(session_id, event_id, only_if=_tag(if_match))
+    server.sessions.remove_mark(session_id, event_id, only_if=tag_of(if_match))
 
 
 @router.get(
@@ -313,17 +370,6 @@ async def events(
 async def ledger(session_id: str, server: ServerState) -> Ledger:
     """What became of every frame: recorded, lost for a reason, or still with the node."""
     return server.recorder.ledger(session_id)
-
-
-def _tag(if_match: str | None) -> str | None:
-    """What is expected, of an `If-Match` with or without quotes; any is none."""
-    said = (if_match or "").strip().removeprefix("W/").strip('"')
-    return None if said in ("", "*") else said
-
-
-def _mentions(session: object, q: str) -> bool:
-    said = [getattr(session, name) for name in ("id", "name", "subject", "notes", "node", "scene")]
-    return any(q in text.casefold() for text in (*said, *getattr(session, "tags", ())))
 
 
 def _key_of(cursor: str) -> tuple[int, str]:

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Response
 from pydantic import Field
 
 from service.api.routes import sessions as one
-from service.api.routes.access import ServerState, problems
+from service.api.routes.access import IdempotencyKey, ServerState, asked_with, problems
 from service.server.screens.views import SessionView, View
 from service.server.server import Server
 from service.server.takes import Take
@@ -18,6 +18,7 @@ from service.server.takes import Take
 router = APIRouter(prefix="/takes", tags=["takes"])
 
 _UNKNOWN = problems(_404="There is no session of this take.")
+_FAILED = problems(_409="It failed on every node.")
 _OVER = problems(_409="None of its sessions is being recorded, or it failed on every node.")
 
 
@@ -51,12 +52,18 @@ class TakeView(View):
     operation_id="startTake",
     summary="Record several nodes together",
     status_code=HTTPStatus.CREATED,
-    responses=problems(_409="It can be recorded on no node."),
+    responses=problems(
+        _409="It can be recorded on no node; or what this request began is in the trash.",
+        _422="Not as described, or the Idempotency-Key came with another request.",
+    ),
 )
-async def start(body: StartTake, server: ServerState, response: Response) -> TakeView:
+async def start(
+    body: StartTake, server: ServerState, response: Response, idempotency_key: IdempotencyKey = None
+) -> TakeView:
     """One session a node, with one name and one `take`.
 
-    A node that cannot be recorded is in `failed` with the reason, and the others are recorded.
+    A node that cannot be recorded is in `failed` with the reason, and the others are recorded. The
+    same request with the same key begins none of them later.
     """
     take = server.takes.start(
         body.name,
@@ -65,6 +72,7 @@ async def start(body: StartTake, server: ServerState, response: Response) -> Tak
         subject=body.subject or "",
         notes=body.notes,
         tags=body.tags,
+        asked=asked_with(idempotency_key, "take", body),
     )
     _tell_nodes(server, take)
     response.headers["Location"] = f"/api/v1/takes/{take.id}"
@@ -81,10 +89,13 @@ async def get_take(take_id: str, server: ServerState) -> TakeView:
     "/{take_id}/stop",
     operation_id="stopTake",
     summary="Stop all of a take",
-    responses={**_UNKNOWN, **_OVER},
+    responses={**_UNKNOWN, **_FAILED},
 )
 async def stop(take_id: str, server: ServerState) -> TakeView:
-    """End those of its sessions that are being recorded, as each is stopped by itself."""
+    """End those of its sessions that are being recorded, as each is stopped by itself.
+
+    Those that were stopped before stay as they are, and are in the answer, too.
+    """
     take = server.takes.stop(take_id)
     _tell_nodes(server, take)
     there = [node.name for node in server.nodes if node.connected]

@@ -33,10 +33,11 @@ from storage.sessions.beside import EVENTS_NAME
 
 if TYPE_CHECKING:
     from storage.formats.export import Format
+    from storage.sessions.choice import Choice
 
 SERVER = "http://127.0.0.1:8000"
 
-_LONG = {"ledger", "events", "clock", "calibration", "scene_content"}
+_LONG = {"ledger", "events", "clock", "calibration", "scene_content", "asked"}
 """What a list of sessions leaves out."""
 
 ServerOption = Annotated[str | None, typer.Option(help=f"Address of the server; default {SERVER}.")]
@@ -51,21 +52,54 @@ def sessions_command(
     data: Annotated[
         Path | None, typer.Option(help="Data folder to look into, without any server.")
     ] = None,
+    node: Annotated[
+        list[str] | None, typer.Option(help="Only those of this node; again for others.")
+    ] = None,
+    tag: Annotated[
+        list[str] | None, typer.Option(help="Only those with this tag; again: and that one.")
+    ] = None,
+    search: Annotated[
+        str | None, typer.Option(help="Only those with this in name, subject, notes, tag or node.")
+    ] = None,
+    take: Annotated[str | None, typer.Option(help="Only those of this take.")] = None,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            "--from", help="Only those started then or later: 2026-11-24 or 2026-11-24T08:00, UTC."
+        ),
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option("--to", help="Only those started before that.")
+    ] = None,
+    complete: Annotated[
+        str | None, typer.Option(help="true: all is there; false: some may come; lossy: never.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List recorded sessions, newest first."""
+    """List recorded sessions, newest first: all, or those that fulfil all that is asked for."""
     from rich.markup import escape
     from rich.table import Table
 
+    from storage.sessions.choice import Choice, completeness_of, instant_ns
+
+    choice = Choice(
+        nodes=tuple(node or ()),
+        tags=tuple(tag or ()),
+        take=take,
+        q=search,
+        from_t_ns=None if since is None else instant_ns(since, where="--from"),
+        to_t_ns=None if until is None else instant_ns(until, where="--to"),
+        complete=None if complete is None else completeness_of(complete, where="--complete"),
+    )
     if server is not None and data is not None:
         raise UsageError("--server and --data are two places to look in", remedy="Name one")
     if data is not None:
-        found = _in_folder(data)
+        found = _in_folder(data, choice)
     else:
         from service.client import Client
 
         with Client(server or SERVER) as client:
-            found = client.sessions()
+            found = client.sessions(choice)
     if as_json:
         print_json({"items": found})
         return
@@ -220,21 +254,27 @@ def _names(columns: str | None) -> tuple[str, ...]:
     return tuple(name.strip() for name in (columns or "").split(",") if name.strip())
 
 
-def _in_folder(data: Path) -> list[dict[str, Any]]:
-    from storage.sessions.folder import SessionFolder
+def _in_folder(data: Path, choice: Choice) -> list[dict[str, Any]]:
+    from storage.sessions.folder import Completeness, Session, SessionFolder
 
     if not data.is_dir():
         raise UsageError(f"no data folder {str(data)!r}")
     sessions, unreadable = SessionFolder(data / "sessions").load_all()
     for session_id, error in unreadable.items():
         remark(printable(f"session {session_id} is left out: {error}"))
-    found = []
-    for session in sessions:
-        ledger = session.ledger
-        content = session.model_dump(mode="json", exclude=_LONG)
-        complete = False if ledger is None else "lossy" if ledger.lossy else ledger.complete
-        found.append({**content, "complete": complete, "marks": len(session.events)})
-    return found
+
+    def complete(session: Session) -> Completeness:
+        return False if session.ledger is None else session.ledger.completeness
+
+    return [
+        {
+            **session.model_dump(mode="json", exclude=_LONG),
+            "complete": complete(session),
+            "marks": len(session.events),
+        }
+        for session in sessions
+        if choice.takes(session, complete)
+    ]
 
 
 def sealed_file(session: str, data: Path | None) -> Path:

@@ -303,7 +303,7 @@ class SessionView(View):
         made |= {"marks", "waits_for", "said"}
         content = session.model_dump(include=set(cls.model_fields) - made)
         return cls(
-            **content | {"complete": "lossy" if ledger.lossy else ledger.complete},
+            **content | {"complete": ledger.completeness},
             frames=ledger.recorded,
             pending_frames=ledger.pending,
             waits_for=recorder.waits_for(session, ledger),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -75,6 +75,9 @@ WRONG: tuple[tuple[str, str, bytes | None, int], ...] = (
     ("GET", "/sessions?limit=501", None, 422),
     ("GET", "/sessions?limit=many", None, 422),
     ("GET", "/sessions?q=" + "x" * 201, None, 422),
+    ("GET", "/sessions?from=yesterday", None, 422),
+    ("GET", "/sessions?to=2026-13-01", None, 422),
+    ("GET", "/sessions?complete=yes", None, 422),
 )
 
 
@@ -160,7 +163,8 @@ def many(running: Running, node: FakeNode) -> list[str]:
         Session(
             id=new_session_id(datetime(2026, 1, 1, tzinfo=UTC)),
             name=f"{'mud' if i % 3 else 'Sand'} {i}",
-            node="bench",
+            node="bench" if i % 2 else "other",
+            tags=("Odd", "third") if i % 3 else ("odd",),
             state="recording",
             started_t_ns=begin_ns + i // 4,
             parts=(Part(boot_id=node.boot_id, seq_first=0, seq_last=0),),
@@ -174,9 +178,11 @@ def many(running: Running, node: FakeNode) -> list[str]:
     return [session.id for session in sessions]
 
 
-def pages(running: Running, limit: int, q: str | None) -> list[dict[str, Any]]:
+def pages(
+    running: Running, limit: int, q: str | None = None, **wanted: Any
+) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
-    query: dict[str, Any] = {"limit": limit} | ({} if q is None else {"q": q})
+    query: dict[str, Any] = {"limit": limit, **wanted} | ({} if q is None else {"q": q})
     for _ in range(30):
         page = running.http.get("/sessions", params=query).json()
         assert len(page["items"]) <= limit
@@ -196,6 +202,37 @@ def test_pages_lose_and_repeat_nothing(running: Running, many: list[str]) -> Non
             assert ids == [one for one in many if one in ids]
             assert len(ids) == count
             assert all(q.casefold() in session["name"].casefold() for session in found)
+
+
+def test_pages_of_what_is_asked_for_have_that_and_nothing_else(
+    running: Running, many: list[str]
+) -> None:
+    every = pages(running, 500)
+    instants = sorted({one["started_t_ns"] for one in every})
+    since, until_ = instants[1], instants[4]
+
+    def is_within(one: dict[str, Any]) -> bool:
+        return bool(since <= one["started_t_ns"] < until_)
+
+    meant: list[tuple[dict[str, Any], Callable[[dict[str, Any]], bool]]] = [
+        ({"node": "bench"}, lambda one: one["node"] == "bench"),
+        ({"node": ["bench", "other"]}, lambda one: True),
+        ({"tag": "odd"}, lambda one: True),
+        ({"tag": ["THIRD", "odd"]}, lambda one: len(one["tags"]) == 2),
+        ({"from": since, "to": until_}, is_within),
+        (
+            {"from": since, "to": until_, "node": "bench", "q": "mud"},
+            lambda one: is_within(one) and one["node"] == "bench" and "mud" in one["name"],
+        ),
+        ({"to": "2000-01-01"}, lambda one: False),
+        ({"from": "2000-01-01T00:00:00Z"}, lambda one: True),
+        ({"complete": "false"}, lambda one: one["complete"] is False),
+        ({"complete": "lossy"}, lambda one: one["complete"] == "lossy"),
+    ]
+    for wanted, is_meant in meant:
+        for limit in (1, 3, 500):
+            found = [one["id"] for one in pages(running, limit, **wanted)]
+            assert found == [one["id"] for one in every if is_meant(one)], wanted
 
 
 def test_a_cursor_that_is_none_harms_nothing(running: Running, many: list[str]) -> None:

@@ -8,7 +8,7 @@ from storage.sessions.beside import read_events
 from storage.verify.session import verify_session
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
-from tests.service.running import assert_refused
+from tests.service.running import Running, assert_refused
 
 
 @pytest.fixture
@@ -87,3 +87,29 @@ def test_who_changes_what_somebody_else_has_changed_meanwhile_is_told(session: R
     assert http.patch(session.url, json={"tags": ["wet"]}, headers=now).status_code == 200
     for headers in ({}, {"If-Match": "*"}):
         assert http.patch(session.url, json={"name": "x"}, headers=headers).status_code == 200
+
+
+def test_a_session_that_somebody_else_has_renamed_is_not_deleted(session: Recording) -> None:
+    http, seen = session.running.http, session.now()["said"]
+    http.patch(session.url, json={"name": "the best one"})
+    answer = http.delete(session.url, headers={"If-Match": f'"{seen}"'})
+    assert_refused(answer, 412, "changed by somebody else")
+    assert session.now()["name"] == "the best one"
+    assert http.delete(session.url, headers={"If-Match": session.now()["said"]}).status_code == 204
+
+
+def test_a_tare_that_another_one_has_followed_is_neither_replaced_nor_undone_unseen(
+    running: Running, tared: FakeNode
+) -> None:
+    seen = running.node()["tare"]["id"]
+    url, matching = "/nodes/bench/tare", {"If-Match": seen}
+    tared.deliver(200, alive=True)
+    other = running.http.post(url, headers=matching)
+    assert other.status_code == 201, other.text
+    assert_refused(running.http.post(url, headers=matching), 412, "changed by somebody else")
+    undo = f"/nodes/bench/tares/{other.json()['id']}"
+    assert_refused(running.http.delete(undo, headers=matching), 412, "changed by somebody else")
+    assert running.node()["tare"]["id"] == other.json()["id"]
+    matching = {"If-Match": f'"{other.json()["id"]}"'}
+    assert running.http.delete(undo, headers=matching).status_code == 204
+    assert running.node()["tare"]["id"] == seen

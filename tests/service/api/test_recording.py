@@ -61,12 +61,6 @@ def test_a_stop_answers_sealed_while_the_node_streams(
     assert int(tared.all_sent().t_ns[last + 1]) > stopped["stopped_t_ns"]
 
 
-def test_a_session_is_stopped_once(running: Running, tared: FakeNode) -> None:
-    session = tared.record()
-    session.stop()
-    assert_refused(running.http.post(f"{session.url}/stop"), 409, "stopped already")
-
-
 def test_a_node_that_is_away_cannot_be_recorded(running: Running, tared: FakeNode) -> None:
     tared.leave()
     answer = running.http.post("/sessions", json={"node": "bench", "name": "x"})

@@ -164,18 +164,19 @@ def test_a_node_that_is_lost_in_between_is_marked_and_stopped_with_the_others(
     assert right.sealed()["complete"] is True
 
 
-def test_what_was_stopped_alone_is_left_out_of_what_is_done_to_its_take(
+def test_what_was_stopped_alone_is_not_marked_with_its_take_and_stays_as_it_was_stopped(
     running: Running, feet: dict[str, FakeNode]
 ) -> None:
     made = take(running, nodes=["left", "right"])
-    running.session(made["sessions"][0]["id"]).stop()
+    alone = running.session(made["sessions"][0]["id"]).stop()
     marked = running.http.post(f"/takes/{made['id']}/events", json={"label": "x"}).json()
     assert nodes_of(marked) == ["right"]
-    assert nodes_of(running.http.post(f"/takes/{made['id']}/stop").json()) == ["right"]
+    stopped = running.http.post(f"/takes/{made['id']}/stop").json()
+    assert nodes_of(stopped) == ["left", "right"]
+    assert stopped["sessions"][0]["stopped_t_ns"] == alone["stopped_t_ns"]
     assert nodes_of(running.http.get(f"/takes/{made['id']}").json()) == ["left", "right"]
-    for path, body in (("stop", None), ("events", {"label": "late"})):
-        answer = running.http.post(f"/takes/{made['id']}/{path}", json=body)
-        assert_refused(answer, 409, "stopped already")
+    answer = running.http.post(f"/takes/{made['id']}/events", json={"label": "late"})
+    assert_refused(answer, 409, "stopped already")
 
 
 def test_sessions_are_listed_by_take(running: Running, feet: dict[str, FakeNode]) -> None:
@@ -199,7 +200,8 @@ def test_a_take_that_there_is_not_is_not_found(running: Running, take_id: str) -
         ("POST", "/events", {"label": "x"}),
     ):
         answer = running.http.request(method, f"/takes/{take_id}{path}", json=body)
-        assert answer.status_code in (404, 405), (method, path)
+        is_index = answer.url.path == "/api/v1"  # of two dots a client makes that
+        assert answer.status_code in (404, 405) or is_index, (method, path)
 
 
 @pytest.mark.parametrize(

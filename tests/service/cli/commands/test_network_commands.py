@@ -115,6 +115,12 @@ def test_sessions_lists_what_the_server_has_and_what_the_folder_has(
     found = json.loads(run("sessions", "--data", str(demo.data), "--json").stdout)["items"]
     assert [s["id"] for s in asked] == [s["id"] for s in found] == [session]
     assert asked[0]["complete"] is found[0]["complete"] is True
+    for where in (("--server", demo.url), ("--data", str(demo.data))):
+        wanted = ("--node", "demo", "--complete", "true", "--from", "2020-01-01", "--search", "1+1")
+        chosen = json.loads(run("sessions", *where, *wanted, "--json").stdout)["items"]
+        assert [s["id"] for s in chosen] == [session]
+        for other in (("--to", "2020-01-01"), ("--tag", "mud"), ("--take", "x")):
+            assert json.loads(run("sessions", *where, *other, "--json").stdout)["items"] == []
     table = run("sessions", "--server", demo.url, COLUMNS="200")
     assert session in table.stdout
     assert "=1+1 [b]" in table.stdout

@@ -1,0 +1,102 @@
+"""Which sessions of many: by node, tag, take, text, time and completeness. Pure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from devices.errors import UsageError
+from storage.sessions.folder import Completeness, Session
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_T_NS_END = 2**63
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a session has to be; what is left empty may be anything.
+
+    Attributes:
+        nodes: one of these has recorded it.
+        tags: it has all of these, in whatever case.
+        take: it is of this take.
+        q: text in id, name, subject, notes, node, scene or a tag, in whatever case.
+        from_t_ns: it was started at this instant or later, UTC.
+        to_t_ns: it was started before this one.
+        complete: what there is of it.
+    """
+
+    nodes: tuple[str, ...] = ()
+    tags: tuple[str, ...] = ()
+    take: str | None = None
+    q: str | None = None
+    from_t_ns: int | None = None
+    to_t_ns: int | None = None
+    complete: Completeness | None = None
+
+    def takes(self, session: Session, complete: Callable[[Session], Completeness]) -> bool:
+        """Is it one of these?
+
+        Args:
+            session: as it is now.
+            complete: says what there is of one; asked last, since it may have to count.
+        """
+        tags = {tag.casefold() for tag in session.tags}
+        return (
+            (not self.nodes or session.node in self.nodes)
+            and all(tag.strip().casefold() in tags for tag in self.tags)
+            and (self.take is None or session.take == self.take)
+            and (self.from_t_ns is None or session.started_t_ns >= self.from_t_ns)
+            and (self.to_t_ns is None or session.started_t_ns < self.to_t_ns)
+            and (self.q is None or _mentions(session, self.q.casefold()))
+            and (self.complete is None or complete(session) == self.complete)
+        )
+
+
+def instant_ns(said: str, *, where: str) -> int:
+    """An instant in ns since 1970, UTC: such a number, or an ISO 8601 date, with or without time.
+
+    Args:
+        said: without an offset it is UTC; a date alone is its midnight.
+        where: the option or parameter, for the message.
+
+    Raises:
+        UsageError: it is neither, or before 1970 or after 2261.
+    """
+    text = said.strip()
+    try:
+        t_ns = int(text[:20]) if re.fullmatch(r"[0-9]{9,}", text, re.ASCII) else _iso_ns(text)
+    except (ValueError, OverflowError):
+        t_ns = -1
+    if not 0 <= t_ns < _T_NS_END:
+        raise UsageError(
+            f"{where} {said[:40]!r} is no instant",
+            expected="2026-11-24, 2026-11-24T08:00, 2026-11-24T08:00:00Z, or nanoseconds "
+            "since 1970; without an offset it is UTC",
+        )
+    return t_ns
+
+
+def _iso_ns(text: str) -> int:
+    at = datetime.fromisoformat(text)
+    at = at if at.tzinfo is not None else at.replace(tzinfo=UTC)
+    return (at - _EPOCH) // timedelta(microseconds=1) * 1000
+
+
+def completeness_of(said: str, *, where: str) -> Completeness:
+    """What `true`, `false` and `lossy` stand for.
+
+    Raises:
+        UsageError: it is none of these.
+    """
+    known: dict[str, Completeness] = {"true": True, "false": False, "lossy": "lossy"}
+    if said not in known:
+        raise UsageError(f"{where} {said[:40]!r}", expected="true, false or lossy")
+    return known[said]
+
+
+def _mentions(session: Session, q: str) -> bool:
+    said = (session.id, session.name, session.subject, session.notes, session.node, session.scene)
+    return any(q in text.casefold() for text in (*said, *session.tags))
