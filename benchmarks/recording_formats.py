@@ -18,8 +18,9 @@ import pyarrow.parquet as pq
 from recording_data import Recording, batches
 
 from devices.frames import FrameBatch
-from storage.formats.sealed import export_file
+from storage.formats.sealed import export_of
 from storage.formats.slice import Slice
+from storage.formats.written.arrow import ARROW
 from storage.journal.journal import Journal
 from storage.schema import FRAMES, flat_columns, wire_schema
 from storage.sessions.file import ROW_GROUP_NS, SessionWriter
@@ -161,7 +162,7 @@ def read_as_service(path: Path, column: str, begin_ns: int, end_ns: int) -> Valu
     with SessionReader(path, only_slices=True) as reader:
         first_ns = _first_t_ns(path)
         part = Slice((begin_ns - first_ns) * 1e-9, (end_ns - first_ns) * 1e-9, (column,))
-        content = b"".join(export_file(reader, "arrow", part, clock="node", marks=None))
+        content = b"".join(ARROW.written(export_of(reader, part)))
     return pa.ipc.open_stream(content).read_all().column(column).to_numpy()
 
 

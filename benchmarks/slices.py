@@ -42,8 +42,9 @@ from service.offline.estimate.request import EstimateRequest
 from service.offline.estimate.session import Estimated, estimate_session
 from service.server.server import Server
 from storage.file_hash import sha256_of
-from storage.formats.sealed import export_file
+from storage.formats.sealed import export_of
 from storage.formats.slice import Slice
+from storage.formats.written.arrow import ARROW
 from storage.schema import ESTIMATES, Array
 from storage.sessions.file import SessionWriter
 from storage.sessions.folder import (
@@ -146,7 +147,7 @@ def by_export(path: Path, start_s: float) -> Values:
     """What `foottile export` does."""
     part = Slice(start_s, start_s + SECONDS, (COLUMN,))
     with SessionReader(path, only_slices=True) as reader:
-        return _column(b"".join(export_file(reader, "arrow", part, clock="node", marks=None)))
+        return _column(b"".join(ARROW.written(export_of(reader, part))))
 
 
 def by_estimate(path: Path, start_s: float) -> Estimated:

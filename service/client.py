@@ -24,11 +24,13 @@ from storage.durable import (
     write_whole,
 )
 from storage.file_hash import sha256_of
-from storage.formats.export import Format
+from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
+from storage.formats.written.format import Format
 from storage.sessions.choice import Choice
 from storage.sessions.claims import SESSION_NAME
 from storage.sessions.folder import FRAMES_NAME
+from storage.verify.exported import FORMATS as PROVEN
 from storage.verify.exported import verify_export
 
 API = "/api/v1"
@@ -213,8 +215,17 @@ class Client:
             self._pull_table(f"/sessions/{session_id}/{name}", folder / f"{name}.parquet")
         return {**session, "path": str(path), "resumed_bytes": resumed}
 
-    def pull_slice(self, session_id: str, out: Path, part: Slice, to: Format) -> dict[str, Any]:
-        """Download some seconds or columns of a session into a file in the folder `out`.
+    def pull_made(
+        self,
+        session_id: str,
+        out: Path,
+        part: Slice,
+        to: Format,
+        options: FormatOptions = NO_OPTIONS,
+    ) -> dict[str, Any]:
+        """Download a session, or some seconds or columns of it, in some format.
+
+        It is one file in the folder `out`.
 
         The server reads, and sends, no more than that. A slice has no hash of its own: its pages'
         checksums prove it if it is Parquet, and its metadata say what it was made of.
@@ -232,16 +243,18 @@ class Client:
         with storage_errors(out):
             out.mkdir(parents=True, exist_ok=True)
         end = "end" if part.end_s is None else f"{part.end_s:g}s"
-        path = out / f"{session_id}_{part.start_s or 0.0:g}s-{end}.{to}"
-        query: dict[str, object] = {"format": to, "start_s": part.start_s, "end_s": part.end_s}
+        path = out / f"{session_id}_{part.start_s or 0.0:g}s-{end}.{to.ending}"
+        query: dict[str, object] = {"format": to.name, "start_s": part.start_s, "end_s": part.end_s}
         query["columns"] = ",".join(part.columns) or None
+        query |= options.model_dump(mode="json")
         asked = {name: str(value) for name, value in query.items() if value is not None}
         # Under a name of its own until it is proven: who is cut off begins anew.
         partial = temporary_of(path)
         try:
             self._write(f"/sessions/{session_id}/data", asked, partial)
-            report = verify_export(partial)
-            if report is None or report.problems:
+            # Of other formats the connection says whether they came to their end.
+            report = verify_export(partial) if to.name in PROVEN else None
+            if to.name in PROVEN and (report is None or report.problems):
                 why = "it cannot be read" if report is None else report.problems[0]
                 raise LinkError(
                     f"the slice did not come whole: {why}",

@@ -157,9 +157,15 @@ SERVER_TIME = (
 MARKS = (Column("event", pa.string(), "1", "what people marked at this frame"),)
 """Placed when a session is read (`storage.formats.marks`); never in a sealed file."""
 
+TIMES = (
+    Column("time_s", pa.float64(), "s", "seconds after the session's first frame, of t_ns"),
+    Column("time_utc", pa.timestamp("ns", "UTC"), "UTC", "t_ns as a timestamp"),
+)
+"""Made of `t_ns` when a session is read; never in a sealed file."""
+
 KNOWN = {
     column.name: column
-    for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL, *SERVER_TIME, *MARKS)
+    for column in (*FRAMES, *PARTS, *ESTIMATES, *TRUTH, *MILL, *SERVER_TIME, *MARKS, *TIMES)
 }
 
 

@@ -7,10 +7,12 @@ from pathlib import Path
 
 from devices.errors import UsageError
 from storage.durable import whole_file
-from storage.formats.export import ClockName, Format
+from storage.formats.export import ClockName
 from storage.formats.marks import Mark
-from storage.formats.sealed import export_file, marks_of
+from storage.formats.options import NO_OPTIONS, FormatOptions
+from storage.formats.sealed import export_of, marks_of
 from storage.formats.slice import Slice
+from storage.formats.written.registry import format_named
 from storage.sessions.beside import EVENTS_NAME, read_events
 from storage.sessions.reader import SessionReader
 
@@ -21,11 +23,13 @@ _ALL = Slice()
 class ExportOptions:
     """What to export; see `foottile export --help`."""
 
-    to: Format
+    to: str
+    """Name of the format."""
     part: Slice = _ALL
     clock: ClockName = "node"
     marks: bool | None = None
     """None: if there are events beside the frames."""
+    options: FormatOptions = NO_OPTIONS
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,7 @@ def export_session(source: Path, out: Path, options: ExportOptions) -> Exported:
         FileFormatError: a file is damaged.
         StorageError: `out` cannot be written.
     """
+    to = format_named(options.to)
     with SessionReader(source, only_slices=not options.part.is_all) as reader:
         beside = source.with_name(EVENTS_NAME)
         stored = read_events(beside) if options.marks is not False and beside.is_file() else None
@@ -62,10 +67,15 @@ def export_session(source: Path, out: Path, options: ExportOptions) -> Exported:
                 expected="a session's folder as a server sealed it or `foottile pull` fetched it",
             )
         placed = None if stored is None else marks_of(reader, stored.events, options.part)
+        export = export_of(
+            reader,
+            options.part,
+            clock=options.clock,
+            marks=placed,
+            options=options.options,
+        )
         with whole_file(out) as file:
-            for chunk in export_file(
-                reader, options.to, options.part, clock=options.clock, marks=placed
-            ):
+            for chunk in to.written(export):
                 file.write(chunk)
         lacks_marks = options.marks is None and stored is None and "session" in reader.notes
     left_out = tuple(placed.left_out) if placed is not None else ()

@@ -1,28 +1,26 @@
-"""A session, or a slice of it, as a stream of bytes in another format: memory stays bounded.
+"""A session, or a slice of it, as a format is given it: frames in pieces, and facts.
 
-Columns are the flat ones of a sealed file, whatever the format. What an emulated or a measured
-session has is what is given; nothing is resampled.
+Columns are the flat ones of a sealed file, whatever the format; memory stays bounded as long as the
+format writes what it is given. What an emulated or a measured session has is what is given; nothing
+is resampled here.
 """
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, BinaryIO, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.csv as pacsv
-import pyarrow.parquet as pq
 
 from devices.errors import UsageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
 from storage.formats.marks import Marks
+from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
 from storage.schema import (
     ARRAY_INFO_KEY,
@@ -30,50 +28,45 @@ from storage.schema import (
     KNOWN,
     MARKS,
     SERVER_TIME,
+    TIMES,
     Array,
     flat_column,
 )
-from storage.sessions.file import EXPORT_KEY, parquet_options
+from storage.sessions.file import EXPORT_KEY
 from storage.sessions.footer import NOTES_KEY
-
-Format = Literal["parquet", "arrow", "csv"]
-FORMATS: tuple[Format, ...] = get_args(Format)
 
 ClockName = Literal["node", "server"]
 CLOCKS: tuple[ClockName, ...] = get_args(ClockName)
 """Whose time goes with the frames: the node's own only, or the server's beside it."""
 
-MEDIA_TYPES: Mapping[Format, str] = {
-    "parquet": "application/vnd.apache.parquet",
-    "arrow": "application/vnd.apache.arrow.stream",
-    "csv": "text/csv; charset=utf-8; header=present",
-}
-
 _MADE = {column.name: "Ask for the clock `server` as well" for column in SERVER_TIME}
 _MADE |= {column.name: "Ask for marks as well" for column in MARKS}
 
-Pieces = Iterable[tuple[FrameBatch, Mapping[str, Array]]]
+_TIME_NAMES = tuple(column.name for column in TIMES)
+
 Flat = Mapping[str, Array]
-"""Flat columns by name, n rows each."""
+"""Flat columns by name, n rows each; what is not known is what it is in memory."""
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a session has, to be exported.
+    """The frames a session has.
 
     Attributes:
         names: its quantities, of `storage.schema.KNOWN`, in the order of their columns.
         read: gives these flat columns, and others if it likes, of frames in order.
-        span_ns: `t_ns` of the session's first frame, and the latest; None: `read` gives the session
-            from its first frame to its last, and not only where the slice is.
+        begin_t_ns: `t_ns` of the session's first frame.
+        end_t_ns: the latest `t_ns`; None: `read` gives the session from its first frame to its
+            last, not only where the slice is, and gives it once.
     """
 
     names: Sequence[str]
     read: Callable[[Sequence[str]], Iterable[Flat]]
-    span_ns: tuple[int, int] | None = None
+    begin_t_ns: int
+    end_t_ns: int | None = None
 
 
-def content_of(pieces: Pieces) -> Content:
+def content_of(pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]]) -> Content:
     """The content of a session of which all frames are given; the first of them are read.
 
     Args:
@@ -88,107 +81,179 @@ def content_of(pieces: Pieces) -> Content:
         raise UsageError("the session has no frames")
     names = [column.name for column in FRAMES] + list(first[1])
     flat = (_flat(frames, extra) for frames, extra in chain((first,), there))
-    return Content(names, lambda _: flat)
+    return Content(names, lambda _: flat, int(first[0].t_ns[0]))
 
 
-def export(
-    content: Content,
-    info: ArrayInfo,
-    notes: Mapping[str, object],
-    to: Format,
-    part: Slice,
-    clock: ClockTable | None = None,
-    marks: Marks | None = None,
-    source: Mapping[str, object] | None = None,
-) -> Iterator[bytes]:
-    """A session's frames as bytes of a file.
+@dataclass(frozen=True)
+class Export:
+    """What a format is given to write.
 
-    Args:
+    Attributes:
         content: the frames.
         info: the array.
-        notes: for the file's metadata; CSV has no place for them.
-        to: format.
-        part: rows and columns.
+        notes: of the session, whatever else a reader should know.
+        part: rows and columns that are wanted.
         clock: adds `t_server_ns` and its bound, and how they were found to the notes; None: not.
         marks: adds `event`, and what became of each mark to the notes; None: not.
-        source: which session it is of, and its hashes; for the metadata.
-
-    Yields:
-        Chunks of the file. There is a header even if no frame is in the slice, as in a gap.
-
-    Raises:
-        UsageError: a column is not there, or the slice begins after the session's end; raised
-            before the first chunk.
+        source: which session it is of, and its hashes.
+        options: of the format.
     """
-    if clock is not None:
-        notes = {**notes, "clock": clock.summary().model_dump(mode="json")}
-    if marks is not None:
-        notes = {**notes, "marks": [mark.as_dict() for mark in marks.all]}
-    chosen = {"start_s": part.start_s, "end_s": part.end_s, "columns": list(part.columns)}
-    made_of = {**(source or {}), **chosen, "clock": "node" if clock is None else "server"}
-    metadata: dict[bytes | str, bytes | str] = {
-        ARRAY_INFO_KEY: info.model_dump_json().encode(),
-        NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
-        EXPORT_KEY: json.dumps(made_of).encode(),
-    }
-    tables = _tables(content, len(info.tiles), metadata, notes, part, clock, marks)
-    first = next(tables)
-    sink = _Sink()
-    writer = _open(sink, first.schema, to)
-    writer.write_table(first)
-    yield sink.taken()
-    for table in tables:
-        writer.write_table(table)
-        yield sink.taken()
-    writer.close()
-    yield sink.taken()
 
+    content: Content
+    info: ArrayInfo
+    notes: Mapping[str, object]
+    part: Slice
+    clock: ClockTable | None = None
+    marks: Marks | None = None
+    source: Mapping[str, object] = field(default_factory=dict)
+    options: FormatOptions = NO_OPTIONS
 
-def _tables(
-    content: Content,
-    tiles: int,
-    metadata: dict[bytes | str, bytes | str],
-    notes: Mapping[str, object],
-    part: Slice,
-    clock: ClockTable | None,
-    marks: Marks | None,
-) -> Iterator[pa.Table]:
-    made = [column.name for column in SERVER_TIME] if clock is not None else []
-    made += [column.name for column in MARKS] if marks is not None else []
-    chosen = _chosen([*content.names, *made], tiles, part.columns)
-    begin_t_ns, end_t_ns = content.span_ns or (None, 0)
-    header: pa.Table | None = None
-    for flat in content.read(_needed(chosen, made, content.names)):
-        t_ns = flat["t_ns"]
-        if begin_t_ns is None:
-            begin_t_ns = end_t_ns = int(t_ns[0])
-        if content.span_ns is None:
-            end_t_ns = max(end_t_ns, int(t_ns.max()))
-        values = _of_rows(flat, part.rows(t_ns, begin_t_ns))
-        if clock is not None:
-            times = (values["t_mono_ns"], values["t_ns"], values.get("part"))
-            values |= clock.columns(*times)
-        if marks is not None:
-            values["event"] = marks.column(values["seq"], values.get("part"))
-        columns = [flat_column(KNOWN[of], name, values[name], notes) for name, of in chosen.items()]
-        table = pa.Table.from_arrays(
-            [array for _, array in columns],
-            schema=pa.schema([field for field, _ in columns], metadata=metadata),
-        )
-        if len(table):
-            yield table
-            header = table
-        elif header is None:
-            header = table
-    if header is None or len(header):
-        return
-    end_s = (end_t_ns - (begin_t_ns or 0)) * 1e-9
-    if part.begins_after(end_s):
-        raise UsageError(
-            f"the slice starts at {part.start_s:g} s, and the session ends at {end_s:.3f} s",
-            expected="a start before the session's end",
-        )
-    yield header
+    @property
+    def about(self) -> dict[str, object]:
+        """What the file is of, and what was chosen of it; as JSON."""
+        part = self.part
+        chosen = {"start_s": part.start_s, "end_s": part.end_s, "columns": list(part.columns)}
+        return {**self.source, **chosen, "clock": "node" if self.clock is None else "server"}
+
+    @property
+    def all_notes(self) -> dict[str, object]:
+        """The session's, with what is known of clock and marks, if they are in it; as JSON."""
+        notes = dict(self.notes)
+        if self.clock is not None:
+            notes["clock"] = self.clock.summary().model_dump(mode="json")
+        if self.marks is not None:
+            notes["marks"] = [mark.as_dict() for mark in self.marks.all]
+        return notes
+
+    @property
+    def has_forces(self) -> bool:
+        """Was it estimated?"""
+        return "grf_n" in self.content.names
+
+    def chosen(self, columns: Sequence[str] = ()) -> dict[str, str]:
+        """Flat name, and of which quantity it is, of each of these columns, in their order.
+
+        Args:
+            columns: names, of all tiles or of one; empty: those that the slice names, or all.
+
+        Raises:
+            UsageError: one is not there.
+        """
+        present = [*_TIME_NAMES, *self.content.names, *self._made]
+        chosen = _chosen(present, len(self.info.tiles), columns or self.part.columns)
+        if columns or self.part.columns or self.options.times is not False:
+            return chosen
+        return {name: of for name, of in chosen.items() if of not in _TIME_NAMES}
+
+    def pieces(self, columns: Sequence[str] = ()) -> Iterator[dict[str, Array]]:
+        """Flat columns of the slice's frames, in pieces of some thousand rows.
+
+        Args:
+            columns: as for `chosen`.
+
+        Yields:
+            One piece at least, of no rows if the slice lies in a gap; all others have rows. Of a
+            session that is not sealed they come once.
+
+        Raises:
+            UsageError: a column is not there, or the slice begins after the session's end; before
+                the first piece.
+        """
+        chosen, made, content = self.chosen(columns), self._made, self.content
+        end_t_ns = content.begin_t_ns if content.end_t_ns is None else content.end_t_ns
+        header: dict[str, Array] | None = None
+        has_rows = False
+        for flat in content.read(_needed(chosen, made, content.names)):
+            t_ns = flat["t_ns"]
+            if content.end_t_ns is None:
+                end_t_ns = max(end_t_ns, int(t_ns.max()))
+            values = _of_rows(flat, self.part.rows(t_ns, content.begin_t_ns))
+            if self.clock is not None:
+                times = (values["t_mono_ns"], values["t_ns"], values.get("part"))
+                values |= self.clock.columns(*times)
+            if self.marks is not None:
+                values["event"] = self.marks.column(values["seq"], values.get("part"))
+            t_ns = values["t_ns"]
+            values["time_s"] = (t_ns - content.begin_t_ns) * 1e-9
+            values["time_utc"] = t_ns.view("datetime64[ns]")
+            piece = {name: values[name] for name in chosen}
+            header = header or piece
+            if len(t_ns):
+                has_rows = True
+                yield piece
+        if has_rows or header is None:
+            return
+        end_s = (end_t_ns - content.begin_t_ns) * 1e-9
+        if self.part.begins_after(end_s):
+            raise UsageError(
+                f"the slice starts at {self.part.start_s:g} s, and the session ends at "
+                f"{end_s:.3f} s",
+                expected="a start before the session's end",
+            )
+        yield header
+
+    def tables(self) -> Iterator[pa.Table]:
+        """The same as Arrow tables, with units, array and notes in their metadata."""
+        chosen, notes = self.chosen(), self.all_notes
+        metadata: dict[bytes | str, bytes | str] = {
+            ARRAY_INFO_KEY: self.info.model_dump_json().encode(),
+            NOTES_KEY: json.dumps(notes, sort_keys=True).encode(),
+            EXPORT_KEY: json.dumps(self.about).encode(),
+        }
+        tiles = self._tile_of(chosen)
+        for piece in self.pieces():
+            fields, arrays = [], []
+            for name, values in piece.items():
+                plain, array = flat_column(KNOWN[chosen[name]], name, values, notes)
+                fields.append(self._with_tile(plain, tiles[name]))
+                arrays.append(array)
+            yield pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=metadata))
+
+    def whole(self, columns: Sequence[str], *, frames_max: int) -> dict[str, Array]:
+        """All of these columns at once, for a format that cannot be written in pieces.
+
+        Args:
+            columns: as for `chosen`, and `t_ns` among them.
+            frames_max: limit of the format.
+
+        Raises:
+            UsageError: as for `pieces`, or there are more frames: it names the slice to ask for.
+        """
+        pieces: list[dict[str, Array]] = []
+        left = frames_max
+        for piece in self.pieces(columns):
+            left -= len(piece["t_ns"])
+            pieces.append(piece)
+            if left < 0:
+                fits_ns = int(piece["t_ns"][left]) - self.content.begin_t_ns
+                start_s, end_s = self.part.start_s or 0.0, np.floor(fits_ns * 1e-6) * 1e-3
+                raise UsageError(
+                    f"there are more than {frames_max} frames, the limit of this format",
+                    expected=f"a slice: here {start_s:g} s to {end_s:.3f} s fits",
+                )
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+    def _tile_of(self, chosen: Mapping[str, str]) -> dict[str, int | None]:
+        return {
+            name: int(name.removeprefix(f"{of}_")) if KNOWN[of].per_tile else None
+            for name, of in chosen.items()
+        }
+
+    def _with_tile(self, plain: pa.Field[Any], tile: int | None) -> pa.Field[Any]:
+        """With number and serial of its tile, also in its name if that is asked for."""
+        if tile is None:
+            return plain
+        serial = self.info.tiles[tile].serial
+        said: dict[bytes | str, bytes | str] = dict((plain.metadata or {}).items())
+        said |= {b"tile": str(tile).encode(), b"serial": serial.encode()}
+        if self.options.names == "serial":
+            plain = plain.with_name(f"{plain.name.removesuffix(f'_{tile}')}_{serial}")
+        return plain.with_metadata(said)
+
+    @property
+    def _made(self) -> list[str]:
+        made = [column.name for column in SERVER_TIME] if self.clock is not None else []
+        return made + ([column.name for column in MARKS] if self.marks is not None else [])
 
 
 def _flat(frames: FrameBatch, extra: Mapping[str, Array]) -> dict[str, Array]:
@@ -212,7 +277,7 @@ def _of_rows(flat: Flat, rows: Array) -> dict[str, Array]:
 def _needed(chosen: Mapping[str, str], made: Sequence[str], names: Sequence[str]) -> list[str]:
     """Columns to read: those chosen, and those by which rows are found and others made."""
     by = ["t_ns", *(("t_mono_ns", "seq", "part") if made else ())]
-    read = [name for name, of in chosen.items() if of not in made]
+    read = [name for name, of in chosen.items() if of not in (*made, *_TIME_NAMES)]
     return list(dict.fromkeys([*read, *(name for name in by if name in names)]))
 
 
@@ -234,55 +299,3 @@ def _chosen(present: Sequence[str], tiles: int, asked: Sequence[str]) -> dict[st
                 remedy=_MADE.get(name, ""),
             )
     return chosen
-
-
-class _Sink(io.BytesIO):
-    """A file that is handed on in pieces."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._given = 0
-
-    def tell(self) -> int:
-        """Position in the whole file, of which only the end is kept here."""
-        return self._given + super().tell()
-
-    def taken(self) -> bytes:
-        """What was written since."""
-        piece = self.getvalue()
-        self._given += len(piece)
-        self.seek(0)
-        self.truncate()
-        return piece
-
-
-def _open(sink: _Sink, schema: pa.Schema, to: Format) -> Any:
-    match to:
-        case "parquet":
-            return pq.ParquetWriter(sink, schema, **parquet_options(schema))
-        case "arrow":
-            return pa.ipc.new_stream(sink, schema)
-        case "csv":
-            return _CsvWriter(sink, schema)
-
-
-def write_csv(sink: BinaryIO, table: pa.Table) -> None:
-    """A table as CSV, in which no text is a spreadsheet's formula."""
-    with _CsvWriter(sink, table.schema) as writer:
-        writer.write_table(table)
-
-
-_FORMULA = r"^([=+\-@'\t\r\n\x{ff0b}\x{ff0d}\x{ff1d}\x{ff20}])"
-"""What a spreadsheet takes for the beginning of a formula, and the sign that says it is none."""
-
-
-class _CsvWriter(pacsv.CSVWriter):
-    """Text that begins like a formula gets an apostrophe before it, and so does one with one."""
-
-    def write_table(self, table: pa.Table, max_chunksize: int | None = None) -> None:
-        """Append rows."""
-        for i, field in enumerate(table.schema):
-            if pa.types.is_string(field.type):
-                text = pc.replace_substring_regex(table.column(i), _FORMULA, r"'\1")
-                table = table.set_column(i, field, text)
-        super().write_table(table, max_chunksize)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from devices.errors import FileFormatError, UsageError
 from devices.frames import FRAME_COLUMNS
 from storage.clock.table import ClockTable
-from storage.formats.export import ClockName, Content, Format, export
+from storage.formats.export import ClockName, Content, Export
 from storage.formats.marks import NEAREST_NS, TIMES, Mark, Marks, place
+from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
 from storage.schema import FRAMES, KNOWN
 from storage.sessions.beside import clock_beside
@@ -71,28 +72,32 @@ def _near(reader: SessionReader, clock: ClockTable, events: Sequence[Event]) -> 
     return sorted(near)
 
 
-def export_file(
-    reader: SessionReader, to: Format, part: Slice, *, clock: ClockName, marks: Marks | None
-) -> Iterator[bytes]:
-    """A sealed file as bytes of another one: what the slice needs of it is read, and no more.
+def export_of(
+    reader: SessionReader,
+    part: Slice,
+    *,
+    clock: ClockName = "node",
+    marks: Marks | None = None,
+    options: FormatOptions = NO_OPTIONS,
+) -> Export:
+    """A sealed file as formats are given it: what the slice needs of it is read, and no more.
 
     Raises:
-        UsageError: as for `export`; the server's time is asked for, and no clock table is
-            there.
+        UsageError: the server's time is asked for, and no clock table is there.
         FileFormatError: the file or its clock table is damaged.
     """
     extra = [name for name in KNOWN if name not in FRAME_COLUMNS and reader.has(name)]
     table = clock_beside(reader) if clock == "server" else None
-    span_ns = reader.span_ns()
-    begin_ns, end_ns = part.bounds_ns(span_ns[0])
+    begin_t_ns, end_t_ns = reader.span_ns()
+    bounds_ns = part.bounds_ns(begin_t_ns)
     names = [*(column.name for column in FRAMES), *extra]
-    yield from export(
-        Content(names, lambda flat: reader.flat(flat, begin_ns, end_ns), span_ns),
+    return Export(
+        Content(names, lambda flat: reader.flat(flat, *bounds_ns), begin_t_ns, end_t_ns),
         reader.info,
         reader.notes,
-        to,
         part,
         table,
         marks,
-        source=reader.identity,
+        reader.identity,
+        options,
     )

@@ -31,7 +31,7 @@ _TOTAL = ("grf_n", "cop_x_m", "cop_y_m")
 
 def is_session(names: Iterable[str]) -> bool:
     """Are these a session's columns, and no load trace's?"""
-    return "t_ns" in names and "time_s" not in names
+    return "t_ns" in names
 
 
 def as_load(columns: Columns, schema: pa.Schema, *, where: str) -> Columns:

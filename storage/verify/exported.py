@@ -17,8 +17,12 @@ from storage.schema import ARRAY_INFO_KEY, KNOWN
 from storage.sessions.content_hash import CONTENT_KEY
 from storage.sessions.file import EXPORT_KEY
 
+FORMATS = frozenset({"parquet", "arrow", "csv"})
+"""Formats whose exports it recognises."""
 _HEADER_MAX = 1 << 20
-_TILE_NUMBER = re.compile(r"_[0-9]+$")
+_SEMICOLONS = re.compile(r'"[^";,]*";')
+_OF_A_TILE = re.compile("|".join(f"{c.name}_." for c in KNOWN.values() if c.per_tile))
+"""Number or serial is behind the quantity."""
 
 
 @dataclass
@@ -103,12 +107,12 @@ def _csv(path: Path) -> ExportReport | None:
     with path.open("rb") as file:
         first = file.readline(_HEADER_MAX)
     try:
-        (names,) = csv.reader([first.decode("utf-8").rstrip("\r\n")])
+        header = first.decode("utf-8").rstrip("\r\n")
+        between = ";" if _SEMICOLONS.match(header) else ","
+        (names,) = csv.reader([header], delimiter=between)
     except (UnicodeDecodeError, ValueError, csv.Error):
         return None
-    is_ours = bool(names) and all(
-        name in KNOWN or _TILE_NUMBER.sub("", name) in KNOWN for name in names
-    )
+    is_ours = bool(names) and all(name in KNOWN or _OF_A_TILE.match(name) for name in names)
     return ExportReport(path, "csv") if is_ours else None
 
 

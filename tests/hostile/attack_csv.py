@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from devices.frames import FrameBatch
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import Format, content_of, export
+from storage.formats.export import content_of
 from storage.formats.marks import BETWEEN, TIMES, Marks, place
 from storage.formats.slice import Slice
 from storage.schema import Array
@@ -21,6 +21,7 @@ from storage.sessions.folder import Event
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
 from tests.hostile.attack import Outcome, Play, attack
+from tests.storage.formats.exports import TABLES, export
 
 ROWS = 24
 SIGNS = "=+-@\t\r\n\uff1d\uff0b\uff0d\uff20"  # the last four are the first, full width
@@ -64,16 +65,13 @@ def labels_in_a_spreadsheet(play: Play) -> Outcome:
         labels = [_label(play.random) for _ in range(play.random.randrange(1, 9))]
         frames, extra = _session(play.random)
         marks = _placed(labels, frames, play.random)
-        written = {to: _written(to, frames, extra, marks) for to in _FORMATS}
+        written = {to: _written(to, frames, extra, marks) for to in TABLES}
         wrong = _wrong(written, marks, frames)
         if wrong is None:
             outcome.saw("text is text, numbers are numbers")
         else:
             outcome.failed(f"{wrong}: labels {labels!r}")
     return outcome
-
-
-_FORMATS: tuple[Format, ...] = ("csv", "arrow", "parquet")
 
 
 def _label(random: Random) -> str:
@@ -103,7 +101,7 @@ def _placed(labels: list[str], frames: FrameBatch, random: Random) -> Marks:
     return place(events, [times], clock, Slice())
 
 
-def _written(to: Format, frames: FrameBatch, extra: dict[str, Array], marks: Marks) -> bytes:
+def _written(to: str, frames: FrameBatch, extra: dict[str, Array], marks: Marks) -> bytes:
     half = ROWS // 2
     pieces = [
         (frames.rows(a, a + half), {name: values[a : a + half] for name, values in extra.items()})
@@ -112,7 +110,7 @@ def _written(to: Format, frames: FrameBatch, extra: dict[str, Array], marks: Mar
     return b"".join(export(content_of(pieces), make_array(), {}, to, Slice(), None, marks))
 
 
-def _wrong(written: dict[Format, bytes], marks: Marks, frames: FrameBatch) -> str | None:
+def _wrong(written: dict[str, bytes], marks: Marks, frames: FrameBatch) -> str | None:
     arrow = pa.ipc.open_stream(written["arrow"]).read_all()
     if not pq.read_table(io.BytesIO(written["parquet"])).equals(arrow):
         return "Parquet and Arrow differ"

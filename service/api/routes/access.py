@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from devices.errors import StateError, UnknownError
 from service.api.problems import MEDIA_TYPE, Problem
 from service.server.server import Server
-from storage.formats.export import MEDIA_TYPES
 from storage.formats.slice import SECONDS_MAX
+from storage.formats.written.parquet import PARQUET
 from storage.sessions.folder import Asked, Session
 
 _SCHEMA = {"content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}}}
@@ -52,7 +52,7 @@ def stored_table(session: Session, path: Path) -> FileResponse:
             remedy="Stop it, or ask for format=json",
         )
     return FileResponse(
-        present(path), media_type=MEDIA_TYPES["parquet"], filename=f"{session.id}.{path.name}"
+        present(path), media_type=PARQUET.media_type, filename=f"{session.id}.{path.name}"
     )
 
 

@@ -11,13 +11,13 @@ from service.api.routes.access import ServerState, present, problems, stored_tab
 from service.server.server import Server
 from storage.clock.file import CLOCK_NAME
 from storage.clock.table import ClockSummary
-from storage.formats.export import MEDIA_TYPES
+from storage.formats.written.parquet import PARQUET
 from storage.sessions.beside import clock_beside
 from storage.sessions.folder import FRAMES_NAME
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
-_PARQUET = MEDIA_TYPES["parquet"]
+_PARQUET = PARQUET.media_type
 
 
 @router.get(

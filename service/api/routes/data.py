@@ -24,10 +24,14 @@ from service.sessions.frames import SessionFrames
 from service.version import SOFTWARE
 from storage.clock.file import CLOCK_NAME
 from storage.file_hash import sha256_of
-from storage.formats.export import MEDIA_TYPES, ClockName, Format, content_of, export
+from storage.formats.export import ClockName, Export, content_of
 from storage.formats.marks import TIMES, Marks, place
-from storage.formats.sealed import export_file, marks_of
+from storage.formats.options import FormatOptions
+from storage.formats.sealed import export_of, marks_of
 from storage.formats.slice import Slice
+from storage.formats.written.format import Format
+from storage.formats.written.parquet import PARQUET
+from storage.formats.written.registry import FORMATS, FormatName, format_named
 from storage.schema import ROUNDED_TO
 from storage.sessions.folder import FRAMES_NAME, Session
 
@@ -36,12 +40,13 @@ router = APIRouter(prefix="/sessions", tags=["data"])
 _CHUNK = 256 << 10  # three times the default's throughput (performance.md)
 _SINGLE_RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{0,18})|-(\d{1,18}))")
 _YEAR_S = 31_536_000
+_MEDIA_TYPES = [known.media_type for known in FORMATS.values()]
 
 
-class DataQuery(SecondsQuery):
+class DataQuery(SecondsQuery, FormatOptions):
     """Which data, and how."""
 
-    format: Format = "parquet"
+    format: FormatName = PARQUET.name
     columns: str | None = Field(
         default=None,
         description="Names with commas between: of all tiles (`force_n`) or one (`force_n_0`).",
@@ -56,14 +61,23 @@ class DataQuery(SecondsQuery):
     marks: bool | None = Field(
         default=None,
         description="Adds `event`: what people marked, at the frame nearest in time; null "
-        "elsewhere. Left out: true for Arrow and CSV, false for Parquet, which is then the sealed "
-        "file.",
+        "elsewhere. Left out: true, but false for Parquet, which is then the sealed file.",
     )
+
+    @property
+    def to(self) -> Format:
+        """The format."""
+        return format_named(self.format)
 
     @property
     def has_marks(self) -> bool:
         """Are marks wanted?"""
-        return self.format != "parquet" if self.marks is None else self.marks
+        return self.to.is_marked if self.marks is None else self.marks
+
+    @property
+    def options(self) -> FormatOptions:
+        """Of the format."""
+        return FormatOptions(**{name: getattr(self, name) for name in FormatOptions.model_fields})
 
     @property
     def slice(self) -> Slice:
@@ -77,13 +91,14 @@ class DataQuery(SecondsQuery):
         part = self.slice
         columns = ",".join(part.columns)
         rows = f"{part.start_s}|{part.end_s}"
-        return f"{self.format}|{rows}|{columns}|{self.clock}|{self.has_marks}"
+        options = self.options.model_dump_json(exclude_none=True)
+        return f"{self.format}|{rows}|{columns}|{self.clock}|{self.has_marks}|{options}"
 
     @property
     def is_stored(self) -> bool:
         """Is it the sealed file as it is?"""
-        is_plain = self.clock == "node" and not self.has_marks
-        return self.format == "parquet" and self.slice.is_all and is_plain
+        is_plain = self.clock == "node" and not self.has_marks and not self.options.set_names
+        return self.to is PARQUET and self.slice.is_all and is_plain
 
 
 @router.head("/{session_id}/data", include_in_schema=False)
@@ -95,13 +110,13 @@ class DataQuery(SecondsQuery):
     responses={
         200: {
             "description": "The data.",
-            "content": {media_type.split(";")[0]: {} for media_type in MEDIA_TYPES.values()},
+            "content": {media_type.split(";")[0]: {} for media_type in _MEDIA_TYPES},
         },
         206: {"description": "A range of the stored file."},
         304: {"description": "It is what If-None-Match names."},
         **problems(
             _404="No such session, or nothing was recorded.",
-            _409="Parquet is there only when the session is sealed.",
+            _409="This format is there only when the session is sealed.",
             _416="The range is outside the file.",
             _422="No such format or column, or a slice that holds no time of the session.",
         ),
@@ -113,7 +128,7 @@ async def data(
     request: Request,
     server: ServerState,
 ) -> Response:
-    """A session as Parquet, Arrow or CSV.
+    """A session in a format of your choice; `GET /formats` lists them.
 
     Parquet without slice, columns, server's clock or marks is the stored file: with ranges, a
     strong ETag that is its SHA-256, and a digest. Everything else is made on request and streamed;
@@ -126,10 +141,12 @@ async def data(
     headers = {"Foottile-Complete": complete}
     if session.state == "sealed" and session.sha256 is None:
         raise UnknownError(f"session {session_id}: {session.problem}")
-    if session.state != "sealed" and query.format == "parquet":
+    if session.state != "sealed" and query.to.needs_sealed:
+        others = [known.name for known in FORMATS.values() if not known.needs_sealed]
         raise StateError(
-            f"session {session_id} is {session.state}, and Parquet is made when it is sealed",
-            remedy="Stop it, or ask for format=arrow or csv",
+            f"session {session_id} is {session.state}, and {query.to.title} is made when it is "
+            "sealed",
+            remedy=f"Stop it, or ask for format={' or '.join(others)}",
         )
     if session.sha256 is not None and query.is_stored:
         return _stored(session, session.sha256, request, server, headers)
@@ -164,7 +181,7 @@ def _stored(
     answer = FileResponse(
         path,
         headers=headers,
-        media_type=MEDIA_TYPES["parquet"],
+        media_type=PARQUET.media_type,
         filename=f"{session.id}.parquet",
         stat_result=path.stat(),
     )
@@ -191,7 +208,7 @@ async def _made(
     headers |= {"Cache-Control": "private, no-cache", "Accept-Ranges": "none"}
     if has_it(request, tag):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    headers["Content-Disposition"] = f'attachment; filename="{session.id}.{query.format}"'
+    headers["Content-Disposition"] = f'attachment; filename="{session.id}.{query.to.ending}"'
     marks = None
     if query.has_marks:
         marks = await run_in_threadpool(_marks, session, query, server)
@@ -203,7 +220,7 @@ async def _made(
     if first is None:
         raise UsageError("the session has no frames")
     if request.method == "HEAD":
-        answer = Response(headers=headers, media_type=MEDIA_TYPES[query.format])
+        answer = Response(headers=headers, media_type=query.to.media_type)
         del answer.headers["content-length"]  # it is not known before it is made
         return answer
 
@@ -212,7 +229,7 @@ async def _made(
         async for chunk in iterate_in_threadpool(chunks):
             yield chunk
 
-    return StreamingResponse(body(), headers=headers, media_type=MEDIA_TYPES[query.format])
+    return StreamingResponse(body(), headers=headers, media_type=query.to.media_type)
 
 
 def _clocks_hash(session: Session, server: Server) -> str:
@@ -239,14 +256,18 @@ def _marks(session: Session, query: DataQuery, server: Server) -> Marks:
 def _chunks(
     session: Session, query: DataQuery, server: Server, marks: Marks | None
 ) -> Iterator[bytes]:
-    to, part = query.format, query.slice
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
         pieces, source = SessionFrames(sources), {"session": session.id, "state": session.state}
         content = content_of(pieces)  # the first frames: then it is known how they are estimated
         notes = {name: pieces.notes[name] for name in (ROUNDED_TO,) if name in pieces.notes}
-        yield from export(content, sources.info, notes, to, part, clock, marks, source)
+        yield from query.to.written(
+            Export(content, sources.info, notes, query.slice, clock, marks, source, query.options)
+        )
         return
-    with server.sessions.frames(session.id, only_slices=not part.is_all) as reader:
-        yield from export_file(reader, to, part, clock=query.clock, marks=marks)
+    with server.sessions.frames(session.id, only_slices=not query.slice.is_all) as reader:
+        export = export_of(
+            reader, query.slice, clock=query.clock, marks=marks, options=query.options
+        )
+        yield from query.to.written(export)

@@ -20,14 +20,14 @@ from service.api.routes.access import SecondsQuery, ServerState, has_it, problem
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX, Seen, overview_of_session
 from service.version import SOFTWARE
-from storage.formats.export import MEDIA_TYPES
 from storage.formats.slice import Slice
+from storage.formats.written.arrow import ARROW
 from storage.schema import Array
 from storage.sessions.folder import Session
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
-_ARROW = MEDIA_TYPES["arrow"]
+_ARROW = ARROW.media_type
 _ONE_AT_A_TIME = CapacityLimiter(1)
 """Each thread that makes pictures keeps memory of them; and one picture waits for few others, which
 take milliseconds."""

@@ -22,7 +22,7 @@ from service.api.routes.access import (
     tag_of,
 )
 from service.server.screens.views import EventView, Page, SessionView
-from storage.formats.export import MEDIA_TYPES
+from storage.formats.written.parquet import PARQUET
 from storage.sessions.beside import EVENTS_NAME
 from storage.sessions.choice import Choice, completeness_of, instant_ns
 from storage.sessions.folder import Ledger
@@ -345,7 +345,7 @@ async def remove_mark(
     responses={
         200: {
             "description": "The list, or the stored table.",
-            "content": {MEDIA_TYPES["parquet"]: {}},
+            "content": {PARQUET.media_type: {}},
         },
         **problems(
             _404="No such session, or its table has been taken away.",

@@ -23,12 +23,12 @@ from service.server.server import Server
 from service.sessions.stance_overlay import overlay_of_session
 from service.sessions.stances import stances_of_session
 from service.version import SOFTWARE
-from storage.formats.export import MEDIA_TYPES
+from storage.formats.written.arrow import ARROW
 from storage.sessions.folder import Session
 
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 
-_ARROW = MEDIA_TYPES["arrow"]
+_ARROW = ARROW.media_type
 _ONE_AT_A_TIME = CapacityLimiter(1)
 """An overlay reads every frame under load: of several that are asked for one after the other is."""
 _DIGITS = 6

@@ -78,7 +78,7 @@ def query_command(
     elif as_json:
         print_json({"rows": _rows(answer), "left_out": archive.left_out})
     elif as_csv:
-        from storage.formats.export import write_csv
+        from storage.formats.written.csv_text import write_csv
 
         write_csv(sys.stdout.buffer, answer)
     else:

@@ -9,6 +9,7 @@ import typer
 
 from devices.errors import UsageError, needs_extra
 from devices.words import printable
+from service.cli.format_options import FormatOption, with_format_options
 from service.cli.many import (
     NOT_ALL,
     JobsOption,
@@ -29,10 +30,10 @@ from service.cli.options import (
     say,
     stdout,
 )
+from storage.formats.options import FormatOptions
 from storage.sessions.beside import EVENTS_NAME
 
 if TYPE_CHECKING:
-    from storage.formats.export import Format
     from storage.sessions.choice import Choice
 
 SERVER = "http://127.0.0.1:8000"
@@ -127,6 +128,7 @@ def sessions_command(
     stdout.print(table)
 
 
+@with_format_options
 @needs_extra("server", "`foottile pull`")
 def pull_command(
     session: Annotated[str, typer.Argument(help="Id of the session.")],
@@ -135,8 +137,10 @@ def pull_command(
     start_s: StartOption = None,
     end_s: EndOption = None,
     columns: ColumnsOption = None,
-    to: Annotated[str, typer.Option("--format", help="parquet, arrow or csv.")] = "parquet",
+    to: FormatOption = "parquet",
     as_json: JsonOption = False,
+    *,
+    options: FormatOptions,
 ) -> None:
     """Download a sealed session: data, description, events. Goes on where it was broken off.
 
@@ -146,14 +150,16 @@ def pull_command(
     """
     from service.client import Client
     from storage.formats.slice import Slice
+    from storage.formats.written.parquet import PARQUET
+    from storage.formats.written.registry import format_named
 
-    chosen = _format(to)
+    chosen = format_named(to)
     part = Slice(start_s, end_s, _names(columns))
     with Client(server or SERVER) as client, progress(f"pulling {session}"):
-        if part.is_all and chosen == "parquet":
+        if part.is_all and chosen is PARQUET and not options.set_names:
             pulled = client.pull(session, out)
         else:
-            pulled = client.pull_slice(session, out, part, chosen)
+            pulled = client.pull_made(session, out, part, chosen, options)
     if as_json:
         print_json(pulled)
     elif "resumed_bytes" not in pulled:
@@ -167,9 +173,10 @@ def pull_command(
         raise typer.Exit(3)
 
 
+@with_format_options
 def export_command(
     out: Annotated[str, typer.Option(help="File to write; for many sessions, a folder or URI.")],
-    to: Annotated[str, typer.Option("--format", help="parquet, arrow or csv.")],
+    to: FormatOption,
     sessions: Annotated[
         list[str] | None,
         typer.Argument(
@@ -201,6 +208,8 @@ def export_command(
     as_json: Annotated[
         bool, typer.Option("--json", help="Of many sessions print each as a line of JSON.")
     ] = False,
+    *,
+    options: FormatOptions,
 ) -> None:
     """Write a sealed session, or a slice of it, in another format.
 
@@ -211,15 +220,17 @@ def export_command(
     from service.offline.export import ExportOptions, export_session
     from storage.formats.export import CLOCKS
     from storage.formats.slice import Slice
+    from storage.formats.written.registry import format_named
 
     if clock not in CLOCKS:
         raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
-    options = ExportOptions(_format(to), Slice(start_s, end_s, _names(columns)), clock, marks)
+    part = Slice(start_s, end_s, _names(columns))
+    wanted = ExportOptions(format_named(to).name, part, clock, marks, options)
     if not is_one(sessions, manifest) or is_remote(out):
         from service.offline.archive.tasks import ExportTask
 
         summary = run_many(
-            ExportTask(options),
+            ExportTask(wanted),
             sessions,
             manifest,
             out=out,
@@ -233,21 +244,12 @@ def export_command(
     source = sealed_file((sessions or [""])[0], data)
     path = output_path(Path(out), source)
     with progress(f"writing {path.name}"):
-        done = export_session(source, path, options)
+        done = export_session(source, path, wanted)
     say(f"{path}: {done.size_bytes} bytes")
     for mark in done.left_out:
         remark(f"mark {mark.event.label!r} is not in it: {mark.left_out}")
     if done.lacks_marks:
         remark(f"without marks: there is no {EVENTS_NAME} beside {source.name}")
-
-
-def _format(named: str) -> Format:
-    from storage.formats.export import FORMATS
-
-    for known in FORMATS:
-        if named == known:
-            return known
-    raise UsageError(f"--format {named!r}", expected=" or ".join(FORMATS))
 
 
 def _names(columns: str | None) -> tuple[str, ...]:

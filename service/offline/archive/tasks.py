@@ -21,6 +21,7 @@ from storage.checked_json import with_check
 from storage.clock.file import CLOCK_NAME
 from storage.file_hash import sha256_of
 from storage.formats.slice import Slice
+from storage.formats.written.registry import format_named
 from storage.sessions.beside import EVENTS_NAME
 from storage.sessions.claims import LEDGER_NAME, PULLED_EVENTS_NAME, SESSION_NAME, bytes_of
 from storage.sessions.folder import FRAMES_NAME
@@ -164,11 +165,12 @@ class ExportTask:
 
     def options(self) -> dict[str, Any]:
         """As for any task."""
-        return {**vars(self.export), "part": vars(self.export.part)}
+        asked = self.export.options.model_dump(exclude_none=True)
+        return {**vars(self.export), "part": vars(self.export.part), "options": asked}
 
     def run(self, source: Path, work: Path) -> dict[str, Any]:
         """As for any task."""
-        name = f"{Path(FRAMES_NAME).stem}.{self.export.to}"
+        name = f"{Path(FRAMES_NAME).stem}.{format_named(self.export.to).ending}"
         done = export_session(frames_of(source), work / name, self.export)
         left_out = {mark.event.label: mark.left_out for mark in done.left_out}
         return {"bytes": done.size_bytes, "marks_left_out": left_out}

@@ -16,11 +16,12 @@ import pytest
 
 from devices.errors import LinkError, StateError, UsageError
 from service.client import Client
-from storage.formats.export import FORMATS, Format
 from storage.formats.slice import Slice
+from storage.formats.written.registry import format_named
 from storage.verify.data import verdict_of, verify
 from tests.service.api.sealed import Sealed
 from tests.service.running import Running
+from tests.storage.formats.exports import TABLES
 
 
 def test_the_client_pulls_a_session_whole(sealed: Sealed, tmp_path: Path) -> None:
@@ -134,11 +135,11 @@ def test_the_client_says_that_no_server_answers(running: Running, tmp_path: Path
         client.sessions()
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_the_client_pulls_a_slice(sealed: Sealed, tmp_path: Path, to: Format) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_the_client_pulls_a_slice(sealed: Sealed, tmp_path: Path, to: str) -> None:
     part = Slice(0.25, 0.5, ("t_ns", "grf_n"))
     with Client(sealed.running.url) as client:
-        pulled = client.pull_slice(sealed.id, tmp_path / "out", part, to)
+        pulled = client.pull_made(sealed.id, tmp_path / "out", part, format_named(to))
     path = Path(pulled["path"])
     assert path.name == f"{sealed.id}_0.25s-0.5s.{to}"
     assert pulled["bytes"] == path.stat().st_size
@@ -159,11 +160,13 @@ def test_a_slice_that_is_refused_leaves_nothing_behind(sealed: Sealed, tmp_path:
     out = tmp_path / "out"
     with Client(sealed.running.url) as client:
         with pytest.raises(LinkError, match="no column"):
-            client.pull_slice(sealed.id, out, Slice(columns=("weight_n",)), "arrow")
+            client.pull_made(sealed.id, out, Slice(columns=("weight_n",)), format_named("arrow"))
         with pytest.raises(LinkError, match="is recording"):
-            client.pull_slice(sealed.recording.id, out, Slice(0.0, 1.0), "parquet")
+            client.pull_made(sealed.recording.id, out, Slice(0.0, 1.0), format_named("parquet"))
         with pytest.raises(UsageError, match="this is a data folder"):
-            client.pull_slice(sealed.id, sealed.session.folder, Slice(0.0, 1.0), "arrow")
+            client.pull_made(
+                sealed.id, sealed.session.folder, Slice(0.0, 1.0), format_named("arrow")
+            )
     assert list(out.iterdir()) == []
 
 
@@ -183,5 +186,5 @@ def test_a_slice_that_is_damaged_on_its_way_is_refused(
             Client(sealed.running.url) as client,
             pytest.raises(LinkError, match="did not come whole"),
         ):
-            client.pull_slice(sealed.id, out, Slice(0.25, 0.5), to)
+            client.pull_made(sealed.id, out, Slice(0.25, 0.5), format_named(to))
     assert list(out.iterdir()) == []

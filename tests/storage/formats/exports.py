@@ -10,9 +10,13 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
-from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, FrameBatch
-from storage.formats.export import Format, content_of, export
+from devices.frames import NO_SERVO_AGE, NO_SERVO_COUNTS, NOT_READ, ArrayInfo, FrameBatch
+from storage.clock.table import ClockTable
+from storage.formats.export import Content, Export, content_of
+from storage.formats.marks import Marks
+from storage.formats.options import FormatOptions
 from storage.formats.slice import Slice
+from storage.formats.written.registry import format_named
 from storage.schema import CONTACT_UNKNOWN, Array
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
@@ -68,12 +72,36 @@ def cut(batch: FrameBatch, columns: Mapping[str, Array], every: int) -> Iterator
         )
 
 
-def exported(to: Format, part: Slice | None = None, *, every: int = 20) -> bytes:
-    pieces = cut(frames(), extra(), every)
-    return b"".join(export(content_of(pieces), make_array(), NOTES, to, part or Slice()))
+TABLES = ("parquet", "arrow", "csv")
+"""Formats that hold any columns, as a table."""
+NO_TIMES = FormatOptions(times=False)
+"""What is in the session, and nothing that is made of it."""
 
 
-def read(content: bytes, to: Format) -> pa.Table:
+def export(
+    content: Content,
+    info: ArrayInfo,
+    notes: Mapping[str, object],
+    to: str,
+    part: Slice,
+    clock: ClockTable | None = None,
+    marks: Marks | None = None,
+    source: Mapping[str, object] | None = None,
+    options: FormatOptions = NO_TIMES,
+) -> Iterator[bytes]:
+    wanted = Export(content, info, notes, part, clock, marks, source or {}, options)
+    return format_named(to).written(wanted)
+
+
+def exported(
+    to: str, part: Slice | None = None, *, every: int = 20, options: FormatOptions = NO_TIMES
+) -> bytes:
+    content = content_of(cut(frames(), extra(), every))
+    chunks = export(content, make_array(), NOTES, to, part or Slice(), options=options)
+    return b"".join(chunks)
+
+
+def read(content: bytes, to: str) -> pa.Table:
     if to == "parquet":
         return pq.read_table(io.BytesIO(content))
     if to == "arrow":
@@ -97,5 +125,5 @@ def values(table: pa.Table) -> dict[str, list[object]]:
     }
 
 
-def names(part: Slice, to: Format = "arrow") -> list[str]:
+def names(part: Slice, to: str = "arrow") -> list[str]:
     return read(exported(to, part), to).column_names

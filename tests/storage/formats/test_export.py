@@ -16,7 +16,7 @@ from devices.errors import UsageError
 from devices.frames import NO_SERVO_COUNTS, NOT_READ, ArrayInfo
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import FORMATS, MEDIA_TYPES, Format, content_of, export
+from storage.formats.export import content_of
 from storage.formats.slice import Slice
 from storage.schema import ARRAY_INFO_KEY, CONTACT_UNKNOWN, FRAMES
 from storage.sessions.footer import NOTES_KEY
@@ -24,8 +24,10 @@ from tests.builders.arrays import PERIOD_NS, make_array
 from tests.storage.formats.exports import (
     NOTES,
     ROWS,
+    TABLES,
     Piece,
     cut,
+    export,
     exported,
     extra,
     frames,
@@ -56,7 +58,7 @@ def test_every_format_says_the_same_of_a_slice(
         None if end is None else end * PERIOD_NS * 1e-9,
         tuple(columns),
     )
-    tables = {to: read(exported(to, part, every=every), to) for to in FORMATS}
+    tables = {to: read(exported(to, part, every=every), to) for to in TABLES}
     expected = range(start or 0, ROWS if end is None else min(end, ROWS))
     for to, table in tables.items():
         assert table.num_rows == len(expected), to
@@ -67,8 +69,8 @@ def test_every_format_says_the_same_of_a_slice(
         assert tables["arrow"].column("seq").to_pylist() == [2**60 + i for i in expected]
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_a_slice_of_a_gap_has_a_header_and_no_rows(to: Format) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_a_slice_of_a_gap_has_a_header_and_no_rows(to: str) -> None:
     def with_a_gap() -> Iterator[Piece]:
         yield frames().rows(0, 10), {}
         yield frames().rows(40, ROWS), {}
@@ -79,8 +81,8 @@ def test_a_slice_of_a_gap_has_a_header_and_no_rows(to: Format) -> None:
     assert found.num_rows == 0
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_a_slice_that_begins_after_the_end_is_refused_before_the_first_chunk(to: Format) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_a_slice_that_begins_after_the_end_is_refused_before_the_first_chunk(to: str) -> None:
     chunks = export(
         content_of(cut(frames(), extra(), 20)), make_array(), NOTES, to, Slice(ROWS * 2e-3 + 1)
     )
@@ -122,12 +124,12 @@ def test_values_are_those_of_the_session_and_what_is_not_known_is_null() -> None
 def test_all_columns_come_in_the_order_of_a_sealed_file() -> None:
     flat = [f for column in FRAMES for f in column.flat_names(2)]
     further = ["part", "force_n_0", "force_n_1", "grf_n", "contact", "estimate_status", "phase"]
-    for to in FORMATS:
+    for to in TABLES:
         assert names(Slice(), to) == flat + further
 
 
 @pytest.mark.parametrize("to", ["parquet", "arrow"])
-def test_units_array_and_notes_go_with_it(to: Format) -> None:
+def test_units_array_and_notes_go_with_it(to: str) -> None:
     schema = read(exported(to, Slice(columns=("force_n", "t_ns"))), to).schema
     units = {field.name: (field.metadata or {}).get(b"unit") for field in schema}
     assert units["force_n_1"] == b"N"
@@ -146,10 +148,6 @@ def test_csv_is_lines_with_a_header() -> None:
     assert len(lines) == 3
 
 
-def test_every_format_has_a_media_type() -> None:
-    assert set(MEDIA_TYPES) == set(FORMATS) == {"parquet", "arrow", "csv"}
-
-
 # --- the server's time ----------------------------------------------------------------------------
 
 
@@ -162,15 +160,15 @@ def clock() -> ClockTable:
     return ClockTable({"0" * 32: rows}, [StreamFacts("0" * 32, 10**18, True)], ["0" * 32, "other"])
 
 
-def on_servers_axis(to: Format, part: Slice | None = None, *, every: int = 20) -> bytes:
+def on_servers_axis(to: str, part: Slice | None = None, *, every: int = 20) -> bytes:
     columns = extra()
     columns["part"][30:] = 1
     pieces = cut(frames(), columns, every)
     return b"".join(export(content_of(pieces), make_array(), NOTES, to, part or Slice(), clock()))
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_the_servers_time_is_added_and_raw_time_stays(to: Format) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_the_servers_time_is_added_and_raw_time_stays(to: str) -> None:
     table = read(on_servers_axis(to), to)
     assert table.column_names[-2:] == ["t_server_ns", "t_server_uncertainty_ns"]
     assert table.column("t_ns").to_pylist() == frames().t_ns.tolist()
@@ -184,9 +182,9 @@ def test_the_servers_time_is_added_and_raw_time_stays(to: Format) -> None:
     assert t_server_ns[30:] == bound_ns[30:] == [None] * (ROWS - 30)  # the stream was not measured
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", TABLES)
 @pytest.mark.parametrize("every", [1, 7])
-def test_any_pieces_give_the_same_servers_time(to: Format, every: int) -> None:
+def test_any_pieces_give_the_same_servers_time(to: str, every: int) -> None:
     part = Slice(columns=("t_server_ns", "t_server_uncertainty_ns"))
     found = read(on_servers_axis(to, part, every=every), to)
     assert found.column_names == list(part.columns)
@@ -194,7 +192,7 @@ def test_any_pieces_give_the_same_servers_time(to: Format, every: int) -> None:
 
 
 @pytest.mark.parametrize("to", ["parquet", "arrow"])
-def test_notes_say_how_the_servers_time_was_found(to: Format) -> None:
+def test_notes_say_how_the_servers_time_was_found(to: str) -> None:
     schema = read(on_servers_axis(to, Slice(columns=("t_server_ns",))), to).schema
     assert schema.field("t_server_ns").type == pa.int64()
     assert schema.field("t_server_ns").nullable
@@ -216,8 +214,8 @@ def test_the_servers_time_is_not_there_unless_it_is_asked_for() -> None:
 # --- in pieces ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: Format) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: str) -> None:
     """Of an endless session the beginning comes, and what was given away is kept no longer."""
     rows, asked = 500, 0
     piece = frames(rows)
@@ -238,22 +236,22 @@ def test_chunks_come_while_frames_are_read_and_are_no_larger_than_a_piece(to: Fo
     assert max(sizes[1:]) < 1.5 * min(sizes[1:])
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_frames_outside_of_a_slice_make_no_chunks(to: Format) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_frames_outside_of_a_slice_make_no_chunks(to: str) -> None:
     part = Slice(0.09, None, ("seq",))
     chunks = list(export(content_of(cut(frames(), extra(), 1)), make_array(), {}, to, part))
     assert len(chunks) <= 1 + 5 + 1
     assert read(b"".join(chunks), to).num_rows == 5
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_a_session_without_frames_is_refused(to: Format) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_a_session_without_frames_is_refused(to: str) -> None:
     with pytest.raises(UsageError, match="no frames"):
         next(export(content_of([]), make_array(), {}, to, Slice()))
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_an_error_on_the_way_is_not_the_end_of_a_file(to: Format) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_an_error_on_the_way_is_not_the_end_of_a_file(to: str) -> None:
     def broken() -> Iterator[Piece]:
         yield frames(), {}
         raise OSError("the disk is gone")

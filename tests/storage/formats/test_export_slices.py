@@ -9,11 +9,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from storage.formats.export import FORMATS, Format, content_of, export
+from storage.formats.export import content_of
 from storage.formats.slice import Slice
 from storage.schema import FRAMES
 from tests.builders.arrays import make_array
-from tests.storage.formats.exports import ROWS, cut, exported, extra, frames, names, read
+from tests.storage.formats.exports import (
+    ROWS,
+    TABLES,
+    cut,
+    export,
+    exported,
+    extra,
+    frames,
+    names,
+    read,
+)
 
 # --- rows -----------------------------------------------------------------------------------------
 
@@ -36,9 +46,9 @@ def test_a_slice_begins_with_its_start_and_ends_before_its_end(
     assert table.column("seq").to_pylist() == [2**60 + i for i in range(first, last + 1)]
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", TABLES)
 @pytest.mark.parametrize("every", [20, ROWS])
-def test_a_slice_between_two_frames_still_has_a_header(to: Format, every: int) -> None:
+def test_a_slice_between_two_frames_still_has_a_header(to: str, every: int) -> None:
     part = Slice(0.051, 0.0515, ("t_ns", "force_n"))
     table = read(exported(to, part, every=every), to)
     assert table.num_rows == 0
@@ -59,7 +69,7 @@ def test_only_a_slice_of_everything_is_all() -> None:
 # --- columns --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", TABLES)
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [
@@ -74,7 +84,7 @@ def test_only_a_slice_of_everything_is_all() -> None:
     ],
 )
 def test_columns_are_asked_for_by_tile_or_for_all_tiles_and_keep_their_order(
-    to: Format, asked: tuple[str, ...], expected: str
+    to: str, asked: tuple[str, ...], expected: str
 ) -> None:
     assert names(Slice(columns=asked), to) == expected.split()
 
@@ -82,9 +92,9 @@ def test_columns_are_asked_for_by_tile_or_for_all_tiles_and_keep_their_order(
 @pytest.mark.parametrize(
     "unknown", ["magic", "force_n_2", "force_n_", "FORCE_N", "", "true_grf_n", "x" * 10_000, "a\0"]
 )
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", TABLES)
 def test_a_column_that_is_not_there_is_refused_before_the_first_chunk(
-    to: Format, unknown: str
+    to: str, unknown: str
 ) -> None:
     chunks = export(
         content_of(cut(frames(), extra(), 20)),

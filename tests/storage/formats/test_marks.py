@@ -17,7 +17,7 @@ from devices.errors import UsageError
 from devices.frames import FrameBatch
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import FORMATS, Format, content_of, export
+from storage.formats.export import content_of
 from storage.formats.marks import NEAREST_NS, TIMES, Marks, place
 from storage.formats.slice import Slice
 from storage.schema import Array
@@ -25,6 +25,7 @@ from storage.sessions.folder import Event
 from storage.sessions.footer import NOTES_KEY
 from tests.builders.arrays import PERIOD_NS, make_array
 from tests.builders.frames import make_frames
+from tests.storage.formats.exports import TABLES, export
 
 UTC_NS = 10**18
 OFFSET_NS = 7_000_000_000
@@ -150,7 +151,7 @@ def test_any_pieces_give_the_frames_that_a_search_of_all_frames_gives(
 # --- in a file ------------------------------------------------------------------------------------
 
 
-def exported(to: Format, marks: Marks | None, columns: tuple[str, ...] = ()) -> bytes:
+def exported(to: str, marks: Marks | None, columns: tuple[str, ...] = ()) -> bytes:
     frames, part = session()
     pieces = ((frames.rows(a, a + 20), {"part": part[a : a + 20]}) for a in range(0, ROWS, 20))
     return b"".join(
@@ -158,14 +159,14 @@ def exported(to: Format, marks: Marks | None, columns: tuple[str, ...] = ()) -> 
     )
 
 
-def read(content: bytes, to: Format) -> pa.Table:
+def read(content: bytes, to: str) -> pa.Table:
     if to == "parquet":
         return pq.read_table(io.BytesIO(content))
     return pa.ipc.open_stream(content).read_all()
 
 
 @pytest.mark.parametrize("to", ["parquet", "arrow"])
-def test_the_column_is_the_last_one_and_all_others_keep_their_bits(to: Format) -> None:
+def test_the_column_is_the_last_one_and_all_others_keep_their_bits(to: str) -> None:
     table = read(exported(to, placed(at(3 * PERIOD_NS, labels=["stone"]))), to)
     plain = read(exported(to, None), to)
     assert table.column_names == [*plain.column_names, "event"]
@@ -182,8 +183,8 @@ def test_in_csv_the_other_columns_keep_their_bytes() -> None:
     assert ends == [b',"event"', *[b',"stone"' if row == 3 else b"," for row in range(ROWS)]]
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_without_any_mark_the_column_is_there_and_empty(to: Format) -> None:
+@pytest.mark.parametrize("to", TABLES)
+def test_without_any_mark_the_column_is_there_and_empty(to: str) -> None:
     content = exported(to, Marks(()), ("event",))
     if to == "csv":
         assert content == b'"event"\n' + b"\n" * ROWS

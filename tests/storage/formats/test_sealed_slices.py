@@ -20,10 +20,11 @@ from devices.frames import FrameBatch
 from storage.clock.file import write_clock
 from storage.clock.log import ClockOffset
 from storage.clock.table import StreamFacts
-from storage.formats.export import ClockName, content_of, export
+from storage.formats.export import ClockName, content_of
 from storage.formats.marks import TIMES, place
-from storage.formats.sealed import export_file, marks_of
+from storage.formats.sealed import export_of, marks_of
 from storage.formats.slice import Slice
+from storage.formats.written.arrow import ARROW
 from storage.schema import Array
 from storage.sessions import file
 from storage.sessions.beside import clock_beside
@@ -32,6 +33,7 @@ from storage.sessions.folder import Event
 from storage.sessions.reader import SessionReader
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
+from tests.storage.formats.exports import NO_TIMES, export
 from tests.storage.sessions.session_files import rewritten
 
 SECOND_NS = 1_000_000_000
@@ -114,7 +116,8 @@ def outcome(chunks: Callable[[], Any]) -> pa.Table | str:
 def sliced(path: Path, part: Slice, clock: ClockName, events: Sequence[Event]) -> pa.Table | str:
     with SessionReader(path, only_slices=True) as reader:
         marks = marks_of(reader, events, part) if events else None
-        return outcome(lambda: export_file(reader, "arrow", part, clock=clock, marks=marks))
+        wanted = export_of(reader, part, clock=clock, marks=marks, options=NO_TIMES)
+        return outcome(lambda: ARROW.written(wanted))
 
 
 def of_the_whole(
@@ -237,7 +240,7 @@ def place_of(path: Path, group: int, name: str) -> tuple[int, int]:
 
 def table_of(path: Path, part: Slice) -> pa.Table:
     with SessionReader(path, only_slices=True) as reader:
-        content = b"".join(export_file(reader, "arrow", part, clock="node", marks=None))
+        content = b"".join(ARROW.written(export_of(reader, part, options=NO_TIMES)))
     return pa.ipc.open_stream(content).read_all()
 
 

@@ -11,13 +11,14 @@ import pytest
 
 from devices.emulation.ground.load_trace import LoadTrace
 from devices.errors import LoadTraceError
-from storage.formats.export import FORMATS, Format, content_of, export
+from storage.formats.export import content_of
 from storage.formats.load_trace import read_load_trace
 from storage.formats.slice import Slice
 from storage.schema import Array
 from storage.sessions.file import SessionWriter
 from tests.builders.arrays import PERIOD_NS, make_array, make_tile
 from tests.builders.frames import make_frames
+from tests.storage.formats.exports import TABLES, export
 
 ROWS = 20
 ARRAY = make_array([make_tile(0), make_tile(1, reference=True), make_tile(2)])
@@ -48,7 +49,7 @@ def written(path: Path, columns: dict[str, Array]) -> Path:
     return path
 
 
-def exported(folder: Path, to: Format, columns: dict[str, Array], *names: str) -> Path:
+def exported(folder: Path, to: str, columns: dict[str, Array], *names: str) -> Path:
     path = folder / f"out.{to}"
     pieces = [(make_frames(ROWS, 3), columns)]
     path.write_bytes(b"".join(export(content_of(pieces), ARRAY, {}, to, Slice(columns=names))))
@@ -71,7 +72,7 @@ def test_a_sealed_session_presses_what_it_estimated_on_the_tiles_that_bear_load(
 
 
 @pytest.mark.parametrize("to", ["parquet", "csv"])
-def test_what_was_really_pressed_goes_before_what_was_estimated(tmp_path: Path, to: Format) -> None:
+def test_what_was_really_pressed_goes_before_what_was_estimated(tmp_path: Path, to: str) -> None:
     trace = read_load_trace(exported(tmp_path, to, ESTIMATES | TRUTH))
     np.testing.assert_allclose(cells(trace), TRUE_N[:, [0, 2]], rtol=1e-15)
     assert trace.angle_rad is not None
@@ -80,7 +81,7 @@ def test_what_was_really_pressed_goes_before_what_was_estimated(tmp_path: Path, 
 
 
 def test_every_export_that_is_a_table_is_read_again(tmp_path: Path) -> None:
-    for to in FORMATS:
+    for to in TABLES:
         path = exported(tmp_path, to, ESTIMATES)
         if to == "arrow":
             with pytest.raises(LoadTraceError, match=r"CSV file in UTF-8 .* or a Parquet file"):
@@ -90,7 +91,7 @@ def test_every_export_that_is_a_table_is_read_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("to", ["parquet", "csv"])
-def test_a_sum_with_its_centre_of_pressure_is_a_load_too(tmp_path: Path, to: Format) -> None:
+def test_a_sum_with_its_centre_of_pressure_is_a_load_too(tmp_path: Path, to: str) -> None:
     names = ("t_ns", "grf_n", "cop_x_m", "cop_y_m")
     trace = read_load_trace(exported(tmp_path, to, ESTIMATES, *names))
     assert trace.cells_n is None

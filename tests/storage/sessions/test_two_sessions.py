@@ -11,10 +11,11 @@ import pytest
 
 from storage.clock.bounds import Rows
 from storage.clock.table import ClockTable, StreamFacts
-from storage.formats.export import content_of, export
+from storage.formats.export import content_of
 from storage.formats.slice import Slice
 from tests.builders.arrays import make_array
 from tests.builders.frames import make_frames
+from tests.storage.formats.exports import export
 
 ROOT = Path(__file__).resolve().parents[3]
 SECOND = 1_000_000_000

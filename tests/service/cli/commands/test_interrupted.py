@@ -76,7 +76,7 @@ def test_ctrl_c_is_said_and_leaves_no_file_and_no_process(
 @pytest.mark.parametrize(
     ("place", "arguments"),
     [
-        ("service.offline.export.export_file", "export s.parquet --format csv --out x.csv"),
+        ("service.offline.export.export_of", "export s.parquet --format csv --out x.csv"),
         ("storage.verify.data.verify", "verify ."),
         ("service.sessions.recover.recover", "recover data"),
         ("service.offline.estimate.session.estimate_session", "estimate s.parquet --out x.parquet"),

@@ -13,12 +13,13 @@ from service.offline.estimate.request import EstimateRequest
 from service.offline.estimate.session import estimate_session
 from service.sessions.pipeline import EstimateStream
 from service.sessions.stances import stances_of_session
-from storage.formats.export import content_of, export
+from storage.formats.export import content_of
 from storage.formats.slice import Slice
 from storage.schema import ESTIMATES
 from storage.sessions.file import SessionWriter
 from storage.sessions.reader import SessionReader
 from tests.service.sessions.pieces import array, calibration, frames, hopping, options
+from tests.storage.formats.exports import export
 
 NAMES = [column.name for column in ESTIMATES]
 

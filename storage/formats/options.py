@@ -1,0 +1,39 @@
+"""What formats may be asked for besides the slice: one list, of which each takes its own."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class FormatOptions(BaseModel):
+    """Options of formats. None: what the format does by itself.
+
+    REST and the command line offer these fields as they are; a format that does not know one that
+    is set refuses it (`storage.formats.written.format.Format.options`).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    names: Literal["number", "serial"] | None = Field(
+        default=None,
+        description="What columns of one tile end in: its number, from 0, or its serial.",
+    )
+    times: bool | None = Field(
+        default=None,
+        description="Columns `time_s`, seconds after the session's first frame, and `time_utc`, "
+        "`t_ns` as a timestamp: in whatever is made, but not in the sealed Parquet file.",
+    )
+    decimal: Literal["point", "comma"] | None = Field(
+        default=None,
+        description="Decimal sign of CSV; with a comma, columns are parted by semicolons.",
+    )
+
+    @property
+    def set_names(self) -> list[str]:
+        """Names of those that are set."""
+        return [name for name, value in self if value is not None]
+
+
+NO_OPTIONS = FormatOptions()

@@ -1,0 +1,91 @@
+"""CSV, in which no text is a spreadsheet's formula."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pacsv
+
+from storage.formats.export import Export
+from storage.formats.written.format import TABLE_OPTIONS, Format
+from storage.formats.written.sink import in_pieces
+
+_FORMULA = r"^([=+\-@'\t\r\n\x{ff0b}\x{ff0d}\x{ff1d}\x{ff20}])"
+"""What a spreadsheet takes for the beginning of a formula, and the sign that says it is none."""
+
+
+def write_csv(sink: BinaryIO, table: pa.Table) -> None:
+    """A table as CSV, in which no text is a spreadsheet's formula."""
+    with _Writer(sink, table.schema) as writer:
+        writer.write_table(table)
+
+
+class _Writer(pacsv.CSVWriter):
+    """Text that begins like a formula gets an apostrophe before it, and so does one with one."""
+
+    def write_table(self, table: pa.Table, max_chunksize: int | None = None) -> None:
+        """Append rows."""
+        super().write_table(_without_formulas(table), max_chunksize)
+
+
+class _CommaWriter:
+    """Numbers with a decimal comma, and semicolons between columns; Arrow's writer knows none."""
+
+    def __init__(self, sink: BinaryIO, schema: pa.Schema) -> None:
+        self._sink = sink
+        names = (name.replace('"', '""') for name in schema.names)
+        self._sink.write((";".join(f'"{name}"' for name in names) + "\n").encode())
+
+    def write_table(self, table: pa.Table) -> None:
+        """Append rows."""
+        for batch in _without_formulas(table).to_batches():
+            cells = [_cells(column) for column in batch.columns]
+            lines = _joined(*cells, between=";")
+            self._sink.write("".join(f"{line}\n" for line in lines.to_pylist()).encode())
+
+    def close(self) -> None:
+        """Nothing is left to write."""
+
+
+def _cells(column: pa.Array[Any]) -> pa.Array[Any]:
+    if pa.types.is_string(column.type):
+        text = pc.replace_substring(column, '"', '""')
+        quoted: pa.Array[Any] = pc.if_else(
+            pc.is_null(text), text, _joined('"', text, '"', between="")
+        )
+        return quoted
+    text = column.cast(pa.string())
+    is_real = pa.types.is_floating(column.type)
+    return pc.replace_substring(text, ".", ",") if is_real else text
+
+
+def _joined(*texts: pa.Array[Any] | str, between: str) -> pa.Array[Any]:
+    join: Any = pc.binary_join_element_wise  # its stubs know no mixture
+    joined: pa.Array[Any] = join(*texts, between, null_handling="replace", null_replacement="")
+    return joined
+
+
+def _without_formulas(table: pa.Table) -> pa.Table:
+    for i, field in enumerate(table.schema):
+        if pa.types.is_string(field.type):
+            text = pc.replace_substring_regex(table.column(i), _FORMULA, r"'\1")
+            table = table.set_column(i, field, text)
+    return table
+
+
+def _write(export: Export) -> Iterator[bytes]:
+    opened = _CommaWriter if export.options.decimal == "comma" else _Writer
+    return in_pieces(export.tables(), opened)
+
+
+CSV = Format(
+    "csv",
+    "CSV",
+    "spreadsheets, MATLAB, R",
+    "text/csv; charset=utf-8; header=present",
+    _write,
+    options=(*TABLE_OPTIONS, "decimal"),
+)

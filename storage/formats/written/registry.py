@@ -1,0 +1,46 @@
+"""All formats that sessions are written in; a new one is a line here, and its module."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import AfterValidator, WithJsonSchema
+
+from devices.errors import UsageError
+from storage.formats.written.arrow import ARROW
+from storage.formats.written.csv_text import CSV
+from storage.formats.written.format import Format
+from storage.formats.written.parquet import PARQUET
+
+FORMATS: Mapping[str, Format] = {
+    known.name: known
+    for known in (
+        PARQUET,
+        ARROW,
+        CSV,
+    )
+}
+
+
+def format_named(name: str) -> Format:
+    """The format that people call so.
+
+    Raises:
+        UsageError: there is none.
+    """
+    if name not in FORMATS:
+        raise UsageError(f"no format {name[:80]!r}", expected="one of " + ", ".join(FORMATS))
+    return FORMATS[name]
+
+
+def _known(name: str) -> str:
+    if name not in FORMATS:
+        raise ValueError("should be one of " + ", ".join(FORMATS))
+    return name
+
+
+FormatName = Annotated[
+    str, AfterValidator(_known), WithJsonSchema({"type": "string", "enum": list(FORMATS)})
+]
+"""In models: the name of a format."""
