@@ -1,0 +1,129 @@
+"""The main path once more in Firefox: watch, record, mark, stop, look back, download."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from tests.service.fake_node import Play
+from tests.waiting import until
+from tests.web.firefox import ENTER, ESCAPE, FIREFOX, RIGHT, Firefox
+from tests.web.scripted import Scripted
+
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(
+        FIREFOX is None, reason="no Firefox; on Debian: sudo apt-get install firefox-esr"
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def browser_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Firefox]:
+    firefox = Firefox(tmp_path_factory.mktemp("firefox"))
+    yield firefox
+    firefox.close()
+
+
+@pytest.fixture
+def firefox(browser_of_all: Firefox) -> Iterator[Firefox]:
+    """Fails the test if a page complains in its console."""
+    browser_of_all.complaints()
+    yield browser_of_all
+    browser_of_all.open("about:blank")
+    assert browser_of_all.complaints() == []
+
+
+def is_drawn(selector: str) -> str:
+    """An expression: something is on this canvas, in more than one colour."""
+    return f"""(() => {{
+      const canvas = document.querySelector("{selector}");
+      const all = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+      return new Set(new Uint32Array(all.buffer)).size > 4;
+    }})()"""
+
+
+def test_what_stands_on_the_foot_is_watched_recorded_marked_looked_at_and_downloaded(
+    scripted: Scripted, firefox: Firefox
+) -> None:
+    with Play(scripted.node, 5.0) as play:
+        firefox.open(scripted.url)
+        firefox.wait("document.body.dataset.live === 'true'")
+        firefox.wait("Math.abs(Number(document.getElementById('grf').dataset.value) - 10) < 0.01")
+        firefox.wait("document.querySelectorAll('#bars [data-value]').length === 2")
+        firefox.wait(is_drawn("#trace"))
+        play.force_n = 8.0
+        firefox.wait("Math.abs(Number(document.getElementById('grf').dataset.value) - 16) < 0.01")
+
+        firefox.find("#session-name").send_keys("in Firefox")
+        firefox.click("#record")
+        firefox.wait_for_text("#recordings", "in Firefox")
+        firefox.find("#mark-label").send_keys("a stone", ENTER)
+        firefox.wait_for_text("#notices", "a stone")
+        until(lambda: scripted.running.sessions()[0]["frames"] > 300)
+        firefox.click("#stop")
+        until(lambda: scripted.running.sessions()[0]["state"] == "sealed")
+
+    firefox.click("#sessions a[href^='/sessions/']")
+    firefox.wait("document.querySelector('#plots')?.dataset.settled === 'true'")
+    firefox.wait(is_drawn("#plots-canvas"))
+    firefox.wait_for_text("#marks-list", "a stone")
+    firefox.wait("document.getElementById('replay').dataset.waiting === 'false'")
+    assert firefox.run("return document.getElementById('plots').dataset.whole") == "true"
+    firefox.drag("#plots", (300, 200), (500, 200))
+    firefox.wait("document.getElementById('plots').dataset.whole === 'false'")
+    firefox.wait("/from=/.test(location.search)")  # the link carries it
+    firefox.keys(RIGHT)
+    firefox.wait("document.getElementById('readout').dataset.timeS")
+    firefox.wait("Math.abs(Number(document.getElementById('grf').dataset.value) - 16) < 0.01")
+    first = firefox.wait("document.getElementById('replay').dataset.seq")
+    firefox.click("#play")
+    firefox.wait("document.getElementById('replay').dataset.seq !== arguments[0]", first)
+    firefox.wait("document.getElementById('play').dataset.going === 'false'")  # at its end
+
+    firefox.click("#zoom-all")
+    firefox.wait("document.getElementById('plots').dataset.whole === 'true'")
+    firefox.click("#download-parquet")
+    table = pq.read_table(firefox.downloaded(".parquet"))
+    session = scripted.running.sessions()[0]
+    assert session["name"] == "in Firefox"
+    assert table.num_rows == session["frames"] > 300
+    assert (np.diff(table["seq"].to_numpy()) == 1).all()
+
+
+def test_on_a_phone_nothing_is_wider_than_the_screen(scripted: Scripted, firefox: Firefox) -> None:
+    session = scripted.recorded("walk")
+    with Play(scripted.node, 5.0):
+        firefox.open(scripted.url, 390, 844)
+        firefox.wait("document.body.dataset.live === 'true'")
+        firefox.wait("document.documentElement.scrollWidth <= innerWidth")
+        firefox.keys("?")
+        firefox.wait("document.getElementById('help-dialog').open")
+        firefox.keys(ESCAPE)
+        firefox.wait("!document.getElementById('help-dialog').open")
+    firefox.open(f"{scripted.url}/sessions/{session.id}", 390, 844)
+    firefox.wait("document.querySelector('#plots')?.dataset.settled === 'true'")
+    firefox.wait("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_what_a_page_complains_of_is_heard(scripted: Scripted, browser_of_all: Firefox) -> None:
+    """Else the tests before this one could not fail for it."""
+    browser_of_all.open(scripted.url)
+    browser_of_all.complaints()
+    browser_of_all.run(
+        "console.warn('hm'); setTimeout(() => missing());"
+        "document.body.append(Object.assign(document.createElement('script'), {text: 'void 0'}))"
+    )
+    heard: list[str] = []
+
+    def all_three() -> bool:
+        heard.extend(browser_of_all.complaints())
+        return len(heard) >= 3
+
+    until(all_three)
+    for word in ("hm", "missing is not defined", "Content-Security-Policy"):
+        assert any(word in complaint for complaint in heard), heard
+    assert len(heard) == 3
