@@ -18,6 +18,7 @@ with warnings.catch_warnings():
     driver = pytest.importorskip(
         "marionette_driver.marionette", reason="no marionette-driver, which is in the extra `dev`"
     )
+    from marionette_driver import errors
 
 from tests.waiting import PATIENCE_S
 
@@ -107,10 +108,17 @@ class Firefox:
 
     def click(self, selector: str) -> None:
         """Click, as soon as there is something that can be clicked."""
-        self.wait(
-            "document.querySelector(arguments[0] + ':not(:disabled)')?.checkVisibility()", selector
-        )
-        self.find(selector).click()
+        clickable = "document.querySelector(arguments[0] + ':not(:disabled)')?.checkVisibility()"
+
+        def clicked() -> bool:
+            self.wait(clickable, selector)
+            try:
+                self.find(selector).click()
+            except errors.StaleElementException:  # the page has drawn it anew meanwhile
+                return False
+            return True
+
+        self._until(clicked, f"a click on {selector}")
 
     def keys(self, *keys: str) -> None:
         """Press keys, wherever the focus is."""
