@@ -9,11 +9,9 @@ from typing import Any
 
 import pytest
 
-import service.api.routes.ingest
-import service.api.routes.sessions
-import service.server.recorder
 import service.server.server
 from tests.service.fake_node import FakeNode, NodeOf
+from tests.service.patient import be_patient
 from tests.service.process import Process, Start
 from tests.service.running import Running, ServeWith
 from tests.waiting import PATIENCE_S, until
@@ -45,10 +43,8 @@ def serve_with(
 ) -> Iterator[ServeWith]:
     """A server with this token and these names; its ticks are quick, and so the tests are."""
     monkeypatch.setattr(service.server.server, "TICK_S", TICK_S)
-    monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # its frames are long ago
-    monkeypatch.setattr(service.api.routes.ingest, "SILENCE_S", silence_s)
     # The scripted node sends what passes a stop only when that was answered.
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.02)
+    be_patient(monkeypatch, settle_s=0.02, silence_s=silence_s)
     started: list[Running] = []
 
     def start(**options: Any) -> Running:

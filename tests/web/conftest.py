@@ -16,10 +16,9 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-import service.api.routes.ingest
-import service.api.routes.sessions
-import service.server
-import service.server.recorder
+import service.server.server
+from tests.service.patient import be_patient, patient_server
+from tests.service.running import Running
 from tests.waiting import PATIENCE_S
 from tests.web.scripted import Scripted
 
@@ -157,10 +156,8 @@ def open_page(browser: Browser) -> Iterator[Callable[..., Page]]:
 @pytest.fixture
 def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Scripted]]:
     """Starts a server, of these options, and the node of a test."""
-    monkeypatch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
     monkeypatch.setattr(service.server.server, "TICK_S", 0.05)
-    monkeypatch.setattr(service.api.routes.ingest, "SILENCE_S", PATIENCE_S)
-    monkeypatch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # its lead is long ago
+    be_patient(monkeypatch)
     started: list[Scripted] = []
 
     def start(**options: Any) -> Scripted:
@@ -170,6 +167,13 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     yield start
     for one in started:
         one.close()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """A server of a module's own."""
+    with patient_server(tmp_path_factory.mktemp("server") / "data") as running:
+        yield running
 
 
 @pytest.fixture

@@ -33,13 +33,12 @@ def row_of(page: Page, session: Recording) -> Any:
     return page.locator(f'#sessions [data-session-id="{session.id}"]')
 
 
-def counted(page: Page, session: Recording) -> tuple[int, ...]:
-    """Frames of a recording as the page, its list, REST and the ledger say."""
+def counted(page: Page, session: Recording) -> tuple[int | None, ...]:
+    """Frames of a recording as the page, its list, REST and the ledger say; None: it says none."""
     said = page.locator("#recordings .recording-text").inner_text()
-    found = re.search(r"([\d,]+) frames", said)
-    assert found is not None, said
-    listed = row_of(page, session).locator(".c-frames .taken").inner_text()
-    here = [int(text.replace(",", "")) for text in (found[1], listed)]
+    listed = row_of(page, session).locator(".c-frames .taken").inner_text() + " frames"
+    found = [re.search(r"([\d,]+) frames", text) for text in (said, listed)]
+    here = [int(one[1].replace(",", "")) if one else None for one in found]
     ledger = sum(part["recorded"] for part in session.ledger()["parts"])
     return (*here, session.now()["frames"], ledger)
 

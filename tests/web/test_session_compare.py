@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from urllib.parse import urlencode
 
 import numpy as np
@@ -11,13 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-import service.api.routes.ingest
-import service.server.recorder
 from tests.service.fake_node import FakeNode
 from tests.service.plates import LAG_S, compare, hopped, write_plate
 from tests.service.recording import Recording
 from tests.service.running import Running
-from tests.waiting import PATIENCE_S
 from tests.web.test_accessible import complaints
 from tests.web.test_session_page import grf
 
@@ -27,17 +24,6 @@ OpenPage = Callable[..., Page]
 
 PLATE = "plate <b>1"
 STONE = "a stone"
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    running = Running(tmp_path_factory.mktemp("session-compare") / "data")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # what nodes say is of long ago
-        patch.setattr(service.api.routes.ingest, "SILENCE_S", PATIENCE_S)
-        running.start()
-        yield running
-        running.stop()
 
 
 def marked(session: Recording, frame: int) -> int:

@@ -11,13 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-import service.api.routes.ingest
-import service.api.routes.sessions
-import service.server.recorder
 from tests.service.fake_node import FakeNode, Play
 from tests.service.recording import Recording
 from tests.service.running import Running
-from tests.waiting import PATIENCE_S
 from tests.web.conftest import wait_until
 from tests.web.received import Received
 from tests.web.scripted import Scripted
@@ -29,18 +25,6 @@ OpenPage = Callable[..., Page]
 
 LOST = 40
 LABEL = "a <b>stone</b>"
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    running = Running(tmp_path_factory.mktemp("session-page") / "data")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # what nodes say is of long ago
-        patch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
-        patch.setattr(service.api.routes.ingest, "SILENCE_S", PATIENCE_S)
-        running.start()
-        yield running
-        running.stop()
 
 
 @pytest.fixture(scope="module")

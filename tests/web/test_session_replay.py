@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,15 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 from playwright.sync_api import Page, expect
 
-import service.api.routes.ingest
-import service.api.routes.sessions
-import service.server.recorder
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
 from tests.builders.arrays import make_servo
 from tests.service.fake_node import FakeNode
 from tests.service.recording import Recording
 from tests.service.running import Running
-from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.real_time
 
@@ -53,32 +49,25 @@ class Rolling(FakeNode):
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recording]:
+def session(server: Running) -> Recording:
     """A foot that rolls over, then a saturated tile, one that is not read, and lost frames."""
-    running = Running(tmp_path_factory.mktemp("replay") / "data")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # what nodes say is of long ago
-        patch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
-        patch.setattr(service.api.routes.ingest, "SILENCE_S", PATIENCE_S)
-        running.start()
-        node = Rolling(running)
-        node.connect()
-        node.tared()
-        recording = node.record(name="roll")
-        over: Any = np.linspace(0.0, 1.0, ROLLED)[:, None] * [60.0, -60.0] + [5.0, 65.0]
-        node.send(200, [0.0, 0.0], alive=True)
-        node.send(ROLLED, over)
-        node.send(SATURATED, [20.0, 200.0], alive=True)
-        node.send(UNREAD, [20.0, 0.0], alive=True, status=TileStatus.NO_ANSWER)
-        node.send(200, [0.0, 0.0], alive=True)
-        first = node.seq
-        node.frames(LOST)
-        node.say_lost(evicted=[[first, first + LOST - 1]])
-        node.deliver(100, [20.0, 30.0], alive=True)
-        node.finish(recording)
-        yield recording
-        node.close()
-        running.stop()
+    node = Rolling(server)
+    node.connect()
+    node.tared()
+    recording = node.record(name="roll")
+    over: Any = np.linspace(0.0, 1.0, ROLLED)[:, None] * [60.0, -60.0] + [5.0, 65.0]
+    node.send(200, [0.0, 0.0], alive=True)
+    node.send(ROLLED, over)
+    node.send(SATURATED, [20.0, 200.0], alive=True)
+    node.send(UNREAD, [20.0, 0.0], alive=True, status=TileStatus.NO_ANSWER)
+    node.send(200, [0.0, 0.0], alive=True)
+    first = node.seq
+    node.frames(LOST)
+    node.say_lost(evicted=[[first, first + LOST - 1]])
+    node.deliver(100, [20.0, 30.0], alive=True)
+    node.finish(recording)
+    node.close()
+    return recording
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-import service.api.routes.sessions
-import service.server.recorder
 from storage.checked_json import write_checked
 from storage.sessions.folder import SessionFolder
 from tests.service.fake_node import FakeNode
+from tests.service.patient import be_patient
 from tests.service.running import Running
 from tests.web.received import Received
 from tests.web.test_accessible import complaints
@@ -34,8 +33,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     data = tmp_path_factory.mktemp("archive") / "data"
     running = Running(data)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service.server.recorder, "BEHIND_S", 1e9)  # what the node says is of long ago
-        patch.setattr(service.api.routes.sessions, "SETTLE_S", 0.1)
+        be_patient(patch)
         running.start()
         node = FakeNode(running)
         node.connect()

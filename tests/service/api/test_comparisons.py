@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.service.fake_node import FakeNode
+from tests.service.patient import patient_server
 from tests.service.plates import LAG_S, ZERO_N, compare, hopped, write_plate
 from tests.service.recording import Recording
 from tests.service.running import assert_refused
@@ -18,15 +21,31 @@ from tests.service.running import assert_refused
 NAME = "plate 1"
 
 
+@pytest.fixture(scope="module")
+def compared_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recording]:
+    folder = tmp_path_factory.mktemp("compared")
+    with patient_server(folder / "data") as running:
+        node = FakeNode(running)
+        node.connect()
+        node.tared()
+        session = hopped(node)
+        node.close()
+        plate = folder / f"{NAME}.csv"
+        write_plate(session, plate)
+        limits = "grf_mae_n=2,grf_r2=0.9999"
+        asked = ("--remove-offset", "--reference-sigma-n", "0.3", "--limits", limits)
+        assert compare(session, plate, *asked) == 3
+        yield session
+
+
 @pytest.fixture
-def compared(tared: FakeNode, tmp_path: Path) -> Recording:
-    session = hopped(tared)
-    plate = tmp_path / f"{NAME}.csv"
-    write_plate(session, plate)
-    limits = "grf_mae_n=2,grf_r2=0.9999"
-    asked = ("--remove-offset", "--reference-sigma-n", "0.3", "--limits", limits)
-    assert compare(session, plate, *asked) == 3
-    return session
+def compared(compared_once: Recording, tmp_path: Path) -> Iterator[Recording]:
+    """A session and what it was compared with; a test may spoil what is kept of that."""
+    kept, copy = compared_once.folder / "comparisons", tmp_path / "kept"
+    shutil.copytree(kept, copy)
+    yield compared_once
+    shutil.rmtree(kept)
+    shutil.copytree(copy, kept)
 
 
 def asked(session: Recording, path: str = "", **query: Any) -> Any:
