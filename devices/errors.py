@@ -47,7 +47,7 @@ from typing import ClassVar, Literal, TypedDict, Unpack
 
 from devices.words import printable
 
-Extra = Literal["server", "emulation", "plot", "gpio", "rig", "archive", "mocap"]
+Extra = Literal["server", "emulation", "plot", "gpio", "rig", "archive", "mocap", "mcap"]
 
 _OURS = ("devices", "storage", "service")
 
