@@ -29,6 +29,12 @@ class FormatOptions(BaseModel):
         default=None,
         description="Decimal sign of CSV; with a comma, columns are parted by semicolons.",
     )
+    body: str | None = Field(
+        default=None,
+        max_length=100,
+        pattern=r"^[\w.:-]+$",
+        description="OpenSim: the model's body that the ground acts on, as `calcn_r`; else `foot`.",
+    )
 
     @property
     def set_names(self) -> list[str]:

@@ -9,8 +9,10 @@ from pydantic import AfterValidator, WithJsonSchema
 
 from devices.errors import UsageError
 from storage.formats.written.arrow import ARROW
+from storage.formats.written.c3d import C3D
 from storage.formats.written.csv_text import CSV
 from storage.formats.written.format import Format
+from storage.formats.written.opensim import OPENSIM
 from storage.formats.written.parquet import PARQUET
 
 FORMATS: Mapping[str, Format] = {
@@ -19,6 +21,8 @@ FORMATS: Mapping[str, Format] = {
         PARQUET,
         ARROW,
         CSV,
+        C3D,
+        OPENSIM,
     )
 }
 

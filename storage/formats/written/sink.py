@@ -20,6 +20,10 @@ class Sink(io.BytesIO):
         """Not in what was handed on."""
         return False
 
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Nobody can; zip files ask so, not by `seekable`."""
+        raise io.UnsupportedOperation("seek")
+
     def tell(self) -> int:
         """Position in the whole file, of which only the end is kept here."""
         return self._given + super().tell()
@@ -28,7 +32,7 @@ class Sink(io.BytesIO):
         """What was written since."""
         piece = self.getvalue()
         self._given += len(piece)
-        self.seek(0)
+        super().seek(0)
         self.truncate()
         return piece
 

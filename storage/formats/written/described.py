@@ -1,0 +1,72 @@
+"""What a file says of itself where its format has room for lines of text only."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+from storage.formats.export import Export
+
+
+def described(export: Export, begin_ns: int) -> dict[str, str]:
+    """Facts of an export by name, as text in ASCII.
+
+    Args:
+        export: what is written.
+        begin_ns: instant of its first sample, on the clock that was asked for.
+    """
+    about, notes = export.about, export.notes
+    seconds, rest = divmod(begin_ns, 1_000_000_000)
+    begin = datetime.fromtimestamp(seconds, tz=UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    clock = "the node's" if export.clock is None else "the server's"
+    said = {
+        "SESSION": str(about.get("session") or "none: simulated or estimated by itself"),
+        "NODE": export.info.node,
+        "COMPLETE": completeness(notes, about.get("state")),
+        "BEGIN_T_NS": str(begin_ns),
+        "BEGIN_UTC": f"{begin}.{rest:09d}Z by {clock} clock"
+        + ("" if export.info.clock_set or export.clock is not None else ", which was not set"),
+        "SLICE": f"{export.part.start_s or 0.0:g} s to "
+        + ("the end" if export.part.end_s is None else f"{export.part.end_s:g} s"),
+        "CONTENT_SHA256": str(about.get("content_sha256") or "not sealed"),
+        "CALIBRATION": _calibration(notes),
+        "SCALE": str(notes.get("absolute_scale") or "not known"),
+        "SOFTWARE": export.info.software,
+    }
+    return {name: ascii_of(text) for name, text in said.items()}
+
+
+def completeness(notes: Mapping[str, object], state: object = None) -> str:
+    """Is the session all that it should be? In words.
+
+    Args:
+        notes: of the session, with its ledger if it is sealed.
+        state: of one that is not.
+    """
+    ledger = notes.get("ledger")
+    if not isinstance(ledger, dict):
+        return "not known: " + (f"it is {state}" if state else "there is no ledger")
+    lost: dict[str, int] = {}
+    for part in ledger.get("parts", ()):
+        for reason, count in part.get("lost", {}).items():
+            lost[reason] = lost.get(reason, 0) + count
+    said = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
+    if ledger.get("complete") and not ledger.get("lossy"):
+        return "complete"
+    return f"lossy: {said or 'frames are missing'}"
+
+
+def ascii_of(text: str) -> str:
+    """Letters without their accents; what ASCII has nothing for is its code point, as U+1F600."""
+    line = " ".join(text.split())
+    plain = unicodedata.normalize("NFKD", line)
+    kept = (c for c in plain if not unicodedata.combining(c))
+    return "".join(c if c.isascii() and c.isprintable() else f"U+{ord(c):04X}" for c in kept)
+
+
+def _calibration(notes: Mapping[str, object]) -> str:
+    found = notes.get("calibration")
+    if not isinstance(found, dict):
+        return "not known"
+    return ", ".join(f"{name} {value}" for name, value in found.items() if isinstance(value, str))

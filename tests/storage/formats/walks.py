@@ -1,0 +1,110 @@
+"""A walk that nobody went: frames with estimates of which every number is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from devices.frames import ArrayInfo
+from storage.formats.export import Export, content_of
+from storage.formats.slice import Slice
+from storage.schema import CONTACT_UNKNOWN, Array
+from tests.builders.arrays import make_array, make_tile
+from tests.builders.frames import make_frames, with_columns
+
+RATE_HZ = 500.0
+ROWS = 1000
+STANCES = ((100, 400), (500, 900))
+"""First frame of each, and the one behind its last."""
+PEAK_N = 30.0
+ARRAY = make_array(
+    [
+        make_tile(0, x_m=0.03, y_m=0.01),
+        make_tile(1, x_m=0.03, y_m=-0.01),
+        make_tile(2, x_m=-0.01, y_m=0.01),
+        make_tile(3, x_m=-0.01, y_m=-0.01),
+        make_tile(4, x_m=0.3, y_m=0.0, reference=True),
+    ]
+)
+
+
+def walk() -> dict[str, Array]:
+    """Columns of two stances: in the first the foot rolls forward, in the second it stands.
+
+    Noise without contact is 0.05 N; the first and the last frame of a stance have no COP.
+    """
+    n = np.arange(ROWS)
+    columns = {
+        "grf_n": np.where(n % 2, 0.05, -0.05),
+        "grf_sigma_n": np.full(ROWS, 0.25),
+        "grf_at_least_n": np.zeros(ROWS),
+        "cop_x_m": np.full(ROWS, np.nan),
+        "cop_y_m": np.full(ROWS, np.nan),
+        "contact": np.zeros(ROWS, dtype=np.uint8),
+        "estimate_status": np.full(ROWS, 16, dtype=np.uint16),
+        "part": np.zeros(ROWS, dtype=np.uint16),
+    }
+    for number, (begin, end) in enumerate(STANCES):
+        phase = (np.arange(begin, end) - begin + 1) / (end - begin + 1)
+        columns["contact"][begin:end] = 1
+        columns["grf_n"][begin:end] = PEAK_N * np.sin(np.pi * phase)
+        columns["grf_at_least_n"][begin:end] = columns["grf_n"][begin:end] - 0.6
+        rows = slice(begin + 1, end - 1)
+        columns["cop_x_m"][rows] = -0.01 + 0.04 * phase[1:-1] if number == 0 else 0.02
+        columns["cop_y_m"][rows] = 0.004
+        columns["estimate_status"][rows] = 0
+    force_n = np.repeat(0.25 * columns["grf_n"][:, None], len(ARRAY.tiles), axis=1)
+    force_n[:, -1] = np.nan
+    return {**columns, "force_n": force_n}
+
+
+def saturated(columns: dict[str, Array], rows: slice) -> dict[str, Array]:
+    """The same with a tile beyond its range there."""
+    changed = {name: values.copy() for name, values in columns.items()}
+    for name in ("grf_n", "cop_x_m", "cop_y_m"):
+        changed[name][rows] = np.nan
+    changed["estimate_status"][rows] |= 1 | 16
+    return changed
+
+
+def unseen(columns: dict[str, Array], rows: slice) -> dict[str, Array]:
+    """The same where nothing is known of contact, either."""
+    changed = saturated(columns, rows)
+    changed["contact"][rows] = CONTACT_UNKNOWN
+    return changed
+
+
+def export_of_walk(
+    columns: dict[str, Array] | None = None,
+    *,
+    keep: Array | None = None,
+    info: ArrayInfo = ARRAY,
+    notes: dict[str, object] | None = None,
+    every: int = 300,
+    times: dict[str, Any] | None = None,
+    **facts: Any,
+) -> Export:
+    """An export of a walk.
+
+    Args:
+        columns: its estimates; None: of `walk`.
+        keep: the frames that are there; None: all.
+        info: the array.
+        notes: of the session.
+        every: rows of a piece.
+        times: further columns of `make_frames`.
+        facts: further attributes of `Export`.
+    """
+    columns = walk() if columns is None else columns
+    count = len(next(iter(columns.values())))
+    kept = np.arange(count) if keep is None else keep
+    given = {name: np.asarray(values)[kept] for name, values in (times or {}).items()}
+    frames = with_columns(make_frames(kept, len(info.tiles)), **given)
+    pieces = (
+        (frames.rows(a, a + every), {name: v[kept][a : a + every] for name, v in columns.items()})
+        for a in range(0, len(kept), every)
+    )
+    made = Export(content_of(pieces), info, notes or {}, facts.pop("part", Slice()))
+    return replace(made, **facts)
