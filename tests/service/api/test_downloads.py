@@ -216,6 +216,25 @@ def test_a_recording_session_gives_what_there_is(sealed: Sealed, to: str) -> Non
     assert found["force_n_0"].to_numpy()[20:40] == pytest.approx(np.full(20, 5.0), abs=0.1)
 
 
+@pytest.mark.parametrize(("to", "ending"), [("c3d", "c3d"), ("opensim", "opensim.zip")])
+def test_files_of_motion_laboratories_are_of_sealed_and_of_recording_sessions(
+    sealed: Sealed, to: str, ending: str
+) -> None:
+    for session in (sealed.session, sealed.recording):
+        answer = sealed.made(session, format=to)
+        assert answer.status_code == 200, answer.text
+        begin = {"c3d": b"\x02\x50", "opensim": b"PK\x03\x04"}[to]
+        assert answer.content.startswith(begin)
+        name = f'filename="{session.id}.{ending}"'
+        assert name in answer.headers["content-disposition"]
+    for query, said in (
+        ({"columns": "grf_n"}, "columns of its own"),
+        ({"start_s": 100}, "starts at 100 s"),
+        ({"decimal": "comma"}, "no option"),
+    ):
+        assert_refused(sealed.made(format=to, **query), 422, said)
+
+
 @pytest.mark.parametrize(
     "query",
     [

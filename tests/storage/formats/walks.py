@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from storage.schema import CONTACT_UNKNOWN, Array
 from tests.builders.arrays import make_array, make_tile
 from tests.builders.frames import make_frames, with_columns
 
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "formats.md"
 RATE_HZ = 500.0
 ROWS = 1000
 STANCES = ((100, 400), (500, 900))
@@ -74,6 +76,12 @@ def unseen(columns: dict[str, Array], rows: slice) -> dict[str, Array]:
     changed = saturated(columns, rows)
     changed["contact"][rows] = CONTACT_UNKNOWN
     return changed
+
+
+def lines_of_documents(section: str) -> str:
+    """The example in Python of a section of docs/formats.md."""
+    text = DOCUMENT.read_text("utf-8").split(f"\n## {section}\n")[1].split("\n## ")[0]
+    return text.split("```python\n")[1].split("```")[0]
 
 
 def export_of_walk(

@@ -25,6 +25,7 @@ from tests.storage.formats.walks import (
     ROWS,
     STANCES,
     export_of_walk,
+    lines_of_documents,
     saturated,
     walk,
 )
@@ -229,6 +230,21 @@ def test_read_as_a_reference_a_session_gives_its_own_force_and_cop(tmp_path: Pat
     own_m = np.stack([columns["cop_x_m"], columns["cop_y_m"]], axis=1)
     np.testing.assert_allclose(found.cop_m, own_m, atol=1e-6)
     assert found.notes == ()
+
+
+def test_the_lines_in_the_documents_read_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "session.c3d").write_bytes(b"".join(C3D.written(export_of_walk())))
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, Any] = {}
+    exec(lines_of_documents("C3D"), found)  # noqa: S102  # our own
+    columns = walk()
+    on = columns["contact"] == 1
+    np.testing.assert_allclose(found["grf_n"], on * columns["grf_n"], atol=1e-5)
+    np.testing.assert_allclose(found["cop_m"][0], columns["cop_x_m"], atol=1e-6)
+    assert found["events"][0] == (pytest.approx(STANCES[0][0] / RATE_HZ), "Foot Strike")
+    assert found["complete"] == ["not known: there is no ledger"]
 
 
 def refused(export: Export) -> str:

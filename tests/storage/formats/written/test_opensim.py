@@ -24,7 +24,15 @@ from storage.formats.written import opensim as written_opensim
 from storage.formats.written.opensim import COLUMNS, OPENSIM
 from storage.schema import Array
 from storage.sessions.folder import Event
-from tests.storage.formats.walks import RATE_HZ, ROWS, STANCES, export_of_walk, saturated, walk
+from tests.storage.formats.walks import (
+    RATE_HZ,
+    ROWS,
+    STANCES,
+    export_of_walk,
+    lines_of_documents,
+    saturated,
+    walk,
+)
 
 GRAVITY = 9.80665
 """Of OpenSim's models, m/s2."""
@@ -258,6 +266,18 @@ def test_opensim_computes_what_the_loads_do_to_a_foot(
     np.testing.assert_allclose(held[:, 0], z_m * force_n, atol=2e-3)
     assert not math.isclose(float(np.ptp(held[:, 4])), 0.0)
     assert np.isfinite(y_m).all()
+
+
+@pytest.mark.slow
+def test_the_lines_in_the_documents_compute_torques(
+    opensim: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Unpacked(export_of_walk(on_the_ground(), source={"session": "ID"}), tmp_path)
+    free_foot(opensim, tmp_path).rename(tmp_path / "leg.osim")
+    (tmp_path / "still.mot").rename(tmp_path / "leg.mot")
+    monkeypatch.chdir(tmp_path)
+    exec(lines_of_documents("OpenSim"), {})  # noqa: S102  # our own
+    assert opensim.TimeSeriesTable(str(tmp_path / "torques.sto")).getNumColumns() == 6
 
 
 @pytest.mark.slow
