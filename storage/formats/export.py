@@ -19,6 +19,7 @@ import pyarrow as pa
 from devices.errors import UsageError
 from devices.frames import ArrayInfo, FrameBatch
 from storage.clock.table import ClockTable
+from storage.formats.facts import facts_of
 from storage.formats.marks import Marks
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
@@ -110,10 +111,20 @@ class Export:
 
     @property
     def about(self) -> dict[str, object]:
-        """What the file is of, and what was chosen of it; as JSON."""
+        """What the file is of, what was chosen of it, and its facts (`storage.formats.facts`).
+
+        As JSON; who resamples or fills says so in its place.
+        """
         part = self.part
-        chosen = {"start_s": part.start_s, "end_s": part.end_s, "columns": list(part.columns)}
-        return {**self.source, **chosen, "clock": "node" if self.clock is None else "server"}
+        chosen: dict[str, object] = {
+            "start_s": part.start_s,
+            "end_s": part.end_s,
+            "columns": list(part.columns),
+        }
+        chosen["clock"] = "node" if self.clock is None else "server"
+        has_server_time = self.clock is not None
+        facts = facts_of(self.notes, self.source, has_server_time=has_server_time)
+        return {**self.source, **chosen, **facts}
 
     @property
     def all_notes(self) -> dict[str, object]:

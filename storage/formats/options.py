@@ -36,6 +36,12 @@ class FormatOptions(BaseModel):
         description="OpenSim: the model's body that the ground acts on, as `calcn_r`; else `foot`.",
     )
 
+    messages: Literal["foxglove", "ros2"] | None = Field(
+        default=None,
+        description="Messages of MCAP: Foxglove's, with every column of every frame, or those of "
+        "ROS 2.",
+    )
+
     @property
     def set_names(self) -> list[str]:
         """Names of those that are set."""

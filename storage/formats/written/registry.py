@@ -12,6 +12,7 @@ from storage.formats.written.arrow import ARROW
 from storage.formats.written.c3d import C3D
 from storage.formats.written.csv_text import CSV
 from storage.formats.written.format import Format
+from storage.formats.written.mcap.file import MCAP
 from storage.formats.written.opensim import OPENSIM
 from storage.formats.written.parquet import PARQUET
 
@@ -23,6 +24,7 @@ FORMATS: Mapping[str, Format] = {
         CSV,
         C3D,
         OPENSIM,
+        MCAP,
     )
 }
 

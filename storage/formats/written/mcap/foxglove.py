@@ -1,0 +1,204 @@
+"""Foxglove's messages, as Protobuf: every frame with all its columns, the foot, marks as log.
+
+A frame is a message of our own, `foottile.Frame`, whose fields are the columns; numbers in it have
+fixed widths, so that all messages of a session are equally long. The foot is a
+`foxglove.SceneUpdate`, a mark a `foxglove.Log` (https://docs.foxglove.dev/docs/visualization/
+message-schemas).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow as pa
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
+from google.protobuf.timestamp_pb2 import Timestamp
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from storage.formats.export import Export
+from storage.formats.written.mcap.packed import Packed
+from storage.formats.written.mcap.source import (
+    METRES_PER_NEWTON,
+    TILE_HEIGHT_M,
+    TILE_RADIUS_M,
+    Channels,
+    Frames,
+    Message,
+    colour,
+    frame_id,
+    numbers,
+)
+from storage.schema import KNOWN, Array, Column
+
+_NS = 1_000_000_000
+_SCENE = ("grf_n", "cop_x_m", "cop_y_m", "force_n")
+
+# Protobuf's types of fixed width: their number, wire type (of 32 or 64 bits), and numpy's name.
+_FLOAT = FieldDescriptorProto.TYPE_FLOAT, 5, "<f4"
+_DOUBLE = FieldDescriptorProto.TYPE_DOUBLE, 1, "<f8"
+_FIXED32 = FieldDescriptorProto.TYPE_FIXED32, 5, "<u4"
+_FIXED64 = FieldDescriptorProto.TYPE_FIXED64, 1, "<u8"
+_SFIXED32 = FieldDescriptorProto.TYPE_SFIXED32, 5, "<i4"
+_SFIXED64 = FieldDescriptorProto.TYPE_SFIXED64, 1, "<i8"
+
+
+def columns_of(export: Export) -> list[str]:
+    """Flat columns of a frame: those that were chosen, but times made for tables and texts."""
+    return [
+        name
+        for name, of in export.chosen().items()
+        if pa.types.is_integer(KNOWN[of].type) or pa.types.is_floating(KNOWN[of].type)
+        if name != "time_s" or "time_s" in export.part.columns
+    ]
+
+
+def needed(export: Export) -> list[str]:
+    """Columns to be read."""
+    there = [name for name in _SCENE if export.has_forces]
+    return [*columns_of(export), *there]
+
+
+class FoxgloveMessages:
+    """Of one session.
+
+    Args:
+        channels: where they go.
+        export: the session.
+        prefix: of its topics.
+    """
+
+    def __init__(self, channels: Channels, export: Export, prefix: str) -> None:
+        self._info, self._has_forces = export.info, export.has_forces
+        chosen = export.chosen()
+        self._columns = {name: KNOWN[chosen[name]] for name in columns_of(export)}
+        self._packed = _packed(list(self._columns.values()), list(self._columns))
+        descriptors = _frame_descriptors(self._columns)
+        frame = channels.register_schema(
+            "foottile.Frame", "protobuf", descriptors.SerializeToString()
+        )
+        self._frames = channels.register_channel(f"{prefix}/frames", "protobuf", frame, {})
+        self._marks = _channel(channels, f"{prefix}/marks", Log)
+        self._scene = _channel(channels, f"{prefix}/foot", SceneUpdate)
+
+    def messages(self, frames: Frames) -> Iterator[Message]:
+        """Of some frames."""
+        packed = self._packed.messages(
+            {name: _in_field(c, frames.flat[name]) for name, c in self._columns.items()}
+        )
+        beside: dict[int, list[Message]] = {}
+        t_ns = frames.t_ns.tolist()
+        for row, text in frames.marks:
+            mark = Log(
+                timestamp=_time(t_ns[row]), level=Log.INFO, message=text, name=self._info.node
+            )
+            beside.setdefault(row, []).append((t_ns[row], self._marks, mark.SerializeToString()))
+        for row, content in zip(frames.shown, self._scenes(frames), strict=True):
+            beside.setdefault(row, []).append((t_ns[row], self._scene, content))
+        channel = self._frames
+        for row, (at_ns, content) in enumerate(zip(t_ns, packed, strict=True)):
+            yield at_ns, channel, content
+            if row in beside:
+                yield from beside[row]
+
+    def _scenes(self, frames: Frames) -> Iterator[bytes]:
+        tiles = self._info.tiles
+        rows = frames.shown
+        unknown = np.full((len(rows), len(tiles)), np.nan)
+        forces_n = frames.tiles("force_n", len(tiles))[rows] if self._has_forces else unknown
+        for row, force_n in zip(rows, forces_n.tolist(), strict=True):
+            update = SceneUpdate()
+            entity = update.entities.add(id="foot", frame_id=frame_id(self._info))
+            entity.timestamp.CopyFrom(_time(int(frames.t_ns[row])))
+            for tile, of_tile_n in zip(tiles, force_n, strict=True):
+                drawn = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+                place = drawn.pose.position
+                place.x, place.y, place.z = tile.x_m, tile.y_m, tile.z_m
+                drawn.pose.orientation.w = 1.0
+                drawn.size.x = drawn.size.y = 2.0 * TILE_RADIUS_M
+                drawn.size.z = TILE_HEIGHT_M
+                shade = drawn.color
+                shade.r, shade.g, shade.b, shade.a = colour(of_tile_n)
+            if self._has_forces:
+                self._add_arrow(entity, frames, row)
+            yield update.SerializeToString()
+
+    def _add_arrow(self, entity: object, frames: Frames, row: int) -> None:
+        grf_n, x_m, y_m = (float(frames.flat[name][row]) for name in _SCENE[:3])
+        if np.isnan(grf_n) or np.isnan(x_m) or np.isnan(y_m):
+            return
+        lowest_m = min(tile.z_m for tile in self._info.tiles)
+        arrow = entity.arrows.add(  # type: ignore[attr-defined]  # made at run time
+            shaft_length=max(grf_n, 0.0) * METRES_PER_NEWTON,
+            shaft_diameter=0.004,
+            head_length=0.01,
+            head_diameter=0.01,
+        )
+        place, turn, shade = arrow.pose.position, arrow.pose.orientation, arrow.color
+        place.x, place.y, place.z = x_m, y_m, lowest_m
+        # An arrow points along x: turned about y by -90 degrees it points upwards.
+        turn.y, turn.w = -np.sqrt(0.5), np.sqrt(0.5)
+        shade.r, shade.g, shade.b, shade.a = 0.1, 0.7, 0.3, 1.0
+
+
+def _channel(channels: Channels, topic: str, kind: type[Log] | type[SceneUpdate]) -> int:
+    schema = channels.register_schema(
+        kind.DESCRIPTOR.full_name, "protobuf", build_file_descriptor_set(kind).SerializeToString()
+    )
+    return channels.register_channel(topic, "protobuf", schema, {})
+
+
+def _time(t_ns: int) -> Timestamp:
+    return Timestamp(seconds=t_ns // _NS, nanos=t_ns % _NS)
+
+
+def _field(column: Column) -> tuple[int, int, str]:
+    """Type of a column's field: whatever may be unknown has a NaN, and the bits for its values."""
+    kind = column.type
+    if pa.types.is_floating(kind):
+        return _DOUBLE if kind.bit_width == 64 else _FLOAT
+    if column.missing is not None and kind.bit_width < 64:
+        return _FLOAT if kind.bit_width <= 16 else _DOUBLE
+    if pa.types.is_signed_integer(kind):
+        return _SFIXED64 if kind.bit_width == 64 else _SFIXED32
+    return _FIXED64 if kind.bit_width == 64 else _FIXED32
+
+
+def _in_field(column: Column, values: Array) -> Array:
+    is_real = np.dtype(_field(column)[2]).kind == "f"
+    return numbers(column.name, values) if is_real else values
+
+
+def _frame_descriptors(columns: dict[str, Column]) -> FileDescriptorSet:
+    found = FileDescriptorSet()
+    file = found.file.add(name="foottile/Frame.proto", package="foottile", syntax="proto3")
+    message = file.message_type.add(name="Frame")
+    for number, (name, column) in enumerate(columns.items(), start=1):
+        message.field.add(
+            name=name,
+            number=number,
+            type=_field(column)[0],
+            label=FieldDescriptorProto.LABEL_OPTIONAL,
+        )
+    return found
+
+
+def _packed(columns: list[Column], names: list[str]) -> Packed:
+    """Key and value of each field, one after the other (protobuf.dev/programming-guides/encoding).
+
+    All are there, zeros too, which readers take as well as none.
+    """
+    template = bytearray()
+    fields: dict[str, tuple[str, int]] = {}
+    for number, (name, column) in enumerate(zip(names, columns, strict=True), start=1):
+        _, wire, type_ = _field(column)
+        key = number << 3 | wire
+        while key >= 0x80:
+            template.append(key & 0x7F | 0x80)
+            key >>= 7
+        template.append(key)
+        fields[name] = type_, len(template)
+        template += bytes(8 if wire == 1 else 4)
+    return Packed(bytes(template), fields)
