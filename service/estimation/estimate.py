@@ -106,6 +106,7 @@ class Estimator:
 
     def kept(self) -> Columns:
         """All that it remembers, for another one to go on with; records as their bytes."""
+        self._make_room(0)  # rows that nothing reaches back to any more are not worth keeping
         return {name: as_bytes(column).copy() for name, column in self._memory().items()}
 
     @classmethod
