@@ -39,8 +39,8 @@ import websockets.asyncio.client
 from replayed_nodes import DRAIN_S, Played, Sent, played, run_load
 from served import Server, served
 
+from service.estimation import LIVE_LAG_MS
 from service.link import SUBPROTOCOL
-from service.server.live_estimates import LIVE_LAG_MS
 
 RATE_HZ = {4: 541.0, 64: 64.0}
 SCREEN_HZ = 60

@@ -13,6 +13,7 @@ from devices.chips.compensation import Compensation
 from devices.errors import FootTileError, TareError
 from devices.frames import NOT_READ, ArrayInfo, FrameBatch, TileStatus
 from devices.temperature import hold_temperature
+from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.foot import UNSEEN_NS
 from service.estimation.ladder.plan import make_plan
@@ -29,7 +30,6 @@ from service.estimation.warm import is_warming
 from service.server.ranges import Ranges
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
 
-LIVE_LAG_MS = 10.0
 _TADC_OVER_NS = 1_000_000_000
 
 

@@ -102,7 +102,7 @@ class Server:
         except FootTileError:
             self.folder.close()
             raise
-        self.so_fars = SoFars()
+        self.so_fars = SoFars(data)
         """What those who look at a session that is not sealed are shown."""
         self.links: dict[str, Link] = {}
         self._counts: dict[str, Counted] = {}

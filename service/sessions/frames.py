@@ -86,15 +86,29 @@ class SessionFrames:
 
     def raw(self) -> Iterator[tuple[FrameBatch, Columns]]:
         """Frames with the column `part` only."""
-        for number, part in enumerate(self._sources.session.parts):
-            journal = self._sources.journals.get(part.boot_id)
-            if journal is None:
-                continue
-            last = part.seq_last if part.seq_last is not None else journal.held.last
-            if last is None:
-                continue
-            for batch in journal.read(part.seq_first, last):
-                yield batch, {"part": np.full(len(batch), number, dtype=np.uint16)}
+        return raw_from(self._sources)
+
+
+def raw_from(
+    sources: Sources, number: int = 0, seq: int = 0
+) -> Iterator[tuple[FrameBatch, Columns]]:
+    """Frames from the journals in order, with the column `part` only.
+
+    Args:
+        sources: of the session.
+        number: of the part to begin with.
+        seq: its frames before this number are left out.
+    """
+    for i, part in list(enumerate(sources.session.parts))[number:]:
+        journal = sources.journals.get(part.boot_id)
+        first = max(seq, part.seq_first) if i == number else part.seq_first
+        last = journal.held.last if journal is not None else None
+        last = part.seq_last if part.seq_last is not None else last
+        if journal is None or last is None or last < first:
+            continue
+        for batch in journal.read(first, last):
+            if len(batch):
+                yield batch, {"part": np.full(len(batch), i, dtype=np.uint16)}
 
 
 _LATER = "`foottile estimate` adds them where foottile[server] is installed"

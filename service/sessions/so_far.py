@@ -1,25 +1,25 @@
 """What there is by now of a session that is not sealed: each frame is estimated once, on demand.
 
 Frames come from the journals, so a restart of the server loses nothing of the picture, and nobody
-who does not look costs anything. Estimates are those that sealing would make now. They are
-provisional: frames may still come between them, and tares may follow.
+who does not look costs anything. Estimates are as they are live, with the tares that are known now.
+They are provisional: frames may still come between them, tares may follow, and sealing looks
+further ahead.
 """
 
 from __future__ import annotations
 
+import threading
 import time
+from bisect import bisect_left
 from collections import OrderedDict
-from collections.abc import Iterator
-from itertools import takewhile
-
-import numpy as np
+from pathlib import Path
 
 from devices.errors import FootTileError, StateError
 from devices.frames import FrameBatch
-from service.estimation import OFFLINE_LAG_MS
 from service.estimation.warm import is_warming
+from service.sessions.frames import Columns, raw_from
+from service.sessions.milestones import Milestone, Milestones, stream_of
 from service.sessions.overview import Seen
-from service.sessions.pipeline import Columns, EstimateOptions, EstimateStream
 from service.sessions.sources import Sources
 from storage.formats.slice import Slice
 from storage.sessions.pyramid import frame_columns
@@ -30,21 +30,30 @@ AT_ONCE_S = 0.5
 _KEPT = 4
 """Sessions of which something is remembered."""
 _REST = 10
-"""What came too late between the others has all estimated anew, in one tenth of the time."""
+"""What came too late between the others has those behind it estimated anew, in one tenth of the
+time."""
 
 
 class SoFar:
-    """A session as far as it was estimated."""
+    """A session as far as it was estimated.
 
-    def __init__(self, sources: Sources) -> None:
+    Args:
+        sources: of the session.
+        folder: on whose disk estimators' memories are (`service.sessions.milestones`).
+    """
+
+    def __init__(self, sources: Sources, folder: Path) -> None:
+        self.milestones = Milestones(folder)
         self._sources = sources
         self._bins = BinsSoFar()
-        self._stream = _stream(sources)
-        self._at = 0, 0
-        """Part and number of the next frame to take."""
-        self._taken = 0
-        """Frames that were taken from the journals."""
+        self._stream = stream_of(sources)
+        self._at = Milestone()
+        self._again = 0
+        """So many frames will leave that have left before."""
+        self._once = 0
+        """So many frames were taken before it went back."""
         self.took_s = 0.0
+        """What taking them again has cost."""
         self.is_behind = False
         """Is there more in the journals?"""
 
@@ -53,17 +62,23 @@ class SoFar:
         """Are there forces, or only raw counts?"""
         return self._stream is not None
 
-    def fits(self, sources: Sources) -> bool:
-        """Is what was taken still the beginning of the session?"""
+    def is_of(self, sources: Sources) -> bool:
+        """Is anything of what was taken still true?"""
         before = self._sources
         same = sources.info == before.info and sources.calibration == before.calibration
         tares = sources.tares[: len(before.tares)]
-        if not same or tares != before.tares or (_stream(sources) is None) == self.is_estimated:
-            return False
-        return self._held_behind(sources) == self._taken
+        return same and tares == before.tares and (stream_of(sources) is None) != self.is_estimated
+
+    def places(self, sources: Sources) -> list[Milestone]:
+        """Places up to which everything is still as it was: the beginning, and perhaps more."""
+        known = self.milestones.all
+        if not self.is_of(sources):
+            return [Milestone()]
+        count = bisect_left(known, True, key=lambda place: not self._is_true(place, sources))
+        return list(known[: max(1, count)])
 
     def take(self, sources: Sources) -> None:
-        """Estimate what has come since; `sources` are those of now, and `fits` is true of them.
+        """Estimate what has come since; `is_of` is true of `sources`, which are those of now.
 
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
@@ -71,20 +86,46 @@ class SoFar:
         if self.is_estimated and is_warming():  # or it would compile here
             self.is_behind = True
             return
-        begun_s = time.monotonic()
+        begun_s, is_again = time.monotonic(), self._at.taken < self._once
         if self._stream is not None and sources.tares != self._sources.tares:
-            on = _stream(sources)
-            if on is not None and self._taken:
+            on = stream_of(sources)
+            if on is not None and self._at.taken:
                 on.go_on(self._stream.kept())
             self._stream = on
         self._sources = sources
-        pieces = takewhile(lambda _: time.monotonic() - begun_s < AT_ONCE_S, self._pieces())
-        estimated = pieces if self._stream is None else self._stream.run(pieces, ends=False)
-        names = frame_columns(estimated=self.is_estimated)
-        for frames, columns in estimated:
-            own = {name: getattr(frames, name) for name in names if name not in columns}
-            self._bins.feed({**own, **{n: columns[n] for n in (*names, "part") if n in columns}})
-        self.took_s += time.monotonic() - begun_s
+        self.is_behind = True
+        for frames, columns in raw_from(sources, self._at.part, self._at.seq):
+            if time.monotonic() - begun_s >= AT_ONCE_S:
+                break
+            self._feed(frames, columns)
+        else:
+            self.is_behind = False
+        if is_again:
+            self.took_s += time.monotonic() - begun_s
+
+    def is_overtaken(self, sources: Sources) -> bool:
+        """Is something else now of what was taken?"""
+        return not self._is_true(self._at, sources)
+
+    def go_back(self, sources: Sources) -> None:
+        """Forget what is behind the last place up to which everything is as it was."""
+        all_, true = self.milestones.all, self.places(sources)
+        kept = self._bins.cut(true[-1].left)
+        # One frame at least comes again, so that it is known what the next one follows.
+        at = max(0, bisect_left(true, max(kept, 1), key=lambda place: place.left) - 1)
+        at, self._stream = self.milestones.stream_at(all_, at, sources)
+        self.milestones.go_back(at + 1)
+        place = all_[at]
+        self.begin_again(self)
+        self._at = Milestone(
+            place.part, place.seq, place.taken, place.left, place.newest_ns, place.last
+        )
+        self._again = kept - place.left
+        self._sources = sources
+
+    def begin_again(self, before: SoFar) -> None:
+        """What another has taken is taken again."""
+        self._once, self.took_s = before._at.taken, 0.0
 
     def seen(self, part: Slice, points: int) -> Seen:
         """Some time of it as bins, four times as many as points at most.
@@ -101,46 +142,54 @@ class SoFar:
         found, count = thinned(bins, *part.bounds_ns(begin_ns), 4 * points)
         return Seen(found, count * self._bins.frames_in_bin, begin_ns, end_ns)
 
-    def _pieces(self) -> Iterator[tuple[FrameBatch, Columns]]:
-        """Frames from the journals, from where it left off."""
-        number, seq = self._at
-        self.is_behind = True
-        for i, each in list(enumerate(self._sources.session.parts))[number:]:
-            journal = self._sources.journals.get(each.boot_id)
-            first = max(seq, each.seq_first) if i == number else each.seq_first
-            held = None if journal is None else journal.held.last
-            last = each.seq_last if each.seq_last is not None else held
-            if journal is None or last is None or last < first:
-                continue
-            for batch in journal.read(first, last):
-                if not len(batch):
-                    continue
-                yield batch, {"part": np.full(len(batch), i, dtype=np.uint16)}
-                # Only now: a piece that there was no time for is taken the next time.
-                self._at = i, int(batch.seq[-1]) + 1
-                self._taken += len(batch)
-        self.is_behind = False
+    def _feed(self, frames: FrameBatch, extra: Columns) -> None:
+        """Take the next frames."""
+        at = self._at
+        pieces = [(frames, extra)]
+        due = iter(pieces) if self._stream is None else self._stream.run(pieces, ends=False)
+        names = frame_columns(estimated=self.is_estimated)
+        for left, columns in due:
+            own = {name: getattr(left, name) for name in names if name not in columns}
+            own |= {name: columns[name] for name in (*names, "part") if name in columns}
+            self._again -= self._bins.feed(own, there=self._again)
+            self.milestones.note(left.t_ns)
+            at.left += len(left)
+            at.last = int(columns["part"][-1]), int(left.t_ns[-1])
+        at.part, at.seq = int(extra["part"][-1]), int(frames.seq[-1]) + 1
+        at.taken += len(frames)
+        at.newest_ns = max(at.newest_ns, int(frames.t_ns.max()))
+        if at.taken - self.milestones.all[-1].taken >= self.milestones.every:
+            place = Milestone(at.part, at.seq, at.taken, at.left, at.newest_ns, at.last)
+            self.milestones.add(place, None if self._stream is None else self._stream.kept())
 
-    def _held_behind(self, sources: Sources) -> int:
-        """Frames that the journals have by now of where it has been."""
-        number, seq = self._at
+    def _is_true(self, place: Milestone, sources: Sources) -> bool:
+        """Is everything before a place as it was when it was taken?"""
+        tares = sources.tares[len(self._sources.tares) :]
+        if any(tare.t_ns < place.newest_ns for tare in tares):
+            return False
         held = 0
-        for i, each in enumerate(sources.session.parts[: number + 1]):
+        for i, each in enumerate(sources.session.parts[: place.part + 1]):
             journal = sources.journals.get(each.boot_id)
-            ends = [seq - 1] if i == number else []
+            ends = [place.seq - 1] if i == place.part else []
             ends += [each.seq_last] if each.seq_last is not None else []
-            last = min(ends) if ends else -1
+            last = min(ends, default=-1)
             if journal is not None and last >= each.seq_first:
                 held += journal.held.within(each.seq_first, last).count
-        return held
+        return held == place.taken
 
 
 class SoFars:
-    """What is remembered of sessions that are not sealed; of few, those asked for last."""
+    """What is remembered of sessions that are not sealed; of few, those asked for last.
 
-    def __init__(self) -> None:
+    Args:
+        folder: on whose disk it is, as far as it is not in memory.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self._of: OrderedDict[str, SoFar] = OrderedDict()
         self._again_s: dict[str, float] = {}
+        self._one_at_a_time = threading.Lock()
 
     def taken(self, sources: Sources) -> SoFar:
         """A session with what has come by now.
@@ -148,12 +197,37 @@ class SoFars:
         Raises:
             FootTileError: a journal is damaged, or cannot be read.
         """
+        with self._one_at_a_time:
+            return self._taken(sources)
+
+    def nearly(self, sources: Sources) -> SoFar:
+        """The same, but that nobody waits until it has caught up.
+
+        Raises:
+            FootTileError: likewise.
+        """
+        so_far = self._of.get(sources.session.id)
+        return so_far if so_far is not None and so_far.is_behind else self.taken(sources)
+
+    def forget(self, session_id: str) -> None:
+        """It is sealed, or gone."""
+        self._of.pop(session_id, None)
+        self._again_s.pop(session_id, None)
+
+    def _taken(self, sources: Sources) -> SoFar:
         name = sources.session.id
         so_far = self._of.get(name)
-        if so_far is None or not so_far.fits(sources):
-            if so_far is not None and time.monotonic() < self._again_s.get(name, 0.0):
+        if so_far is None:
+            so_far = self._of[name] = SoFar(sources, self._folder)
+        elif not so_far.is_of(sources) or so_far.is_overtaken(sources):
+            if time.monotonic() < self._again_s.get(name, 0.0):
                 return so_far
-            so_far = self._of[name] = SoFar(sources)
+            if so_far.is_of(sources):
+                so_far.go_back(sources)
+            else:
+                before, so_far = so_far, SoFar(sources, self._folder)
+                so_far.begin_again(before)
+                self._of[name] = so_far
         self._of.move_to_end(name)
         while len(self._of) > _KEPT:
             self.forget(next(iter(self._of)))
@@ -164,25 +238,3 @@ class SoFars:
             raise
         self._again_s[name] = time.monotonic() + _REST * so_far.took_s
         return so_far
-
-    def forget(self, session_id: str) -> None:
-        """It is sealed, or gone."""
-        self._of.pop(session_id, None)
-        self._again_s.pop(session_id, None)
-
-
-def _stream(sources: Sources) -> EstimateStream | None:
-    """None: there is nothing to estimate with yet."""
-    if sources.calibration is None or not sources.tares:
-        return None
-    options = EstimateOptions(
-        sources.calibration,
-        sources.info.models,
-        OFFLINE_LAG_MS,
-        tares=sources.tares,
-        exact=sources.exact,
-    )
-    try:
-        return EstimateStream(sources.info, options)
-    except FootTileError:  # a calibration of other tiles
-        return None

@@ -67,11 +67,15 @@ class Content:
     end_t_ns: int | None = None
 
 
-def content_of(pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]]) -> Content:
-    """The content of a session of which all frames are given; the first of them are read.
+def content_of(
+    pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]],
+    span_ns: tuple[int, int] | None = None,
+) -> Content:
+    """The content of a session of which frames are given; the first of them are read.
 
     Args:
         pieces: frames with their further columns, in order.
+        span_ns: `t_ns` of the session's first frame, and the latest; None: these are all frames.
 
     Raises:
         UsageError: there are no frames.
@@ -82,7 +86,8 @@ def content_of(pieces: Iterable[tuple[FrameBatch, Mapping[str, Array]]]) -> Cont
         raise UsageError("the session has no frames")
     names = [column.name for column in FRAMES] + list(first[1])
     flat = (_flat(frames, extra) for frames, extra in chain((first,), there))
-    return Content(names, lambda _: flat, int(first[0].t_ns[0]))
+    begin_t_ns, end_t_ns = span_ns or (int(first[0].t_ns[0]), None)
+    return Content(names, lambda _: flat, begin_t_ns, end_t_ns)
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,11 @@ class Slice:
         """Is it the whole session?"""
         return self == Slice()
 
+    @property
+    def is_some(self) -> bool:
+        """Is it some time, and not all?"""
+        return self.start_s is not None or self.end_s is not None
+
     def bounds_ns(self, begin_t_ns: int) -> tuple[int | None, int | None]:
         """The first instant that is in it, and the first that is not any more; None: no bound.
 

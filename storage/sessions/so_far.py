@@ -15,6 +15,9 @@ _PENDING = 1024
 """Frames that are merged at a time."""
 
 
+_NONE = np.empty(0, np.int64)
+
+
 class BinsSoFar:
     """Gathers consecutive frames into at most `most` bins, which stand for ever more frames.
 
@@ -32,10 +35,22 @@ class BinsSoFar:
         self._before: tuple[int, int] | None = None
         """Part and number of the last frame."""
 
-    def feed(self, frames: Mapping[str, Array]) -> None:
-        """Take the next frames: `storage.sessions.pyramid.frame_columns`, and `part`."""
+    def feed(self, frames: Mapping[str, Array], *, there: int = 0) -> int:
+        """Take the next frames.
+
+        Args:
+            frames: `storage.sessions.pyramid.frame_columns`, and `part`.
+            there: so many of the first are there already.
+
+        Returns:
+            How many of these frames were.
+        """
+        if there and len(frames["seq"]):
+            there = min(there, len(frames["seq"]))
+            self._before = int(frames["part"][there - 1]), int(frames["seq"][there - 1])
+            frames = {name: values[there:] for name, values in frames.items()}
         if not len(frames["seq"]):
-            return
+            return there
         part = int(frames["part"][0])
         before = self._before[1] if self._before is not None and self._before[0] == part else None
         self._before = int(frames["part"][-1]), int(frames["seq"][-1])
@@ -43,6 +58,21 @@ class BinsSoFar:
         self.frames += len(frames["seq"])
         if sum(_length(piece) for piece in self._pending) >= max(_PENDING, self.frames_in_bin):
             self._close_full()
+        return there
+
+    def cut(self, most: int) -> int:
+        """Forget all but the first frames: as many as full bins have, `most` of them at most.
+
+        Returns:
+            How many are left. The frame before the next one has to be fed again.
+        """
+        bins = joined(self._bins) if self._bins else None
+        ends = np.cumsum(bins["frames"], dtype=np.int64) if bins is not None else _NONE
+        count = int(np.searchsorted(ends, most, side="right"))
+        self._bins = [_rows(bins, 0, count)] if bins is not None and count else []
+        self._pending, self._before = [], None
+        self.frames = int(ends[count - 1]) if count else 0
+        return self.frames
 
     def bins(self) -> Bins | None:
         """All there are by now, the last one perhaps not full; None: no frame came."""

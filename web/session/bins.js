@@ -16,7 +16,7 @@ function placeOf(list, value) {
 export class Bins {
   /**
    * @param {{begin_t_ns: number, duration_s: number, frames_in_bin: number, serials: string[],
-   *   provisional?: boolean, columns: Record<string, (number | null)[]>}} overview
+   *   provisional?: boolean, behind?: boolean, columns: Record<string, (number | null)[]>}} overview
    * @param {View} covers the time that was asked for
    */
   constructor(overview, covers) {
@@ -29,6 +29,7 @@ export class Bins {
     this.beginNs = overview.begin_t_ns;
     this.serials = overview.serials;
     this.provisional = Boolean(overview.provisional); // it is not sealed yet
+    this.behind = Boolean(overview.behind); // there are more frames than these
     this.covers = covers;
     this.estimated = "grf_n_min" in overview.columns;
   }

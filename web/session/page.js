@@ -40,6 +40,7 @@ async function look() {
     byId("message").dataset.small = "true";
     // Before its first frames there is nothing to plot.
     await plotted.load(session).catch((error) => { if (!(error instanceof api.Refusal)) throw error; });
+    if (plotted.plots.whole?.behind) setText(byId("message-text"), `${byId("message-text").textContent} Not all of it is shown yet: the server is estimating the rest.`);
     document.body.dataset.state = session.state;
     setTimeout(look, AGAIN_MS);
     return;

@@ -12,7 +12,6 @@ import { Samples } from "./samples.js";
 const AHEAD_S = 1.5; // of the display's time: what is asked for before it is needed
 const SPEED_WORDS = { 0.1: "0.1×", 0.25: "0.25×", 1: "1×", 4: "4×" };
 const JUMP_S = 0.1;
-const PROVISIONAL_MOST = 30_000; // frames
 
 export class Replay {
   /**
@@ -44,20 +43,15 @@ export class Replay {
    * @param {string} id @param {import("./bins.js").Bins} whole
    */
   open(id, whole) {
-    const frames = whole.sum("frames", 0, whole.count);
     const before = this.samples?.whole;
     if (before?.provisional && whole.provisional && before.estimated === whole.estimated) this.samples.grow(whole);
     else {
-      const rateHz = frames / Math.max(1e-3, whole.durationS);
+      const rateHz = whole.sum("frames", 0, whole.count) / Math.max(1e-3, whole.durationS);
       this.samples = new Samples(id, whole, rateHz, { come: this.on.changed, failed: this.on.failed });
       this.shown = null;
     }
-    // Of a session that is not sealed every slice costs the server all that is before it.
-    this.tooLong = whole.provisional && frames > PROVISIONAL_MOST;
-    const dressed = whole.estimated && !this.tooLong;
     byId("replay").hidden = false;
-    for (const part of ["replay-foot", "bars-card"]) byId(part).hidden = !dressed;
-    byId("play").disabled = this.tooLong;
+    for (const part of ["replay-foot", "bars-card"]) byId(part).hidden = !whole.estimated;
     this.sayLag();
   }
 
@@ -81,17 +75,16 @@ export class Replay {
     const { lag_ms: lagMs = null, estimates_problem: problem = null } = this.array ?? {};
     const looks = lagMs === null ? "" : `each takes notice of the ${number(lagMs, 0)} ms behind it.`;
     let text = looks && `Forces as they are stored: ${looks}`;
-    if (whole.provisional) text = looks && `Provisional forces: ${looks} They are estimated once more when the session is sealed.`;
-    if (this.tooLong) text = "The foot at the cursor is shown when the session is sealed: by now it is too long to look into it.";
+    if (whole.provisional) text = looks && `Provisional forces, as they are live: ${looks} They are estimated once more when the session is sealed, with more of what follows.`;
     if (!whole.estimated) text = problem || !whole.provisional ? `There are no forces: ${problem ?? "they were not estimated"}.` : "";
     setText(byId("replay-lag"), text);
   }
 
-  toggle() { if (this.samples && !this.tooLong) this.playing.toggle(); }
+  toggle() { if (this.samples) this.playing.toggle(); }
 
   /** From frame to frame, or by some time; one key after the other. */
   walk(by, jump) {
-    if (!this.samples || this.tooLong) return;
+    if (!this.samples) return;
     if (this.playing.going) this.playing.stop();
     this.walking = this.walking.then(async () => {
       const { samples } = this;
@@ -104,7 +97,7 @@ export class Replay {
 
   draw() {
     const { samples } = this;
-    if (!samples || this.tooLong) return;
+    if (!samples) return;
     const timeS = this.on.at();
     samples.want(timeS, this.playing.going ? AHEAD_S * this.playing.speed : 0);
     const { known, frame } = samples.at(timeS);

@@ -85,7 +85,9 @@ export class Samples {
 
   /** The session has grown: what was its end is asked for again. */
   grow(whole) {
-    const settled = this.numberOf(this.whole.durationS - UNSETTLED_S);
+    const missing = (bins) => bins.sum("missing", 0, bins.count);
+    // Frames that came late have their place between the others, and change what is behind them.
+    const settled = missing(whole) < missing(this.whole) ? 0 : this.numberOf(this.whole.durationS - UNSETTLED_S);
     for (const number of [...this.slices.keys()]) if (number >= settled) this.slices.delete(number);
     this.whole = whole;
   }

@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 from devices.errors import FootTileError, UnknownError
 from devices.frames import ArrayInfo, ServoInfo
 from service.api.routes.access import ServerState, problems
-from service.estimation import OFFLINE_LAG_MS
+from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.server.ranges import Ranges
 from service.server.screens.views import CalibrationView, TileView, View, scale_of, tiles_of
@@ -51,7 +51,7 @@ async def array(session_id: str, server: ServerState) -> ArrayView:
         return await run_in_threadpool(_sealed, session_id, server)
     sources = server.recorder.sources(session_id)
     content = sources.calibration
-    lag_ms = None if content is None else OFFLINE_LAG_MS
+    lag_ms = None if content is None else LIVE_LAG_MS
     return _view(session_id, sources.info, content, lag_ms, sources.problem)
 
 

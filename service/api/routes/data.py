@@ -21,10 +21,12 @@ from service.api.problems import problem
 from service.api.routes.access import SecondsQuery, ServerState, has_it, present, problems
 from service.server.server import Server
 from service.sessions.frames import SessionFrames
+from service.sessions.frames_so_far import FramesSoFar
+from service.sessions.so_far import SoFar
 from service.version import SOFTWARE
 from storage.clock.file import CLOCK_NAME
 from storage.file_hash import sha256_of
-from storage.formats.export import ClockName, Export, content_of
+from storage.formats.export import ClockName, Export
 from storage.formats.marks import TIMES, Marks, place
 from storage.formats.options import FormatOptions
 from storage.formats.sealed import export_of, marks_of
@@ -32,7 +34,6 @@ from storage.formats.slice import Slice
 from storage.formats.written.format import Format
 from storage.formats.written.parquet import PARQUET
 from storage.formats.written.registry import FORMATS, FormatName, format_named
-from storage.schema import ROUNDED_TO
 from storage.sessions.folder import FRAMES_NAME, Session
 
 router = APIRouter(prefix="/sessions", tags=["data"])
@@ -259,11 +260,23 @@ def _chunks(
     if session.sha256 is None:
         sources = server.recorder.sources(session.id)
         clock = sources.clock_table() if query.clock == "server" else None
-        pieces, source = SessionFrames(sources), {"session": session.id, "state": session.state}
-        content = content_of(pieces)  # the first frames: then it is known how they are estimated
-        notes = {name: pieces.notes[name] for name in (ROUNDED_TO,) if name in pieces.notes}
+        # Of all frames each is needed once, whatever is remembered of some.
+        is_some, so_fars = query.slice.is_some, server.so_fars
+        so_far = so_fars.nearly(sources) if is_some else SoFar(sources, server.data)
+        frames = FramesSoFar(so_far, sources, query.slice)
+        source = {"session": session.id, "state": session.state}
+        content = frames.content()  # the first frames: then it is known how they are estimated
         yield from query.to.written(
-            Export(content, sources.info, notes, query.slice, clock, marks, source, query.options)
+            Export(
+                content,
+                sources.info,
+                frames.notes,
+                query.slice,
+                clock,
+                marks,
+                source,
+                query.options,
+            )
         )
         return
     with server.sessions.frames(session.id, only_slices=not query.slice.is_all) as reader:

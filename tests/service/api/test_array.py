@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.estimation import OFFLINE_LAG_MS
+from service.estimation import LIVE_LAG_MS, OFFLINE_LAG_MS
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, assert_refused
 
@@ -24,7 +24,8 @@ def test_a_session_says_where_its_tiles_are_and_how_its_forces_were_estimated(
         assert said["calibration"] == node["calibration"]
         assert said["node"] == node["node"]
         assert said["nominal_rate_hz"] == node["nominal_rate_hz"]
-        assert (said["lag_ms"], said["estimates_problem"]) == (OFFLINE_LAG_MS, None)
+        assert said["estimates_problem"] is None
+    assert (recording["lag_ms"], sealed["lag_ms"]) == (LIVE_LAG_MS, OFFLINE_LAG_MS)
     assert sealed["tiles"][0]["full_scale_n"] == pytest.approx(node["tiles"][0]["full_scale_n"])
     assert sealed["tiles"][0]["full_scale_n"] > 0
 

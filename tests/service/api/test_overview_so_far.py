@@ -14,8 +14,8 @@ from tests.service.recording import Recording
 from tests.service.running import Running, assert_refused
 from tests.waiting import until
 
-HELD_BACK = 51
-"""Frames whose estimates wait for 100 ms of look-ahead, and the one at its end."""
+HELD_BACK = 6
+"""Frames whose estimates wait for 10 ms of look-ahead, and the one at its end."""
 
 
 def asked(session: Recording, **query: Any) -> Any:

@@ -1,0 +1,127 @@
+"""Frames of a session that is not sealed, some time of it or all of it.
+
+What some time costs does not depend on where it is, as far as the session was looked at before. And
+however it was looked at: a frame has the estimate that it has in one go over all frames there are
+by now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain
+from typing import Any
+
+from devices.errors import UsageError
+from devices.frames import FrameBatch
+from service.sessions.frames import Columns, raw_from
+from service.sessions.so_far import SoFar
+from service.sessions.sources import Sources
+from storage.formats.export import Content, content_of
+from storage.formats.slice import Slice
+from storage.intervals import NO_END
+from storage.schema import ROUNDED_TO
+
+Pieces = Iterator[tuple[FrameBatch, Columns]]
+
+
+class FramesSoFar:
+    """Some time of a session that is not sealed.
+
+    Args:
+        so_far: what is known of it.
+        sources: of now.
+        part: which time.
+
+    Attributes:
+        notes: what a file says of the estimates; known with `content`.
+    """
+
+    def __init__(self, so_far: SoFar, sources: Sources, part: Slice) -> None:
+        self.notes: dict[str, Any] = {}
+        self._milestones = so_far.milestones
+        self._places = so_far.places(sources)
+        self._sources = sources
+        self._part = part
+
+    def content(self) -> Content:
+        """Its frames, with estimates if there are any; the first of them are read.
+
+        Raises:
+            UsageError: there are no frames.
+        """
+        first = next(raw_from(self._sources), None)
+        if first is None:
+            raise UsageError("the session has no frames")
+        span_ns = int(first[0].t_ns[0]), self._latest_ns()
+        begin_ns, end_ns = self._part.bounds_ns(span_ns[0])
+        legs = self._legs(begin_ns, end_ns)
+        pieces = chain.from_iterable(self._run(*leg, end_ns) for leg in legs)
+        some = next(pieces, None)
+        if some is None:  # none is of that time: then these say which columns there are
+            some = next(self._run(0, 1, None))
+        return content_of(chain((some,), pieces), span_ns)
+
+    def _legs(self, begin_ns: int | None, end_ns: int | None) -> list[tuple[int, int]]:
+        """Between which places are frames of some time? Behind the last one is what follows."""
+        newest = len(self._places) - 1
+        wanted = [at for at in range(newest) if self._places[at].overlaps(begin_ns, end_ns)]
+        last = self._places[newest].last
+        # Those that wait there are younger than the last one that does not, or of a later part.
+        if end_ns is None or last is None or min(last[1], self._begins_ns(last[0] + 1)) < end_ns:
+            wanted.append(newest)
+        legs: list[tuple[int, int]] = []
+        for at in wanted:
+            begin = legs.pop()[0] if legs and legs[-1][1] == at else at
+            legs.append((begin, at + 1))
+        return legs
+
+    def _run(self, begin: int, end: int, end_ns: int | None) -> Pieces:
+        """Frames between two places, with their estimates; none that is certainly too young."""
+        places = self._places
+        left = places[end].left if end < len(places) else NO_END
+        at, stream = self._milestones.stream_at(places, begin, self._sources)
+        ahead, count = places[begin].left - places[at].left, left - places[at].left
+        pieces: Pieces = raw_from(self._sources, places[at].part, places[at].seq)
+        if stream is not None:
+            pieces = stream.run(pieces)
+        for frames, columns in pieces:
+            if stream is not None and not self.notes:
+                self.notes = {ROUNDED_TO: stream.rounding.by_column()}
+            rows = slice(ahead, min(count, len(frames)))
+            ahead, count = max(0, ahead - len(frames)), count - len(frames)
+            if rows.start < rows.stop:
+                whole = rows.stop - rows.start == len(frames)
+                yield (frames, columns) if whole else _cut(frames, columns, rows)
+            part = int(columns["part"][-1])
+            if count <= 0:
+                return
+            if (
+                end_ns is not None
+                and min(int(frames.t_ns[-1]), self._begins_ns(part + 1)) >= end_ns
+            ):
+                return
+
+    def _begins_ns(self, number: int) -> int:
+        """No frame of this part, nor of a later one, is older than that."""
+        begins = [
+            journal.t_ns_near(part.seq_first, newest=False)
+            for part in self._sources.session.parts[number:]
+            if (journal := self._sources.journals.get(part.boot_id)) is not None
+        ]
+        return min((t_ns for t_ns in begins if t_ns is not None), default=NO_END)
+
+    def _latest_ns(self) -> int:
+        """`t_ns` of the youngest frame."""
+        latest = -NO_END
+        for part in self._sources.session.parts:
+            journal = self._sources.journals.get(part.boot_id)
+            end = NO_END if part.seq_last is None else part.seq_last
+            last = None if journal is None else journal.held.within(part.seq_first, end).last
+            if journal is not None and last is not None:
+                latest = max(latest, *(int(f.t_ns[-1]) for f in journal.read(last, last)))
+        return latest
+
+
+def _cut(frames: FrameBatch, columns: Columns, rows: slice) -> tuple[FrameBatch, Columns]:
+    cut = {name: values[rows] for name, values in columns.items()}
+    return frames.rows(rows.start, rows.stop), cut
