@@ -21,6 +21,7 @@ from service.api.page import PageFiles
 from service.api.routes import (
     access,
     array,
+    calibrations,
     clock,
     comparisons,
     data,
@@ -116,6 +117,7 @@ def make_app(
         health,
         login,
         nodes,
+        calibrations,
         zips,  # before a session of that name
         sessions,
         takes,

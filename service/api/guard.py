@@ -20,9 +20,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.api.logins import Logins, Right, Shown
 from service.api.problems import problem
 from service.link import LIVE_PATH
+from service.server.calibrations import CONTENT_BYTES_MAX
 
 BODY_BYTES_MAX = 64 << 10
 """Longest body of a request: names and notes."""
+CALIBRATIONS_PATH = "/api/v1/calibrations"
 
 LOGIN_PATH = "/api/v1/login"
 TICKETS_PATH = "/api/v1/tickets"
@@ -89,7 +91,7 @@ class Guard:
         elif scope["type"] == "websocket":
             await self._app(scope, receive, send)
         else:
-            await self._app(scope, _Limited(receive), _hardened(send))
+            await self._app(scope, _Limited(receive, _most(scope)), _hardened(send))
 
     def _refusal(self, scope: Scope) -> tuple[HTTPStatus, str] | None:
         headers = Headers(scope=scope)
@@ -104,8 +106,8 @@ class Guard:
                 what = f"Origin {origin[:80]!r} is another site than {host[:80]!r}"
                 return HTTPStatus.FORBIDDEN, what
         length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > BODY_BYTES_MAX:
-            what = f"A body of {length[:20]} bytes; at most {BODY_BYTES_MAX} are taken"
+        if not length.isdigit() or int(length) > _most(scope):
+            what = f"A body of {length[:20]} bytes; at most {_most(scope)} are taken"
             return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, what
         if any(ord(character) < ord(" ") for character in scope["path"]):
             return HTTPStatus.BAD_REQUEST, "The path has control characters in it"
@@ -144,6 +146,12 @@ class Guard:
         return True
 
 
+def _most(scope: Scope) -> int:
+    """Bytes that its body may have: a whole file comes to one path only."""
+    is_file = scope["type"] == "http" and scope["path"] == CALIBRATIONS_PATH
+    return CONTENT_BYTES_MAX if is_file else BODY_BYTES_MAX
+
+
 def _lacking(needed: Right, shown: Shown) -> tuple[HTTPStatus, str] | None:
     """What one who has shown this lacks for what is needed."""
     if shown.right is None:
@@ -159,16 +167,17 @@ def _lacking(needed: Right, shown: Shown) -> tuple[HTTPStatus, str] | None:
 class _Limited:
     """Counts a body that does not state its length."""
 
-    def __init__(self, receive: Receive) -> None:
+    def __init__(self, receive: Receive, most: int) -> None:
         self._receive = receive
+        self._most = most
         self._bytes = 0
 
     async def __call__(self) -> Message:
         message = await self._receive()
         self._bytes += len(message.get("body", b""))
-        if self._bytes > BODY_BYTES_MAX:
+        if self._bytes > self._most:
             raise HTTPException(
-                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"A body of more than {BODY_BYTES_MAX} bytes"
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"A body of more than {self._most} bytes"
             )
         return message
 

@@ -20,12 +20,7 @@ from devices.scene.file import load_scene
 from service.cli.laboratory import Laboratory, Trial
 from service.estimation.calibration import Calibration
 from service.estimation.domes import DOMES, PAPER_DOME, Dome
-from service.offline.calibrations import (
-    BENCH,
-    bench_scene,
-    find_calibration,
-    write_calibration,
-)
+from service.offline.calibrations import BENCH, bench_scene, find_calibration
 from service.offline.processes import spread
 from service.offline.reproduce.judge import Judged, judge
 from service.offline.reproduce.mill import (
@@ -40,6 +35,7 @@ from service.offline.reproduce.result import Experiment, Reproduction
 from service.offline.reproduce.setups import ROLLING, SETUPS, TRIALS, Setup, scene_text
 from service.offline.reproduce.trials import TrialPlan, plans
 from service.offline.reproduce.truth import not_borne_n
+from service.sessions.calibration_file import write_calibration
 from service.version import SOFTWARE
 from storage.durable import make_folder, write_whole
 

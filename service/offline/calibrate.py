@@ -20,6 +20,7 @@ from service.estimation.fitting.bench.indentation import Indentation, pressed_in
 from service.estimation.fitting.effects_fit import fit_effects
 from service.estimation.fitting.fit import fit_tile
 from service.estimation.fitting.timing import UNKNOWN_DELAY, resolved
+from service.offline.bench_marks import Programme, programme_of
 from storage.sessions.reader import SessionReader
 
 
@@ -180,19 +181,43 @@ def _in_words(tile: TileCalibration) -> str:
     return ", ".join([*found, *(f"no {name}" for name in effects.refused)])
 
 
-def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
-    """Every tile's part of a bench recording, and its first and last frame."""
-    if not session.has("pressed_tile", "phase"):
+def _marked(session: SessionReader) -> Programme:
+    """The programme of a recording of a server, which has it in its marks.
+
+    Raises:
+        CalibrationError: it has none, or was broken off in between.
+    """
+    notes = session.notes.get("session")
+    if isinstance(notes, dict) and len(notes.get("parts") or ()) > 1:
+        raise CalibrationError(
+            "the node was restarted while it was recorded",
+            where=str(session.path),
+            expected="a recording in one part",
+            remedy="Record the bench once more",
+        )
+    marked = programme_of(session)
+    if marked is None:
         raise CalibrationError(
             "not an indentation recording",
             where=str(session.path),
-            expected="columns pressed_tile and phase beside reference_force_n",
+            expected="columns pressed_tile and phase beside reference_force_n, or marks such as "
+            "`T01 load`",
             remedy="Record one with the mill, or `foottile simulate --scene indentation`",
         )
-    pieces = list(session.batches("pressed_tile", "phase"))
+    return marked
+
+
+def _read(session: SessionReader) -> tuple[list[Indentation], tuple[int, int]]:
+    """Every tile's part of a bench recording, and its first and last frame."""
+    has_columns = session.has("pressed_tile", "phase")
+    marked = None if has_columns else _marked(session)
+    pieces = list(session.batches(*(("pressed_tile", "phase") if has_columns else ())))
     frames = FrameBatch.concatenate([frames for frames, _ in pieces])
-    pressed = np.concatenate([extra["pressed_tile"] for _, extra in pieces])
-    phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
+    if marked is None:
+        pressed = np.concatenate([extra["pressed_tile"] for _, extra in pieces])
+        phase = np.concatenate([extra["phase"] for _, extra in pieces]).astype(np.str_)
+    else:
+        pressed, phase = marked
     # A soak by itself is one of all tiles.
     only_soak = bool((phase == "soak").any()) and not np.isin(pressed, session.info.serials).any()
     held, _ = hold_temperature(frames)

@@ -19,12 +19,12 @@ from platformdirs import user_cache_path
 from devices.errors import CalibrationError, DamagedFileError, StorageError, needs_extra
 from devices.scene.emulated import Family
 from devices.scene.file import Scene, build_scene, load_scene
-from service.estimation.calibration import EDITED, PRESETS, UNPROVEN, Calibration
+from service.estimation.calibration import PRESETS, UNPROVEN, Calibration
 from service.estimation.effects import Parameter
 from service.rig.emulated import EmulatedFoot
+from service.sessions.calibration_file import calibration_of, not_one, write_calibration
 from service.version import SOFTWARE
-from storage.checked_json import read_checked, write_checked
-from storage.durable import make_folder, set_aside
+from storage.durable import make_folder, read_whole, set_aside
 
 BENCH = "bench"
 SHIPPED = Path(__file__).parent / "shipped"
@@ -84,7 +84,7 @@ def read_calibration(path: Path) -> Calibration:
         StorageError: it cannot be read now.
     """
     try:
-        text = read_checked(path.resolve()).text  # a user may keep links to it
+        content = read_whole(path.resolve())  # a user may keep links to it
     except FileNotFoundError as error:
         raise CalibrationError(
             f"no calibration {str(path)!r}",
@@ -92,19 +92,8 @@ def read_calibration(path: Path) -> Calibration:
         ) from error
     except (DamagedFileError, RuntimeError) as error:  # the second: links in a circle
         what = error.what if isinstance(error, DamagedFileError) else str(error)
-        raise CalibrationError(
-            f"not a calibration: {what}", where=str(path), remedy=EDITED
-        ) from error
-    return Calibration.from_json(text.decode("utf-8", "replace"), where=str(path))
-
-
-def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration file.
-
-    Raises:
-        StorageError: the disk is full or not writable; nothing is left behind then.
-    """
-    write_checked(path, calibration.to_json().encode())
+        raise not_one(what, str(path)) from error
+    return calibration_of(content, where=str(path))
 
 
 def _bench_tile(scene: Scene, parts_seed: int, folder: Path, progress: Progress) -> Calibration:

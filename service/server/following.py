@@ -141,9 +141,15 @@ def _step(session: Session, node: ServerNode) -> list[Session]:
         return [closed.model_copy(update={"parts": (*closed.parts, part)})]
     begin_t_ns = _begin_t_ns(session, node, following)
     scene_content = node.hello.scene if info.scene == node.info.scene else {}
-    calibration = node.hello.calibration
     return [
-        *taken_up(closed, info, begin_t_ns, scene_content=scene_content, calibration=calibration)
+        *taken_up(
+            closed,
+            info,
+            begin_t_ns,
+            scene_content=scene_content,
+            calibration=node.calibration,
+            calibration_source=node.calibration_source,
+        )
     ]
 
 

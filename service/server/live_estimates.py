@@ -96,6 +96,14 @@ class LiveEstimates:
         )
         self._run = EstimateRun(plan)
 
+    def go_on_from(self, before: LiveEstimates) -> None:
+        """Go on where the estimates of the same stream with another calibration end.
+
+        Its last seconds are known here, too, and the frames that it still holds leave first.
+        """
+        before.use(None)
+        self._recent, self._left = before._recent, before._left
+
     def feed(self, frames: FrameBatch) -> Iterator[tuple[FrameBatch, Columns]]:
         """Take the next frames; return the frames that are due, with or without estimates."""
         self._recent.append(frames)

@@ -1,6 +1,7 @@
 """One node as a server knows it: its streams, estimates, tares and clock.
 
-What has to outlive the server is on disk: the journals, the node's last hello and its tares.
+What has to outlive the server is on disk: the journals, the node's last hello, its tares, and the
+calibration that the server was told to use.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import re
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 from devices.errors import (
     DamagedFileError,
@@ -20,7 +22,9 @@ from devices.errors import (
     StorageError,
 )
 from devices.frames import ArrayInfo, FrameBatch
+from service.estimation.calibration import Calibration
 from service.link import BOOT_ID, Hello, StreamNumbers
+from service.server.assignment import Assignment
 from service.server.live_estimates import LiveEstimates
 from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
@@ -58,6 +62,7 @@ class ServerNode:
         self.hello = hello
         self.connected = False
         self.tares = TareHistory(folder / "tares.json")
+        self.assignment = Assignment(folder / "assigned.json")
         self.streams: dict[str, ServerStream] = {}
         """By boot_id: those that are kept here, and those that it said it has."""
         self.unread: set[str] = set()
@@ -92,8 +97,9 @@ class ServerNode:
                 except FootTileError as error:  # a disk that is full, or another version wrote it
                     self.unread.add(path.name)
                     self._found.append(f"a journal is left out until it can be read: {error}")
-        if self.tares.problem is not None:
-            self._found.append(self.tares.problem)
+        for problem in (self.tares.problem, self.assignment.problem):
+            if problem is not None:
+                self._found.append(problem)
         for text in self._found:
             log.warning("node %s: %s", self.name, text)
         self.present = self._stream_of(self.info)
@@ -107,6 +113,52 @@ class ServerNode:
     def problems(self) -> list[str]:
         """What was found damaged of what is kept of it, and what became of it, in words."""
         return [f"node {self.name}: {text}" for text in self._found]
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """What its tiles are to be estimated with: the server's choice, else what it says itself.
+
+        It may not fit them; what is in use is `live.calibration`.
+        """
+        if self.assignment.problem is not None:
+            return None
+        assigned = self.assignment.present
+        return self.hello.calibration if assigned is None else assigned.calibration
+
+    @property
+    def calibration_source(self) -> Literal["node", "server"]:
+        """Who says which that is."""
+        chosen = self.assignment.present is not None or self.assignment.problem is not None
+        return "server" if chosen else "node"
+
+    @property
+    def calibration_problem(self) -> str | None:
+        """Why none is in use."""
+        own = self.hello.calibration_problem if self.calibration_source == "node" else None
+        return self.assignment.problem or self.live.calibration_problem or own
+
+    def use_calibration(self, calibration: Calibration | None, t_ns: int) -> None:
+        """Estimate with a calibration of the server's choice from the next frame on.
+
+        What is being recorded keeps the one that it began with.
+
+        Args:
+            calibration: which; None: the node's own again.
+            t_ns: the server's UTC.
+
+        Raises:
+            StorageError: that cannot be kept; nothing has changed then.
+        """
+        if calibration is None:
+            self.assignment.take_back(t_ns)
+        else:
+            self.assignment.put(calibration, t_ns)
+        before = self.live
+        self._estimate_anew()
+        try:
+            self.live.go_on_from(before)
+        except Exception as error:
+            self._go_without_estimates(error)
 
     @property
     def info(self) -> ArrayInfo:
@@ -384,7 +436,7 @@ class ServerNode:
         self._has_failed = False
         try:
             tare = self.tares.to_use(self.info)
-            self.live = LiveEstimates(self.info, self.hello.calibration, tare)
+            self.live = LiveEstimates(self.info, self.calibration, tare)
         except Exception as error:
             self._go_without_estimates(error)
             return

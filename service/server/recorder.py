@@ -103,6 +103,7 @@ class Recorder:
             part,
             scene_content=node.hello.scene,
             calibration=node.live.calibration,
+            calibration_source=node.calibration_source,
             subject=subject,
             notes=notes,
             tags=tags,

@@ -13,7 +13,9 @@ from typing import Any
 from devices.errors import FootTileError, StorageError
 from service.link import Close, Wanted
 from service.server.book import SessionBook, Trash, destroy
+from service.server.calibrations import CalibrationBook
 from service.server.data_folder import DataFolder
+from service.server.fits import Fits
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
@@ -92,6 +94,7 @@ class Server:
             remove_stale_temporaries(data)
             self.check_storage()
             self.hub = Hub()
+            self.calibrations = CalibrationBook(data / "calibrations")
             self.nodes = ServerNodes(data)
             self.sessions = SessionBook(
                 SessionFolder(data / "sessions"), Trash(data / "trash"), self._tell_session
@@ -99,6 +102,7 @@ class Server:
             self.settling = Settling(self.sessions, self.nodes, self._ask_again, exact=exact)
             self.recorder = Recorder(self.sessions, self.nodes, self.settling)
             self.takes = Takes(self.recorder, self.sessions, self.nodes)
+            self.fits = Fits(self.sessions, self.calibrations)
         except FootTileError:
             self.folder.close()
             raise
@@ -171,9 +175,10 @@ class Server:
             self.folder.take_again()
 
     async def close(self) -> None:
-        """End the links and wait for what is being sealed."""
+        """End the links and what is being fitted, and wait for what is being sealed."""
         for link in list(self.links.values()):
             link.end(Close.RESTART, "the server is going down; connect again")
+        await self.fits.close()
         await self.settling.close()
         for node in self.nodes:
             keep = [node.keep] if node.has_words else []
@@ -196,7 +201,12 @@ class Server:
     @property
     def problems(self) -> list[str]:
         """What was found damaged in the data folder, and what became of it, in words."""
-        return self.folder.problems + self.nodes.problems + self.sessions.problems
+        return [
+            *self.folder.problems,
+            *self.nodes.problems,
+            *self.sessions.problems,
+            *self.calibrations.problems,
+        ]
 
     async def empty_trash(self) -> tuple[int, int]:
         """Delete what is in the trash for good; return the number of sessions and of bytes.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Literal
 
 from devices.frames import ArrayInfo
 from service.estimation.calibration import Calibration
@@ -53,6 +53,7 @@ def taken_up(
     *,
     scene_content: Mapping[str, Any],
     calibration: Calibration | None,
+    calibration_source: Literal["node", "server"] = "node",
 ) -> tuple[Session, Session]:
     """A session whose node came back with other tiles, and the one that takes it up.
 
@@ -64,6 +65,7 @@ def taken_up(
         begin_t_ns: when its stream began, by the clock that sessions are stopped by.
         scene_content: of the node's scene file.
         calibration: of the tiles that it has now.
+        calibration_source: who said which that is.
     """
     problem = "the node came back with other tiles: recording ended"
     update: dict[str, object] = {"problem": problem}
@@ -76,6 +78,7 @@ def taken_up(
         Part(boot_id=info.boot_id, seq_first=0),
         scene_content=scene_content,
         calibration=calibration,
+        calibration_source=calibration_source,
         state=session.state,
         started_t_ns=begin_t_ns,
         stopped_t_ns=session.stopped_t_ns,

@@ -85,6 +85,7 @@ def _session_of(folder: Path, what: str) -> Session | None:
         "state": "sealed",
         "scene_content": notes.get("scene") or {},
         "calibration": notes.get("calibration"),
+        "calibration_source": notes.get("calibration_source", "node"),
         "events": events.events if events is not None else (),
         "clock": clock.offsets if clock is not None else (),
         "problem": f"{what} and was made again from {FRAMES_NAME}; lost are {', '.join(lost)}",

@@ -97,6 +97,8 @@ def sources_of(
     }
     if emulated is not None:
         notes["emulated"] = emulated
+    if session.calibration_source != "node":
+        notes["calibration_source"] = session.calibration_source
     return Sources(
         session=session,
         info=info,
@@ -111,6 +113,8 @@ def sources_of(
 
 def _calibration_of(session: Session) -> tuple[Calibration | None, str | None]:
     if session.calibration is None:
+        if session.calibration_source == "server":
+            return None, "the calibration that was assigned to the node did not fit or was lost"
         return None, "the node had no calibration"
     try:
         return Calibration.model_validate(session.calibration), None

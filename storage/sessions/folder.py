@@ -134,6 +134,8 @@ class Session(_Record):
     """The scene file of the node when it was started."""
     calibration: dict[str, Any] | None = None
     """The calibration in use when it was started; a later one does not change a recording."""
+    calibration_source: Literal["node", "server"] = "node"
+    """Who said which: the node itself, or the server, where one was assigned to the node."""
     events: tuple[Event, ...] = ()
     clock: tuple[ClockOffset, ...] = ()
     missed_slots_at_start: int = 0

@@ -12,7 +12,8 @@ import numpy as np
 from devices.errors import FootTileError
 from devices.frames import ArrayInfo
 from service.link import PROTOCOL, Hello
-from service.offline.calibrations import read_calibration, write_calibration
+from service.offline.calibrations import read_calibration
+from service.sessions.calibration_file import write_calibration
 from service.sessions.recover import recover
 from service.sessions.tares import TareHistory
 from storage.checked_json import write_checked

@@ -69,13 +69,14 @@ _UNKNOWN = problems(_404="No such node.")
 
 InForce = Annotated[
     str | None,
-    Header(description="Id of the tare in force when you looked: only if it still is."),
+    Header(description="Id of the tare in force when you looked, or `none`: only if it still is."),
 ]
 
 
 def _expect_in_force(node: ServerNode, if_match: str | None) -> None:
     recorded = node.tares.in_force(node.info)
-    expect(tag_of(if_match), "" if recorded is None else recorded.id, f"the tare of {node.name!r}")
+    in_force = "none" if recorded is None else recorded.id
+    expect(tag_of(if_match), in_force, f"the tare of {node.name!r}")
 
 
 @router.get("", operation_id="listNodes", summary="All nodes the server knows")

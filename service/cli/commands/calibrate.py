@@ -39,6 +39,9 @@ def calibrate_command(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Calibration file to write (JSON).")],
+    name: Annotated[
+        str | None, typer.Option(help="What it is called; default: the file's name.")
+    ] = None,
     plot: Annotated[
         Path | None,
         typer.Option(help="Draw curves, residuals, a release and a tap to this PNG."),
@@ -116,7 +119,7 @@ def calibrate_command(
     from service.estimation.effects import Parameter
     from service.estimation.fitting.timing import UNKNOWN_DELAY
     from service.offline.calibrate import calibrate_recordings, read_recordings
-    from service.offline.calibrations import write_calibration
+    from service.sessions.calibration_file import write_calibration
     from storage.durable import write_whole
 
     delay = UNKNOWN_DELAY
@@ -131,7 +134,7 @@ def calibrate_command(
     with progress("fitting"):
         pressed = read_recordings(recordings)
         calibration = calibrate_recordings(
-            pressed, name=path.stem, reference=reference, delay=delay, progress=remark
+            pressed, name=name or path.stem, reference=reference, delay=delay, progress=remark
         )
         png = None
         if plot_path is not None:

@@ -11,7 +11,7 @@ from service.cli.commands.sessions import sealed_file
 from service.cli.options import output_path, print_json, progress, remark, stdout
 from service.estimation.effects import Parameter
 from service.offline.against import Against, AgainstOptions, calibrate_against
-from service.offline.calibrations import write_calibration
+from service.sessions.calibration_file import write_calibration
 
 
 def calibrate_mounted(

@@ -21,6 +21,7 @@ from service.sessions.tare_file import RecordedTare
 from storage.sessions.folder import Event, Part, Session
 
 T = TypeVar("T")
+CalibrationSource = Literal["node", "server"]
 
 
 class View(BaseModel):
@@ -164,6 +165,9 @@ class NodeView(View):
     schedule: str
     nominal_rate_hz: float
     calibration: CalibrationView | None
+    calibration_source: CalibrationSource = Field(
+        description="Who says which: the node itself, or the server, where one was assigned."
+    )
     calibration_problem: str | None = Field(description="Why there is no calibration.")
     tare: TareView | None = Field(description="The tare in force.")
     tare_problem: str | None = Field(
@@ -220,7 +224,8 @@ class NodeView(View):
             else CalibrationView(
                 id=live.calibration_id, name=calibration.name, absolute_scale=scale_of(live.ranges)
             ),
-            calibration_problem=live.calibration_problem or node.hello.calibration_problem,
+            calibration_source=node.calibration_source,
+            calibration_problem=node.calibration_problem,
             tare=TareView.of(tare) if tare is not None else None,
             tare_problem=node.tare_keeper.problem,
             tare_warnings=node.tare_keeper.warnings(),
@@ -288,6 +293,9 @@ class SessionView(View):
     )
     scene: str
     calibration_id: str | None
+    calibration_source: CalibrationSource = Field(
+        description="Who said which calibration: the node, or the server, where one was assigned."
+    )
     absolute_scale: Literal["measured", "assumed"] | None
     problem: str | None = Field(description="What a person should know of it.")
     said: str = Field(

@@ -9,7 +9,8 @@ import pytest
 
 from devices.errors import CalibrationError
 from service.estimation.calibration import Calibration
-from service.offline.calibrations import find_calibration, read_calibration, write_calibration
+from service.offline.calibrations import find_calibration, read_calibration
+from service.sessions.calibration_file import write_calibration
 from storage.checked_json import is_unchanged, without_check
 from storage.verify.data import verdict_of, verify
 from tests.builders.calibrations import make_calibration, newton_tile

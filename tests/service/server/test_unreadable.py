@@ -14,11 +14,12 @@ import pytest
 
 from devices.errors import StorageError
 from service.api.address import token_for
-from service.offline.calibrations import read_calibration, write_calibration
+from service.offline.calibrations import read_calibration
 from service.server import settling
 from service.server.data_folder import DataFolder
 from service.server.nodes import ServerNodes
 from service.server.server import Server
+from service.sessions.calibration_file import write_calibration
 from service.sessions.tares import TareHistory
 from storage import durable
 from storage.checked_json import write_checked

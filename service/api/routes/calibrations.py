@@ -1,0 +1,384 @@
+"""Calibrations that the server keeps: uploaded, fitted here, downloaded, and used for a node."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Header, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from devices.errors import CalibrationError, FootTileError, UsageError
+from service.api.routes.access import FULL, ServerState, has_it, problems, tag_of
+from service.estimation.calibration import Calibration
+from service.server.book import expect
+from service.server.calibrations import Kept
+from service.server.fits import SESSIONS_MAX, Fit
+from service.server.live_estimates import LIVE_LAG_MS
+from service.server.node import ServerNode
+from service.server.screens.views import (
+    CalibrationSource,
+    CalibrationView,
+    Page,
+    View,
+    scale_of,
+)
+from service.server_clock import utc_ns
+from service.sessions.calibration_file import calibration_of, content_of
+from service.sessions.pipeline import EstimateOptions, EstimateStream
+
+router = APIRouter(tags=["calibrations"])
+
+_NONE = "none"
+"""Names, as an id, that no calibration is in use."""
+_UNKNOWN = problems(_404="No such calibration.", _409="Its file is damaged.")
+_NO_NODE = problems(_404="No such node.")
+
+Line = Annotated[
+    str,
+    StringConstraints(
+        strip_whitespace=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f-\x9f]*$"
+    ),
+]
+SessionId = Annotated[str, StringConstraints(max_length=100)]
+
+
+class KeptView(View):
+    """One calibration in short."""
+
+    id: str = Field(description="Hash of its content.", examples=["983bbbe1624bad0b"])
+    name: str
+    reference: str = Field(description="The force sensor that its scale comes from.")
+    date: str = Field(description="Of the recordings, ISO 8601.")
+    serials: list[str] = Field(description="Tiles that it has a curve of; `*`: any.")
+    refused: list[str] = Field(description="Tiles whose recordings gave none; its file says why.")
+    absolute_scale: Literal["measured", "assumed"]
+    mounted: bool = Field(description="Whether a plate has shown how its tiles are mounted.")
+
+    @classmethod
+    def of(cls, kept: Kept) -> KeptView:
+        """As it is kept."""
+        return cls(
+            id=kept.id,
+            name=kept.name,
+            reference=kept.reference,
+            date=kept.date,
+            serials=list(kept.serials),
+            refused=list(kept.refused),
+            absolute_scale="assumed" if kept.is_assumed else "measured",
+            mounted=kept.is_mounted,
+        )
+
+
+class StartFit(BaseModel):
+    """What to fit."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    sessions: Annotated[tuple[SessionId, ...], Field(min_length=1, max_length=SESSIONS_MAX)] = (
+        Field(description="Bench recordings; repeats of a tile may be spread over several.")
+    )
+    name: Line = Field(examples=["left leg, November"])
+    reference: Line = Field(default="not stated", description="The force sensor.")
+    reference_delay_ms: Annotated[float, Field(ge=-1000, le=1000, strict=True)] | None = Field(
+        default=None,
+        description="How late its readings are; not known if left out, which costs certainty.",
+    )
+    reference_delay_sigma_ms: Annotated[float, Field(ge=0, le=1000, strict=True)] = Field(
+        default=0.1, description="Standard uncertainty of that."
+    )
+
+
+class FitView(View):
+    """A fit, under way or ended."""
+
+    id: str
+    name: str
+    sessions: list[str]
+    state: Literal["running", "done", "failed", "cancelled"]
+    started_t_ns: int = Field(description="Server's UTC.")
+    ended_t_ns: int | None
+    said: list[str] = Field(description="What was found so far, a line a tile.")
+    calibration_id: str | None = Field(description="What came of it, once it is done.")
+    problem: str | None = Field(description="Why it failed.")
+
+    @classmethod
+    def of(cls, fit: Fit) -> FitView:
+        """As it is now."""
+        return cls(
+            id=fit.id,
+            name=fit.name,
+            sessions=list(fit.sessions),
+            state=fit.state,
+            started_t_ns=fit.started_t_ns,
+            ended_t_ns=fit.ended_t_ns,
+            said=list(fit.said),
+            calibration_id=fit.calibration_id,
+            problem=fit.problem,
+        )
+
+
+class Assign(BaseModel):
+    """Which calibration a node's tiles are to be estimated with."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    id: Annotated[str, StringConstraints(max_length=100)] = Field(
+        description="Of one that the server keeps."
+    )
+
+
+class NodeCalibrationView(View):
+    """Which calibration a node's tiles are estimated with."""
+
+    node: str
+    source: CalibrationSource = Field(
+        description="Who says which: the node itself, or the server, where one was assigned."
+    )
+    assigned_t_ns: int | None = Field(description="When that was, server's UTC.")
+    calibration: CalibrationView | None = Field(description="What is in use; null: none.")
+    problem: str | None = Field(description="Why none is.")
+    own_id: str | None = Field(description="Of the one that the node says itself.")
+
+    @classmethod
+    def of(cls, node: ServerNode) -> NodeCalibrationView:
+        """As it is now."""
+        live, own, assigned = node.live, node.hello.calibration, node.assignment.present
+        used = None
+        if live.calibration is not None and live.calibration_id and live.ranges is not None:
+            used = CalibrationView(
+                id=live.calibration_id,
+                name=live.calibration.name,
+                absolute_scale=scale_of(live.ranges),
+            )
+        return cls(
+            node=node.name,
+            source=node.calibration_source,
+            assigned_t_ns=None if assigned is None else assigned.t_ns,
+            calibration=used,
+            problem=node.calibration_problem,
+            own_id=None if own is None else own.id,
+        )
+
+
+InUse = Annotated[
+    str | None,
+    Header(
+        description="Id of the calibration in use when you looked, or `none`: only if it still is."
+    ),
+]
+
+
+@router.get("/calibrations", operation_id="listCalibrations", summary="Calibrations")
+async def list_calibrations(server: ServerState) -> Page[KeptView]:
+    """All that the server keeps, the newest recordings first."""
+    return Page(items=[KeptView.of(kept) for kept in server.calibrations.all()])
+
+
+@router.post(
+    "/calibrations",
+    operation_id="uploadCalibration",
+    summary="Upload a calibration",
+    status_code=HTTPStatus.CREATED,
+    responses={
+        **problems(
+            _409="There are too many.",
+            _413="It is longer than 1 MiB.",
+            _422="It is no calibration, has an unknown field, or its hash is of another content.",
+        ),
+        **FULL,
+    },
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "description": "The file as `foottile calibrate` writes it.",
+            "content": {"application/json": {"schema": {"type": "object"}}},
+        }
+    },
+)
+async def upload(request: Request, server: ServerState, response: Response) -> KeptView:
+    """Keep a calibration file, checked as wherever one is read; the same file twice is one.
+
+    One without `id` and `check` was written by hand, and is called unproven.
+    """
+    calibration = await run_in_threadpool(_understood, await request.body())
+    kept = server.calibrations.keep(calibration)
+    response.headers["Location"] = f"/api/v1/calibrations/{kept.id}"
+    return KeptView.of(kept)
+
+
+@router.get("/calibrations/fits", operation_id="listFits", summary="Fits")
+async def list_fits(server: ServerState) -> Page[FitView]:
+    """The last of them since the server was started, newest first."""
+    return Page(items=[FitView.of(fit) for fit in server.fits.all()])
+
+
+@router.post(
+    "/calibrations/fits",
+    operation_id="startFit",
+    summary="Fit a calibration",
+    status_code=HTTPStatus.ACCEPTED,
+    responses=problems(
+        _404="No such session.",
+        _409="Another one is being fitted, or a session is not sealed.",
+        _422="Not as described, or the sessions are too long.",
+    ),
+)
+async def start_fit(body: StartFit, server: ServerState, response: Response) -> FitView:
+    """Fit every tile that was pressed in sessions of a bench, as `foottile calibrate` does.
+
+    It goes on beside the server; what is asked for again and again is how far it is.
+    """
+    options = {"reference": body.reference}
+    if body.reference_delay_ms is not None:
+        options["reference_delay_ms"] = repr(body.reference_delay_ms)
+        options["reference_delay_sigma_ms"] = repr(body.reference_delay_sigma_ms)
+    fit = server.fits.start(body.name, body.sessions, options)
+    response.headers["Location"] = f"/api/v1/calibrations/fits/{fit.id}"
+    return FitView.of(fit)
+
+
+@router.get(
+    "/calibrations/fits/{fit_id}",
+    operation_id="getFit",
+    summary="How far a fit is",
+    responses=problems(_404="No such fit."),
+)
+async def get_fit(fit_id: str, server: ServerState) -> FitView:
+    """What it has found so far, and the id of the calibration once it is done."""
+    return FitView.of(server.fits.get(fit_id))
+
+
+@router.delete(
+    "/calibrations/fits/{fit_id}",
+    operation_id="cancelFit",
+    summary="Cancel a fit",
+    responses=problems(_404="No such fit."),
+)
+async def cancel_fit(fit_id: str, server: ServerState) -> FitView:
+    """Nothing of it is kept; one that has ended stays as it is."""
+    return FitView.of(await server.fits.cancel(fit_id))
+
+
+@router.get(
+    "/calibrations/{calibration_id}",
+    operation_id="getCalibration",
+    summary="A calibration file",
+    response_class=Response,
+    responses={
+        200: {"description": "The file.", "content": {"application/json": {}}},
+        304: {"description": "You have it."},
+        **_UNKNOWN,
+    },
+)
+async def get_calibration(calibration_id: str, request: Request, server: ServerState) -> Response:
+    """Whole, as every command of `foottile` takes it; its id is its entity tag."""
+    calibration = await run_in_threadpool(server.calibrations.get, calibration_id)
+    return _file(calibration, request)
+
+
+@router.delete(
+    "/calibrations/{calibration_id}",
+    operation_id="deleteCalibration",
+    summary="Delete a calibration",
+    status_code=HTTPStatus.NO_CONTENT,
+    responses={**problems(_404="No such calibration."), **FULL},
+)
+async def delete_calibration(calibration_id: str, server: ServerState) -> None:
+    """Sessions that were recorded with it, and nodes that it was assigned to, have it still."""
+    server.calibrations.delete(calibration_id)
+
+
+@router.get(
+    "/nodes/{node}/calibration",
+    operation_id="getNodeCalibration",
+    summary="A node's calibration",
+    responses=_NO_NODE,
+)
+async def node_calibration(node: str, server: ServerState) -> NodeCalibrationView:
+    """Which one is in use, and who says so."""
+    return NodeCalibrationView.of(server.nodes.get(node))
+
+
+@router.put(
+    "/nodes/{node}/calibration",
+    operation_id="assignCalibration",
+    summary="Assign a calibration",
+    responses={
+        **problems(
+            _404="No such node or calibration.",
+            _409="The calibration's file is damaged.",
+            _412="Another calibration is in use than If-Match names.",
+            _422="Not as described, or it does not fit the node's tiles.",
+        ),
+        **FULL,
+    },
+)
+async def assign(
+    node: str, body: Assign, server: ServerState, if_match: InUse = None
+) -> NodeCalibrationView:
+    """Estimate a node's tiles with this one, in place of its own, until that is taken back.
+
+    From the next frame on, and for sessions that begin then; what is being recorded keeps what it
+    began with. The choice outlives a restart of either side.
+    """
+    the_node = server.nodes.get(node)
+    calibration = await run_in_threadpool(server.calibrations.get, body.id)
+    _expect_in_use(the_node, if_match)
+    _check_fits(the_node, calibration)
+    the_node.use_calibration(calibration, utc_ns())
+    server.tell_node(the_node)
+    return NodeCalibrationView.of(the_node)
+
+
+@router.delete(
+    "/nodes/{node}/calibration",
+    operation_id="takeBackCalibration",
+    summary="Take an assignment back",
+    responses={
+        **_NO_NODE,
+        **problems(_412="Another calibration is in use than If-Match names."),
+        **FULL,
+    },
+)
+async def take_back(node: str, server: ServerState, if_match: InUse = None) -> NodeCalibrationView:
+    """The node's own calibration is in use again, if it has one."""
+    the_node = server.nodes.get(node)
+    _expect_in_use(the_node, if_match)
+    if the_node.calibration_source == "server":
+        the_node.use_calibration(None, utc_ns())
+        server.tell_node(the_node)
+    return NodeCalibrationView.of(the_node)
+
+
+def _understood(content: bytes) -> Calibration:
+    try:
+        return calibration_of(content, where="the body")
+    except CalibrationError as error:
+        raise UsageError(error.what, expected=error.expected, remedy=error.remedy) from error
+
+
+def _file(calibration: Calibration, request: Request) -> Response:
+    headers = {"ETag": f'"{calibration.id}"'}
+    if has_it(request, calibration.id):
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    return Response(content_of(calibration), media_type="application/json", headers=headers)
+
+
+def _expect_in_use(node: ServerNode, if_match: str | None) -> None:
+    expect(tag_of(if_match), node.live.calibration_id or _NONE, f"the calibration of {node.name!r}")
+
+
+def _check_fits(node: ServerNode, calibration: Calibration) -> None:
+    """Refuse what the tiles that the node said last cannot be estimated with.
+
+    Raises:
+        UsageError: a tile is not in it, has another chip, or a model lacks what it needs.
+    """
+    try:
+        EstimateStream(node.info, EstimateOptions(calibration, node.info.models, LIVE_LAG_MS))
+    except FootTileError as error:
+        raise UsageError(
+            f"calibration {calibration.name} does not fit node {node.name!r}: {error}"
+        ) from error

@@ -1,0 +1,86 @@
+"""A bench recording whose programme is in its marks, as whoever moves the spindle made them.
+
+A mark says what is done from its instant on: `T01 load` that tile T01 is under the spindle, which
+goes down; `soak` and `end` that nothing is. Others are remarks. A misspelt one is refused: a stroke
+would go on where it had ended.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from devices.errors import CalibrationError
+from storage.schema import NO_INSTANT
+from storage.sessions.beside import EVENTS_NAME, clock_beside, read_events
+from storage.sessions.folder import Event
+from storage.sessions.reader import SessionReader
+
+PRESSED = ("rest", "load", "unload", "hold", "release", "tap")
+"""What is done with a tile, named before it."""
+IDLE = {"soak": "soak", "end": "rest"}
+"""What is said of no tile, and the phase that it is."""
+_FORM = "SERIAL and one of " + ", ".join(PRESSED) + "; or " + " or ".join(IDLE)
+
+Programme = tuple[npt.NDArray[np.object_], npt.NDArray[np.str_]]
+"""Of every frame: serial of the tile under the spindle or None, and phase."""
+
+
+def programme_of(session: SessionReader) -> Programme | None:
+    """What the marks beside a sealed session say; None: none of them says any of that.
+
+    Raises:
+        CalibrationError: one is misspelt, or it is not known at which frame it was.
+        FileFormatError: what lies beside the frames is damaged.
+    """
+    try:
+        events = read_events(session.path.with_name(EVENTS_NAME)).events
+    except FileNotFoundError:
+        return None
+    serials, where = session.info.serials, str(session.path.parent)
+    said = [(event, _said_by(event, serials, where)) for event in events]
+    steps = sorted(((event.t_ns, step) for event, step in said if step is not None))
+    if not steps:
+        return None
+    clock = clock_beside(session)
+    pieces = [
+        clock.columns(piece["t_mono_ns"], piece["t_ns"], None)["t_server_ns"]
+        for piece in session.columns("t_mono_ns", "t_ns")
+    ]
+    t_server_ns = np.concatenate(pieces)
+    if (t_server_ns == NO_INSTANT).any():
+        raise CalibrationError(
+            "the node's clock was not compared with the server's, by which its marks are",
+            where=where,
+            remedy="Record once the node's clock is measured, some seconds after it connects",
+        )
+    step_at = np.searchsorted([t_ns for t_ns, _ in steps], t_server_ns, side="right")
+    tiles = np.array([None, *(tile or None for _, (tile, _) in steps)], dtype=object)
+    phases = np.array(["rest", *(phase for _, (_, phase) in steps)], dtype=np.str_)
+    return tiles[step_at], phases[step_at]
+
+
+def _said_by(event: Event, serials: Sequence[str], where: str) -> tuple[str, str] | None:
+    """Serial, empty for none, and phase that begins; None: it is a remark.
+
+    Raises:
+        CalibrationError: it seems to mean one and does not say which.
+    """
+    label = event.label.strip()
+    if label in IDLE:
+        return "", IDLE[label]
+    serial, _, phase = (part.strip() for part in label.rpartition(" "))
+    if serial in serials and phase in PRESSED:
+        return serial, phase
+    begins = any(re.match(rf"{re.escape(known)}\b", label) for known in serials)
+    if begins or phase in PRESSED or label.lower() in IDLE:
+        raise CalibrationError(
+            f"mark {label[:80]!r} says no step of a bench",
+            where=where,
+            expected=f"{_FORM}, of a tile of {', '.join(serials)}",
+            remedy="Rename or remove it on the session's page",
+        )
+    return None

@@ -1,0 +1,236 @@
+"""Calibrations fitted on the server, from sessions that it has: `foottile calibrate` beside it.
+
+A process of its own does it, one at a time and after everything else that wants the processor, so
+that recording goes on. What it has found is kept when it is whole, or not at all; a server that
+ends has it end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import secrets
+import sys
+import tempfile
+from collections import OrderedDict, deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from devices.errors import FootTileError, StateError, UnknownError, UsageError
+from service.estimation.calibration import Calibration
+from service.server.book import SessionBook
+from service.server.calibrations import CalibrationBook
+from service.server_clock import utc_ns
+from service.sessions.calibration_file import calibration_of
+from storage.durable import read_whole
+from storage.sessions.folder import FRAMES_NAME
+
+log = logging.getLogger("foottile.fits")
+
+SESSIONS_MAX = 32
+FRAMES_MAX = 1_000_000
+"""Half an hour of the fastest array; all frames are in memory at once."""
+_KEPT = 16
+"""Of those that have ended, the newest."""
+_SAID_KEPT = 300
+"""Lines: more than an array has tiles."""
+_LINE_BYTES = 4000
+_LASTS_MAX_S = 1800.0
+"""A process that hangs is not waited for without end."""
+_NICENESS = 15
+_COMMAND = (sys.executable, "-c", "from service.cli.main import main; main()", "calibrate")
+_REFUSED_SOME = 3
+"""Exit code of `foottile calibrate`: written, but a tile was refused."""
+
+FitState = Literal["running", "done", "failed", "cancelled"]
+
+
+@dataclass
+class Fit:
+    """One of them, under way or ended."""
+
+    id: str
+    name: str
+    sessions: tuple[str, ...]
+    started_t_ns: int
+    state: FitState = "running"
+    ended_t_ns: int | None = None
+    said: deque[str] = field(default_factory=lambda: deque(maxlen=_SAID_KEPT))
+    """What was found so far, a line a tile."""
+    calibration_id: str | None = None
+    problem: str | None = None
+    """Why it failed."""
+
+
+class Fits:
+    """The fits of a server, of which one may be under way.
+
+    Args:
+        sessions: to fit.
+        calibrations: where what was found is kept.
+    """
+
+    def __init__(self, sessions: SessionBook, calibrations: CalibrationBook) -> None:
+        self._sessions = sessions
+        self._calibrations = calibrations
+        self._fits: OrderedDict[str, Fit] = OrderedDict()
+        self._task: asyncio.Task[None] | None = None
+        self._running: Fit | None = None
+
+    def all(self) -> list[Fit]:
+        """Those that are known, the newest first."""
+        return [*reversed(self._fits.values())]
+
+    def get(self, fit_id: str) -> Fit:
+        """One of them.
+
+        Raises:
+            UnknownError: there is none of this id, or it was long ago.
+        """
+        if fit_id not in self._fits:
+            raise UnknownError(
+                f"no fit {fit_id[:80]!r}",
+                expected=f"one of the last {_KEPT} since the server was started",
+            )
+        return self._fits[fit_id]
+
+    def start(self, name: str, sessions: Sequence[str], options: Mapping[str, str]) -> Fit:
+        """Begin to fit what was recorded on a bench; from the server's loop.
+
+        Args:
+            name: of the calibration.
+            sessions: ids; repeats of a tile may be spread over several.
+            options: more of `foottile calibrate`, by name.
+
+        Raises:
+            UnknownError: no such session.
+            StateError: a session is not sealed, or another fit is under way.
+            UsageError: a session is named twice, or they are too long.
+        """
+        if self._running is not None:
+            raise StateError(
+                f"calibration {self._running.name!r} is being fitted",
+                remedy="Wait until it is done, or cancel it",
+            )
+        ids = tuple(dict.fromkeys(sessions))
+        if len(ids) < len(sessions):
+            raise UsageError("a session is named twice", remedy="Name each once")
+        found = [self._sessions.get(one) for one in ids]
+        for session in found:
+            if session.sha256 is None:
+                raise StateError(
+                    f"session {session.id} is {session.state} and has no sealed file",
+                    expected="sealed sessions",
+                )
+        frames = sum(session.frames for session in found)
+        if frames > FRAMES_MAX:
+            raise UsageError(
+                f"these sessions have {frames} frames",
+                expected=f"at most {FRAMES_MAX} in one fit",
+                remedy="Fit fewer, or pull them and run `foottile calibrate`",
+            )
+        fit = Fit(secrets.token_hex(6), name, ids, utc_ns())
+        self._fits[fit.id] = fit
+        while len(self._fits) > _KEPT:
+            self._fits.popitem(last=False)
+        folder = self._sessions.folder
+        paths = [folder.path(one) / FRAMES_NAME for one in ids]
+        self._running = fit
+        self._task = asyncio.get_running_loop().create_task(self._run(fit, paths, options))
+        return fit
+
+    async def cancel(self, fit_id: str) -> Fit:
+        """End one that is under way, with nothing kept; one that has ended stays as it is.
+
+        Raises:
+            UnknownError: there is none of this id.
+        """
+        fit = self.get(fit_id)
+        if fit is self._running:
+            await self.close()
+        return fit
+
+    async def close(self) -> None:
+        """End what is under way."""
+        if self._task is None or self._running is None:
+            return
+        fit, task = self._running, self._task
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        if fit.state == "running":  # it had not begun yet
+            self._end(fit, "cancelled")
+
+    async def _run(self, fit: Fit, paths: list[Path], options: Mapping[str, str]) -> None:
+        try:
+            with tempfile.TemporaryDirectory(prefix="foottile-fit-") as folder:
+                out = Path(folder) / "calibration.json"
+                await self._have_fitted(fit, paths, out, options)
+                found = await asyncio.to_thread(_read, out)
+                fit.calibration_id = self._calibrations.keep(found).id
+            self._end(fit, "done")
+        except asyncio.CancelledError:
+            self._end(fit, "cancelled")
+        except (FootTileError, OSError) as error:
+            fit.problem = str(error)
+            self._end(fit, "failed")
+        except Exception as error:
+            log.exception("fit %s: this is a bug", fit.id)
+            fit.problem = f"the server made a mistake: {error!r}"
+            self._end(fit, "failed")
+
+    def _end(self, fit: Fit, state: FitState) -> None:
+        fit.state, fit.ended_t_ns = state, utc_ns()
+        self._running = self._task = None
+
+    async def _have_fitted(
+        self, fit: Fit, paths: list[Path], out: Path, options: Mapping[str, str]
+    ) -> None:
+        """Have the process write the calibration at `out`.
+
+        Raises:
+            StateError: it did not.
+        """
+        said = {"name": fit.name, **options}
+        process = await asyncio.create_subprocess_exec(
+            *(*_COMMAND, f"--out={out}"),
+            *(f"--{name.replace('_', '-')}={value}" for name, value in said.items()),
+            *("--", *map(str, paths)),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for us
+        )
+        try:
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
+            async with asyncio.timeout(_LASTS_MAX_S):
+                await self._listen(fit, process)
+                code = await process.wait()
+        except TimeoutError as error:
+            raise StateError(f"it was not done after {_LASTS_MAX_S:.0f} s") from error
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+        if code not in (0, _REFUSED_SOME):
+            last = fit.said[-1] if fit.said else f"the process ended with {code}"
+            raise StateError(last.removeprefix("foottile: "))
+
+    @staticmethod
+    async def _listen(fit: Fit, process: asyncio.subprocess.Process) -> None:
+        assert process.stderr is not None  # noqa: S101  # it was asked for
+        rest = b""
+        while piece := await process.stderr.read(_LINE_BYTES):
+            *lines, rest = (rest + piece).split(b"\n")
+            rest = rest[-_LINE_BYTES:]
+            fit.said.extend(line.decode(errors="replace")[:1000] for line in lines if line.strip())
+        if rest.strip():
+            fit.said.append(rest.decode(errors="replace")[:1000])
+
+
+def _read(out: Path) -> Calibration:
+    return calibration_of(read_whole(out), where=str(out))

@@ -1,0 +1,44 @@
+"""A calibration as a file: read from its text, and written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from devices.errors import CalibrationError, DamagedFileError
+from service.estimation.calibration import EDITED, Calibration
+from storage.checked_json import checked, with_check, write_checked
+
+
+def calibration_of(content: bytes, *, where: str) -> Calibration:
+    """The calibration in a file, which may have been written by hand: then its name says so.
+
+    Raises:
+        CalibrationError: it is not one, or not what its hashes are of.
+    """
+    try:
+        text = checked(content, where=where).text
+    except DamagedFileError as error:
+        raise not_one(error.what, where) from error
+    try:
+        return Calibration.from_json(text.decode("utf-8", "replace"), where=where)
+    except RecursionError as error:
+        raise not_one("it is nested too deeply", where) from error
+
+
+def not_one(what: str, where: str) -> CalibrationError:
+    """Of a file that is no calibration."""
+    return CalibrationError(f"not a calibration: {what}", where=where, remedy=EDITED)
+
+
+def content_of(calibration: Calibration) -> bytes:
+    """All bytes of its file."""
+    return with_check(calibration.to_json().encode())
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Write a calibration file.
+
+    Raises:
+        StorageError: the disk is full or not writable; nothing is left behind then.
+    """
+    write_checked(path, calibration.to_json().encode())

@@ -1,0 +1,88 @@
+"""A calibration from a recording of a server: what the mill did is in its marks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from devices.errors import CalibrationError
+from service.offline.calibrate import read_recordings
+from storage.sessions.beside import write_events
+from storage.sessions.folder import FRAMES_NAME, Event, Session, SessionFolder
+from tests.service import benches
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def recorded(bench_cache: Path, tmp_path: Path) -> Path:
+    """Folder of a bench session, sealed, with its marks."""
+    return benches.put(benches.pressed(bench_cache), tmp_path)
+
+
+def session_in(folder: Path) -> Session:
+    return SessionFolder(folder.parent).load(folder.name)
+
+
+def marked(folder: Path, *events: Event) -> Path:
+    """The same, with other marks."""
+    write_events(session_in(folder).model_copy(update={"events": events}), folder)
+    return folder / FRAMES_NAME
+
+
+def test_marks_say_the_same_as_the_mills_own_notes(recorded: Path, bench_cache: Path) -> None:
+    (by_notes,), (by_marks,) = (
+        read_recordings([path])["T01"]
+        for path in (benches.pressed(bench_cache), recorded / FRAMES_NAME)
+    )
+    assert set(by_notes.indentation.phase) >= {"rest", "load", "unload", "hold", "release"}
+    assert (by_marks.chip, by_marks.boot_id, by_marks.seq) == (
+        by_notes.chip,
+        by_notes.boot_id,
+        by_notes.seq,
+    )
+    names = ("t_ns", "kpa", "reference_n", "phase", "under_spindle", "tadc")
+    with_spindle = by_notes.indentation.under_spindle
+    for name in names:
+        noted, marked_as = (getattr(one.indentation, name) for one in (by_notes, by_marks))
+        rows = with_spindle if name == "reference_n" else slice(None)
+        np.testing.assert_array_equal(marked_as[rows], noted[rows], err_msg=name)
+
+
+def test_nothing_is_under_the_spindle_in_a_soak_and_after_the_end(recorded: Path) -> None:
+    steps = session_in(recorded).events[1:]
+    newest, *_ = steps
+    for label, phase in (("soak", "soak"), ("end", "rest")):
+        path = marked(recorded, newest.model_copy(update={"label": label}), *steps[1:])
+        ((found,),) = read_recordings([path]).values()
+        assert found.indentation.phase[-1] == phase
+        assert not found.indentation.under_spindle[-1]
+
+
+@pytest.mark.parametrize(
+    ("label", "says"),
+    [
+        ("T01 laod", "says no step of a bench"),
+        ("T09 load", "of a tile of T01"),
+        ("load", "says no step of a bench"),
+        ("Soak", "says no step of a bench"),
+    ],
+)
+def test_a_step_that_is_misspelt_is_refused_and_no_stroke_goes_on(
+    recorded: Path, label: str, says: str
+) -> None:
+    wrong, *others = session_in(recorded).events[1:]
+    path = marked(recorded, wrong.model_copy(update={"label": label}), *others)
+    with pytest.raises(CalibrationError, match=says):
+        read_recordings([path])
+
+
+def test_without_a_step_or_a_table_of_marks_it_is_no_bench(recorded: Path) -> None:
+    path = marked(recorded, session_in(recorded).events[0])
+    with pytest.raises(CalibrationError, match="marks such as `T01 load`"):
+        read_recordings([path])
+    (recorded / "events.parquet").unlink()
+    with pytest.raises(CalibrationError, match="not an indentation recording"):
+        read_recordings([path])
