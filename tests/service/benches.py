@@ -65,7 +65,8 @@ def put(recording: Path, data: Path, *, marked: bool = True) -> Path:
     with SessionReader(recording) as reader:
         pieces = list(reader.batches("pressed_tile", "phase"))
         info = reader.info
-        part = Part(boot_id=info.boot_id, seq_first=0, seq_last=reader.frame_count - 1)
+        last = reader.frame_count - 1
+        part = Part(boot_id=info.boot_id, seq_first=0, seq_last=last)
         about = {"id": SESSION_ID, "parts": [part.model_dump()]}
         with SessionWriter(folder / FRAMES_NAME, info, {"session": about}) as writer:
             for frames, _ in pieces:
@@ -87,7 +88,7 @@ def put(recording: Path, data: Path, *, marked: bool = True) -> Path:
         parts=(part,),
         scene="indentation",
         events=(remark, *(reversed(steps) if marked else ())),
-        frames=part.seq_last + 1,  # type: ignore[operator]
+        frames=last + 1,
         sha256=sha256_of(frames_path),
         bytes=frames_path.stat().st_size,
         ledger=Ledger(
@@ -97,8 +98,8 @@ def put(recording: Path, data: Path, *, marked: bool = True) -> Path:
                 PartLedger(
                     boot_id=part.boot_id,
                     seq_first=0,
-                    seq_last=part.seq_last,
-                    recorded=part.seq_last + 1,  # type: ignore[operator]
+                    seq_last=last,
+                    recorded=last + 1,
                     lost={},
                     pending=0,
                 ),

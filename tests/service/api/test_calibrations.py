@@ -344,14 +344,15 @@ def test_what_cannot_be_fitted_is_refused_at_once(
     running, twice = with_bench, [benches.SESSION_ID] * 2
     assert_refused(fit(running, sessions=twice), 422, "named twice")
     assert_refused(fit(running, sessions=["20200101T000000Z-000000"]), 404, "20200101")
-    for wrong in (
+    wrongs: tuple[dict[str, Any], ...] = (
         {"sessions": []},
         {"sessions": ["x"] * 33},
         {"name": ""},
         {"name": "two\nlines"},
         {"reference_delay_ms": 1e9},
         {"out": "/etc/passwd"},
-    ):
+    )
+    for wrong in wrongs:
         assert fit(running, **wrong).status_code == 422, wrong
     monkeypatch.setattr("service.server.fits.FRAMES_MAX", 10)
     assert_refused(fit(running), 422, "at most 10 in one fit")
