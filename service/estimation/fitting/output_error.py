@@ -8,6 +8,7 @@ force. Every loading may have a gain of its own about one, because loadings do n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import nnls
@@ -94,7 +95,9 @@ class OutputErrorProblem:
         noise_kpa = 1.0 / np.where(self._usable, points.weight, 1.0)
         weight = 1.0 / np.hypot(noise_kpa, _MODEL * self._gauge_kpa)
         self._weight = np.where(self._usable, weight, 0.0)
-        self._load = load(points.t_s, points.force_n)
+        between = load(points.t_s, points.force_n)
+        # Of all unknowns one alone moves it, and interpolation costs as much as the smaller models.
+        self._force_n = lru_cache(maxsize=2)(lambda late_s: between(points.t_s + late_s))
         self._told_s = told_s(points)
 
     def fit(self, parts: Parts, scatter: float | None = None) -> Fit:
@@ -241,7 +244,7 @@ class OutputErrorProblem:
     def _gains(self, model: DomeModel, scatter: float) -> tuple[Floats, Floats]:
         """Gain of each loading, by least squares with a prior of one, and modelled pressures."""
         points = self._points
-        modelled = model.pressed(points.t_s, self._load(points.t_s + model.late_s))
+        modelled = model.pressed(points.t_s, self._force_n(model.late_s))
         gauge_kpa = modelled[:, 0] - model.baseline_kpa
         n = points.loadings
         prior = 1.0 / scatter**2

@@ -76,7 +76,7 @@ def test_of_an_emulated_dome_the_flowing_part_of_its_loop_is_found() -> None:
 
 @pytest.mark.parametrize("late_s", [-300e-6, 233e-6])
 @pytest.mark.parametrize(
-    "serial", ["T01", pytest.param("T03", marks=soak), "T04", pytest.param("T05", marks=soak)]
+    "serial", ["T01", *(pytest.param(other, marks=soak) for other in ("T03", "T04", "T05"))]
 )
 def test_a_dome_that_is_sampled_at_another_instant_keeps_its_gas(
     serial: str, late_s: float
@@ -91,7 +91,7 @@ def test_a_dome_that_is_sampled_at_another_instant_keeps_its_gas(
 
 
 @pytest.mark.parametrize("gamma_tau_s", [0.036, 0.012])
-@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=soak)])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(other, marks=soak) for other in (1, 2))])
 def test_a_gas_that_cools_as_fast_as_the_rubber_creeps_is_not_given_up_for_the_creep(
     gamma_tau_s: float, seed: int
 ) -> None:
