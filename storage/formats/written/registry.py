@@ -12,9 +12,11 @@ from storage.formats.written.arrow import ARROW
 from storage.formats.written.c3d import C3D
 from storage.formats.written.csv_text import CSV
 from storage.formats.written.format import Format
+from storage.formats.written.matlab import MATLAB
 from storage.formats.written.mcap.file import MCAP
 from storage.formats.written.opensim import OPENSIM
 from storage.formats.written.parquet import PARQUET
+from storage.formats.written.xdf import XDF
 
 FORMATS: Mapping[str, Format] = {
     known.name: known
@@ -25,6 +27,8 @@ FORMATS: Mapping[str, Format] = {
         C3D,
         OPENSIM,
         MCAP,
+        MATLAB,
+        XDF,
     )
 }
 

@@ -31,6 +31,7 @@ from storage.schema import CONTACT_UNKNOWN, Array
 from storage.sessions.folder import Event
 from tests.builders.arrays import make_array
 from tests.storage.formats.exports import NOTES, ROWS, cut, export, extra, frames
+from tests.storage.formats.walks import lines_of_documents
 
 ROS2 = FormatOptions(messages="ros2")
 LABEL = "a “stone” / 石 🦶"
@@ -291,3 +292,14 @@ def test_what_broke_off_is_no_whole_file(options: FormatOptions) -> None:
 def test_a_slice_of_a_gap_is_a_file_without_frames() -> None:
     part = Slice(0.051, 0.0515)
     assert "/left/frames" not in foxglove(written(part=part))
+
+
+def test_the_example_of_the_document_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "session.mcap").write_bytes(written())
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, Any] = {}
+    exec(lines_of_documents("MCAP"), found)  # noqa: S102  # our own
+    assert found["t_ns"] == frames().t_ns[-1]
+    assert found["grf_n"] == np.float32(40.0)

@@ -1,0 +1,231 @@
+"""XDF, the file of LabStreamingLayer: streams of samples, each with its instant, and marks.
+
+The layout is that of https://github.com/sccn/xdf/wiki/Specifications. Of each part of a session
+there is a stream of 32-bit floats, with all estimates and counts, and one of 64-bit floats, with
+numbers that need them; of all together a stream of marks. Instants are the node's, in seconds since
+1970, and with the server's clock every few seconds a clock offset leads from them to the server's,
+as LSL's own recorder has it. No rate is stated, so that readers leave every instant as it is.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+import numpy as np
+import pyarrow as pa
+
+from storage.formats.export import Export
+from storage.formats.written.format import Format
+from storage.schema import KNOWN, NO_INSTANT, Array
+
+_MAGIC = b"XDF:"
+_FILE_HEADER, _STREAM_HEADER, _SAMPLES, _CLOCK_OFFSET, _STREAM_FOOTER = 1, 2, 3, 4, 6
+_OFFSET_EVERY_NS = 5_000_000_000
+"""As LSL's recorder does."""
+_COUNTERS = ("seq", "servo_counts", "servo_age_us")
+"""Beyond what 32-bit floats count exactly."""
+_TIMES = ("time_s", "time_utc", "t_ns", "t_mono_ns", "t_server_ns", "t_server_uncertainty_ns")
+"""Every sample has its instant."""
+
+
+@dataclass
+class _Stream:
+    """One stream, and what its footer will say."""
+
+    number: int
+    columns: Sequence[str]
+    dtype: str
+    samples: int = 0
+    first_s: float = 0.0
+    last_s: float = 0.0
+    offsets: list[tuple[float, float]] = field(default_factory=list)
+
+    def count(self, at_s: Array) -> None:
+        """Of further samples."""
+        if len(at_s):
+            self.first_s = self.first_s if self.samples else float(at_s[0])
+            self.last_s = float(at_s[-1])
+            self.samples += len(at_s)
+
+    def chunk(self, tag: int, content: bytes) -> bytes:
+        """A chunk of this stream."""
+        return _chunk(tag, struct.pack("<I", self.number) + content)
+
+    def footer(self) -> bytes:
+        """Its last chunk."""
+        info = Element("info")
+        said = {"first_timestamp": repr(self.first_s), "last_timestamp": repr(self.last_s)}
+        _texts(info, {**said, "sample_count": str(self.samples)})
+        offsets = SubElement(info, "clock_offsets")
+        for at_s, value_s in self.offsets:
+            _texts(SubElement(offsets, "offset"), {"time": repr(at_s), "value": repr(value_s)})
+        return self.chunk(_STREAM_FOOTER, tostring(info))
+
+
+def _write(export: Export) -> Iterator[bytes]:
+    chosen = {
+        name: of
+        for name, of in export.chosen().items()
+        if of not in _TIMES and not pa.types.is_string(KNOWN[of].type)
+    }
+    asked = [*chosen, "t_ns"]
+    asked += ["part"] if "part" in export.content.names else []
+    asked += ["t_server_ns"] if export.clock is not None else []
+    asked += ["event"] if export.marks is not None else []
+    pieces = export.pieces(asked)
+    first = next(pieces)  # what is wrong is said before anything is given away
+    file = _File(export, chosen)
+    yield file.header()
+    yield file.piece(first)
+    for piece in pieces:
+        yield file.piece(piece)
+    yield file.footers()
+
+
+class _File:
+    """The streams of a file, as far as it is written."""
+
+    def __init__(self, export: Export, chosen: Mapping[str, str]) -> None:
+        self._export, self._chosen = export, chosen
+        self._streams: list[_Stream] = []
+        self._parts: dict[int, list[_Stream]] = {}
+        self._marks: _Stream | None = None
+        self._next_offset_ns: dict[int, int] = {}
+
+    def header(self) -> bytes:
+        """What comes first, with what the file says of itself."""
+        info = Element("info")
+        said = {"version": "1.0", **{k: str(v) for k, v in self._export.about.items()}}
+        _texts(info, {**said, "software": self._export.info.software})
+        begin = _MAGIC + _chunk(_FILE_HEADER, tostring(info, xml_declaration=True))
+        if self._export.marks is None:
+            return begin
+        self._marks, header = self._opened("marks", "Markers", ["label"], "string")
+        return begin + header
+
+    def piece(self, piece: Mapping[str, Array]) -> bytes:
+        """Chunks of some frames."""
+        content = bytearray()
+        parts = piece.get("part", np.zeros(len(piece["t_ns"]), dtype=np.uint16))
+        # A stream for what has no frame, too, so that its channels are said.
+        for part in np.unique(parts).tolist() or [0]:
+            rows = parts == part
+            content += self._of_part(part, {name: v[rows] for name, v in piece.items()})
+        return bytes(content)
+
+    def footers(self) -> bytes:
+        """What comes last: without it a stream is not at its end."""
+        return b"".join(stream.footer() for stream in self._streams)
+
+    def _of_part(self, part: int, flat: Mapping[str, Array]) -> bytes:
+        content = bytearray()
+        if part not in self._parts:
+            self._parts[part] = []
+            counters = [name for name, of in self._chosen.items() if of in _COUNTERS]
+            others = [name for name, of in self._chosen.items() if of not in _COUNTERS]
+            of_part = f" part {part}" if part else ""
+            for name, columns, format_ in (
+                ("frames", others, "float32"),
+                ("counters", counters, "double64"),
+            ):
+                if columns:
+                    stream, header = self._opened(name + of_part, "Force", columns, format_)
+                    self._parts[part].append(stream)
+                    content += header
+        at_s = flat["t_ns"] * 1e-9
+        if len(at_s):
+            content += self._offsets(part, flat)
+            for stream in self._parts[part]:
+                stream.count(at_s)
+                content += stream.chunk(_SAMPLES, self._samples(stream, at_s, flat))
+            content += self._marked(at_s, flat)
+        return bytes(content)
+
+    def _samples(self, stream: _Stream, at_s: Array, flat: Mapping[str, Array]) -> bytes:
+        row = np.dtype([("bytes", "u1"), ("s", "<f8"), ("v", stream.dtype, len(stream.columns))])
+        rows = np.zeros(len(at_s), dtype=row)
+        rows["bytes"], rows["s"] = 8, at_s
+        for i, name in enumerate(stream.columns):
+            missing = KNOWN[self._chosen[name]].missing
+            values = flat[name].astype(np.float64)
+            if missing is not None:
+                values[flat[name] == missing] = np.nan
+            rows["v"][:, i] = values
+        return struct.pack("<BI", 4, len(at_s)) + rows.tobytes()
+
+    def _offsets(self, part: int, flat: Mapping[str, Array]) -> bytes:
+        content = bytearray()
+        if "t_server_ns" not in flat:
+            return b""
+        known = np.flatnonzero(flat["t_server_ns"] != NO_INSTANT)
+        t_ns, t_server_ns = flat["t_ns"][known], flat["t_server_ns"][known]
+        if not len(t_ns):
+            return b""
+        begin_ns = self._next_offset_ns.get(part, int(t_ns[0]))
+        instants_ns = np.arange(begin_ns, int(t_ns[-1]) + 1, _OFFSET_EVERY_NS)
+        due = np.unique(np.searchsorted(t_ns, instants_ns))
+        for row in due:
+            pair = float(t_ns[row]) * 1e-9, float(t_server_ns[row] - t_ns[row]) * 1e-9
+            self._next_offset_ns[part] = int(t_ns[row]) + _OFFSET_EVERY_NS
+            for stream in self._parts[part]:
+                stream.offsets.append(pair)
+                content += stream.chunk(_CLOCK_OFFSET, struct.pack("<dd", *pair))
+        return bytes(content)
+
+    def _marked(self, at_s: Array, flat: Mapping[str, Array]) -> bytes:
+        if self._marks is None:
+            return b""
+        rows = [row for row, text in enumerate(flat["event"]) if text is not None]
+        content = bytearray(struct.pack("<BI", 4, len(rows)))
+        for row in rows:
+            text = flat["event"][row].encode()
+            content += struct.pack("<BdBI", 8, at_s[row], 4, len(text)) + text
+        self._marks.count(at_s[rows])
+        return self._marks.chunk(_SAMPLES, bytes(content)) if rows else b""
+
+    def _opened(
+        self, name: str, kind: str, columns: Sequence[str], format_: str
+    ) -> tuple[_Stream, bytes]:
+        """A further stream, and its header."""
+        dtype = {"float32": "<f4", "double64": "<f8", "string": ""}[format_]
+        stream = _Stream(len(self._streams) + 1, columns, dtype)
+        self._streams.append(stream)
+        node = self._export.info.node
+        info = Element("info")
+        said = {"name": f"{node} {name}", "type": kind, "channel_count": str(len(columns))}
+        said |= {"nominal_srate": "0", "channel_format": format_}
+        source = f"{node} {self._export.about.get('session') or ''} {name}"
+        _texts(info, {**said, "source_id": source, "version": "1.1", "hostname": node})
+        desc = SubElement(info, "desc")
+        _texts(desc, {"nominal_rate_hz": repr(self._export.info.nominal_rate_hz)})
+        channels = SubElement(desc, "channels")
+        for column in columns:
+            of = KNOWN[self._chosen[column]] if column in self._chosen else None
+            unit, meaning = (of.unit, of.description) if of else ("1", "what people marked")
+            channel = {"label": column, "unit": unit, "type": kind, "description": meaning}
+            if of is not None and of.per_tile:
+                tile = self._export.info.tiles[int(column.removeprefix(f"{of.name}_"))]
+                channel["serial"] = tile.serial
+            _texts(SubElement(channels, "channel"), channel)
+        return stream, stream.chunk(_STREAM_HEADER, tostring(info, xml_declaration=True))
+
+
+def _chunk(tag: int, content: bytes) -> bytes:
+    return struct.pack("<BIH", 4, len(content) + 2, tag) + content
+
+
+def _texts(parent: Element, texts: Mapping[str, str]) -> None:
+    for name, text in texts.items():
+        SubElement(parent, name).text = text
+
+
+XDF = Format(
+    "xdf",
+    "XDF",
+    "pyxdf, MNE, EEGLAB, MoBILAB",
+    "application/x-xdf",
+    _write,
+)

@@ -1,0 +1,151 @@
+"""XDF files, read by pyxdf."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import pyxdf
+
+from devices.frames import NO_SERVO_COUNTS, NOT_READ
+from storage.clock.bounds import Rows
+from storage.clock.table import ClockTable, StreamFacts
+from storage.formats.export import content_of
+from storage.formats.options import NO_OPTIONS
+from storage.formats.slice import Slice
+from storage.schema import Array
+from tests.builders.arrays import make_array
+from tests.storage.formats.exports import NOTES, ROWS, cut, export, extra, frames
+from tests.storage.formats.walks import lines_of_documents
+from tests.storage.formats.written.test_mcap import LABEL, marks
+
+BOOTS = ["0" * 32, "1" * 32]
+
+
+def written(
+    part: Slice | None = None,
+    columns: Mapping[str, Array] | None = None,
+    clock: ClockTable | None = None,
+    *,
+    every: int = 20,
+) -> bytes:
+    content = content_of(cut(frames(), extra() if columns is None else columns, every))
+    source = {"session": "s <&> 🦶"}
+    options = NO_OPTIONS
+    chunks = export(
+        content,
+        make_array(node="left"),
+        NOTES,
+        "xdf",
+        part or Slice(),
+        clock,
+        marks(),
+        source,
+        options,
+    )
+    return b"".join(chunks)
+
+
+def read(content: bytes, **options: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Streams by name, and the header; nothing is done to instants unless it is asked for."""
+    plain = {"synchronize_clocks": False, "dejitter_timestamps": False}
+    streams, header = pyxdf.load_xdf(io.BytesIO(content), **(plain | options))
+    return {stream["info"]["name"][0]: stream for stream in streams}, header["info"]
+
+
+def labels(stream: Any) -> list[str]:
+    return [channel["label"][0] for channel in stream["info"]["desc"][0]["channels"][0]["channel"]]
+
+
+def series(stream: Any, name: str) -> Array:
+    found: Array = stream["time_series"][:, labels(stream).index(name)]
+    return found
+
+
+@pytest.mark.parametrize("every", [1, 20, ROWS])
+def test_every_frame_is_a_sample_at_its_instant_with_nan_for_what_is_not_known(every: int) -> None:
+    batch, columns = frames(), extra()
+    streams, _ = read(written(every=every))
+    assert set(streams) == {"left frames", "left counters", "left marks"}
+    of_frames, counters = streams["left frames"], streams["left counters"]
+    for stream in (of_frames, counters):
+        at_ns = (stream["time_stamps"] * 1e9).astype(np.int64)
+        assert np.abs(at_ns - batch.t_ns).max() < 300  # a float of seconds since 1970
+    for i in range(2):
+        force_n = columns["force_n"][:, i].astype(np.float32)
+        np.testing.assert_array_equal(series(of_frames, f"force_n_{i}"), force_n)
+        padc = np.where(batch.padc[:, i] == NOT_READ, np.nan, batch.padc[:, i])
+        np.testing.assert_array_equal(series(of_frames, f"padc_{i}"), padc)
+    servo = np.where(batch.servo_counts == NO_SERVO_COUNTS, np.nan, batch.servo_counts)
+    np.testing.assert_array_equal(series(counters, "servo_counts"), servo)
+    np.testing.assert_array_equal(series(counters, "seq"), batch.seq.astype(np.float64))
+
+
+def test_channels_have_units_and_serials_and_footers_count_the_samples() -> None:
+    stream = read(written())[0]["left frames"]
+    channels = stream["info"]["desc"][0]["channels"][0]["channel"]
+    said = {channel["label"][0]: channel for channel in channels}
+    assert said["force_n_1"]["unit"] == ["N"]
+    assert said["force_n_1"]["serial"] == [make_array().tiles[1].serial]
+    footer = stream["footer"]["info"]
+    assert footer["sample_count"] == [str(ROWS)]
+    assert float(footer["last_timestamp"][0]) == stream["time_stamps"][-1]
+
+
+def test_a_mark_is_a_sample_of_text_at_its_frame() -> None:
+    stream = read(written())[0]["left marks"]
+    assert stream["time_series"] == [[LABEL]]
+    assert abs(stream["time_stamps"][0] - frames().t_ns[12] * 1e-9) < 1e-6
+    assert stream["info"]["type"] == ["Markers"]
+
+
+def test_the_file_says_what_it_is() -> None:
+    _, header = read(written())
+    assert header["session"] == ["s <&> 🦶"]
+    assert header["resampled"] == ["nothing"]
+    assert header["complete"] == ["None"]
+    assert "node's clock" in header["time_base"][0]
+
+
+def test_clock_offsets_lead_each_part_to_the_servers_time() -> None:
+    """The server is 90 s ahead of the first part's clock; of the second nothing was measured."""
+    columns = extra()
+    columns["part"][30:] = 1
+    ahead = Rows(np.array([0, 60_000_000]), np.array([90 * 10**9] * 2), np.array([100] * 2))
+    clock = ClockTable(
+        {BOOTS[0]: ahead}, [StreamFacts(boot, 10**18, True) for boot in BOOTS], BOOTS
+    )
+    raw, _ = read(written(columns=columns, clock=clock))
+    set_, _ = read(written(columns=columns, clock=clock), synchronize_clocks=True)
+    assert len(raw["left frames"]["clock_times"]) == 1
+    first = set_["left frames"]["time_stamps"] - raw["left frames"]["time_stamps"]
+    np.testing.assert_allclose(first, 90.0, atol=1e-5)
+    assert len(first) == 30
+    second = "left frames part 1"
+    assert not raw[second]["clock_times"]
+    np.testing.assert_array_equal(set_[second]["time_stamps"], raw[second]["time_stamps"])
+    assert len(raw[second]["time_stamps"]) == ROWS - 30
+
+
+def test_only_what_was_asked_for_is_in_it() -> None:
+    streams, _ = read(written(Slice(0.02, 0.04, ("grf_n", "force_n_1"))))
+    assert labels(streams["left frames"]) == ["grf_n", "force_n_1"]
+    assert len(streams["left frames"]["time_stamps"]) == 10
+    assert "left counters" not in streams
+    gap, _ = read(written(Slice(0.051, 0.0515)))
+    assert len(gap["left frames"]["time_stamps"]) == 0
+
+
+def test_the_example_of_the_document_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "session.xdf").write_bytes(written())
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, Any] = {}
+    exec(lines_of_documents("XDF"), found)  # noqa: S102  # our own
+    np.testing.assert_array_equal(found["grf_n"], extra()["grf_n"].astype(np.float32))
+    np.testing.assert_allclose(found["time_s"], frames().t_ns * 1e-9)
