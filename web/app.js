@@ -125,7 +125,7 @@ function takeFrame(frame) {
   status.see(frame);
   notes.see(state.node, frame, nowMs);
   trace.add(frame, state.node.nominal_rate_hz, nowMs);
-  past.see(state.node, frame, trace.windowS, nowMs);
+  past.see(state.node, frame, trace.windowS, nowMs, tileTraces.wants(bars.unit));
 }
 
 function keepSpan(frame, earlier) {
@@ -212,7 +212,7 @@ function tick() {
   notes.draw(node, state.frame, nowMs, state.serverNowMs(), state.problems);
   tares.draw(node);
   actions.draw();
-  if (node && !node.connected) past.see(node, null, trace.windowS, nowMs);
+  if (node && !node.connected) past.see(node, null, trace.windowS, nowMs, tileTraces.wants(bars.unit));
 }
 
 function draw() {

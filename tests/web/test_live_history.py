@@ -81,6 +81,19 @@ def test_what_was_before_joins_what_is_heard_without_a_seam(
     assert all(n == last - first + 1 for first, last, n, _ in spans)
 
 
+def test_traces_of_tiles_begin_with_what_was_before(
+    scripted: Scripted, open_page: OpenPage
+) -> None:
+    streamed(scripted)
+    with Play(scripted.node, 20.0):
+        page = open_page(scripted.url)
+        expect(page.locator(LIVE)).to_have_count(1)
+        with page.expect_response("**/recent?*tiles=force_n") as asked:
+            page.click("#as-traces")
+        assert len(asked.value.json()["tiles"]["seq"]) > 50
+        until(lambda: page.evaluate(DRAWN.replace("#trace", "#tile-traces")) > 100)
+
+
 def test_a_page_that_is_opened_has_a_trace_at_once(scripted: Scripted, open_page: OpenPage) -> None:
     streamed(scripted)
     with Play(scripted.node, 20.0):

@@ -42,8 +42,8 @@ export async function call(method, path, body, stop = null, type = JSON_TYPE, sa
 }
 
 const id = encodeURIComponent;
-export const recent = (node, seconds, before) =>
-  call("GET", `/nodes/${id(node)}/recent?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}`);
+export const recent = (node, seconds, before, tiles) =>
+  call("GET", `/nodes/${id(node)}/recent?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}${tiles ? `&tiles=${tiles}` : ""}`);
 export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, {});
 export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);

@@ -17,6 +17,7 @@ export class Points {
 
   clear() {
     this.all = [];
+    this.tilesPast = []; // each tile, before the first live message that has it
     this.offsetS = null; // page clock minus sample clock
   }
 
@@ -48,6 +49,17 @@ export class Points {
     this.all.forEach((point, i) => { point.gap = this.isGap(this.all[i - 1], point); });
     this.offsetS ??= nowMs / 1000 - past.at(-1).timeS - (recent.age_ms ?? 0) / 1000;
     this.trim();
+  }
+
+  /** The same of each tile: least and greatest of `unit`, as the server says of a tenth of a second each. */
+  precedeTiles(recent, unit, before) {
+    const [low, high] = ["min", "max"].map((which) => unit.replace("_", `_${which}_`));
+    this.tilesPast = recent.seq.map((seq, i) => ({
+      seqFirst: recent.seq_first[i], seq, n: recent.n[i], timeS: recent.t_ns[i] / 1e9,
+      tiles: { [low]: recent.min[i], [high]: recent.max[i] },
+    }));
+    this.tilesPast.forEach((point, i) => { point.gap = this.isGap(this.tilesPast[i - 1], point); });
+    for (const point of this.all) if (point.seq < (before ?? Infinity)) point.tiles = null; // these are there now
   }
 
   isGap(before, point) {

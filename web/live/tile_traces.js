@@ -31,6 +31,12 @@ export class TileTraces {
     this.show();
   }
 
+  /** What of each tile is drawn, as the API calls it; null: they are not shown so. */
+  wants(unit) {
+    if (!this.shown) return null;
+    return unit === "N" ? "force_n" : "gauge_kpa";
+  }
+
   show() {
     byId("as-bars").setAttribute("aria-pressed", String(!this.shown));
     byId("as-traces").setAttribute("aria-pressed", String(this.shown));
@@ -39,7 +45,7 @@ export class TileTraces {
   }
 
   /** @param {{points: object[], endS: number, windowS: number, live: boolean}} seen what the force is drawn of */
-  draw(node, { points, endS, windowS, live }, nowMs, unitChosen) {
+  draw(node, { points, tilesPast, endS, windowS, live }, nowMs, unitChosen) {
     if (!this.shown || nowMs - this.drawnMs < EVERY_MS) return;
     this.drawnMs = nowMs;
     const { canvas, context } = this;
@@ -58,7 +64,8 @@ export class TileTraces {
     const rowPx = height / node.tiles.length;
     const shades = rowPx < ROW_PX ? shadesOf(canvas) : null;
     const x = (timeS) => width - RIGHT_PX - ((endS - timeS) / windowS) * (width - RIGHT_PX - LEFT_PX);
-    const known = points.filter((point) => point.tiles);
+    const heard = points.filter((point) => point.tiles);
+    const known = [...tilesPast.filter((point) => point.timeS > endS - windowS), ...heard];
     context.font = `600 ${Math.min(13, Math.max(8, rowPx - 2))}px system-ui, sans-serif`;
     node.tiles.forEach((tile, i) => {
       const unit = unitOf(tile, unitChosen);
@@ -99,6 +106,14 @@ export class TileTraces {
     }
     context.strokeStyle = colours.fill;
     context.lineWidth = 1.5;
+    // Of the time before, least and greatest are known, and not which came last.
+    for (const run of runs(points, (point) => (of(point, "") === null ? of(point, "max_") : null))) {
+      for (const which of ["max_", "min_"]) {
+        context.beginPath();
+        run.forEach((point) => context.lineTo(x(point.timeS), y(of(point, which))));
+        context.stroke();
+      }
+    }
     context.lineJoin = "round";
     for (const run of runs(points, (point) => of(point, ""))) {
       context.beginPath();

@@ -63,7 +63,7 @@ export class Trace {
 
   /** Keep the picture as it is; points are still taken. */
   pause(nowMs) {
-    this.held = { points: [...this.points.all], offsetS: this.points.offsetS, nowMs };
+    this.held = { points: [...this.points.all], tilesPast: this.points.tilesPast, offsetS: this.points.offsetS, nowMs };
   }
 
   goOn() {
@@ -147,7 +147,7 @@ export class Trace {
     }
     context.restore();
     setData(byId("trace-legend"), "bound", String(someBound));
-    return { points, endS, windowS, live };
+    return { points, tilesPast: (this.held ?? this.points).tilesPast, endS, windowS, live };
   }
 
   /** A bound: the force is on its line or anywhere in the stripes above. */

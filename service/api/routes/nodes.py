@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import Annotated, Any
+from math import isfinite
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query
 from pydantic import BaseModel, ConfigDict, Field
@@ -15,6 +16,7 @@ from service.server.screens.picture import rounded
 from service.server.screens.recent import SECONDS_MAX
 from service.server.screens.spans import Span
 from service.server.screens.views import DriftView, NodeView, Page, TaresPage, TareView, View
+from service.server.server import Server
 from service.sessions.tares import REASON_LENGTH_MAX
 
 router = APIRouter(prefix="/nodes", tags=["nodes"])
@@ -43,6 +45,20 @@ class RecentQuery(BaseModel):
         description="Only what ends before this number: `seq_first` of a live message of the last "
         "second, which then goes on without a seam.",
     )
+    tiles: Literal["force_n", "gauge_kpa"] | None = Field(
+        default=None, description="Adds `tiles`: this of each of them."
+    )
+
+
+class RecentTilesView(View):
+    """Spans of a tenth of a second, oldest first; the values of each span are over tiles."""
+
+    seq_first: list[int]
+    seq: list[int]
+    n: list[int]
+    t_ns: list[int]
+    min: list[list[float | None]]
+    max: list[list[float | None]]
 
 
 class RecentView(View):
@@ -63,6 +79,7 @@ class RecentView(View):
     grf_at_least_max_n: list[float | None] = Field(
         description="Greatest lower bound of its frames whose GRF is not known."
     )
+    tiles: RecentTilesView | None = Field(description="Only where it was asked for.")
 
 
 _UNKNOWN = problems(_404="No such node.")
@@ -122,8 +139,23 @@ async def get_recent(
         node=the_node.name,
         boot_id=the_node.boot_id,
         age_ms=None if age_ms is None else round(age_ms, 1),
+        tiles=None if query.tiles is None else _recent_tiles(the_node, query, query.tiles, server),
         **(numbers | forces),
     )
+
+
+def _recent_tiles(
+    node: ServerNode, query: RecentQuery, unit: str, server: Server
+) -> RecentTilesView:
+    recent = server.hub.recent_tiles(node)
+    rows, *extremes = recent.rows(query.seconds, unit, query.before_seq)
+    least, greatest = ([_four_digits(row) for row in values.tolist()] for values in extremes)
+    numbers = {name: rows[name].tolist() for name in ("seq_first", "seq", "n", "t_ns")}
+    return RecentTilesView(min=least, max=greatest, **numbers)
+
+
+def _four_digits(values: list[float]) -> list[float | None]:
+    return [float(f"{value:.4g}") if isfinite(value) else None for value in values]
 
 
 @router.post(

@@ -17,6 +17,7 @@ from service.link import Close, HangUp
 from service.server.node import Estimated, ServerNode
 from service.server.screens.picture import Summary, dumps, sum_up
 from service.server.screens.recent import Recent
+from service.server.screens.recent_tiles import RecentTiles
 from service.server.screens.spans import span_of
 from service.server_clock import utc_ns
 
@@ -129,6 +130,7 @@ class Hub:
         self._nodes: dict[str, ServerNode] = {}
         """Those that have sent frames."""
         self._recent: dict[str, Recent] = {}
+        self._recent_tiles: dict[str, RecentTiles] = {}
 
     @property
     def subscribers(self) -> int:
@@ -178,6 +180,7 @@ class Hub:
             node.shown_t_ns = int(frames.t_ns[-1])
             span = span_of(frames, columns)
             self._recent.setdefault(node.name, Recent()).add(node.boot_id, span)
+            self._of_tiles(node, frames.tile_count).add(span, columns)
             if self._feeds:
                 piece = sum_up(node.boot_id, span, frames, columns)
                 for summary in self._changing():
@@ -187,6 +190,16 @@ class Hub:
         """What was told of its present stream."""
         recent = self._recent.get(node.name)
         return recent if recent is not None and recent.boot_id == node.boot_id else Recent()
+
+    def recent_tiles(self, node: ServerNode) -> RecentTiles:
+        """The same of each of its tiles."""
+        return self._of_tiles(node, len(node.info.tiles))
+
+    def _of_tiles(self, node: ServerNode, tiles: int) -> RecentTiles:
+        recent = self._recent_tiles.get(node.name)
+        if recent is None or (recent.boot_id, recent.tiles) != (node.boot_id, tiles):
+            recent = self._recent_tiles[node.name] = RecentTiles(node.boot_id, tiles)
+        return recent
 
     def age_ms(self, node: ServerNode) -> float | None:
         """How old the newest frame of its present stream is; None where that is not known."""

@@ -47,6 +47,22 @@ def test_it_ends_where_a_live_message_begins(running: Running, tared: FakeNode) 
     assert recent["seq"][-1] == first - 1
 
 
+def test_each_tile_is_in_it_if_that_is_asked_for(running: Running, tared: FakeNode) -> None:
+    assert running.http.get(RECENT).json()["tiles"] is None
+    for force_n in ([10.0, 20.0], [10.0, 90.0], [10.0, 20.0]):
+        tared.send(100, force_n)
+    until(lambda: running.http.get(RECENT).json()["seq"][-1] > tared.seq - 12)
+    tiles = running.http.get(RECENT, params={"tiles": "force_n", "seconds": 60}).json()["tiles"]
+    assert sum(tiles["n"]) == tiles["seq"][-1] + 1
+    highs = [
+        [value for value in tile if value is not None] for tile in zip(*tiles["max"], strict=True)
+    ]
+    assert [max(tile) for tile in highs] == pytest.approx([10.0, 90.0], abs=1.0)
+    assert all(low is None or low < 95.0 for span in tiles["min"] for low in span)
+    kpa = running.http.get(RECENT, params={"tiles": "gauge_kpa"}).json()["tiles"]
+    assert max(value for span in kpa["max"] for value in span if value is not None) > 0.0
+
+
 def test_frames_that_are_missing_are_missing_in_it(running: Running, tared: FakeNode) -> None:
     missing = tared.frames(100)
     tared.send(100)
@@ -72,7 +88,9 @@ def test_another_stream_is_another_story(running: Running, tared: FakeNode) -> N
     until(lambda: running.http.get(RECENT).json()["seq"])
 
 
-@pytest.mark.parametrize("query", ["seconds=0", "seconds=60.1", "before_seq=-1", "second=5"])
+@pytest.mark.parametrize(
+    "query", ["seconds=0", "seconds=60.1", "before_seq=-1", "second=5", "tiles=grf_n"]
+)
 def test_what_cannot_be_asked_is_refused(running: Running, tared: FakeNode, query: str) -> None:
     assert_refused(running.http.get(f"{RECENT}?{query}"), 422, query.partition("=")[0])
 
