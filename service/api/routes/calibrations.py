@@ -11,11 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from devices.errors import CalibrationError, FootTileError, UsageError
 from service.api.routes.access import FULL, ServerState, has_it, problems, tag_of
+from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.server.book import expect
 from service.server.calibrations import Kept
 from service.server.fits import SESSIONS_MAX, Fit
-from service.server.live_estimates import LIVE_LAG_MS
 from service.server.node import ServerNode
 from service.server.screens.views import (
     CalibrationSource,
