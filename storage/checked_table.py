@@ -37,7 +37,9 @@ class CheckedTable:
     """False: it states no hash, so it may have changed since an older version wrote it."""
 
 
-def write_table(path: Path, table: pa.Table, *, is_plain: bool = False) -> None:
+def write_table(
+    path: Path, table: pa.Table, *, is_plain: bool = False, group_rows: int | None = None
+) -> None:
     """Write a table with its hash, whole or not at all.
 
     Args:
@@ -45,6 +47,7 @@ def write_table(path: Path, table: pa.Table, *, is_plain: bool = False) -> None:
         table: what it is to hold.
         is_plain: neither compressed nor with dictionaries, of which a table of few rows has little:
             it is read in less than half of the time.
+        group_rows: of a row group at most; None: as many as there are, nearly.
 
     Raises:
         StorageError: the disk is full or not writable; nothing is left behind then.
@@ -55,7 +58,7 @@ def write_table(path: Path, table: pa.Table, *, is_plain: bool = False) -> None:
     compression = "none" if is_plain else "zstd"
     options: dict[str, Any] = {"compression": compression, "use_dictionary": not is_plain}
     with pq.ParquetWriter(sink, table.schema, write_page_checksum=True, **options) as file:
-        file.write_table(table)
+        file.write_table(table, row_group_size=group_rows)
         file.add_key_value_metadata({FILE_HASH_KEY.decode(): NO_HASH.decode()})
     put_hash(sink, where=str(path))
     write_whole(path, sink.getvalue())

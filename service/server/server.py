@@ -25,6 +25,7 @@ from service.server.settling import Settling
 from service.server.streams import ServerStream
 from service.server.takes import Takes
 from service.server_clock import utc_ns
+from service.sessions.comparison_series import SeriesKept
 from service.sessions.so_far import SoFars
 from storage.durable import remove_stale_temporaries
 from storage.intervals import Intervals
@@ -108,6 +109,8 @@ class Server:
             raise
         self.so_fars = SoFars(data)
         """What those who look at a session that is not sealed are shown."""
+        self.series = SeriesKept()
+        """What sessions were compared with, for those who look at it."""
         self.links: dict[str, Link] = {}
         self._counts: dict[str, Counted] = {}
         """What screens were told last, by session."""

@@ -1,73 +1,131 @@
-"""What a session was compared with at any zoom: bins with least and greatest, so no peak hides."""
+"""What a session was compared with at any zoom: bins with least and greatest, so no peak hides.
+
+The bins are those of `storage.sessions.pyramid`. A series is read whole once, and held against its
+hash; then its coarser levels are in memory, and of the file a zoom reads its row groups only.
+"""
 
 from __future__ import annotations
 
-from itertools import pairwise
+import threading
+from collections import OrderedDict
+from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
-from devices.arrays import Ints, Times
 from storage.formats.slice import Slice
 from storage.schema import Array
+from storage.sessions.comparisons import SERIES_NAME, read_series, series_footer, series_within
+from storage.sessions.footer import stamps_of
+from storage.sessions.pyramid import FACTOR, ROWS, Bins, levels_over, merged
 
 GAP_STEPS = 3.5
 """Frames that are further apart than so many usual steps have something missing between them."""
 _BINNED = ("reference_grf_n", "reference_cop_x_m", "reference_cop_y_m")
+_KEPT = 4
 
 
-def bins_of_series(
-    series: pa.Table, begin_ns: int, part: Slice, points: int
-) -> tuple[dict[str, Array], int]:
-    """Some time of a comparison.
+class Series:
+    """One comparison's series, as far as it is in memory: 1.3 MB for a million frames.
 
     Args:
-        series: of `storage.sessions.comparisons`.
-        begin_ns: of the session's first frame.
-        part: which time; its columns do not count.
-        points: how many bins at the most, but for those that gaps break.
+        folder: of the comparison.
+        table: its series, whole, as it was read and proven just now.
 
-    Returns:
-        `t_first_ns`, `t_last_ns`, `frames`, `missing` (1 if something is, just before the bin), and
-        of the reference and of `error_n`, ours less that, `_min` and `_max`, NaN where neither is
-        known; and how many frames a bin has at the most.
+    Raises:
+        DamagedFileError: it is not there any more.
+        StorageError: it cannot be read now.
     """
-    t_ns: Times = series["t_ns"].to_numpy()
-    inside = np.flatnonzero(part.rows(t_ns, begin_ns))
-    t_ns = t_ns[inside]
-    values = {name: series[name].to_numpy()[inside].astype(np.float32) for name in _BINNED}
-    values["error_n"] = series["grf_n"].to_numpy()[inside] - values["reference_grf_n"]
-    size = max(1, -(-len(t_ns) // points))
-    starts, gaps = _starts(t_ns, size)
-    if not len(starts):
-        empty = {name: np.empty(0, np.float32) for name in _names(values)}
-        none = {name: np.empty(0, np.int64) for name in ("t_first_ns", "t_last_ns")}
-        return none | {name: np.empty(0, np.uint32) for name in ("frames", "missing")} | empty, 1
-    ends = np.append(starts[1:], len(t_ns))
-    bins: dict[str, Array] = {
-        "t_first_ns": t_ns[starts],
-        "t_last_ns": t_ns[ends - 1],
-        "frames": (ends - starts).astype(np.uint32),
+
+    def __init__(self, folder: Path, table: pa.Table) -> None:
+        self._folder, self._footer = folder, series_footer(folder)
+        steps = np.diff(table["t_ns"].to_numpy())
+        self._gap_ns = GAP_STEPS * float(np.median(steps)) if len(steps) else np.inf
+        frames = _bins_of(table, self._gap_ns)
+        self._levels = levels_over(merged(frames, ROWS)) if len(table) else []
+
+    def seen(self, begin_ns: int, part: Slice, points: int) -> tuple[Bins, int]:
+        """Some time of it, as `points` bins at least and four times as many at most.
+
+        There are fewer where there are fewer frames, and more where gaps break them: no bin reaches
+        over a gap.
+
+        Args:
+            begin_ns: of the session's first frame.
+            part: which time; its columns do not count.
+            points: how many bins.
+
+        Returns:
+            `t_first_ns`, `t_last_ns`, `frames`, `missing` (how often something is, in the bin or
+            just before it), and of the reference and of `error_n`, ours less that, `_min` and
+            `_max`, NaN where neither is known; and how many frames a bin has at the most.
+
+        Raises:
+            DamagedFileError: a row group is damaged.
+            StorageError: it cannot be read now.
+        """
+        bounds_ns = part.bounds_ns(begin_ns)
+        for above in reversed(range(len(self._levels))):
+            found = _within(self._levels[above], *bounds_ns)
+            if len(found["frames"]) >= points:
+                return found, ROWS * FACTOR**above
+        bins = _bins_of(series_within(self._folder, self._footer, *bounds_ns), self._gap_ns)
+        size = 1
+        while len(bins["frames"]) // (size * FACTOR) >= points:
+            size *= FACTOR
+        return (bins if size == 1 else merged(bins, size)), size
+
+
+class SeriesKept:
+    """Series that were asked for last, for as long as their files are the same."""
+
+    def __init__(self) -> None:
+        self._of: OrderedDict[Path, tuple[tuple[int, ...], Series]] = OrderedDict()
+        self._one_at_a_time = threading.Lock()
+
+    def of(self, folder: Path) -> Series | None:
+        """The series of a comparison; None: an older version wrote none.
+
+        Raises:
+            DamagedFileError: it is not what was written.
+            StorageError: it cannot be read now.
+        """
+        path = folder / SERIES_NAME
+        with self._one_at_a_time:
+            stamps = stamps_of(path)
+            kept = self._of.pop(path, None)
+            if kept is None or kept[0] != stamps:
+                table = read_series(folder)
+                if table is None:
+                    return None
+                kept = stamps, Series(folder, table)
+            self._of[path] = kept
+            while len(self._of) > _KEPT:
+                self._of.popitem(last=False)
+            return kept[1]
+
+
+def _bins_of(table: pa.Table, gap_ns: float) -> Bins:
+    """A bin for each frame; a part is what no gap breaks."""
+    t_ns: Array = table["t_ns"].to_numpy()
+    gaps = np.zeros(len(t_ns), np.bool_)
+    gaps[1:] = np.diff(t_ns) > gap_ns
+    bins: Bins = {
+        "t_first_ns": t_ns,
+        "t_last_ns": t_ns,
+        "part": np.cumsum(gaps).astype(np.uint16),  # it is enough that neighbours differ
+        "frames": np.ones(len(t_ns), np.uint32),
         "missing": gaps.astype(np.uint32),
     }
+    values = {name: table[name].to_numpy().astype(np.float32) for name in _BINNED}
+    values["error_n"] = table["grf_n"].to_numpy() - values["reference_grf_n"]
     for name, column in values.items():
-        bins[f"{name}_min"] = np.fmin.reduceat(column, starts)
-        bins[f"{name}_max"] = np.fmax.reduceat(column, starts)
-    return bins, size
+        bins |= {f"{name}_min": column, f"{name}_max": column}
+    return bins
 
 
-def _names(values: dict[str, Array]) -> list[str]:
-    return [f"{name}_{which}" for name in values for which in ("min", "max")]
-
-
-def _starts(t_ns: Times, size: int) -> tuple[Ints, npt.NDArray[np.bool_]]:
-    """First frame of every bin, and whether something is missing before it."""
-    if not len(t_ns):
-        return np.empty(0, np.int64), np.empty(0, np.bool_)
-    steps = np.diff(t_ns)
-    broken = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1 if len(steps) else steps
-    edges = np.concatenate([[0], broken, [len(t_ns)]]).astype(np.int64)
-    runs = [np.arange(first, end, size) for first, end in pairwise(edges)]
-    starts = np.concatenate(runs)
-    return starts, np.isin(starts, broken)
+def _within(bins: Bins, begin_ns: int | None, end_ns: int | None) -> Bins:
+    """Those with frames of some time; they are in its order."""
+    first = 0 if begin_ns is None else int(np.searchsorted(bins["t_last_ns"], begin_ns))
+    end = None if end_ns is None else int(np.searchsorted(bins["t_first_ns"], end_ns))
+    return {name: values[first:end] for name, values in bins.items()}

@@ -8,15 +8,20 @@ up among those that there are, and never made into a path.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 from devices.errors import DamagedFileError, StorageError, UnknownError
 from storage.checked_json import read_checked
 from storage.checked_table import read_table, write_table
+from storage.durable import open_own
 from storage.schema import Column
 
 COMPARISONS = "comparisons"
@@ -25,6 +30,8 @@ REPORT_NAME = "compare.json"
 SERIES_NAME = "series.parquet"
 
 _F32 = pa.float32()
+_GROUP_ROWS = 1 << 16
+"""Of a row group: two minutes."""
 ROWS_MAX = 2_500_000
 """Of a series: more would not be read at once (`storage.durable.BYTES_MAX`)."""
 
@@ -131,7 +138,7 @@ def write_series(path: Path, table: pa.Table) -> None:
     Raises:
         StorageError: the disk is full or not writable.
     """
-    write_table(path, table)
+    write_table(path, table, group_rows=_GROUP_ROWS)
 
 
 def read_series(folder: Path) -> pa.Table | None:
@@ -154,3 +161,61 @@ def read_series(folder: Path) -> pa.Table | None:
             remedy="Compare again",
         )
     return read.table
+
+
+def series_footer(folder: Path) -> pq.FileMetaData:
+    """Where things are in a series that `read_series` has proven just now.
+
+    Raises:
+        DamagedFileError: it cannot be read as Parquet any more.
+        StorageError: it cannot be read now.
+    """
+    with open_own(folder / SERIES_NAME) as content, _damage(folder / SERIES_NAME):
+        return pq.read_metadata(content)
+
+
+def series_within(
+    folder: Path, footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | None
+) -> pa.Table:
+    """Some time of a series; read are its row groups only, their pages held against checksums.
+
+    Args:
+        folder: of the comparison.
+        footer: of the very file.
+        begin_ns: of the first instant; None: from the beginning.
+        end_ns: of the instant behind the last; None: to the end.
+
+    Raises:
+        DamagedFileError: a page is not what its checksum is of.
+        StorageError: it cannot be read now.
+    """
+    where = pc.scalar(True)
+    if begin_ns is not None:
+        where &= pc.field("t_ns") >= begin_ns
+    if end_ns is not None:
+        where &= pc.field("t_ns") < end_ns
+    with open_own(folder / SERIES_NAME) as content, _damage(folder / SERIES_NAME):
+        options: dict[str, Any] = {"metadata": footer, "page_checksum_verification": True}
+        with pq.ParquetFile(content, **options) as file:
+            groups = _groups_within(footer, begin_ns, end_ns)
+            return file.read_row_groups(groups, use_threads=False).filter(where)
+
+
+def _groups_within(footer: pq.FileMetaData, begin_ns: int | None, end_ns: int | None) -> list[int]:
+    found = []
+    for group in range(footer.num_row_groups):
+        said: Any = footer.row_group(group).column(0).statistics
+        is_after = begin_ns is None or said.max >= begin_ns
+        if is_after and (end_ns is None or said.min < end_ns):
+            found.append(group)
+    return found
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # damaged bytes may cause any error
+        raise DamagedFileError(
+            f"cannot be read: {' '.join(str(error).split())[:300]}", where=str(path)
+        ) from error

@@ -18,7 +18,6 @@ from starlette.concurrency import run_in_threadpool
 from devices.errors import FileFormatError, StateError, UnknownError, UsageError
 from service.api.routes.access import SecondsQuery, ServerState, problems
 from service.server.server import Server
-from service.sessions.comparison_series import bins_of_series
 from service.sessions.overview import POINTS_MAX
 from storage.formats.slice import Slice
 from storage.schema import Array
@@ -27,7 +26,6 @@ from storage.sessions.comparisons import (
     comparison_of,
     comparisons_of,
     read_report,
-    read_series,
 )
 from storage.sessions.folder import Session
 
@@ -36,7 +34,7 @@ router = APIRouter(prefix="/sessions", tags=["sessions"])
 T = TypeVar("T")
 
 _ONE_AT_A_TIME = CapacityLimiter(1)
-"""A series is read whole: of several that are asked for one after the other is."""
+"""A series is read whole once: of several that are asked for one after the other is."""
 _PROBLEMS = problems(
     _404="No such session or comparison, or nothing was recorded.",
     _409="A session is compared when it is sealed.",
@@ -73,7 +71,7 @@ class SeriesQuery(SecondsQuery):
     """Which time, and how finely."""
 
     points: Annotated[int, Field(ge=1, le=POINTS_MAX)] = Field(
-        default=1000, description="Bins at the most, but for those that gaps break."
+        default=1000, description="Bins at least, if there are as many frames; four times at most."
     )
 
 
@@ -185,8 +183,8 @@ def _report(session: Session, name: str, server: Server) -> ReportView:
 
 
 def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> bytes:
-    table = read_series(comparison_of(server.sessions.folder.path(session.id), name))
-    if table is None:
+    kept = server.series.of(comparison_of(server.sessions.folder.path(session.id), name))
+    if kept is None:
         raise UnknownError(
             f"the comparison with {name!r} has no series",
             remedy="An older version made it, or it is too long: compare again",
@@ -194,16 +192,18 @@ def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> 
     with server.sessions.frames(session.id, only_slices=True) as reader:
         begin_ns, end_ns = reader.span_ns()
     part = Slice(query.start_s, query.end_s)
-    bins, size = bins_of_series(table, begin_ns, part, query.points)
+    bins, size = kept.seen(begin_ns, part, query.points)
+    columns = {column: values for column, values in bins.items() if column != "part"}
     times = {
-        f"t_{which}_s": (bins.pop(f"t_{which}_ns") - begin_ns) * 1e-9 for which in ("first", "last")
+        f"t_{which}_s": (columns.pop(f"t_{which}_ns") - begin_ns) * 1e-9
+        for which in ("first", "last")
     }
     content = {
         "session_id": session.id,
         "begin_t_ns": begin_ns,
         "duration_s": (end_ns - begin_ns) * 1e-9,
         "frames_in_bin": size,
-        "columns": {column: _plain(values) for column, values in (times | bins).items()},
+        "columns": {column: _plain(values) for column, values in (times | columns).items()},
     }
     return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
 

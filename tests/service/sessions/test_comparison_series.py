@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.sessions.comparison_series import bins_of_series
+import service.sessions.comparison_series
+import storage.sessions.comparisons
+from service.sessions.comparison_series import Series, SeriesKept
 from storage.formats.slice import Slice
-from storage.sessions.comparisons import SCHEMA
+from storage.sessions.comparisons import SCHEMA, SERIES_NAME, write_series
+from storage.sessions.pyramid import Bins
 
 BEGIN_NS = 1_700_000_000_000_000_000
+ALL = Slice()
 
 
-def series(t_ms: list[int], ours_n: list[float], reference_n: list[float]) -> pa.Table:
+def series(t_ms: Any, ours_n: Any, reference_n: Any) -> pa.Table:
     n = len(t_ms)
     columns = [
-        pa.array([BEGIN_NS + 1_000_000 * t for t in t_ms], pa.int64()),
+        pa.array(BEGIN_NS + 1_000_000 * np.asarray(t_ms, np.int64), pa.int64()),
         pa.array(ours_n, pa.float32()),
         pa.array(reference_n, pa.float32()),
         pa.array([None] * n, pa.float32()),
@@ -29,47 +35,126 @@ def series(t_ms: list[int], ours_n: list[float], reference_n: list[float]) -> pa
     return pa.table(columns, schema=SCHEMA)
 
 
-FORCES = st.lists(
-    st.tuples(st.floats(-10, 900, width=32), st.floats(-10, 900, width=32)), min_size=1
+def kept(folder: Path, table: pa.Table) -> Series:
+    write_series(folder / SERIES_NAME, table)
+    found = SeriesKept().of(folder)
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("series")
+
+
+def rows_of(bins: Bins, i: int, t_ms: np.ndarray) -> np.ndarray:
+    first, last = ((bins[f"t_{of}_ns"][i] - BEGIN_NS) // 1_000_000 for of in ("first", "last"))
+    return np.flatnonzero((t_ms >= first) & (t_ms <= last))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    steps=st.lists(st.sampled_from([2, 2, 2, 2, 2, 2, 90]), min_size=1, max_size=40),
+    times=st.integers(1, 40),
+    points=st.integers(1, 60),
+    begin=st.integers(0, 300),
+    length=st.integers(1, 3000),
 )
-
-
-@given(FORCES, st.integers(1, 60))
-def test_no_peak_of_the_reference_hides_and_every_frame_is_in_one_bin(
-    forces_n: list[tuple[float, float]], points: int
+def test_no_peak_of_the_reference_hides_and_no_bin_reaches_over_a_gap(
+    folder: Path, steps: list[int], times: int, points: int, begin: int, length: int
 ) -> None:
-    ours_n, theirs_n = (np.array(each, np.float32) for each in zip(*forces_n, strict=True))
-    n = len(ours_n)
-    table = series(list(range(0, 2 * n, 2)), ours_n.tolist(), theirs_n.tolist())
-    bins, size = bins_of_series(table, BEGIN_NS, Slice(), points)
-    assert len(bins["frames"]) <= points
-    assert bins["frames"].sum() == n
-    assert bins["frames"].max() <= size
-    starts = [0, *np.cumsum(bins["frames"]).tolist()]
-    for i, (begin, end) in enumerate(pairwise(starts)):
-        assert bins["t_first_ns"][i] == BEGIN_NS + 2_000_000 * begin
-        assert bins["t_last_ns"][i] == BEGIN_NS + 2_000_000 * (end - 1)
-        assert bins["reference_grf_n_max"][i] == theirs_n[begin:end].max()
-        assert bins["reference_grf_n_min"][i] == theirs_n[begin:end].min()
-        error_n = (ours_n - theirs_n)[begin:end]
+    t_ms = np.cumsum([0, *(steps * times)])
+    rng = np.random.default_rng(len(t_ms))
+    ours_n, theirs_n = rng.normal(400.0, 300.0, (2, len(t_ms))).astype(np.float32)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(storage.sessions.comparisons, "_GROUP_ROWS", 50)
+        found = kept(folder, series(t_ms, ours_n, theirs_n))
+    part = Slice(1e-3 * begin, 1e-3 * (begin + length))
+    bins, size = found.seen(BEGIN_NS, part, points)
+    inside = np.flatnonzero((t_ms >= begin) & (t_ms < begin + length))
+    rows = [rows_of(bins, i, t_ms) for i in range(len(bins["frames"]))]
+    assert bins["frames"].tolist() == [len(each) for each in rows]
+    assert bins["frames"].max(initial=0) <= size
+    all_rows = np.concatenate([np.empty(0, np.int64), *rows]).tolist()
+    assert all_rows == sorted(set(all_rows))
+    assert set(inside.tolist()) <= set(all_rows)
+    assert size == 1 or len(rows) >= points
+    steps_break = np.median(np.diff(t_ms)) < 90
+    for i, each in enumerate(rows):
+        error_n = (ours_n - theirs_n)[each]
+        assert bins["reference_grf_n_max"][i] == theirs_n[each].max()
+        assert bins["reference_grf_n_min"][i] == theirs_n[each].min()
         assert (bins["error_n_min"][i], bins["error_n_max"][i]) == (error_n.min(), error_n.max())
+        assert not steps_break or (np.diff(t_ms[each]) < 90).all()
     assert np.isnan(bins["reference_cop_x_m_max"]).all()
-    assert not bins["missing"].any()
 
 
-def test_no_bin_reaches_over_a_gap() -> None:
-    t_ms = [*range(0, 20, 2), *range(100, 120, 2)]
-    table = series(t_ms, [1.0] * 20, [2.0] * 20)
-    bins, size = bins_of_series(table, BEGIN_NS, Slice(), 3)
-    assert size == 7
-    assert bins["frames"].tolist() == [7, 3, 7, 3]
-    assert bins["missing"].tolist() == [0, 0, 1, 0]
+def test_a_zoom_costs_the_same_wherever_it_is_and_however_long_the_series(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    n = 300_000
+    forces_n = np.arange(n) % 1000
+    whole = kept(tmp_path, series(2 * np.arange(n), forces_n, forces_n))
+    read: list[int] = []
+    within = storage.sessions.comparisons.series_within
+
+    def counted(folder: Path, footer: Any, *bounds_ns: int | None) -> pa.Table:
+        read.append(len(storage.sessions.comparisons._groups_within(footer, *bounds_ns)))
+        return within(folder, footer, *bounds_ns)
+
+    monkeypatch.setattr(service.sessions.comparison_series, "series_within", counted)
+    for part in (ALL, Slice(0.0, 550.0), Slice(100.0, 400.0)):
+        bins, size = whole.seen(BEGIN_NS, part, 500)
+        assert 500 <= len(bins["frames"]) <= 2000 + 2
+        assert size >= 64
+        assert bins["error_n_max"].max() == 0.0
+    assert read == []
+    for start_s in (0.0, 300.0, 595.0):
+        bins, size = whole.seen(BEGIN_NS, Slice(start_s, start_s + 2.0), 800)
+        assert (len(bins["frames"]), size) == (1000, 1)
+    assert read == [1, 1, 1]
 
 
-def test_what_is_asked_for_is_some_time_of_it_and_nothing_is_no_error() -> None:
-    table = series(list(range(0, 100, 2)), [1.0] * 50, [2.0] * 50)
-    bins, size = bins_of_series(table, BEGIN_NS, Slice(start_s=0.01, end_s=0.02), 100)
+def test_it_is_read_whole_once_and_again_when_it_is_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[Path] = []
+    whole = storage.sessions.comparisons.read_series
+
+    def counted(folder: Path) -> pa.Table | None:
+        read.append(folder)
+        return whole(folder)
+
+    monkeypatch.setattr(service.sessions.comparison_series, "read_series", counted)
+    series_kept = SeriesKept()
+    write_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [2.0, 2.0]))
+    first = series_kept.of(tmp_path)
+    assert series_kept.of(tmp_path) is first
+    write_series(tmp_path / SERIES_NAME, series([0, 2], [1.0, 1.0], [5.0, 2.0]))
+    second = series_kept.of(tmp_path)
+    assert second is not None
+    assert second.seen(BEGIN_NS, ALL, 10)[0]["reference_grf_n_max"].tolist() == [5.0, 2.0]
+    assert len(read) == 2
+    for folder in (tmp_path / str(i) for i in range(6)):
+        folder.mkdir()
+        write_series(folder / SERIES_NAME, series([0], [1.0], [1.0]))
+        assert series_kept.of(folder) is not None
+    assert len(series_kept._of) == 4
+
+
+def test_what_is_asked_for_is_some_time_of_it_and_nothing_is_no_error(tmp_path: Path) -> None:
+    table = kept(tmp_path, series(range(0, 100, 2), [1.0] * 50, [2.0] * 50))
+    bins, size = table.seen(BEGIN_NS, Slice(start_s=0.01, end_s=0.02), 100)
     assert size == 1
     assert ((bins["t_first_ns"] - BEGIN_NS) * 1e-6).tolist() == pytest.approx([10, 12, 14, 16, 18])
-    bins, _ = bins_of_series(table, BEGIN_NS, Slice(start_s=5.0), 100)
+    bins, _ = table.seen(BEGIN_NS, Slice(start_s=5.0), 100)
     assert {len(values) for values in bins.values()} == {0}
+
+
+def test_bins_are_broken_where_something_is_missing(tmp_path: Path) -> None:
+    t_ms = [*range(0, 20, 2), *range(100, 120, 2)]
+    bins, size = kept(tmp_path, series(t_ms, [1.0] * 20, [2.0] * 20)).seen(BEGIN_NS, ALL, 3)
+    assert size == 4
+    assert bins["frames"].tolist() == [4, 4, 2, 4, 4, 2]
+    assert bins["missing"].tolist() == [0, 0, 0, 1, 0, 0]
+    assert all(a < b for a, b in pairwise(bins["t_first_ns"].tolist()))
