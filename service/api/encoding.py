@@ -9,7 +9,15 @@ is compressed already.
 from __future__ import annotations
 
 import gzip
+from collections.abc import Mapping
+from typing import Any
 
+import numpy as np
+from pydantic import ConfigDict, TypeAdapter
+
+from storage.schema import Array
+
+_JSON = TypeAdapter(dict[str, Any], config=ConfigDict(ser_json_inf_nan="null"))
 _LEVEL = 1
 """Of numbers: less than half of the length in a hundredth of a second; the best takes ten times as
 long."""
@@ -22,6 +30,25 @@ def takes_gzip(accept_encoding: str) -> bool:
         if coding == "gzip":
             return not weight or weight.strip("0.") != ""
     return False
+
+
+def numbers_as_json(about: Mapping[str, object], columns: Mapping[str, Array]) -> bytes:
+    """An object with facts, and columns of numbers by name; what is not a number is null.
+
+    By pydantic, which takes a fifth of the time that Python's own writer does.
+
+    Args:
+        about: facts by name.
+        columns: single precision is written to a millionth: micrometres and micronewtons.
+    """
+    return _JSON.dump_json({**about, "columns": {name: _plain(v) for name, v in columns.items()}})
+
+
+def _plain(values: Array) -> list[Any]:
+    if values.dtype == np.float32:
+        values = np.round(values.astype(np.float64), 6)
+    plain: list[Any] = values.tolist()
+    return plain
 
 
 def packed(numbers: bytes) -> bytes:

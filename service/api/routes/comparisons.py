@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import numpy as np
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from devices.errors import FileFormatError, StateError, UnknownError, UsageError
+from service.api.encoding import numbers_as_json
 from service.api.routes.access import SecondsQuery, ServerState, problems
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX
 from storage.formats.slice import Slice
-from storage.schema import Array
 from storage.sessions.comparisons import (
     SERIES_NAME,
     comparison_of,
@@ -198,19 +195,10 @@ def _series(session: Session, name: str, query: SeriesQuery, server: Server) -> 
         f"t_{which}_s": (columns.pop(f"t_{which}_ns") - begin_ns) * 1e-9
         for which in ("first", "last")
     }
-    content = {
+    about = {
         "session_id": session.id,
         "begin_t_ns": begin_ns,
         "duration_s": (end_ns - begin_ns) * 1e-9,
         "frames_in_bin": size,
-        "columns": {column: _plain(values) for column, values in (times | columns).items()},
     }
-    return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
-
-
-def _plain(values: Array) -> list[Any]:
-    """As JSON has it, to a millionth of SI units; instants as they are."""
-    if values.dtype == np.float32:
-        values = np.round(values.astype(np.float64), 6)
-    plain: list[Any] = values.tolist()
-    return [None if isinstance(value, float) and math.isnan(value) else value for value in plain]
+    return numbers_as_json(about, times | columns)

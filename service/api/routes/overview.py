@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import pyarrow as pa
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from devices.errors import UnknownError, UsageError
-from service.api.encoding import packed, takes_gzip
+from service.api.encoding import numbers_as_json, packed, takes_gzip
 from service.api.routes.access import SecondsQuery, ServerState, has_it, problems
 from service.server.server import Server
 from service.sessions.overview import POINTS_MAX, Seen, overview_of_session
@@ -161,8 +159,7 @@ def _written(
         **said,
     }
     if not as_arrow:
-        content = {**about, "columns": {name: _plain(values) for name, values in columns.items()}}
-        text = json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+        text = numbers_as_json(about, columns)
         return packed(text) if as_gzip else text
     metadata = {"foottile.overview": json.dumps(about)}
     table = pa.table({name: pa.array(v) for name, v in columns.items()}, metadata=metadata)
@@ -194,13 +191,3 @@ def _chosen(columns: dict[str, Array], wanted: str | None) -> dict[str, Array]:
         for name, values in columns.items()
         if not names or name in always or name.startswith(tuple(names))
     }
-
-
-def _plain(values: Array) -> list[Any]:
-    """As JSON has it, single precision to a millionth: micrometres and micronewtons."""
-    if values.dtype == np.float32:
-        values = np.round(values.astype(np.float64), 6)
-    if values.dtype.kind == "f" and np.isnan(values).any():
-        return [None if math.isnan(value) else value for value in values.tolist()]
-    plain: list[Any] = values.tolist()
-    return plain
