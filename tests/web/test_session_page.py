@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from storage.formats.written.registry import FORMATS
 from tests.service.fake_node import FakeNode, Play
 from tests.service.recording import Recording
 from tests.service.running import Running
@@ -323,6 +324,14 @@ def test_a_mark_is_set_at_the_cursor_and_what_is_in_view_can_be_downloaded(
         page.click("#download-csv")
     lines = download.value.path().read_text("utf-8").splitlines()
     assert len([line for line in lines if not line.startswith("#")]) == 101
+    page.click("#downloads-more summary")
+    offered = page.locator("#download-list [data-format]")
+    names = offered.evaluate_all("items => items.map((item) => item.dataset.format)")
+    assert set(names) == set(FORMATS) - {"parquet", "arrow", "csv"}
+    with page.expect_download() as further:
+        page.click("#download-xdf")
+    assert further.value.suggested_filename == f"{walk.id}.xdf"
+    assert further.value.path().read_bytes().startswith(b"XDF:")
     with page.expect_download() as picture:
         page.click("#picture")
     assert picture.value.path().read_bytes().startswith(b"\x89PNG")

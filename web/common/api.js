@@ -84,6 +84,7 @@ export const emptyTrash = () => call("DELETE", "/trash");
 /** @param {{limit: number, cursor?: string, q?: string, complete?: string}} query */
 export const listSessions = (query) => call("GET", `/sessions?${new URLSearchParams(query)}`);
 export const zipAddress = (ids) => `${PREFIX}/sessions/zip?ids=${ids.map(id).join(",")}`;
+export const listFormats = () => call("GET", "/formats");
 /** Of a download, with marks if there are any; Parquet without them is the sealed file itself. */
 export const dataAddress = (session, format, part = "") =>
   `${PREFIX}/sessions/${id(session.id)}/data?format=${format}${session.marks ? "&marks=true" : ""}${part}`;

@@ -4,6 +4,7 @@ import * as api from "../common/api.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, setText } from "../common/text.js";
 import { offsetAt } from "./clock.js";
+import { Downloads } from "./downloads.js";
 import { listen } from "./gestures.js";
 import { drawLegend } from "./legend.js";
 import { Loader } from "./load.js";
@@ -39,6 +40,7 @@ export class Plotted {
       at: () => this.cursorS ?? this.view.from, go: (timeS) => this.cursorTo(timeS),
       changed: () => this.draw(), failed: (error) => notice(error.message, { bad: true }),
     });
+    this.downloads = new Downloads();
     this.cursorS = null;
     this.drawing = 0;
   }
@@ -55,7 +57,10 @@ export class Plotted {
     const grown = this.session.marks !== session.marks || whole.estimated !== this.plots.whole?.estimated;
     this.session = session;
     this.takeWhole(whole);
-    if (first) this.listen();
+    if (first) {
+      this.listen();
+      quietly(async () => { await this.downloads.load(); this.downloads.offer(this.plots.whole); this.drawLinks(); });
+    }
     this.draw();
     if (first || sealed || grown) await this.loadBeside(whole, sealed);
   }
@@ -73,7 +78,7 @@ export class Plotted {
     }
     const tiles = whole.serials.length;
     byId("as-heat").hidden = tiles < 2 || tiles > 32;
-    byId("download-parquet").hidden = whole.provisional;
+    this.downloads.offer(whole);
     this.replay.open(this.session.id, whole);
   }
 
@@ -299,11 +304,7 @@ export class Plotted {
 
   /** Downloads of what is in view. */
   drawLinks() {
-    const all = views.isWhole(this.view, this.durationS);
-    const part = all ? "" : `&start_s=${this.view.from.toFixed(6)}&end_s=${this.view.to.toFixed(6)}`;
-    setText(byId("download-what"), all ? "Download" : "Download what is in view");
-    for (const format of ["parquet", "arrow", "csv"]) {
-      byId(`download-${format}`).href = api.dataAddress({ ...this.session, marks: this.plots.marks.length }, format, part);
-    }
+    const session = { ...this.session, marks: this.plots.marks.length };
+    this.downloads.draw(session, this.view, views.isWhole(this.view, this.durationS));
   }
 }

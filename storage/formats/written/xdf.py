@@ -225,7 +225,7 @@ def _texts(parent: Element, texts: Mapping[str, str]) -> None:
 XDF = Format(
     "xdf",
     "XDF",
-    "pyxdf, MNE, EEGLAB, MoBILAB",
+    "pyxdf, beside LabStreamingLayer",
     "application/x-xdf",
     _write,
 )
