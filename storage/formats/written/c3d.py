@@ -15,16 +15,18 @@ import tempfile
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from threading import Semaphore
 from typing import Any
 
 import numpy as np
 
 from devices.arrays import Floats
 from devices.errors import StorageError
+from devices.frames import TileInfo
 from storage.formats.export import Export
 from storage.formats.written.described import ascii_of, described
 from storage.formats.written.format import Format
-from storage.formats.written.reaction import FURTHER, Reaction, reaction_of
+from storage.formats.written.reaction import FURTHER, Reaction, reactions_of
 from storage.schema import KNOWN
 
 FRAMES_MAX = 2_000_000
@@ -38,30 +40,39 @@ EVENTS_MAX = 255
 MARGIN_MM = 10.0
 """By which the platform is larger than the rectangle of the tiles' places."""
 
-_CHANNELS = {
-    **{"Fx1": ("N", "not measured, 0"), "Fy1": ("N", "not measured, 0")},
-    "Fz1": ("N", "GRF, down on the platform; 0 without contact"),
-    "Mx1": ("Nmm", "GRF times COP, at the platform's centre; NaN where no COP is stated"),
-    "My1": ("Nmm", "GRF times COP, at the platform's centre; NaN where no COP is stated"),
-    "Mz1": ("Nmm", "not measured, 0"),
+_WRENCH = {
+    "Fx": ("N", "not measured, 0"),
+    "Fy": ("N", "not measured, 0"),
+    "Fz": ("N", "GRF, down on the platform; 0 without contact"),
+    "Mx": ("Nmm", "GRF times COP, at the platform's centre; NaN where no COP is stated"),
+    "My": ("Nmm", "GRF times COP, at the platform's centre; NaN where no COP is stated"),
+    "Mz": ("Nmm", "not measured, 0"),
 }
+_UNCERTAINTY = "t_server_uncertainty_s"
+_SIDES = {"left": "Left", "right": "Right"}
+"""Contexts of events as the manual has them, of nodes that are called so."""
 _PIECE = 1 << 20
 _TEXT = 100
+_ONE_AT_A_TIME = Semaphore()
+"""Each takes a gigabyte for an hour."""
+
+Groups = Mapping[str, Mapping[str, Any]]
+Channel = tuple[str, str, str, Floats]
+"""Label, unit, description, samples."""
 
 
 def _write(export: Export) -> Iterator[bytes]:
+    return _write_together([export])
+
+
+def _write_together(exports: Sequence[Export]) -> Iterator[bytes]:
     import ezc3d  # noqa: F401  # if it is not installed, that is said before anything is read
 
-    tiles = [i for i, tile in enumerate(export.info.tiles) if not tile.reference]
-    wanted = [*FURTHER, "force_n"]
-    frames_max = min(FRAMES_MAX, NUMBERS_MAX // (len(_CHANNELS) + len(FURTHER) + len(tiles) + 3))
-    found = reaction_of(export, wanted, frames_max)
-    groups, analog = c3d_content(found, export)
     try:
         with tempfile.TemporaryDirectory(prefix="foottile-") as folder:
             path = Path(folder) / "session.c3d"
-            _save(path, groups, analog)
-            del analog
+            with _ONE_AT_A_TIME:
+                _save(path, *_read(exports))
             with path.open("rb") as file:
                 while piece := file.read(_PIECE):
                     yield piece
@@ -74,78 +85,141 @@ def _write(export: Export) -> Iterator[bytes]:
         ) from error
 
 
-Groups = Mapping[str, Mapping[str, Any]]
+def _read(exports: Sequence[Export]) -> tuple[Groups, Floats]:
+    tiles = sum(len(_loaded(export)) for export in exports)
+    width = len(exports) * (len(_WRENCH) + len(FURTHER) + 4) + tiles
+    frames_max = min(FRAMES_MAX, NUMBERS_MAX // width)
+    return c3d_content(reactions_of(exports, [*FURTHER, "force_n"], frames_max), exports)
 
 
-def c3d_content(found: Reaction, export: Export) -> tuple[dict[str, dict[str, Any]], Floats]:
+def c3d_content(
+    found: Sequence[Reaction], exports: Sequence[Export]
+) -> tuple[dict[str, dict[str, Any]], Floats]:
     """Parameters by group and name, and analog samples, (channels, n).
 
     Integers, floats and texts are arrays or lists of these; the last dimension is that which
     changes slowest in the file, as in the manual.
+
+    Args:
+        found: what the platforms feel, on one axis; one for each of
+        exports: the sessions.
     """
-    centre_m, corners_mm = _platform(export)
-    channels = dict(_CHANNELS)
-    rows = list(_wrench(found, centre_m))
-    for name in ("grf_n", *FURTHER, "contact", "estimate_status"):
-        if name in found.columns:
-            about = KNOWN[name]
-            channels[name] = about.unit, about.description
-            rows.append(found.at(name))
-    for i, tile in enumerate(export.info.tiles):
-        name = f"force_n_{i}"
-        if name in found.columns and not tile.reference:
-            x_mm, y_mm, z_mm = (1e3 * place for place in (tile.x_m, tile.y_m, tile.z_m))
-            place = f"at {x_mm:g}, {y_mm:g}, {z_mm:g} mm"
-            channels[name] = "N", f"force along its axis on tile {tile.serial} {place}"
-            rows.append(found.at(name))
-    per_frame = -(-len(rows[0]) // C3D_FRAMES_MAX)
-    filling = -len(rows[0]) % per_frame
-    analog = np.full((len(rows), len(rows[0]) + filling), np.nan)
-    analog[:, : len(rows[0])] = rows
-    rate_hz = found.steady.rate_hz
-    events = found.events[:EVENTS_MAX]
+    platforms = [_platform(export) for export in exports]
+    channels: list[Channel] = []
+    for number, (reaction, (centre_m, _)) in enumerate(zip(found, platforms, strict=True), 1):
+        named = zip(_WRENCH.items(), _wrench(reaction, centre_m), strict=True)
+        channels += [(f"{name}{number}", *about, values) for (name, about), values in named]
+    for number, (reaction, export) in enumerate(zip(found, exports, strict=True), 1):
+        prefix = f"{number}:" if len(found) > 1 else ""
+        channels += [(prefix + label, *rest) for label, *rest in _further(reaction, export)]
+    samples = len(found[0].steady)
+    per_frame = -(-samples // C3D_FRAMES_MAX)
+    filling = -samples % per_frame
+    analog = np.full((len(channels), samples + filling), np.nan)
+    for row, (*_, values) in zip(analog, channels, strict=True):
+        row[:samples] = values
+    rate_hz = found[0].steady.rate_hz
+    groups: dict[str, dict[str, Any]] = {
+        "POINT": {
+            "RATE": [rate_hz / per_frame],
+            "UNITS": ["mm"],
+            "X_SCREEN": ["+X"],
+            "Y_SCREEN": ["+Z"],
+        },
+        "ANALOG": {
+            "RATE": [rate_hz],
+            "LABELS": [label for label, *_ in channels],
+            "DESCRIPTIONS": [ascii_of(text)[:_TEXT] for _, _, text, _ in channels],
+            "UNITS": [unit for _, unit, *_ in channels],
+            "GEN_SCALE": [1.0],
+            "SCALE": np.ones(len(channels)),
+            "OFFSET": np.zeros(len(channels), dtype=np.int64),
+        },
+        "FORCE_PLATFORM": {
+            "USED": np.array([len(found)]),
+            "TYPE": np.full(len(found), 2),
+            "ZERO": np.array([1, 0]),
+            "CORNERS": np.stack([corners_mm.T for _, corners_mm in platforms], axis=2),
+            "ORIGIN": np.zeros((3, len(found))),
+            "CHANNEL": np.arange(1, 6 * len(found) + 1).reshape(len(found), 6).T,
+        },
+        "EVENT": _events(found, exports),
+        "MANUFACTURER": {
+            "COMPANY": ["FootTile"],
+            "SOFTWARE": [ascii_of(exports[0].info.software)[:_TEXT]],
+        },
+    }
+    for number, (reaction, export) in enumerate(zip(found, exports, strict=True), 1):
+        said = _said(reaction, export, filling, sum(len(each.events) for each in found))
+        wrapped = {name: textwrap.wrap(text, _TEXT) or [" "] for name, text in said.items()}
+        groups["FOOTTILE" + (str(number) if len(found) > 1 else "")] = wrapped
+    return groups, analog
+
+
+def _said(found: Reaction, export: Export, filling: int, events: int) -> dict[str, str]:
+    filled = f"; the last {filling} samples fill the last frame: NaN" if filling else ""
+    text = f"{found.marks} marks, {len(found.events) - found.marks} begins and ends of contact"
+    if events > EVENTS_MAX:
+        text += (
+            f"; the last {events - EVENTS_MAX} of all are left out, {EVENTS_MAX} being the most: "
+            "see channel contact"
+        )
     said = {
         **described(export, found.steady.begin_ns),
         "AXES": "the foot frame: x forward, y to the left, z up the segment, origin at the ankle; "
         "the platform moves with the foot",
-        "TIME_BASE": found.steady.says()
-        + (f"; the last {filling} samples fill the last frame: NaN" if filling else ""),
+        "TIME_BASE": found.steady.says() + filled,
         "UNKNOWN": "NaN: no frame, a saturated or missing tile, or no COP stated while in contact; "
         "estimate_status says which, grf_at_least_n is a lower bound",
-        "SHEAR": "not measured: Fx1, Fy1 and Mz1 are 0",
-        "EVENTS": _of_events(found),
+        "SHEAR": "not measured: Fx, Fy and Mz are 0",
+        "EVENTS": text,
     }
-    groups: dict[str, dict[str, Any]] = {
-        "POINT": {"RATE": [rate_hz / per_frame], "UNITS": ["mm"], "X_SCREEN": ["+X"]}
-        | {"Y_SCREEN": ["+Z"]},
-        "ANALOG": {
-            "RATE": [rate_hz],
-            "LABELS": list(channels),
-            "DESCRIPTIONS": [ascii_of(text)[:_TEXT] for _, text in channels.values()],
-            "UNITS": [unit for unit, _ in channels.values()],
-            "GEN_SCALE": [1.0],
-            "SCALE": np.ones(len(rows)),
-            "OFFSET": np.zeros(len(rows), dtype=np.int64),
-        },
-        "FORCE_PLATFORM": {
-            "USED": np.array([1]),
-            "TYPE": np.array([2]),
-            "ZERO": np.array([1, 0]),
-            "CORNERS": corners_mm.T.reshape(3, 4, 1),
-            "ORIGIN": np.zeros((3, 1)),
-            "CHANNEL": np.arange(1, 7).reshape(6, 1),
-        },
-        "EVENT": {
-            "USED": np.array([len(events)]),
-            "CONTEXTS": ["General"] * len(events),
-            "LABELS": [ascii_of(label)[:_TEXT] or "mark" for _, label in events],
-            "DESCRIPTIONS": [" "] * len(events),
-            "TIMES": np.array([divmod(at_s, 60.0) for at_s, _ in events]).reshape(-1, 2).T,
-        },
-        "MANUFACTURER": {"COMPANY": ["FootTile"], "SOFTWARE": [said["SOFTWARE"][:_TEXT]]},
-        "FOOTTILE": {name: textwrap.wrap(text, _TEXT) or [" "] for name, text in said.items()},
+    if found.uncertainty_s is not None:
+        said["CLOCK_UNCERTAINTY"] = (
+            f"the truth is within {np.nanmax(found.uncertainty_s) * 1e3:.3f} ms of the axis at most: "
+            f"channel {_UNCERTAINTY}; between two platforms, within the sum of both"
+        )
+    return said
+
+
+def _further(found: Reaction, export: Export) -> Iterator[Channel]:
+    for name in ("grf_n", *FURTHER, "contact", "estimate_status"):
+        if name in found.columns:
+            yield name, KNOWN[name].unit, KNOWN[name].description, found.at(name)
+    if found.uncertainty_s is not None:
+        about = "bound of the time of the frames by the server's clock"
+        yield _UNCERTAINTY, "s", about, found.uncertainty_s
+    for i, tile in _loaded(export).items():
+        if f"force_n_{i}" in found.columns:
+            x_mm, y_mm, z_mm = (1e3 * place for place in (tile.x_m, tile.y_m, tile.z_m))
+            place = f"at {x_mm:g}, {y_mm:g}, {z_mm:g} mm"
+            text = f"force along its axis on tile {tile.serial} {place}"
+            yield f"force_n_{i}", "N", text, found.at(f"force_n_{i}")
+
+
+def _events(found: Sequence[Reaction], exports: Sequence[Export]) -> dict[str, Any]:
+    marks: list[tuple[float, str, str]] = []
+    contacts: list[tuple[float, str, str]] = []
+    for reaction, export in zip(found, exports, strict=True):
+        node = export.info.node
+        named = ascii_of(node)[:_TEXT] if len(found) > 1 else "General"
+        context = _SIDES.get(node.lower(), named)
+        events = [(at_s, context, label) for at_s, label in reaction.events]
+        marks += events[: reaction.marks]
+        contacts += events[reaction.marks :]
+    kept = [*sorted(marks), *sorted(contacts)][:EVENTS_MAX]
+    return {
+        "USED": np.array([len(kept)]),
+        "CONTEXTS": [context or "General" for _, context, _ in kept],
+        "LABELS": [ascii_of(label)[:_TEXT] or "mark" for _, _, label in kept],
+        "DESCRIPTIONS": [" "] * len(kept),
+        "TIMES": np.array([divmod(at_s, 60.0) for at_s, *_ in kept]).reshape(-1, 2).T,
     }
-    return groups, analog
+
+
+def _loaded(export: Export) -> dict[int, TileInfo]:
+    """Tiles that bear load, by their number."""
+    return {i: tile for i, tile in enumerate(export.info.tiles) if not tile.reference}
 
 
 def _platform(export: Export) -> tuple[Floats, Floats]:
@@ -154,14 +228,17 @@ def _platform(export: Export) -> tuple[Floats, Floats]:
     In the order of the manual: the quadrants +x +y, -x +y, -x -y, +x -y of its own axes, of which y
     and z are the foot's turned.
     """
-    places = np.array([(t.x_m, t.y_m, t.z_m) for t in export.info.tiles if not t.reference])
+    places = np.array([(t.x_m, t.y_m, t.z_m) for t in _loaded(export).values()])
     low, high = places.min(axis=0) * 1e3 - MARGIN_MM, places.max(axis=0) * 1e3 + MARGIN_MM
     z_mm = float(places[:, 2].mean()) * 1e3
-    corners = [
-        *((high[0], low[1], z_mm), (low[0], low[1], z_mm)),
-        *((low[0], high[1], z_mm), (high[0], high[1], z_mm)),
-    ]
-    corners_mm = np.array(corners)
+    corners_mm = np.array(
+        [
+            (high[0], low[1], z_mm),
+            (low[0], low[1], z_mm),
+            (low[0], high[1], z_mm),
+            (high[0], high[1], z_mm),
+        ]
+    )
     return corners_mm.mean(axis=0) * 1e-3, corners_mm
 
 
@@ -176,14 +253,6 @@ def _wrench(found: Reaction, centre_m: Floats) -> Iterator[Floats]:
         moment = np.where(found.is_unloaded, 0.0, -1e3 * along_m * fz_n)
         yield found.steady.between(moment)
     yield nothing
-
-
-def _of_events(found: Reaction) -> str:
-    text = f"{found.marks} marks, {len(found.events) - found.marks} begins and ends of contact"
-    over = len(found.events) - EVENTS_MAX
-    if over > 0:
-        text += f"; the last {over} are left out, {EVENTS_MAX} being the most: see channel contact"
-    return text
 
 
 def _save(path: Path, groups: Groups, analog: Floats) -> None:
@@ -224,6 +293,7 @@ C3D = Format(
     "Visual3D, Mokka, QTM, Vicon",
     "application/octet-stream",
     _write,
+    write_together=_write_together,
     takes_columns=False,
     needs_forces=True,
     frames_max=FRAMES_MAX,

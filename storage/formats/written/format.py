@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
 
@@ -23,6 +24,7 @@ class Format:
         opened_by: some programs that open it, for people who have to choose.
         media_type: as HTTP calls it.
         write: gives the file in chunks; see the package.
+        write_together: writes several sessions on one axis of time; None: it knows one only.
         suffix: of its files, without the dot; empty: the name.
         options: names of the fields of `FormatOptions` that it knows.
         takes_columns: can columns be chosen? Else it has those that it has.
@@ -39,6 +41,7 @@ class Format:
     opened_by: str
     media_type: str
     write: Callable[[Export], Iterator[bytes]]
+    write_together: Callable[[Sequence[Export]], Iterator[bytes]] | None = None
     suffix: str = ""
     options: tuple[str, ...] = ()
     takes_columns: bool = True
@@ -67,6 +70,37 @@ class Format:
             UsageError: it cannot have what is asked for: a column, an option, too many frames,
                 a slice behind the session's end; before the first chunk.
         """
+        self._check(export)
+        with self._needed():
+            yield from self.write(export)
+
+    def written_together(self, exports: Sequence[Export]) -> Iterator[bytes]:
+        """One file of several sessions, on one axis of time, in chunks.
+
+        Raises:
+            UsageError: as for `written`, of any of them; it holds one session only, or one has no
+                time that the others share.
+        """
+        if self.write_together is None:
+            raise UsageError(
+                f"{self.name} holds one session only",
+                remedy="Write a file for each: leave --together out",
+            )
+        for export in exports:
+            self._check(export)
+            if export.clock is None:
+                raise UsageError(
+                    "the nodes' own clocks are no common axis", remedy="Ask for the server's clock"
+                )
+        with self._needed():
+            yield from self.write_together(exports)
+
+    def _needed(self) -> AbstractContextManager[None]:
+        if self.extra is None:
+            return nullcontext()
+        return needs_extra(self.extra, f"the format {self.name}")
+
+    def _check(self, export: Export) -> None:
         for name in export.options.set_names:
             if name not in self.options:
                 known = ", ".join(self.options)
@@ -87,8 +121,3 @@ class Format:
                 remedy="Add them with `foottile estimate`, or ask for its counts as Parquet, "
                 "Arrow or CSV",
             )
-        if self.extra is None:
-            yield from self.write(export)
-            return
-        with needs_extra(self.extra, f"the format {self.name}"):
-            yield from self.write(export)

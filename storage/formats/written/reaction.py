@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from devices.arrays import Floats
+from devices.arrays import Floats, Times
 from devices.errors import UsageError
 from storage.formats.export import Export
-from storage.formats.written.steady import Steady, steady
-from storage.schema import Array
+from storage.formats.written.steady import Steady, axis_of, steady
+from storage.schema import SERVER_TIME, Array
 
-TIMES = ("t_ns", "contact", "grf_n", "cop_x_m", "cop_y_m", "estimate_status")
+NEEDED = ("t_ns", "contact", "grf_n", "cop_x_m", "cop_y_m", "estimate_status")
 """Columns that are needed, and in every session with estimates."""
 FURTHER = (
     *("grf_sigma_n", "grf_at_least_n", "cop_sigma_x_m", "cop_sigma_y_m"),
@@ -27,6 +27,7 @@ FURTHER = (
 """Columns that a session may have."""
 FLAGS = ("contact", "estimate_status", "grf_at_least_n")
 """Columns of which nothing lies between two frames."""
+SERVER_NAMES = [column.name for column in SERVER_TIME]
 STRIKE, OFF = "Foot Strike", "Foot Off"
 """As the C3D manual calls them."""
 
@@ -56,6 +57,12 @@ class Reaction:
         return self.steady.between(column.astype(np.float64))
 
     @property
+    def uncertainty_s(self) -> Floats | None:
+        """(n,), bound of the time of its frames; None: it is the node's own, and nobody compared."""
+        name = "t_server_uncertainty_ns"
+        return self.steady.nearest(self.columns[name]) * 1e-9 if name in self.columns else None
+
+    @property
     def is_unloaded(self) -> npt.NDArray[np.bool_]:
         """(m,), is it known that the foot bears nothing in a frame?"""
         return np.asarray(self.columns["contact"] == 0)
@@ -75,11 +82,42 @@ def reaction_of(export: Export, further: Sequence[str], frames_max: int) -> Reac
         frames_max: more frames, or samples, are refused.
 
     Raises:
-        UsageError: as for `Export.whole` and `steady`; there is no frame, or none has a force.
+        UsageError: as for `Export.whole` and `axis_of`; there is no frame, or none has a force.
     """
+    (found,) = reactions_of([export], further, frames_max)
+    return found
+
+
+def reactions_of(
+    exports: Sequence[Export], further: Sequence[str], frames_max: int
+) -> list[Reaction]:
+    """The same of several, on one axis of time.
+
+    Raises:
+        UsageError: as for `reaction_of`, of any of them.
+    """
+    read = [_frames(export, further, frames_max) for export in exports]
+    streams = [
+        (t_ns, export.info.nominal_rate_hz) for (t_ns, _), export in zip(read, exports, strict=True)
+    ]
+    axis = axis_of(streams, frames_max)
+    found = []
+    for t_ns, columns in read:
+        since_s = (t_ns - axis.begin_ns) * 1e-9
+        marked = _marks(columns, since_s)
+        events = [*marked, *_contacts(columns, since_s)]
+        placed = steady(axis, t_ns, columns["seq"], columns.get("part"))
+        found.append(Reaction(placed, columns, events, len(marked)))
+    return found
+
+
+def _frames(
+    export: Export, further: Sequence[str], frames_max: int
+) -> tuple[Times, dict[str, Array]]:
+    """Instants of the frames, on the clock that was asked for, and their columns."""
     present = set(export.content.names)
-    names = [*TIMES, *(name for name in further if name in present)]
-    names += ["t_server_ns"] if export.clock is not None else []
+    names = [*NEEDED, *(name for name in further if name in present)]
+    names += SERVER_NAMES if export.clock is not None else []
     names += ["event"] if export.marks is not None else []
     names += ["part"] if "part" in present else []
     columns = export.whole(list(dict.fromkeys(["seq", *names])), frames_max=frames_max)
@@ -93,12 +131,7 @@ def reaction_of(export: Export, further: Sequence[str], frames_max: int) -> Reac
             f"none of its {len(t_ns)} frames has a force (estimate_status {_bits(columns)})",
             remedy="Ask for Parquet, Arrow or CSV: they have counts and bounds",
         )
-    found = steady(
-        t_ns, columns["seq"], columns.get("part"), export.info.nominal_rate_hz, frames_max
-    )
-    since_s = (t_ns - found.begin_ns) * 1e-9
-    marked = _marks(columns, since_s)
-    return Reaction(found, columns, [*marked, *_contacts(columns, since_s)], len(marked))
+    return t_ns, columns
 
 
 def _marks(columns: Mapping[str, Array], since_s: Floats) -> list[tuple[float, str]]:

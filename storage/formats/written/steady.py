@@ -7,6 +7,7 @@ there samples are empty.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,21 +82,77 @@ class Steady:
         return f"{text}; {self.empty} samples are empty: frames lost, or not taken"
 
 
-def steady(
-    t_ns: Times, seq: Array, part: Array | None, nominal_hz: float, samples_max: int
-) -> Steady:
-    """Samples at a constant rate from the first of m frames to the last.
+@dataclass(frozen=True)
+class Axis:
+    """One time axis of samples at a constant rate.
+
+    Attributes:
+        rate_hz: as a number of single precision has it, as C3D does.
+        begin_ns: instant of the first.
+        count: how many there are.
+    """
+
+    rate_hz: float
+    begin_ns: int
+    count: int
+
+
+def axis_of(streams: Sequence[tuple[Times, float]], samples_max: int) -> Axis:
+    """The axis of some streams of frames: from the first frame of any to the last of any.
 
     Args:
-        t_ns: (m,), their instants; m > 0.
-        seq: (m,), their numbers.
-        part: (m,), of the session; None: all are of one.
-        nominal_hz: the rate of the array. Where frames come at another one, it is the median's.
+        streams: instants of the frames of each, one at least, and its nominal rate. Where frames
+            come at another one, it is the median's. The axis has the highest.
         samples_max: more are refused.
 
     Raises:
         UsageError: instants run back or are not known, or there were too many samples.
     """
+    for t_ns, _ in streams:
+        _check_instants(t_ns)
+    rate_hz = max(_rate(np.diff(t_ns), nominal_hz) for t_ns, nominal_hz in streams)
+    rate_hz = float(np.float32(rate_hz))
+    begin_ns = min(int(t_ns[0]) for t_ns, _ in streams)
+    end_ns = max(int(t_ns[-1]) for t_ns, _ in streams)
+    count = int((end_ns - begin_ns) * 1e-9 * rate_hz + SAME_PERIODS) + 1
+    if count > samples_max:
+        raise UsageError(
+            f"from the first frame to the last there are {count} samples at {rate_hz:.6g} Hz, with "
+            f"what lies between; the limit here is {samples_max}",
+            expected=f"a slice of {(samples_max - 1) / rate_hz:.3f} s at most",
+        )
+    return Axis(rate_hz, begin_ns, count)
+
+
+def steady(axis: Axis, t_ns: Times, seq: Array, part: Array | None) -> Steady:
+    """Frames on an axis.
+
+    Args:
+        axis: made of these instants, and others if there are.
+        t_ns: (m,), their instants, rising; m > 0.
+        seq: (m,), their numbers.
+        part: (m,), of the session; None: all are of one.
+    """
+    period_ns = 1e9 / axis.rate_hz
+    since_ns = (t_ns - axis.begin_ns).astype(np.float64)
+    due_ns = np.arange(axis.count) * period_ns
+    before = np.maximum(np.searchsorted(since_ns, due_ns, side="right") - 1, 0)
+    after = np.minimum(before + 1, len(t_ns) - 1)
+    length_ns = np.where(after > before, since_ns[after] - since_ns[before], period_ns)
+    share = np.clip((due_ns - since_ns[before]) / length_ns, 0.0, 1.0)
+    is_before = np.abs(due_ns - since_ns[before]) <= SAME_PERIODS * period_ns
+    is_after = np.abs(due_ns - since_ns[after]) <= SAME_PERIODS * period_ns
+    share[is_before] = 0.0
+    share[is_after & (after > before)] = 1.0
+    joined = (seq[1:] == seq[:-1] + 1) & (np.diff(t_ns) <= BRIDGED_PERIODS * period_ns)
+    if part is not None:
+        joined &= part[1:] == part[:-1]
+    is_within = (due_ns >= since_ns[0]) & (due_ns <= since_ns[-1])
+    is_there = (np.append(joined, False)[before] & is_within) | is_before | is_after
+    return Steady(axis.rate_hz, axis.begin_ns, before, after, share, is_there)
+
+
+def _check_instants(t_ns: Times) -> None:
     unknown = int((t_ns == NO_INSTANT).sum())
     if unknown:
         raise UsageError(
@@ -112,31 +169,6 @@ def steady(
             expected="one time axis",
             remedy="Ask for the server's clock, or a slice that ends before",
         )
-    rate_hz = float(np.float32(_rate(steps_ns, nominal_hz)))
-    period_ns = 1e9 / rate_hz
-    since_ns = (t_ns - t_ns[0]).astype(np.float64)
-    count = int(since_ns[-1] / period_ns + SAME_PERIODS) + 1
-    if count > samples_max:
-        raise UsageError(
-            f"from the first frame to the last there are {count} samples at {rate_hz:.6g} Hz, with "
-            f"what lies between parts; the limit here is {samples_max}",
-            expected=f"a slice of {(samples_max - 1) / rate_hz:.3f} s at most",
-        )
-    due_ns = np.arange(count) * period_ns
-    last = len(t_ns) - 1
-    before = np.maximum(np.searchsorted(since_ns, due_ns, side="right") - 1, 0)
-    after = np.minimum(before + 1, last)
-    length_ns = np.where(after > before, since_ns[after] - since_ns[before], period_ns)
-    share = np.clip((due_ns - since_ns[before]) / length_ns, 0.0, 1.0)
-    same_ns = SAME_PERIODS * period_ns
-    share[due_ns - since_ns[before] <= same_ns] = 0.0
-    share[(since_ns[after] - due_ns <= same_ns) & (after > before)] = 1.0
-    joined = (seq[1:] == seq[:-1] + 1) & (steps_ns <= BRIDGED_PERIODS * period_ns)
-    if part is not None:
-        joined &= part[1:] == part[:-1]
-    joined = np.append(joined, False)
-    is_there = joined[before] | (share == 0.0) | (share == 1.0)
-    return Steady(rate_hz, int(t_ns[0]), before, after, share, is_there)
 
 
 def _rate(steps_ns: Times, nominal_hz: float) -> float:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices.errors import UsageError
-from storage.formats.written.steady import SAME_PERIODS, Steady, steady
+from storage.formats.written.steady import SAME_PERIODS, Steady, axis_of, steady
 from storage.schema import NO_INSTANT, Array
 
 BEGIN_NS = 1_700_000_000_123_456_789
@@ -18,7 +18,8 @@ NOMINAL_HZ = 500.0
 
 def at(t_ns: Array, seq: Array | None = None, part: Array | None = None, **more: int) -> Steady:
     numbers = np.arange(len(t_ns), dtype=np.uint64) if seq is None else seq.astype(np.uint64)
-    return steady(t_ns, numbers, part, NOMINAL_HZ, more.get("samples_max", 10_000))
+    axis = axis_of([(t_ns, NOMINAL_HZ)], more.get("samples_max", 10_000))
+    return steady(axis, t_ns, numbers, part)
 
 
 def times(count: int) -> Array:
@@ -110,5 +111,16 @@ def test_a_clock_that_was_never_compared_gives_no_axis() -> None:
 
 def test_years_between_two_parts_are_refused_and_not_filled() -> None:
     t_ns = np.append(times(10), times(10) + 10**18)
-    with pytest.raises(UsageError, match="with what lies between parts; the limit here is 10000"):
+    with pytest.raises(UsageError, match="with what lies between; the limit here is 10000"):
         at(t_ns, part=np.repeat([0, 1], 10))
+
+
+def test_of_two_streams_on_one_axis_each_is_empty_where_it_is_not() -> None:
+    early, late = times(20), times(20) + 10 * PERIOD_NS + 400_000
+    axis = axis_of([(early, NOMINAL_HZ), (late, NOMINAL_HZ)], 100)
+    assert (axis.begin_ns, axis.count) == (BEGIN_NS, 30)
+    numbers = np.arange(20)
+    first, second = (steady(axis, t_ns, numbers, None) for t_ns in (early, late))
+    np.testing.assert_array_equal(np.flatnonzero(first.is_there), np.arange(20))
+    np.testing.assert_array_equal(np.flatnonzero(second.is_there), np.arange(11, 30))
+    np.testing.assert_allclose(second.between(numbers * 1.0)[11:], np.arange(19) + 0.8)
