@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from devices.errors import UsageError
 from storage.durable import whole_file
-from storage.formats.export import ClockName
+from storage.formats.export import ClockName, Export
 from storage.formats.marks import Mark
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.sealed import export_of, marks_of
@@ -58,25 +60,59 @@ def export_session(source: Path, out: Path, options: ExportOptions) -> Exported:
     """
     to = format_named(options.to)
     with SessionReader(source, only_slices=not options.part.is_all) as reader:
-        beside = source.with_name(EVENTS_NAME)
-        stored = read_events(beside) if options.marks is not False and beside.is_file() else None
-        if options.marks and stored is None:
-            raise UsageError(
-                f"there is no {EVENTS_NAME} beside {source.name}, so nothing is known of marks",
-                where=str(source.parent),
-                expected="a session's folder as a server sealed it or `foottile pull` fetched it",
-            )
-        placed = None if stored is None else marks_of(reader, stored.events, options.part)
-        export = export_of(
-            reader,
-            options.part,
-            clock=options.clock,
-            marks=placed,
-            options=options.options,
+        export, lacks_marks = _export_of(reader, options)
+        return _written(out, to.written(export), [export], lacks_marks)
+
+
+def export_together(sources: Sequence[Path], out: Path, options: ExportOptions) -> Exported:
+    """Write several sealed sessions into one file, on the server's axis of time.
+
+    Args:
+        sources: their frames, two at least.
+        out: the file.
+        options: what of each; of a slice, seconds count from each session's own first frame.
+
+    Raises:
+        UsageError: as for `export_session`; the format holds one session only.
+        FileFormatError: a file is damaged.
+        StorageError: `out` cannot be written.
+    """
+    if len(sources) < 2:
+        raise UsageError("a single session with --together", expected="two sessions or more")
+    to = format_named(options.to)
+    with ExitStack() as opened:
+        readers = [
+            opened.enter_context(SessionReader(source, only_slices=not options.part.is_all))
+            for source in sources
+        ]
+        found = [_export_of(reader, options) for reader in readers]
+        exports = [export for export, _ in found]
+        lacks_marks = any(lacks for _, lacks in found)
+        return _written(out, to.written_together(exports), exports, lacks_marks)
+
+
+def _export_of(reader: SessionReader, options: ExportOptions) -> tuple[Export, bool]:
+    """What is to be written, and whether nothing says what was marked."""
+    beside = reader.path.with_name(EVENTS_NAME)
+    stored = read_events(beside) if options.marks is not False and beside.is_file() else None
+    if options.marks and stored is None:
+        raise UsageError(
+            f"there is no {EVENTS_NAME} beside {reader.path.name}, so nothing is known of marks",
+            where=str(reader.path.parent),
+            expected="a session's folder as a server sealed it or `foottile pull` fetched it",
         )
-        with whole_file(out) as file:
-            for chunk in to.written(export):
-                file.write(chunk)
-        lacks_marks = options.marks is None and stored is None and "session" in reader.notes
-    left_out = tuple(placed.left_out) if placed is not None else ()
-    return Exported(out.stat().st_size, left_out, lacks_marks)
+    placed = None if stored is None else marks_of(reader, stored.events, options.part)
+    export = export_of(
+        reader, options.part, clock=options.clock, marks=placed, options=options.options
+    )
+    return export, options.marks is None and stored is None and "session" in reader.notes
+
+
+def _written(
+    out: Path, chunks: Iterator[bytes], exports: Sequence[Export], lacks_marks: bool
+) -> Exported:
+    with whole_file(out) as file:
+        for chunk in chunks:
+            file.write(chunk)
+    left_out = [mark for export in exports if export.marks for mark in export.marks.left_out]
+    return Exported(out.stat().st_size, tuple(left_out), lacks_marks)

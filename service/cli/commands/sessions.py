@@ -202,6 +202,13 @@ def export_command(
             "if there are events beside the frames.",
         ),
     ] = None,
+    together: Annotated[
+        bool,
+        typer.Option(
+            "--together",
+            help="Two sessions or more into one file, on the server's axis of time: c3d.",
+        ),
+    ] = False,
     manifest: ManifestOption = None,
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
@@ -217,7 +224,7 @@ def export_command(
     on where it was broken off. Exit code 3: some of them failed.
     """
     from service.offline.archive.places import is_remote
-    from service.offline.export import ExportOptions, export_session
+    from service.offline.export import ExportOptions, export_session, export_together
     from storage.formats.export import CLOCKS
     from storage.formats.slice import Slice
     from storage.formats.written.registry import format_named
@@ -225,8 +232,14 @@ def export_command(
     if clock not in CLOCKS:
         raise UsageError(f"--clock {clock!r}", expected=" or ".join(CLOCKS))
     part = Slice(start_s, end_s, _names(columns))
-    wanted = ExportOptions(format_named(to).name, part, clock, marks, options)
-    if not is_one(sessions, manifest) or is_remote(out):
+    wanted = ExportOptions(
+        format_named(to).name, part, "server" if together else clock, marks, options
+    )
+    if together and (manifest is not None or is_remote(out)):
+        raise UsageError(
+            "--together with --manifest, or into a URI", remedy="Name the sessions, and a file"
+        )
+    if not together and (not is_one(sessions, manifest) or is_remote(out)):
         from service.offline.archive.tasks import ExportTask
 
         summary = run_many(
@@ -241,15 +254,18 @@ def export_command(
         if summary.states["failed"]:
             raise typer.Exit(NOT_ALL)
         return
-    source = sealed_file((sessions or [""])[0], data)
-    path = output_path(Path(out), source)
+    sources = [sealed_file(session, data) for session in sessions or [""]]
+    path = output_path(Path(out), *sources)
     with progress(f"writing {path.name}"):
-        done = export_session(source, path, wanted)
+        if together:
+            done = export_together(sources, path, wanted)
+        else:
+            done = export_session(sources[0], path, wanted)
     say(f"{path}: {done.size_bytes} bytes")
     for mark in done.left_out:
         remark(f"mark {mark.event.label!r} is not in it: {mark.left_out}")
     if done.lacks_marks:
-        remark(f"without marks: there is no {EVENTS_NAME} beside {source.name}")
+        remark(f"without marks: there is no {EVENTS_NAME} beside {sources[0].name}")
 
 
 def _names(columns: str | None) -> tuple[str, ...]:

@@ -111,7 +111,8 @@ def c3d_content(
         channels += [(f"{name}{number}", *about, values) for (name, about), values in named]
     for number, (reaction, export) in enumerate(zip(found, exports, strict=True), 1):
         prefix = f"{number}:" if len(found) > 1 else ""
-        channels += [(prefix + label, *rest) for label, *rest in _further(reaction, export)]
+        for label, unit, text, values in _further(reaction, export):
+            channels.append((prefix + label, unit, text, values))
     samples = len(found[0].steady)
     per_frame = -(-samples // C3D_FRAMES_MAX)
     filling = -samples % per_frame
@@ -161,8 +162,8 @@ def _said(found: Reaction, export: Export, filling: int, events: int) -> dict[st
     text = f"{found.marks} marks, {len(found.events) - found.marks} begins and ends of contact"
     if events > EVENTS_MAX:
         text += (
-            f"; the last {events - EVENTS_MAX} of all are left out, {EVENTS_MAX} being the most: "
-            "see channel contact"
+            f"; the last {events - EVENTS_MAX} are left out, {EVENTS_MAX} being the most: see "
+            "channel contact"
         )
     said = {
         **described(export, found.steady.begin_ns),
@@ -176,8 +177,8 @@ def _said(found: Reaction, export: Export, filling: int, events: int) -> dict[st
     }
     if found.uncertainty_s is not None:
         said["CLOCK_UNCERTAINTY"] = (
-            f"the truth is within {np.nanmax(found.uncertainty_s) * 1e3:.3f} ms of the axis at most: "
-            f"channel {_UNCERTAINTY}; between two platforms, within the sum of both"
+            f"the truth is within {np.nanmax(found.uncertainty_s) * 1e3:.3f} ms of the axis at "
+            f"most: channel {_UNCERTAINTY}; between two platforms, within the sum of both"
         )
     return said
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 
 from storage.formats.export import Export
+from storage.formats.facts import completeness
 
 
 def described(export: Export, begin_ns: int) -> dict[str, str]:
@@ -23,7 +24,7 @@ def described(export: Export, begin_ns: int) -> dict[str, str]:
     said = {
         "SESSION": str(about.get("session") or "none: simulated or estimated by itself"),
         "NODE": export.info.node,
-        "COMPLETE": completeness(notes, about.get("state")),
+        "COMPLETE": _in_words(notes, export.source),
         "BEGIN_T_NS": str(begin_ns),
         "BEGIN_UTC": f"{begin}.{rest:09d}Z by {clock} clock"
         + ("" if export.info.clock_set or export.clock is not None else ", which was not set"),
@@ -37,24 +38,14 @@ def described(export: Export, begin_ns: int) -> dict[str, str]:
     return {name: ascii_of(text) for name, text in said.items()}
 
 
-def completeness(notes: Mapping[str, object], state: object = None) -> str:
-    """Is the session all that it should be? In words.
-
-    Args:
-        notes: of the session, with its ledger if it is sealed.
-        state: of one that is not.
-    """
-    ledger = notes.get("ledger")
-    if not isinstance(ledger, dict):
-        return "not known: " + (f"it is {state}" if state else "there is no ledger")
-    lost: dict[str, int] = {}
-    for part in ledger.get("parts", ()):
-        for reason, count in part.get("lost", {}).items():
-            lost[reason] = lost.get(reason, 0) + count
+def _in_words(notes: Mapping[str, object], source: Mapping[str, object]) -> str:
+    complete, lost = completeness(notes, source)
+    if complete is None:
+        return "not known: there is no ledger"
     said = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
-    if ledger.get("complete") and not ledger.get("lossy"):
-        return "complete"
-    return f"lossy: {said or 'frames are missing'}"
+    if complete == "lossy":
+        return f"lossy: {said or 'frames are missing'}"
+    return "complete" if complete else f"not complete: it is {source.get('state', 'pending')}"
 
 
 def ascii_of(text: str) -> str:

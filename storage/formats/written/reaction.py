@@ -58,7 +58,7 @@ class Reaction:
 
     @property
     def uncertainty_s(self) -> Floats | None:
-        """(n,), bound of the time of its frames; None: it is the node's own, and nobody compared."""
+        """(n,), bound of the server's time of its frames; None: it is the node's own time."""
         name = "t_server_uncertainty_ns"
         return self.steady.nearest(self.columns[name]) * 1e-9 if name in self.columns else None
 
@@ -103,7 +103,7 @@ def reactions_of(
     axis = axis_of(streams, frames_max)
     found = []
     for t_ns, columns in read:
-        since_s = (t_ns - axis.begin_ns) * 1e-9
+        since_s = (t_ns - axis.begin_ns).astype(np.float64) * 1e-9
         marked = _marks(columns, since_s)
         events = [*marked, *_contacts(columns, since_s)]
         placed = steady(axis, t_ns, columns["seq"], columns.get("part"))

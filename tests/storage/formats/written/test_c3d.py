@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,17 @@ import pytest
 
 from devices.errors import StorageError, UsageError
 from devices.words import printable
+from storage.clock.bounds import Rows
+from storage.clock.table import ClockTable, StreamFacts
 from storage.formats.export import Export
 from storage.formats.marks import Mark, Marks
 from storage.formats.reference import Stated, read_reference
 from storage.formats.slice import Slice
 from storage.formats.written import c3d as written_c3d
 from storage.formats.written.c3d import C3D
+from storage.formats.written.registry import format_named
 from storage.sessions.folder import Event
+from tests.builders.arrays import UTC_NS
 from tests.storage.formats.walks import (
     ARRAY,
     RATE_HZ,
@@ -37,8 +42,9 @@ python_c3d = pytest.importorskip("c3d")
 class Read:
     """A file as the library `c3d` reads it: plain Python, and no part of ezc3d."""
 
-    def __init__(self, export: Export) -> None:
-        self.content = b"".join(C3D.written(export))
+    def __init__(self, export: Export | list[Export]) -> None:
+        chunks = C3D.written_together(export) if isinstance(export, list) else C3D.written(export)
+        self.content = b"".join(chunks)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that there are no points
             self.reader = python_c3d.Reader(io.BytesIO(self.content))
@@ -313,3 +319,95 @@ def test_names_of_nodes_and_serials_are_shown_and_not_obeyed() -> None:
     assert printable(
         found.texts("ANALOG:DESCRIPTIONS")[found.labels.index("force_n_0")]
     ).startswith("force along its axis on tile T'e\"/U+1F600")
+
+
+# --- several sessions -----------------------------------------------------------------------------
+
+LATE_NS = 300_000_000
+BOUND_NS = 400_000
+
+
+def compared(later_ns: int) -> ClockTable:
+    """A clock that is behind the server's by so much."""
+    boot_id = ARRAY.boot_id
+    rows = Rows(*np.array([[0], [later_ns], [BOUND_NS]], dtype=np.int64))
+    return ClockTable({boot_id: rows}, [StreamFacts(boot_id, UTC_NS, True)], [boot_id])
+
+
+def two_feet(**facts: Any) -> list[Export]:
+    left = ARRAY.model_copy(update={"node": "left"})
+    right = ARRAY.model_copy(update={"node": "right-2"})
+    tap = marks({10: "tap"})
+    return [
+        export_of_walk(info=left, clock=compared(0), marks=tap, **facts),
+        export_of_walk(info=right, clock=compared(LATE_NS), marks=tap, **facts),
+    ]
+
+
+def test_two_feet_are_two_platforms_on_the_servers_axis() -> None:
+    found = Read(two_feet())
+    late = round(LATE_NS * 1e-9 * RATE_HZ)
+    fz = np.float32(np.where(walk()["contact"] == 1, walk()["grf_n"], 0.0))
+    assert found.analog.shape[1] == ROWS + late
+    np.testing.assert_allclose(found.channel("Fz1")[:ROWS], fz, atol=1e-4)
+    np.testing.assert_allclose(found.channel("Fz2")[late:], fz, atol=1e-4)
+    assert np.isnan(found.channel("Fz1")[ROWS:]).all()
+    assert np.isnan(found.channel("Fz2")[:late]).all()
+    assert "1:force_n_0" in found.labels
+    assert "2:contact" in found.labels
+    channels = np.ravel(found.reader.get("FORCE_PLATFORM:CHANNEL").int16_array)
+    assert [found.labels[i - 1] for i in channels] == [
+        f"{name}{number}" for number in (1, 2) for name in ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+    ]
+    assert [node for i in (1, 2) for node in found.texts(f"FOOTTILE{i}:NODE")] == [
+        "left",
+        "right-2",
+    ]
+
+
+def test_how_far_the_clocks_may_be_apart_is_in_the_file() -> None:
+    found = Read(two_feet())
+    bound_s = found.channel("1:t_server_uncertainty_s")
+    assert np.nanmin(bound_s) >= BOUND_NS * 1e-9
+    said = " ".join(found.texts("FOOTTILE1:CLOCK_UNCERTAINTY"))
+    assert said.startswith(f"the truth is within {np.nanmax(bound_s) * 1e3:.3f} ms")
+
+
+def test_an_event_says_which_foot_it_is_of() -> None:
+    found = Read(two_feet())
+    named = list(zip(found.texts("EVENT:CONTEXTS"), found.events(), strict=True))
+    assert [(context, label) for context, (label, _) in named[:2]] == [
+        ("Left", "tap"),
+        ("right-2", "tap"),
+    ]
+    strikes = [(context, at_s) for context, (label, at_s) in named if label == "Foot Strike"]
+    expected = [("Left", 0.2), ("right-2", 0.5), ("Left", 1.0), ("right-2", 1.3)]
+    assert [context for context, _ in strikes] == [context for context, _ in expected]
+    np.testing.assert_allclose([t for _, t in strikes], [t for _, t in expected], atol=1e-3)
+
+
+def test_our_reader_of_references_finds_both(tmp_path: Path) -> None:
+    path = tmp_path / "take.c3d"
+    path.write_bytes(Read(two_feet()).content)
+    found = read_reference(path, Stated({"grf_n": "plate2_fz", **cop_of(2)}))
+    on = walk()["contact"] == 1
+    np.testing.assert_allclose(found.grf_n, np.where(on, walk()["grf_n"], 0.0), atol=1e-3)
+    assert "2 plates" in found.notes[0]
+
+
+def cop_of(number: int) -> dict[str, str]:
+    return {f"cop_{axis}_m": f"plate{number}_cop_{axis}" for axis in "xy"}
+
+
+def test_sessions_without_a_common_axis_are_not_put_together() -> None:
+    with pytest.raises(UsageError, match="the nodes' own clocks are no common axis"):
+        list(C3D.written_together([export_of_walk(), export_of_walk()]))
+    with pytest.raises(UsageError, match="opensim holds one session only"):
+        list(format_named("opensim").written_together(two_feet()))
+
+
+def test_sessions_of_different_days_are_refused_and_not_joined() -> None:
+    one, _ = two_feet()
+    other = replace(one, content=two_feet()[1].content, clock=compared(86_400_000_000_000))
+    with pytest.raises(UsageError, match="with what lies between"):
+        list(C3D.written_together([one, other]))

@@ -11,12 +11,13 @@ from xml.etree import ElementTree
 
 import pytest
 
+from storage.formats.export import content_of
 from storage.formats.marks import Mark, Marks
 from storage.formats.options import NO_OPTIONS, FormatOptions
 from storage.formats.slice import Slice
 from storage.sessions.folder import Event
 from tests.builders.arrays import make_array
-from tests.storage.formats.exports import NOTES, content_of, cut, export, extra, frames, read
+from tests.storage.formats.exports import NOTES, cut, export, extra, frames, read
 from tests.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.process, pytest.mark.slow]

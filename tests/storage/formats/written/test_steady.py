@@ -123,4 +123,5 @@ def test_of_two_streams_on_one_axis_each_is_empty_where_it_is_not() -> None:
     first, second = (steady(axis, t_ns, numbers, None) for t_ns in (early, late))
     np.testing.assert_array_equal(np.flatnonzero(first.is_there), np.arange(20))
     np.testing.assert_array_equal(np.flatnonzero(second.is_there), np.arange(11, 30))
-    np.testing.assert_allclose(second.between(numbers * 1.0)[11:], np.arange(19) + 0.8)
+    values = second.between(numbers.astype(np.float64))[11:]
+    np.testing.assert_allclose(values, 0.8 + np.arange(19.0))
