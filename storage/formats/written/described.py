@@ -44,8 +44,12 @@ def _in_words(notes: Mapping[str, object], source: Mapping[str, object]) -> str:
         return "not known: there is no ledger"
     said = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
     if complete == "lossy":
-        return f"lossy: {said or 'frames are missing'}"
-    return "complete" if complete else f"not complete: it is {source.get('state', 'pending')}"
+        text = f"lossy: {said or 'frames are missing'}"
+    else:
+        text = "complete" if complete else f"not complete: it is {source.get('state', 'pending')}"
+    ledger = notes.get("ledger")
+    missed = ledger.get("missed_slots") if isinstance(ledger, dict) else None
+    return f"{text}; {missed} slots in which no frame was taken" if missed else text
 
 
 def ascii_of(text: str) -> str:

@@ -127,25 +127,6 @@ def test_sessions_lists_what_the_server_has_and_what_the_folder_has(
 
 
 @pytest.mark.real_time
-def test_sessions_together_are_one_c3d_file_on_the_servers_axis(
-    demo: Demo, session: str, tmp_path: Path
-) -> None:
-    out = tmp_path / "take.c3d"
-    words = ("--data", str(demo.data), "--out", str(out), "--together")
-    refused = run("export", session, *words, "--format", "c3d")
-    assert refused.returncode == 2
-    assert "two sessions or more" in refused.stderr
-    assert (
-        "csv holds one session only"
-        in run("export", session, session, *words, "--format", "csv").stderr
-    )
-    assert not out.exists()
-    written = run("export", session, session, *words, "--format", "c3d")
-    assert written.returncode == 0, written.stderr
-    assert b"FOOTTILE2" in out.read_bytes()
-
-
-@pytest.mark.real_time
 def test_pull_brings_the_file_verified_and_at_once_the_second_time(
     demo: Demo, session: str, tmp_path: Path
 ) -> None:

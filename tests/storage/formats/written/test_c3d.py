@@ -191,11 +191,17 @@ def test_a_cop_that_is_not_stated_is_none_though_the_force_is_known(plain: Read)
 
 def test_lost_frames_are_empty_samples_and_it_is_said() -> None:
     kept = np.delete(np.arange(ROWS), np.arange(600, 640))
-    ledger = {"complete": True, "lossy": True, "parts": [{"lost": {"disk_full": 40}}]}
+    ledger = {
+        "complete": True,
+        "lossy": True,
+        "parts": [{"lost": {"disk_full": 40}}],
+        "missed_slots": 3,
+    }
     found = Read(export_of_walk(keep=kept, notes={"ledger": ledger}))
     assert np.isnan(found.analog[:, 600:640]).all()
     np.testing.assert_array_equal(found.channel("Fz1")[700], np.float32(walk()["grf_n"][700]))
-    assert found.text("COMPLETE") == "lossy: 40 disk_full"
+    said = "lossy: 40 disk_full; 3 slots in which no frame was taken"
+    assert found.text("COMPLETE") == said
     assert "40 samples are empty" in found.text("TIME_BASE")
 
 
