@@ -91,6 +91,8 @@ class Close(IntEnum):
     TOO_SLOW = 4008
     NAME_TAKEN = 4009
     SUPERSEDED = 4010
+    NO_STREAM = 4011
+    """A stream that was asked for is not here, or not any more."""
 
 
 class HangUp(Exception):  # noqa: N818  # no error: how a connection ends

@@ -247,6 +247,16 @@ class WebSocket(WebSocketsSansIOProtocol):
         if not (self.close_sent or self.disconnected or self.transport.is_closing()):
             self.transport.write(framed)
 
+    def hang_up(self, code: int, reason: str) -> None:
+        """Say why it ends, to one who does not read as well: behind all that was written before.
+
+        Once its application has returned, the transport closes when that has gone.
+        """
+        if not (self.close_sent or self.disconnected or self.transport.is_closing()):
+            self.conn.send_close(code, reason)
+            self.transport.write(b"".join(self.conn.data_to_send()))
+            self.close_sent = True
+
     async def receive(self) -> ASGIReceiveEvent:
         """A message, or the end; the first word of a node gets it its place, if there is one."""
         event = await super().receive()
@@ -265,15 +275,18 @@ class WebSocket(WebSocketsSansIOProtocol):
         self.config.doors.rest(self.transport)
 
 
-async def send_text(socket: StarletteWebSocket, text: str) -> None:
-    """Send a text on an open websocket.
+async def send(socket: StarletteWebSocket, message: str | bytes) -> None:
+    """Send a message on an open websocket, once there is room for it.
 
     Raises:
         WebSocketDisconnect: it has gone; where this end has closed it meanwhile, starlette and
             uvicorn say so with a RuntimeError, which must not be taken for another's.
     """
     try:
-        await socket.send_text(text)
+        if isinstance(message, str):
+            await socket.send_text(message)
+        else:
+            await socket.send_bytes(message)
     except RuntimeError as error:
         raise WebSocketDisconnect(CloseCode.ABNORMAL_CLOSURE) from error
 

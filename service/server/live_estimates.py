@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import takewhile
 
 import numpy as np
@@ -31,6 +32,15 @@ from service.server.ranges import Ranges
 from service.sessions.pipeline import Columns, EstimateOptions, EstimateRun, EstimateStream
 
 _TADC_OVER_NS = 1_000_000_000
+_BEGUN_MAX = 256
+
+
+@dataclass(frozen=True)
+class Begun:
+    """From this frame on estimates were begun anew, with this tare; None: there were none."""
+
+    seq: int
+    tare: Tare | None
 
 
 class LiveEstimates:
@@ -58,6 +68,9 @@ class LiveEstimates:
         self._recent: deque[FrameBatch] = deque()
         self._left: list[tuple[FrameBatch, Columns]] = []
         self._due_t_ns: int | None = None
+        self._has_begun = False
+        self.begun: deque[Begun] = deque(maxlen=_BEGUN_MAX)
+        """With what it has estimated, oldest first: who computes its frames again asks."""
         if calibration is not None:
             try:
                 EstimateStream(info, EstimateOptions(calibration, info.models, LIVE_LAG_MS))
@@ -84,6 +97,7 @@ class LiveEstimates:
         if self._run is not None:  # frames that wait for their look-ahead
             self._left.extend(self._run.finish())
         self.free_since_t_ns = None
+        self._has_begun = False
         if self._calibration is None or tare is None:
             self._run = None
             return
@@ -111,6 +125,10 @@ class LiveEstimates:
             self._recent.popleft()
         left, self._left = self._left, []
         yield from left
+        if not self._has_begun and not (self._run is not None and is_warming()):
+            self._has_begun = True
+            tare = None if self._run is None else self._run.plan.tare
+            self.begun.append(Begun(int(frames.seq[0]), tare))
         if self._run is None:
             yield frames, {}
             return

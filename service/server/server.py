@@ -16,6 +16,7 @@ from service.server.book import SessionBook, Trash, destroy
 from service.server.calibrations import CalibrationBook
 from service.server.data_folder import DataFolder
 from service.server.fits import Fits
+from service.server.full_rate.memory import Memories
 from service.server.node import ServerNode
 from service.server.nodes import ServerNodes
 from service.server.recorder import Recorder
@@ -96,6 +97,7 @@ class Server:
             self.check_storage()
             self.hub = Hub()
             self.calibrations = CalibrationBook(data / "calibrations")
+            self.frames = Memories()
             self.nodes = ServerNodes(data)
             self.sessions = SessionBook(
                 SessionFolder(data / "sessions"), Trash(data / "trash"), self._tell_session

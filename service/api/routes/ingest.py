@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from devices.errors import FileFormatError, LinkError, StorageError
-from service.api.protocols import send_text
+from service.api.protocols import send
 from service.link import (
     MESSAGE_BYTES_MAX,
     PROTOCOL,
@@ -127,7 +127,7 @@ async def _welcome(socket: WebSocket, server: Server, link: Link) -> None:
     link.wanted = server.recorder.wanted(node.name)
     lacks = node.lacks(server.recorder.needed(node.name))
     welcome = Welcome(protocol=PROTOCOL, server_id=server.id, lacks=lacks, wanted=link.wanted)
-    await send_text(socket, say(welcome))
+    await send(socket, say(welcome))
     log.info("node %s connected, stream %s", node.name, node.boot_id)
     server.tell_node(node)
 
@@ -164,6 +164,7 @@ async def _take(socket: WebSocket, server: Server, link: Link) -> None:
             except LinkError as error:
                 raise HangUp(Close.REFUSED, str(error)) from error
             server.hub.publish(node, due)
+            server.frames.publish(node, due)
             if node.live.tare is not tare_before:
                 server.tell_node(node)
             continue
@@ -194,7 +195,7 @@ def _announced(node: ServerNode, boot_id: str) -> ServerStream:
 async def _answer(socket: WebSocket, probe: Probe) -> None:
     try:
         async with asyncio.timeout(SILENCE_S):
-            await send_text(socket, say(probe))
+            await send(socket, say(probe))
     except TimeoutError as error:  # else nobody would notice that nothing is heard either
         raise HangUp(Close.SILENT, f"nothing was read for {SILENCE_S:g} s") from error
 
@@ -208,11 +209,11 @@ async def _tell(socket: WebSocket, server: Server, link: Link) -> None:
         wanted = server.recorder.wanted(link.node.name)
         if wanted != link.wanted:
             link.wanted = wanted
-            await send_text(socket, say(wanted))
+            await send(socket, say(wanted))
         for boot_id, numbers in link.acks().items():
             for first, last in numbers:
                 ack = Ack(boot_id=boot_id, seq_first=first, seq_last=last)
-                await send_text(socket, say(ack))
+                await send(socket, say(ack))
 
 
 async def _receive(socket: WebSocket) -> str | bytes:

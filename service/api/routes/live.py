@@ -1,15 +1,17 @@
-"""The live websocket for screens."""
+"""The live websocket: for screens, and for programs that take every frame."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import logging
+from collections.abc import Awaitable
 from contextlib import suppress
 
-from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from service.api.protocols import OUTLET, send_text
+from service.api.protocols import OUTLET, send
+from service.api.routes.live_frames import LiveFrames
 from service.link import SUBPROTOCOL, Close, HangUp, close_reason
 from service.server.index import age_of
 from service.server.screens.fan_out import RATES_HZ, Outlet, framed
@@ -29,43 +31,56 @@ _TEXT_MAX = 1000
 
 
 async def live(socket: WebSocket, server: Server) -> None:
-    """Serve one screen until it leaves."""
+    """Serve one screen, or one program, until it leaves."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
+    outlet: Outlet = socket.scope["extensions"][OUTLET]["outlet"]
     try:
-        node, rate_hz = _query(socket, server)
-        outlet: Outlet = socket.scope["extensions"][OUTLET]["outlet"]
-        outlet.write(framed([dumps(_hello(server, node))]))
-        viewer = server.hub.join(outlet, rate_hz, node)
-        reading = asyncio.create_task(_read(socket))
-        try:
-            ends: tuple[asyncio.Future[None], ...] = (viewer.over, reading)
-            await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
-            for end in ends:
-                if end.done():
-                    end.result()
-        finally:
-            server.hub.leave(viewer)
-            reading.cancel()
-            await asyncio.gather(reading, return_exceptions=True)
+        if socket.query_params.get("format") == "arrow":
+            await _first_of(LiveFrames(socket, server).run(), _read(socket))
+        else:
+            await _show(socket, server, outlet)
     except HangUp as end:
-        if socket.application_state is not WebSocketState.DISCONNECTED:
-            with suppress(RuntimeError, WebSocketDisconnect, TimeoutError):
-                async with asyncio.timeout(1.0):
-                    await socket.close(end.code, close_reason(end.reason))
+        outlet.hang_up(end.code, close_reason(end.reason))
     except WebSocketDisconnect:  # it went away, perhaps while we were sending
         pass
     except Exception:
-        log.exception("this is a bug; one screen's connection ends, the server goes on")
+        log.exception("this is a bug; one live connection ends, the server goes on")
+
+
+async def _show(socket: WebSocket, server: Server, outlet: Outlet) -> None:
+    node, rate_hz = _query(socket, server)
+    outlet.write(framed([dumps(_hello(server, node))]))
+    viewer = server.hub.join(outlet, rate_hz, node)
+    try:
+        await _first_of(viewer.over, _read(socket))
+    finally:
+        server.hub.leave(viewer)
+
+
+async def _first_of(*ends: Awaitable[None]) -> None:
+    """Wait for the first of these, which ends the others, and give its result."""
+    tasks = [asyncio.ensure_future(end) for end in ends]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in tasks:
+            if task.done():
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _query(socket: WebSocket, server: Server) -> tuple[str | None, float]:
     given = socket.query_params
     if unknown := set(given) - _PARAMETERS:
         raise HangUp(Close.POLICY, f"unknown parameter {sorted(unknown)[0]!r}")
-    for name, only in (("format", "json"), ("policy", "latest")):
-        if given.get(name, only) != only:
-            raise HangUp(Close.POLICY, f"{name}={given[name]!r} is not offered; {only!r} is")
+    if (form := given.get("format", "json")) != "json":
+        raise HangUp(Close.POLICY, f"format={form[:40]!r} is not offered; 'json' and 'arrow' are")
+    if (policy := given.get("policy", "latest")) != "latest":
+        what = f"policy={policy[:40]!r} is not offered in JSON; 'latest' is, and with format=arrow"
+        raise HangUp(Close.POLICY, what + " all are")
     try:
         rate_hz = float(given.get("rate_hz", RATE_HZ))
     except ValueError:
@@ -114,4 +129,4 @@ async def _read(socket: WebSocket) -> None:
         t_ms = said.get("t_ms")
         if isinstance(t_ms, bool) or not isinstance(t_ms, int | float) or not abs(t_ms) < 1e18:
             raise HangUp(Close.POLICY, "ping needs t_ms, a number")
-        await send_text(socket, dumps({"type": "pong", "t_ms": t_ms, "t_ns": utc_ns()}))
+        await send(socket, dumps({"type": "pong", "t_ms": t_ms, "t_ns": utc_ns()}))

@@ -40,6 +40,10 @@ COP_SIGMA_MAX_M = 0.003  # a quarter of a dome: worse says nothing of where the 
 TARE_OLD_NS = 1_800_000_000_000
 """Half an hour: at the 0.3 kPa/K of a sealed bubble a degree in that time is half a newton."""
 LAG_MAX_MS = 60_000.0  # so long are frames kept in memory
+WARM_UP_TIMES = 5.0
+"""Time constants that models run before what they give is used; less than a hundredth is left."""
+WARM_UP_LEAST_S = 10.0
+"""What has no time constant of its own: noise, contact, what holds for the last seconds."""
 GAP = 1.5
 """A frame this many nominal periods after the one before comes after a gap."""
 
@@ -229,3 +233,15 @@ def _chip_end_kpa(entry: TileCalibration, baseline_kpa: float) -> float:
     if facts.ended_by == "chip":
         return facts.end_absolute_kpa
     return max(PRESSURE_MAX_KPA, facts.end_absolute_kpa)
+
+
+def warm_up_s(plan: EstimationPlan) -> float:
+    """How long models have to run before what they give can be used."""
+    ladder, longest_s = plan.ladder, 0.0
+    if ladder.gas is not None:
+        longest_s = max(longest_s, float((ladder.gas.gamma * ladder.gas.tau_s).max()))
+    if ladder.rubber is not None:
+        longest_s = max(longest_s, float(ladder.rubber.tau_s[ladder.rubber.part > 0.0].max()))
+    if ladder.temperature is not None:
+        longest_s = max(longest_s, float(np.abs(ladder.temperature.lag_s).max()))
+    return max(WARM_UP_LEAST_S, WARM_UP_TIMES * longest_s)

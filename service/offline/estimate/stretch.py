@@ -16,17 +16,13 @@ import numpy as np
 
 from devices.errors import UsageError
 from devices.frames import FrameBatch
-from service.estimation.ladder.plan import EstimationPlan
+from service.estimation.ladder.plan import EstimationPlan, warm_up_s
 from service.estimation.tare.tare import Tare
 from service.sessions.pipeline import Extra
 from storage.formats.slice import Slice
 from storage.sessions.reader import SessionReader
 
 Piece = tuple[FrameBatch, Extra]
-TIMES = 5.0
-"""Time constants before the part; less than a hundredth is left then."""
-LEAST_S = 10.0
-"""What has no time constant of its own: noise, contact, what holds for the last seconds."""
 _SETTLE_NS = 1_000_000_000
 """Behind the part, beyond the look-ahead: a frame may wait for the next one."""
 
@@ -103,18 +99,6 @@ def stretch_of(session: SessionReader, part: Slice, plan: EstimationPlan) -> Str
     until_ns = None if end_ns is None else end_ns + plan.lag_ns + _SETTLE_NS
     groups = tuple(session.groups_within(from_ns, until_ns))
     return Stretch(from_ns, begin_ns, end_ns, until_ns, groups)
-
-
-def warm_up_s(plan: EstimationPlan) -> float:
-    """How long models have to run before what they give can be used."""
-    ladder, longest_s = plan.ladder, 0.0
-    if ladder.gas is not None:
-        longest_s = max(longest_s, float((ladder.gas.gamma * ladder.gas.tau_s).max()))
-    if ladder.rubber is not None:
-        longest_s = max(longest_s, float(ladder.rubber.tau_s[ladder.rubber.part > 0.0].max()))
-    if ladder.temperature is not None:
-        longest_s = max(longest_s, float(np.abs(ladder.temperature.lag_s).max()))
-    return max(LEAST_S, TIMES * longest_s)
 
 
 def since(tares: Sequence[Tare], from_ns: int | None) -> tuple[Tare, ...]:

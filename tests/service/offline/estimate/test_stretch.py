@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from devices.errors import FileFormatError, TareError, UsageError
+from service.estimation.ladder.plan import WARM_UP_LEAST_S, WARM_UP_TIMES, warm_up_s
 from service.offline.estimate.request import EstimateRequest
 from service.offline.estimate.session import Estimated, estimate_session
-from service.offline.estimate.stretch import LEAST_S, TIMES, since, warm_up_s
+from service.offline.estimate.stretch import since
 from storage.formats.slice import Slice
 from storage.schema import ESTIMATES
 from storage.sessions.file import SessionWriter
@@ -110,7 +111,7 @@ def test_a_file_of_a_part_says_so_and_proves_itself(raw: Path, tmp_path: Path) -
             **whole.identity,
             "start_s": 100.0,
             "end_s": 110.0,
-            "warm_up_s": LEAST_S,
+            "warm_up_s": WARM_UP_LEAST_S,
         }
         assert "session" not in part.notes
         assert "ledger" not in part.notes
@@ -157,8 +158,8 @@ def test_models_run_before_a_part_for_five_times_what_they_remember() -> None:
     tiles = [newton_tile(serial, effects=effects) for serial in ("T01", "T02")]
     longest_s = max(tau.value for tau in effects.rubber.tau_s)
     plan = newton_plan(array(), models=("static", "gas", "rubber"), tiles=tiles)
-    assert warm_up_s(plan) == max(LEAST_S, TIMES * longest_s)
-    assert warm_up_s(newton_plan(array(), models=STATIC, tiles=tiles)) == LEAST_S
+    assert warm_up_s(plan) == max(WARM_UP_LEAST_S, WARM_UP_TIMES * longest_s)
+    assert warm_up_s(newton_plan(array(), models=STATIC, tiles=tiles)) == WARM_UP_LEAST_S
 
 
 def test_a_part_that_is_not_there_is_refused_and_nothing_is_written(

@@ -1,0 +1,118 @@
+"""Frames with their estimates as Arrow messages: columns of a sealed file, all or those asked for.
+
+Schema and batches, one behind the other, are an Arrow IPC stream. A batch is encoded once for all
+who ask for the same columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pyarrow as pa
+
+from devices.errors import UsageError
+from devices.frames import ArrayInfo
+from service.server.full_rate.reading import Rows
+from storage.schema import ARRAY_INFO_KEY, ESTIMATES, FRAMES, Column, flat_column
+
+ROWS_MAX = 256
+"""Of one message: of 64 tiles it is half a megabyte."""
+_ALWAYS = ("seq", "t_ns")
+"""By `seq` a stream is gone on with, and without an instant a number says little."""
+RECOMPUTED = pa.field(
+    "recomputed",
+    pa.bool_(),
+    nullable=False,
+    metadata={"unit": "1", "description": "estimated again from the journal, not as it came"},
+)
+_COLUMNS = {column.name: column for column in (*FRAMES, *ESTIMATES)}
+_FRAMES = {column.name for column in FRAMES}
+
+
+class Encoder:
+    """Of one stream, for one choice of columns.
+
+    Args:
+        info: the stream's array.
+        asked: names of quantities (`force_n`) or of one tile's (`force_n_0`); none: all.
+
+    Raises:
+        UsageError: there is no such column.
+    """
+
+    def __init__(self, info: ArrayInfo, asked: tuple[str, ...]) -> None:
+        self._chosen = _chosen(len(info.tiles), asked)
+        self._key = tuple(name for name, _, _ in self._chosen)
+        fields = [
+            column.field(name, column.type, nullable=column.name not in _FRAMES or is_missing)
+            for name, column, _ in self._chosen
+            for is_missing in (column.missing is not None or pa.types.is_floating(column.type),)
+        ]
+        text = info.model_dump_json().encode()
+        self.schema = pa.schema([*fields, RECOMPUTED], metadata={ARRAY_INFO_KEY: text})
+
+    def header(self) -> bytes:
+        """The schema's message."""
+        return self.schema.serialize().to_pybytes()
+
+    def messages(self, rows: Rows) -> Iterator[tuple[bytes, int]]:
+        """Frames as messages, `ROWS_MAX` at most in each, and the number after each."""
+        seq, piece = rows.estimated[0].seq, rows.piece
+        for begin in range(0, len(seq), ROWS_MAX):
+            end = min(begin + ROWS_MAX, len(seq))
+            message = None
+            if piece is not None:  # others ask for it, too
+                message = piece.shared.get((self._key, begin))
+            if message is None:
+                message = self._encoded(rows, begin, end)
+                if piece is not None:
+                    piece.shared[self._key, begin] = message
+            yield message, int(seq[end - 1]) + 1
+
+    def _encoded(self, rows: Rows, begin: int, end: int) -> bytes:
+        frames, columns = rows.estimated
+        arrays: list[pa.Array[Any]] = []
+        for name, column, tile in self._chosen:
+            values = getattr(frames, column.name) if column.name in _FRAMES else None
+            values = columns.get(column.name) if values is None else values
+            if values is None:  # there is no calibration, no tare, or they are compiled just now
+                arrays.append(pa.array([None] * (end - begin), column.type))
+                continue
+            values = values[begin:end] if tile is None else values[begin:end, tile]
+            arrays.append(flat_column(column, name, values)[1])
+        arrays.append(pa.array([rows.recomputed] * (end - begin), pa.bool_()))
+        batch = pa.RecordBatch.from_arrays(arrays, schema=self.schema)
+        return batch.serialize().to_pybytes()
+
+
+def _chosen(tiles: int, asked: tuple[str, ...]) -> list[tuple[str, Column, int | None]]:
+    """Name, quantity and tile of each column, each once, in the order of `asked`."""
+    by_name: dict[str, tuple[str, Column, int | None]] = {}
+    by_quantity: dict[str, list[str]] = {}
+    for column in _COLUMNS.values():
+        names = column.flat_names(tiles)
+        by_quantity[column.name] = names
+        for tile, name in enumerate(names):
+            by_name[name] = name, column, tile if column.per_tile else None
+    chosen: dict[str, None] = {}
+    for name in (*_ALWAYS, *(asked or _COLUMNS)):
+        if name in by_quantity:
+            chosen |= dict.fromkeys(by_quantity[name])
+        elif name in by_name:
+            chosen[name] = None
+        else:
+            raise UsageError(
+                f"no column {name[:40]!r} in a live stream of {tiles} tiles",
+                expected=f"some of {', '.join(_COLUMNS)}",
+            )
+    return [by_name[name] for name in chosen]
+
+
+def check_columns(info: ArrayInfo, asked: tuple[str, ...]) -> None:
+    """Whether an array has these columns.
+
+    Raises:
+        UsageError: it lacks one.
+    """
+    _chosen(len(info.tiles), asked)

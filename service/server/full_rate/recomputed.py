@@ -1,0 +1,205 @@
+"""Frames that are not in memory any more, from the journal: estimated again as they were live.
+
+With the live look-ahead, and the tare that was in force. What this server has estimated itself is
+begun anew where it was begun then, so that the bits are the same, if the frames before were there
+then, too. For the time before the server was started the history of tares says which was in force,
+by the frames' own instants; models run before the first frame for as long as they remember.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from devices.frames import ArrayInfo, FrameBatch
+from service.estimation.calibration import Calibration
+from service.estimation.ladder.plan import make_plan, warm_up_s
+from service.estimation.tare.tare import Tare
+from service.server.live_estimates import LIVE_LAG_MS
+from service.server.node import Estimated, ServerNode
+from service.server.streams import ServerStream
+from service.sessions.pipeline import Columns, EstimateRun
+from storage.journal.journal import Journal
+
+ROWS_AT_ONCE = 1024
+
+
+@dataclass(frozen=True)
+class Position:
+    """The frame of a stream that is wanted next."""
+
+    boot_id: str
+    seq: int
+
+
+@dataclass(frozen=True)
+class Change:
+    """Estimates are begun anew here, with this tare; None: there are none from here on.
+
+    Attributes:
+        tare: in force from here on.
+        seq: from this frame on.
+        t_ns: or after this instant of the node's UTC.
+    """
+
+    tare: Tare | None
+    seq: int | None = None
+    t_ns: int | None = None
+
+    def rows_before(self, frames: FrameBatch) -> int:
+        """How many of these frames come before it."""
+        if self.seq is not None:
+            return int(np.searchsorted(frames.seq, self.seq, side="left"))
+        return 0 if self.t_ns is None else int(np.searchsorted(frames.t_ns, self.t_ns, "right"))
+
+
+def estimated(
+    batches: Iterable[FrameBatch],
+    info: ArrayInfo,
+    calibration: Calibration | None,
+    changes: Iterable[Change],
+    *,
+    ends: bool,
+) -> Iterator[Estimated]:
+    """Frames with their estimates, each once, in order.
+
+    Args:
+        batches: frames of one stream, in order.
+        info: its array.
+        calibration: of its tiles; None: there are no estimates.
+        changes: of the tare, in order; before the first there are no estimates.
+        ends: no more frames will come; else those that wait for their look-ahead are left out.
+    """
+    run: EstimateRun | None = None
+    to_come = deque(changes) if calibration is not None else deque()
+    for frames in batches:
+        rest = frames
+        while to_come and (at := to_come[0].rows_before(rest)) < len(rest):
+            if at:
+                yield from _fed(run, rest.rows(0, at))
+                rest = rest.rows(at, len(rest))
+            if run is not None:
+                yield from run.finish()
+            tare = to_come.popleft().tare
+            run = None
+            if tare is not None and calibration is not None:
+                run = EstimateRun(
+                    make_plan(info, calibration, tare, models=info.models, lag_ms=LIVE_LAG_MS)
+                )
+        if len(rest):
+            yield from _fed(run, rest)
+    if ends and run is not None:
+        yield from run.finish()
+
+
+def _fed(run: EstimateRun | None, frames: FrameBatch) -> Iterator[Estimated]:
+    if run is None:
+        yield frames, {}
+    else:
+        yield from run.feed(frames, {})
+
+
+class Recomputed:
+    """Frames of one stream from one number on, as far as the journal goes now.
+
+    Made in the server's loop; `next_rows` may run in another thread.
+
+    Args:
+        node: whose stream it is.
+        stream: the stream, which has a journal.
+        position: the first frame that is wanted.
+        ends: will no more frames of this stream come?
+
+    Raises:
+        FootTileError: the calibration does not fit the stream's tiles.
+        StorageError: the journal cannot be read.
+    """
+
+    def __init__(
+        self, node: ServerNode, stream: ServerStream, position: Position, *, ends: bool
+    ) -> None:
+        assert stream.journal is not None  # noqa: S101  # the caller holds a frame of it
+        self._journal: Journal = stream.journal
+        self.position = position
+        """The frame that is wanted next."""
+        calibration = node.live.calibration
+        if calibration is not None and not stream.info.has_same_tiles_as(node.info):
+            calibration = None
+        last = self._journal.held.last or 0
+        begin = self._begin(node, stream, calibration, position.seq)
+        self._pieces = estimated(
+            self._journal.read(begin, last),
+            stream.info,
+            calibration,
+            _changes(node, stream, begin, last),
+            ends=ends,
+        )
+        self._rest: Estimated | None = None
+
+    def _begin(
+        self, node: ServerNode, stream: ServerStream, calibration: Calibration | None, seq: int
+    ) -> int:
+        """Number of the frame with which models begin."""
+        t_ns = self._journal.t_ns_near(seq, newest=False)
+        tare = node.tares.to_use(stream.info)
+        if calibration is None or tare is None or t_ns is None:
+            return seq
+        plan = make_plan(
+            stream.info, calibration, tare, models=stream.info.models, lag_ms=LIVE_LAG_MS
+        )
+        since = self._journal.first_seq_since(t_ns - round(1e9 * warm_up_s(plan)))
+        return seq if since is None else min(seq, since)
+
+    def next_rows(self) -> Estimated | None:
+        """The next frames that are due, `ROWS_AT_ONCE` at most; None: no more are for now.
+
+        Raises:
+            FileFormatError: the journal is damaged.
+            StorageError: it cannot be read.
+        """
+        while True:
+            rest, self._rest = self._rest, None
+            frames, columns = rest if rest is not None else next(self._pieces, (None, {}))
+            if frames is None:
+                return None
+            begin = int(np.searchsorted(frames.seq, self.position.seq))
+            end = min(len(frames), begin + ROWS_AT_ONCE)
+            # Only frames that follow one another leave together.
+            steps = np.flatnonzero(np.diff(frames.seq[begin:end]) != 1)
+            if len(steps):
+                end = begin + int(steps[0]) + 1
+            if end < len(frames):
+                self._rest = _rows(frames, columns, end, len(frames))
+            if begin < end:
+                self.position = Position(self.position.boot_id, int(frames.seq[end - 1]) + 1)
+                return _rows(frames, columns, begin, end)
+
+
+def _rows(frames: FrameBatch, columns: Columns, begin: int, end: int) -> Estimated:
+    if begin == 0 and end == len(frames):
+        return frames, columns
+    return frames.rows(begin, end), {name: v[begin:end] for name, v in columns.items()}
+
+
+def _changes(node: ServerNode, stream: ServerStream, begin: int, last: int) -> list[Change]:
+    """Where the estimates of these frames began anew, in order."""
+    own = [
+        Change(each.tare, seq=each.seq)
+        for each in (node.live.begun if stream is node.present else ())
+    ]
+    before = [change for change in own if change.seq is not None and change.seq <= begin]
+    if before:  # all of it is this server's own
+        return own[len(before) - 1 :]
+    journal = stream.journal
+    if journal is None:
+        return own
+    until = last if not own or own[0].seq is None else max(begin, own[0].seq - 1)
+    t_ns = journal.t_ns_near(begin, newest=False)
+    until_ns = journal.t_ns_near(until, newest=True)
+    if t_ns is None or until_ns is None:
+        return own
+    tares = node.tares.during(stream.info, t_ns, until_ns)
+    return [*(Change(tare, t_ns=tare.t_ns) for tare in tares), *own]
