@@ -47,9 +47,9 @@ from typing import ClassVar, Literal, TypedDict, Unpack
 
 from devices.words import printable
 
-Extra = Literal["server", "emulation", "plot", "gpio", "rig", "archive", "mocap", "mcap"]
+Extra = Literal["server", "client", "emulation", "plot", "gpio", "rig", "archive", "mocap", "mcap"]
 
-_OURS = ("devices", "storage", "service")
+_OURS = ("devices", "storage", "service", "foottile")
 
 
 @contextmanager

@@ -26,7 +26,7 @@ def test_a_wheel_holds_the_scenes_and_the_packages_and_no_tests(tmp_path: Path) 
     for path in (ROOT / "web").rglob("*.*"):
         assert f"service/web/{path.relative_to(ROOT / 'web')}" in names
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {
-        *("devices", "storage", "service")
+        *("devices", "storage", "service", "foottile")
     }
 
 

@@ -63,6 +63,22 @@ def urls_of(listening: socket.socket, host: str) -> list[str]:
     return [f"http://[{n}]:{port}" if ":" in n else f"http://{n}:{port}" for n in names]
 
 
+def own_names() -> tuple[str, ...]:
+    """Names that this machine goes by in its own network: its host name, and NAME.local by mDNS.
+
+    No domain is looked up: who serves the domain names of a network could say any. A host name with
+    a domain counts as it is and without it.
+    """
+    name = socket.gethostname().lower().rstrip(".")
+    if not _HOST_NAME.fullmatch(name):
+        return ()
+    short = name.partition(".")[0]
+    return tuple(dict.fromkeys((name, short, f"{short}.local")))
+
+
+_HOST_NAME = re.compile(r"(?!\d+$)[a-z0-9](?:[a-z0-9-]{0,62}[a-z0-9])?(?:\.[a-z0-9-]{1,63}){0,8}")
+
+
 def _own_addresses() -> list[str]:
     """This machine's address towards other networks, if it is in one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

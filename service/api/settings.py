@@ -40,7 +40,8 @@ class Settings(Bounds, BaseSettings):
     private: bool = False
     """Is a login, or the token, asked for to look, too?"""
     allow_host: tuple[str, ...] = ()
-    """Names under which the server is reached, in addition to its addresses."""
+    """Names under which the server is reached, in addition to its addresses and this machine's own
+    names."""
     exact: bool = False
     """Are estimates in recorded sessions as computed, and not rounded?"""
 

@@ -10,6 +10,7 @@ import typer
 
 from devices.errors import FootTileError
 from devices.words import printable
+from foottile.errors import FootTileError as ClientError
 from service.cli.table import Commands, name_all
 from service.version import SOFTWARE
 
@@ -58,6 +59,9 @@ def main() -> None:
     except FootTileError as error:
         sys.stderr.write(f"foottile: {error}\n")
         sys.exit(error.exit_code)
+    except ClientError as error:
+        sys.stderr.write(f"foottile: {printable(str(error))}\n")
+        sys.exit(2 if isinstance(error, ValueError) else 1)
     except SystemExit as end:
         if end.code == INTERRUPTED:
             _say_interrupted()

@@ -22,6 +22,7 @@ SUMMARIES = {
     "ticket": "Give a ticket for the live page: an address, and on a terminal its QR code.",
     "sessions": "List recorded sessions, newest first.",
     "pull": "Download a sealed session: data, description, events.",
+    "stream": "Print live frames of a node with their estimates, a line each, until Ctrl-C.",
     "export": "Write a sealed session, or a slice of it, in another format.",
     "query": "Ask in SQL about all sealed sessions at once.",
     "simulate": "Run a scene on emulated hardware in virtual time and write the session.",

@@ -11,10 +11,11 @@ from contextlib import suppress
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from service.api.protocols import OUTLET, send
+from service.api.protocols import WebSocket as Connection
 from service.api.routes.live_frames import LiveFrames
 from service.link import SUBPROTOCOL, Close, HangUp, close_reason
 from service.server.index import age_of
-from service.server.screens.fan_out import RATES_HZ, Outlet, framed
+from service.server.screens.fan_out import RATES_HZ, framed
 from service.server.screens.picture import dumps
 from service.server.screens.views import SessionView
 from service.server.server import Server
@@ -34,7 +35,7 @@ async def live(socket: WebSocket, server: Server) -> None:
     """Serve one screen, or one program, until it leaves."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
-    outlet: Outlet = socket.scope["extensions"][OUTLET]["outlet"]
+    outlet: Connection = socket.scope["extensions"][OUTLET]["outlet"]
     try:
         if socket.query_params.get("format") == "arrow":
             await _first_of(LiveFrames(socket, server).run(), _read(socket))
@@ -48,7 +49,7 @@ async def live(socket: WebSocket, server: Server) -> None:
         log.exception("this is a bug; one live connection ends, the server goes on")
 
 
-async def _show(socket: WebSocket, server: Server, outlet: Outlet) -> None:
+async def _show(socket: WebSocket, server: Server, outlet: Connection) -> None:
     node, rate_hz = _query(socket, server)
     outlet.write(framed([dumps(_hello(server, node))]))
     viewer = server.hub.join(outlet, rate_hz, node)

@@ -32,7 +32,9 @@ def serve_command(
     config: Annotated[Path | None, typer.Option(help="TOML file with settings.")] = None,
     allow_host: Annotated[
         list[str] | None,
-        typer.Option(help="Name under which the server is reached; may be given several times."),
+        typer.Option(
+            help="Further name under which the server is reached; may be given several times."
+        ),
     ] = None,
     private: Annotated[
         bool | None,
@@ -92,7 +94,7 @@ def serve_command(
 
 async def _serve(settings: Settings) -> None:
     from devices.realtime import spare_what_is_loaded
-    from service.api.address import listen, token_for, urls_of
+    from service.api.address import listen, own_names, token_for, urls_of
     from service.api.app import make_app
     from service.api.logins import Logins
     from service.api.serve import serving
@@ -106,7 +108,8 @@ async def _serve(settings: Settings) -> None:
         token = token_for(settings.host, settings.token, settings.data, is_private=settings.private)
         logins = Logins(token, is_private=settings.private)
         urls = urls_of(listening, settings.host)
-        app = make_app(server, hosts=settings.allow_host, logins=logins, urls=urls)
+        hosts = (*settings.allow_host, *own_names())
+        app = make_app(server, hosts=hosts, logins=logins, urls=urls)
         async with serving(app, listening, settings):
             spare_what_is_loaded()
             announce(urls, settings.data, logins, is_kept=not settings.token)

@@ -17,7 +17,7 @@ from service.server.node import Estimated, ServerNode
 from service.sessions.pipeline import Columns
 
 BYTES_MAX = 8 << 20
-"""Of one node: some 15 s of 8 tiles at 544 Hz, and two minutes of 4 tiles at 100 Hz."""
+"""Of one node: some 20 s of 8 tiles at 544 Hz, more of fewer."""
 _PIECE_BYTES = 3000
 """What a piece takes beside its numbers: objects of numpy, some forty."""
 _SHARED_LAST = 16

@@ -39,9 +39,6 @@ class Outlet(Protocol):
     def write(self, framed: bytes) -> None:
         """Write whole frames of the websocket protocol; nothing, if it is closed."""
 
-    def hang_up(self, code: int, reason: str) -> None:
-        """Say why it ends, without waiting."""
-
 
 class Viewer:
     """One screen."""

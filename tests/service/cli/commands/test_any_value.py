@@ -52,6 +52,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "serve": ("--host", "192.0.2.1"),  # no address of this machine: it ends at once
     "sessions": ("--data", "."),
     "simulate": SHORT[1:],
+    "stream": ("bench", "--server", "http://127.0.0.1:1"),
     "ticket": ("--server", "http://127.0.0.1:1", "--data", "."),
     "verify": ("s.parquet",),
 }

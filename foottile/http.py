@@ -1,0 +1,147 @@
+"""Questions to a server over HTTP, and what is wrong with its answers."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from foottile.errors import FootTileError, NoAnswerError, UsageError, refused
+
+try:
+    import httpx
+except ModuleNotFoundError as error:  # a node needs none
+    raise FootTileError("foottile needs httpx: pip install 'foottile[client]'") from error
+
+API = "/api/v1"
+_TRIES = 2
+
+
+class Http:
+    """One server over HTTP; may be used from several threads.
+
+    Args:
+        url: its address.
+        token: its token; None: FOOTTILE_TOKEN, if that is set.
+        timeout_s: how long an answer may keep one waiting.
+
+    Raises:
+        UsageError: that is no address.
+    """
+
+    def __init__(self, url: str, token: str | None, timeout_s: float) -> None:
+        self.url = url.rstrip("/")
+        token = token or os.environ.get("FOOTTILE_TOKEN")
+        self.headers = {"Authorization": f"Bearer {token}"} if token else {}
+        try:
+            self._client = httpx.Client(
+                base_url=self.url + API,
+                headers=[(name.encode(), v.encode()) for name, v in self.headers.items()],
+                timeout=timeout_s,
+                trust_env=False,
+            )
+        except (httpx.InvalidURL, ValueError) as error:
+            raise UsageError(f"{url!r} is no server address: {error}") from error
+        if self._client.base_url.scheme not in ("http", "https") or not self._client.base_url.host:
+            raise UsageError(f"{url!r} is no server address; expected http://HOST:PORT")
+
+    def close(self) -> None:
+        """Close its connections."""
+        self._client.close()
+
+    def get(self, path: str, query: Mapping[str, object] | None = None) -> dict[str, Any]:
+        """Ask for JSON; what is None in the query is left out.
+
+        Raises:
+            FootTileError: no answer, or one that is a problem.
+        """
+        return self._asked("GET", path, _TRIES, params=_given(query))
+
+    def send(
+        self,
+        method: str,
+        path: str,
+        body: Mapping[str, object] | None = None,
+        *,
+        headers: Mapping[str, str] | None = None,
+        again: bool = False,
+    ) -> dict[str, Any]:
+        """Change something.
+
+        Args:
+            method: POST, PATCH or DELETE.
+            path: behind `/api/v1`.
+            body: as JSON; what is None is left out.
+            headers: further ones.
+            again: may it be sent twice, if there was no answer the first time?
+
+        Raises:
+            FootTileError: no answer, or one that is a problem.
+        """
+        given = None if body is None else {k: v for k, v in body.items() if v is not None}
+        tries = _TRIES if again else 1
+        return self._asked(method, path, tries, json=given, headers=dict(headers or {}))
+
+    @contextmanager
+    def stream(self, path: str, query: Mapping[str, object]) -> Iterator[httpx.Response]:
+        """An answer whose content is read in pieces.
+
+        Raises:
+            FootTileError: no answer, one that is a problem, or one that broke off.
+        """
+        try:
+            with self._client.stream("GET", path, params=_given(query)) as answer:
+                if answer.is_error:
+                    answer.read()
+                    raise self._problem(answer)
+                yield answer
+        except httpx.HTTPError as error:
+            raise self._no_answer(error) from error
+
+    def _asked(self, method: str, path: str, tries: int, **how: Any) -> dict[str, Any]:
+        if self._client.is_closed:
+            raise UsageError(f"{self.url}: this connection was closed; make a new one")
+        while True:
+            tries -= 1
+            try:
+                answer = self._client.request(method, path, **how)
+                break
+            except httpx.TransportError as error:
+                if tries <= 0 or isinstance(error, httpx.TimeoutException):
+                    raise self._no_answer(error) from error
+            except httpx.HTTPError as error:
+                raise self._no_answer(error) from error
+        if answer.is_error:
+            raise self._problem(answer)
+        if not answer.content:
+            return {}
+        content = _json(answer)
+        if not isinstance(content, dict):
+            raise NoAnswerError(f"{self.url}: the answer is not a foottile server's")
+        return content
+
+    def _problem(self, answer: httpx.Response) -> FootTileError:
+        reason = f"{answer.reason_phrase} (HTTP {answer.status_code})"
+        return refused(answer.status_code, _json(answer), self.url, otherwise=reason)
+
+    def _no_answer(self, error: Exception) -> NoAnswerError:
+        said = str(error) or type(error).__name__
+        return NoAnswerError(f"{self.url}: no answer: {said}. Is `foottile serve` running there?")
+
+
+def _json(answer: httpx.Response) -> object:
+    try:
+        content: object = json.loads(answer.content)
+    except ValueError:
+        return None
+    return content
+
+
+def _given(query: Mapping[str, object] | None) -> dict[str, str]:
+    return {name: _text(value) for name, value in (query or {}).items() if value is not None}
+
+
+def _text(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)

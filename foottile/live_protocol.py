@@ -1,0 +1,207 @@
+"""What is said on a live websocket, and when to go on after it broke: no socket, no clock here."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+from urllib.parse import urlencode
+
+import pyarrow as pa
+
+from foottile.errors import (
+    DamagedError,
+    FootTileError,
+    FramesLostWarning,
+    NoAnswerError,
+    UsageError,
+    refused,
+)
+
+Policy = Literal["lossless", "drop_oldest", "latest"]
+POLICIES: tuple[Policy, ...] = get_args(Policy)
+
+MESSAGE_BYTES_MAX = 1 << 24
+_POLICY, _NO_STREAM = 1008, 4011
+_LOSSES_MAX = 1000
+_AGAIN_S = (0.1, 5.0)
+_TRY_LATER = 503
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked for.
+
+    Attributes:
+        url: the server's address.
+        node: the node; None: the only one.
+        columns: names; none: all.
+        policy: what is left out, if anything.
+        boot_id: stream to begin in; None: the present one.
+        from_seq: frame to begin with; None: the next that comes.
+    """
+
+    url: str
+    node: str | None
+    columns: tuple[str, ...]
+    policy: Policy
+    boot_id: str | None = None
+    from_seq: int | None = None
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Frames that are left out of a live stream, ends included.
+
+    Attributes:
+        boot_id: the stream.
+        from_seq: the first of them.
+        to_seq: the last of them; None: not known.
+        reason: why; as docs/api.md says.
+    """
+
+    boot_id: str
+    from_seq: int
+    to_seq: int | None
+    reason: str
+
+    def __str__(self) -> str:
+        until = "on" if self.to_seq is None else f"to {self.to_seq}"
+        return (
+            f"frames from {self.from_seq} {until} of stream {self.boot_id} are lost: {self.reason}"
+        )
+
+
+class LiveProtocol:
+    """A live stream over as many connections as it takes.
+
+    Args:
+        asked: what for.
+        on_loss: told of frames that are left out; None: warned of, for `lossless`.
+    """
+
+    def __init__(self, asked: Asked, on_loss: Callable[[Loss], None] | None = None) -> None:
+        self.losses: deque[Loss] = deque(maxlen=_LOSSES_MAX)
+        """What was left out, as far as it was said; the newest thousand."""
+        self._asked = asked
+        self._on_loss = on_loss
+        self._boot_id, self._next_seq = asked.boot_id, asked.from_seq
+        self._schema: pa.Schema | None = None
+        self._failures = 0
+        self._has_begun = False
+
+    @property
+    def position(self) -> tuple[str, int] | None:
+        """Stream and number of the frame that is wanted next; None before the first."""
+        if self._boot_id is None or self._next_seq is None:
+            return None
+        return self._boot_id, self._next_seq
+
+    def address(self) -> str:
+        """Where to connect to, to begin or to go on."""
+        asked = self._asked
+        query = {"format": "arrow", "policy": asked.policy}
+        given = {"node": asked.node, "columns": ",".join(asked.columns) or None}
+        given |= {"boot_id": self._boot_id}
+        given |= {"from_seq": None if self._next_seq is None else str(self._next_seq)}
+        query |= {name: value for name, value in given.items() if value is not None}
+        self._schema = None
+        return f"ws{asked.url.removeprefix('http')}/api/v1/live?{urlencode(query)}"
+
+    def take(self, message: str | bytes) -> pa.RecordBatch | None:
+        """A message; its frames, if it has some.
+
+        Raises:
+            DamagedError: it is not one of a foottile server.
+        """
+        self._failures, self._has_begun = 0, True
+        try:
+            if isinstance(message, str):
+                self._said(json.loads(message))
+                return None
+            if self._schema is None:
+                self._schema = pa.ipc.read_schema(pa.py_buffer(message))
+                return None
+            return self._news(pa.ipc.read_record_batch(pa.py_buffer(message), self._schema))
+        except (ValueError, KeyError, TypeError, pa.ArrowException) as error:
+            raise DamagedError(f"{self._asked.url}: not a live message: {error}") from error
+
+    def closed(self, code: int, reason: str) -> None:
+        """The connection has ended; it is to be opened again, unless this raises.
+
+        Raises:
+            UsageError: what was asked for is not there.
+        """
+        if code == _POLICY:
+            raise UsageError(f"{self._asked.url}: {reason}")
+        if code == _NO_STREAM:
+            if not self._has_begun or self._boot_id is None:
+                raise UsageError(f"{self._asked.url}: {reason}")
+            loss = Loss(self._boot_id, self._next_seq or 0, None, "no_stream")
+            self._boot_id = self._next_seq = None
+            self._lose(loss)
+
+    def refused(self, status: int, body: bytes | bytearray) -> FootTileError | None:
+        """The server has answered with HTTP; None: it may be asked again.
+
+        Args:
+            status: of the answer.
+            body: its content.
+        """
+        if status == _TRY_LATER and self._has_begun:
+            return None
+        try:
+            content: Any = json.loads(body)
+        except ValueError:
+            content = None
+        return refused(status, content, self._asked.url)
+
+    def again_s(self, error: Exception, silent_s: float, give_up_s: float | None) -> float:
+        """How long to wait before it is tried again.
+
+        Args:
+            error: what went wrong.
+            silent_s: since something was heard.
+            give_up_s: how long that may be; None: without end, once it has begun.
+
+        Raises:
+            NoAnswerError: it is not to be tried again.
+        """
+        if not self._has_begun or (give_up_s is not None and silent_s > give_up_s):
+            raise NoAnswerError(f"{self._asked.url}: no answer: {error}") from error
+        self._failures += 1
+        least, most = _AGAIN_S
+        return float(min(most, least * 2 ** min(self._failures - 1, 10)))
+
+    def _said(self, said: dict[str, Any]) -> None:
+        kind = said["type"]
+        if not isinstance(kind, str):
+            raise TypeError("a message without a type")
+        if kind == "stream":
+            if said["boot_id"] != self._boot_id or self._next_seq is None:
+                self._boot_id, self._next_seq = said["boot_id"], int(said["from_seq"])
+            self._schema = None
+        elif kind in ("lost", "dropped"):
+            self._boot_id, self._next_seq = said["boot_id"], int(said["to_seq"]) + 1
+            reason = str(said["reason"])
+            self._lose(Loss(said["boot_id"], int(said["from_seq"]), int(said["to_seq"]), reason))
+
+    def _news(self, batch: pa.RecordBatch) -> pa.RecordBatch | None:
+        seq = batch.column("seq")
+        first, last = seq[0].as_py(), seq[-1].as_py()
+        if first is None or last is None:
+            raise ValueError("frames without numbers")
+        if self._next_seq is not None and first < self._next_seq:  # it was here already
+            batch = batch.slice(self._next_seq - first)
+        self._next_seq = max(last + 1, self._next_seq or 0)
+        return batch if batch.num_rows else None
+
+    def _lose(self, loss: Loss) -> None:
+        self.losses.append(loss)
+        if self._on_loss is not None:
+            self._on_loss(loss)
+        elif self._asked.policy == "lossless":
+            warnings.warn(str(loss), FramesLostWarning, stacklevel=5)

@@ -1,0 +1,228 @@
+"""Sessions: what is known of one, its frames and marks, and how it is ended."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import quote
+
+from foottile.data import Data
+from foottile.errors import ConflictError, DamagedError, FootTileError
+from foottile.http import Http
+
+_LOOK_EVERY_S = 0.2
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Something that was marked.
+
+    Attributes:
+        id: its own, within the session.
+        label: what was written.
+        t_ns: when, in the server's UTC, nanoseconds since 1970.
+    """
+
+    id: str
+    label: str
+    t_ns: int
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any]) -> Mark:
+        """As the server says it."""
+        return cls(facts["id"], facts["label"], facts["t_ns"])
+
+
+class Session:
+    """A session, as the server described it last (`facts`, with every field of the API).
+
+    As a context manager it is stopped at the end of the block, if it is still being recorded.
+    """
+
+    def __init__(self, http: Http, facts: Mapping[str, Any]) -> None:
+        self._http = http
+        self.facts: Mapping[str, Any] = facts
+
+    def __repr__(self) -> str:
+        what = f"{self.name!r} of {self.node}, {self.duration_s:.1f} s, {self.state}"
+        return f"<Session {self.id} {what}>"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if self.refresh().state == "recording":
+                self.stop()
+        except FootTileError:
+            if error is None:  # else that is what has to be told
+                raise
+
+    @property
+    def id(self) -> str:
+        """Its name for machines."""
+        return str(self.facts["id"])
+
+    @property
+    def name(self) -> str:
+        """Its name for people."""
+        return str(self.facts["name"])
+
+    @property
+    def node(self) -> str:
+        """Whose frames they are."""
+        return str(self.facts["node"])
+
+    @property
+    def state(self) -> str:
+        """`recording`, `pending` (frames are still to come), `sealing` or `sealed`."""
+        return str(self.facts["state"])
+
+    @property
+    def complete(self) -> bool | str:
+        """Is every frame there? False: not yet known; "lossy": some are lost for good."""
+        complete: bool | str = self.facts["complete"]
+        return complete
+
+    @property
+    def frames(self) -> int:
+        """How many it has."""
+        return int(self.facts["frames"])
+
+    @property
+    def duration_s(self) -> float:
+        """From its first frame to its last."""
+        return float(self.facts["duration_s"])
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """What people wrote to find it again."""
+        return tuple(self.facts["tags"])
+
+    def refresh(self) -> Self:
+        """Ask what is known of it now.
+
+        Raises:
+            FootTileError: no answer, or it is gone.
+        """
+        self.facts = self._http.get(self._path)
+        return self
+
+    def open(
+        self,
+        columns: Sequence[str] = (),
+        *,
+        start_s: float | None = None,
+        end_s: float | None = None,
+    ) -> Data:
+        """Its frames, or some columns and seconds of them; nothing is fetched yet."""
+        names = (columns,) if isinstance(columns, str) else tuple(columns)
+        return Data(self._http, self.id, names, start_s, end_s)
+
+    def marks(self) -> list[Mark]:
+        """What was marked in it, in order of time.
+
+        Raises:
+            FootTileError: no answer, or it is gone.
+        """
+        return [Mark.of(each) for each in self._http.get(f"{self._path}/events")["items"]]
+
+    def mark(self, label: str, *, t_ns: int | None = None) -> Mark:
+        """Mark this moment, or another one of the server's UTC; sent twice, it is marked once.
+
+        Raises:
+            FootTileError: no answer, or it is refused.
+        """
+        body = {"label": label, "t_ns": t_ns, "id": uuid.uuid4().hex[:12]}
+        return Mark.of(self._http.send("POST", f"{self._path}/events", body, again=True))
+
+    def describe(
+        self,
+        *,
+        name: str | None = None,
+        subject: str | None = None,
+        notes: str | None = None,
+        tags: Sequence[str] | None = None,
+    ) -> Self:
+        """Change what people say of it; what is left out stays.
+
+        Raises:
+            ConflictError: somebody else has changed it since it was asked for; `refresh` it.
+            FootTileError: no answer, or it is refused.
+        """
+        body = {"name": name, "subject": subject, "notes": notes}
+        changes: dict[str, object] = {**body, "tags": None if tags is None else list(tags)}
+        headers = {"If-Match": f'"{self.facts["said"]}"'}
+        self.facts = self._http.send("PATCH", self._path, changes, headers=headers)
+        return self
+
+    def stop(self) -> Self:
+        """End the recording. Answers when it is sealed, or after some seconds.
+
+        Raises:
+            FootTileError: no answer, or it is gone.
+        """
+        self.facts = self._http.send("POST", f"{self._path}/stop", again=True)
+        return self
+
+    def wait(self, timeout_s: float = 60.0) -> Self:
+        """Wait until it is sealed.
+
+        Raises:
+            ConflictError: it is not by then, and says what it waits for.
+            FootTileError: no answer.
+        """
+        end_s = time.monotonic() + timeout_s
+        while self.refresh().state != "sealed":
+            if time.monotonic() > end_s:
+                waits = self.facts.get("waits_for") or self.facts.get("problem") or "its end"
+                raise ConflictError(f"session {self.id} is {self.state}, and waits for {waits}")
+            time.sleep(_LOOK_EVERY_S)
+        return self
+
+    def download(self, path: str | os.PathLike[str], *, format: str = "parquet") -> Path:  # noqa: A002  # the API's name
+        """All of it as a file, which appears whole or not at all; Parquet is checked by its hash.
+
+        Raises:
+            ConflictError: it is not sealed, for Parquet.
+            DamagedError: what came has not the hash that the server states.
+            OSError: the file cannot be written.
+            FootTileError: no answer, or it is refused.
+        """
+        target = Path(path)
+        partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+        digest = hashlib.sha256()
+        try:
+            with (
+                self._http.stream(f"{self._path}/data", {"format": format}) as answer,
+                partial.open("xb") as file,
+            ):
+                for chunk in answer.iter_bytes(_CHUNK):
+                    digest.update(chunk)
+                    file.write(chunk)
+                file.flush()
+                os.fsync(file.fileno())
+            expected = self.refresh().facts["sha256"] if format == "parquet" else None
+            if expected is not None and digest.hexdigest() != expected:
+                raise DamagedError(f"session {self.id}: what came has not the hash that it has")
+            partial.replace(target)
+        finally:
+            partial.unlink(missing_ok=True)
+        return target
+
+    @property
+    def _path(self) -> str:
+        return f"/sessions/{quote(self.id, safe='')}"

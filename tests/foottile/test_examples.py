@@ -1,0 +1,91 @@
+"""Every example of docs/client.md, in its order, against one server with one node."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import foottile
+from tests.service.fake_node import FakeNode, NodeOf
+from tests.service.process import Start
+from tests.service.running import Running
+from tests.foottile.test_live import Sending
+
+PAGE = Path(__file__).parents[2] / "docs" / "client.md"
+URL = "http://laptop.local:8000"
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
+
+
+@pytest.fixture
+def left(running: Running, node_of: NodeOf) -> Iterator[FakeNode]:
+    """A node `left` that streams while the test runs."""
+    node = node_of(running, "left")
+    node.connect()
+    node.tared()
+    with Sending(node):
+        yield node
+
+
+def test_every_python_example_runs(
+    running: Running, left: FakeNode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names: dict[str, Any] = {}
+    lacking = [name for name in ("pandas", "matplotlib") if find_spec(name) is None]
+    for block in blocks("python"):
+        if "pandas()" in block and lacking:
+            continue
+        exec(compile(block.replace(URL, running.url), str(PAGE), "exec"), names)  # noqa: S102
+    names["server"].close()
+    assert len(names["grf_n"]) == len(names["force_n"]) == names["session"].frames
+    assert names["session"].facts["notes"] == "wetter than the second"
+    assert Path("trial.parquet").stat().st_size == names["session"].facts["bytes"]
+    if lacking:
+        pytest.skip(f"all but the notebook's: {', '.join(lacking)} is not installed")
+    assert Path("trial.png").stat().st_size > 1000
+
+
+def test_every_line_for_the_shell_runs(
+    running: Running, left: FakeNode, foottile: Start, tmp_path: Path
+) -> None:
+    (block,) = blocks("sh")
+    for line in block.splitlines():
+        arguments = shlex.split(line.partition("|")[0].partition(">")[0])
+        assert arguments[0] == "foottile"
+        process = foottile(*arguments[1:], "--frames", 3, "--server", running.url)
+        code, out = process.finished()
+        assert code == 0, process.log
+        assert len(out.splitlines()) == (3 if "jsonl" in line else 4)
+
+
+def test_the_matlab_example_runs_in_octave(
+    running: Running, left: FakeNode, tmp_path: Path
+) -> None:
+    octave = shutil.which("octave-cli") or shutil.which("octave")
+    if octave is None:
+        pytest.skip("there is no Octave here")
+    with foottile.connect(running.url) as server, server.record("left", "one") as session:
+        session.mark("so")
+    (block,) = blocks("matlab")
+    with foottile.connect(running.url) as server:
+        server.session(session.id).wait()
+    done = subprocess.run(
+        [octave, "--no-init-file", "--eval", block.replace(URL, running.url)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "trial.csv").read_text().splitlines()[0].replace('"', "") == "t_ns,grf_n"

@@ -1,0 +1,186 @@
+"""A live stream in a program: every frame once, whatever breaks."""
+
+from __future__ import annotations
+
+import json
+import threading
+import warnings
+from collections.abc import Iterator
+
+import pytest
+
+import foottile
+from foottile.live_protocol import Asked, LiveProtocol
+from tests.service.fake_node import FakeNode, Play
+from tests.service.running import Running
+from tests.waiting import until
+
+
+def taken(live: foottile.Live, last: int) -> list[int]:
+    """Numbers of frames until this one has come."""
+    seqs: list[int] = []
+    while not seqs or seqs[-1] < last:
+        seqs += [seq for seq in next(live)["seq"].to_pylist() if seq is not None]
+    return seqs
+
+
+@pytest.fixture
+def played(running: Running, tared: FakeNode) -> Iterator[FakeNode]:
+    with Play(tared, 20.0):
+        yield tared
+
+
+def test_five_lines_give_every_frame(running: Running, played: FakeNode) -> None:
+    seqs: list[int] = []
+    with foottile.connect(running.url) as server:
+        for batch in server.live("bench", columns=["grf_n", "cop_x_m"]):
+            seqs += [seq for seq in batch["seq"].to_pylist() if seq is not None]
+            if len(seqs) > 30:
+                break
+    assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))
+
+
+def test_over_a_restart_of_the_server_it_goes_on_by_itself(
+    running: Running, tared: FakeNode
+) -> None:
+    with foottile.connect(running.url) as server, server.live("bench", ["grf_n"]) as live:
+        with Sending(tared) as sending:
+            seqs = taken(live, sending.first)
+        tared.acknowledged(tared.seq - 1)
+        running.restart()
+        tared.connect()
+        tared.send(100, 20.0)
+        seqs += taken(live, tared.seq - 20)
+        assert live.losses == ()
+    assert seqs == list(range(seqs[0], seqs[-1] + 1))
+
+
+class Sending:
+    """Frames are sent, ten at a time, while the block runs: who connects meanwhile gets some."""
+
+    def __init__(self, node: FakeNode) -> None:
+        self.node, self.first = node, node.seq
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Sending:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.01):
+            self.node.send(10, 20.0)
+
+
+def test_from_a_position_on_it_has_all_that_came_since(running: Running, tared: FakeNode) -> None:
+    tared.deliver(100, 20.0)
+    with foottile.connect(running.url) as server:
+        with server.live("bench", boot_id=tared.boot_id, from_seq=20) as live:
+            seqs = taken(live, 150)
+            position = live.position
+        assert position == (tared.boot_id, seqs[-1] + 1)
+        boot_id, seq = position
+        tared.deliver(20, 20.0)
+        with server.live("bench", boot_id=boot_id, from_seq=seq) as live:
+            seqs += taken(live, 175)
+    assert seqs == list(range(20, seqs[-1] + 1))
+
+
+def test_frames_that_are_lost_are_told(running: Running, tared: FakeNode) -> None:
+    first = tared.seq
+    tared.frames(30)
+    tared.say_lost(disk_full=[[first, tared.seq - 1]])
+    tared.deliver(50, 20.0)
+    told: list[foottile.Loss] = []
+    loss = foottile.Loss(tared.boot_id, first, first + 29, "disk_full")
+    with foottile.connect(running.url) as server:
+        with server.live("bench", from_seq=0, on_loss=told.append) as live:
+            taken(live, tared.seq - 10)
+            assert told == [loss]
+            assert live.losses == (loss,)
+        with (
+            server.live("bench", from_seq=0) as live,
+            pytest.warns(foottile.FramesLostWarning, match="disk_full"),
+        ):
+            taken(live, tared.seq - 10)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"node": "nobody"}, "no node 'nobody'"),
+        ({"columns": ["colour"]}, "no column 'colour'"),
+        ({"policy": "all"}, "policy='all'"),
+        ({"boot_id": "0" * 32, "from_seq": 1}, "no stream"),
+    ],
+)
+def test_what_is_not_there_is_said_and_not_tried_again(
+    running: Running, tared: FakeNode, asked: dict[str, object], said: str
+) -> None:
+    with (
+        foottile.connect(running.url) as server,
+        server.live(**asked) as live,  # type: ignore[arg-type]  # wrong on purpose
+        pytest.raises(foottile.UsageError, match=said),
+    ):
+        next(live)
+
+
+def test_it_gives_up_if_that_is_wanted(running: Running, played: FakeNode) -> None:
+    with (
+        foottile.connect(running.url) as server,
+        server.live("bench", give_up_s=0.0) as live,
+    ):
+        next(live)
+        running.stop()
+        with pytest.raises(foottile.NoAnswerError):
+            list(live)
+
+
+def test_closed_from_another_thread_it_ends(running: Running, tared: FakeNode) -> None:
+    with foottile.connect(running.url) as server:
+        live = server.live("bench")
+        done = threading.Event()
+
+        def read() -> None:
+            assert list(live) is not None
+            done.set()
+
+        thread = threading.Thread(target=read)
+        thread.start()
+        until(lambda: live.is_connected)
+        live.close()
+        thread.join()
+        assert done.is_set()
+
+
+def protocol(**asked: object) -> LiveProtocol:
+    content: dict[str, object] = {
+        "url": "http://x",
+        "node": "n",
+        "columns": (),
+        "policy": "lossless",
+    }
+    return LiveProtocol(Asked(**(content | asked)))  # type: ignore[arg-type]
+
+
+def test_a_stream_that_is_gone_is_a_loss_and_the_next_one_is_begun() -> None:
+    live = protocol()
+    live.take(json.dumps({"type": "stream", "boot_id": "a" * 32, "from_seq": 5}))
+    assert f"boot_id={'a' * 32}&from_seq=5" in live.address()
+    with pytest.warns(foottile.FramesLostWarning, match="from 5 on"):
+        live.closed(4011, "no stream")
+    assert "boot_id" not in live.address()
+    assert live.losses[0].reason == "no_stream"
+
+
+@pytest.mark.parametrize(
+    "message", ["", "[]", "{}", '{"type": 1}', '{"type":"stream"}', b"", b"x" * 99]
+)
+def test_what_no_foottile_server_says_is_damage(message: str | bytes) -> None:
+    live = protocol()
+    with warnings.catch_warnings(), pytest.raises(foottile.DamagedError):
+        live.take(message)
