@@ -13,11 +13,12 @@ from typing import Any
 
 import pytest
 
-import foottile
-from tests.service.fake_node import FakeNode, NodeOf
+import foottile as client
+from tests.builders.arrays import PERIOD_NS
+from tests.service.fake_node import FakeNode, NodeOf, Play
 from tests.service.process import Start
 from tests.service.running import Running
-from tests.foottile.test_live import Sending
+from tests.waiting import PATIENCE_S, until
 
 PAGE = Path(__file__).parents[2] / "docs" / "client.md"
 URL = "http://laptop.local:8000"
@@ -29,11 +30,12 @@ def blocks(language: str) -> list[str]:
 
 @pytest.fixture
 def left(running: Running, node_of: NodeOf) -> Iterator[FakeNode]:
-    """A node `left` that streams while the test runs."""
+    """A node `left` that streams while the test runs, and has for more than two seconds."""
     node = node_of(running, "left")
     node.connect()
     node.tared()
-    with Sending(node):
+    with Play(node, 20.0):
+        until(lambda: node.seq * PERIOD_NS > 3e9)
         yield node
 
 
@@ -65,9 +67,9 @@ def test_every_line_for_the_shell_runs(
         arguments = shlex.split(line.partition("|")[0].partition(">")[0])
         assert arguments[0] == "foottile"
         process = foottile(*arguments[1:], "--frames", 3, "--server", running.url)
-        code, out = process.finished()
-        assert code == 0, process.log
-        assert len(out.splitlines()) == (3 if "jsonl" in line else 4)
+        assert process.ended(PATIENCE_S) == 0, process.err
+        assert len(process.out) == (3 if "jsonl" in line else 4)
+        assert not process.err
 
 
 def test_the_matlab_example_runs_in_octave(
@@ -76,10 +78,10 @@ def test_the_matlab_example_runs_in_octave(
     octave = shutil.which("octave-cli") or shutil.which("octave")
     if octave is None:
         pytest.skip("there is no Octave here")
-    with foottile.connect(running.url) as server, server.record("left", "one") as session:
+    with client.connect(running.url) as server, server.record("left", "one") as session:
         session.mark("so")
     (block,) = blocks("matlab")
-    with foottile.connect(running.url) as server:
+    with client.connect(running.url) as server:
         server.session(session.id).wait()
     done = subprocess.run(
         [octave, "--no-init-file", "--eval", block.replace(URL, running.url)],
