@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket as sockets
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -90,7 +91,7 @@ def test_every_frame_comes_once_with_its_estimates(running: Running, tared: Fake
     with running.socket(LIVE) as socket:
         taken = Taken(socket)
         hello = taken.until_said("hello")
-        sent = tared.send(100, [20.0, 60.0])
+        sent = tared.send(100, [20.0, 60.0], alive=True)
         taken.until(tared.seq - 10)
     assert (hello["node"], hello["policy"], hello["protocol"]) == ("bench", "lossless", 1)
     table = taken.table()
@@ -98,8 +99,8 @@ def test_every_frame_comes_once_with_its_estimates(running: Running, tared: Fake
     assert 60 <= taken.seqs[0] <= 70  # frames that waited for their look-ahead come, too
     assert not any(table["recomputed"].to_pylist())
     rows = table.slice(int(sent.seq[20]) - taken.seqs[0])
-    assert rows["force_n_1"].to_numpy() == pytest.approx(60.0, abs=0.05)
-    assert rows["grf_n"].to_numpy() == pytest.approx(80.0, abs=0.1)
+    assert np.median(rows["force_n_1"].to_numpy()) == pytest.approx(60.0, abs=0.05)
+    assert np.median(rows["grf_n"].to_numpy()) == pytest.approx(80.0, abs=0.1)
     at = np.asarray(rows["seq"]) - int(sent.seq[0])
     assert rows["padc_0"].to_pylist() == sent.padc[at.astype(int), 0].tolist()
     assert rows.schema.field("grf_n").metadata[b"unit"] == b"N"
@@ -324,10 +325,17 @@ def test_a_lossless_client_that_does_not_read_is_told_from_where_to_resume(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service.api.routes.live_frames, "TOO_SLOW_S", 0.05)
-    with running.socket(LIVE, small=True, max_queue=1) as stalled, running.socket(LIVE) as other:
+    # What kernels take in is out of sight of both ends.
+    narrow = sockets.socket()
+    narrow.setsockopt(sockets.SOL_SOCKET, sockets.SO_RCVBUF, 4096)
+    narrow.connect(("127.0.0.1", running.port))
+    with (
+        running.socket(LIVE, small=True, max_queue=1, sock=narrow) as stalled,
+        running.socket(LIVE) as other,
+    ):
         reads = Taken(other)
         reads.until_said("hello")
-        for _ in range(30):
+        for _ in range(14):
             tared.send(500, alive=True)
         reads.until(tared.seq - 10)
         taken = Taken(stalled)

@@ -171,7 +171,7 @@ def test_anything_but_a_ping_closes(running: Running, message: str | bytes) -> N
     ("query", "said"),
     [
         ("speed=3", "'speed'"),
-        ("format=arrow", "format='arrow'"),
+        ("format=xml", "format='xml'"),
         ("policy=all", "policy='all'"),
         ("rate_hz=0", "1 to 60"),
         ("rate_hz=61", "1 to 60"),
