@@ -29,7 +29,7 @@ from replayed_nodes import played, run_load
 from served import Server, cpu_s, served
 
 import foottile
-from service.server.live_estimates import LIVE_LAG_MS
+from service.estimation import LIVE_LAG_MS
 
 SETTLE_S = 3.0
 READY_S = 120.0

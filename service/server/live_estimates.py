@@ -37,9 +37,10 @@ _BEGUN_MAX = 256
 
 @dataclass(frozen=True)
 class Begun:
-    """From this frame on estimates were begun anew, with this tare; None: there were none."""
+    """From this frame on estimates were begun anew, with these; None: there were none."""
 
     seq: int
+    calibration: Calibration | None
     tare: Tare | None
 
 
@@ -50,9 +51,17 @@ class LiveEstimates:
         info: the array.
         calibration: of its tiles; None if there is none.
         tare: the one in force, from before.
+        before: what estimated this node until now; if that was this stream, what it says of where
+            it began goes on here.
     """
 
-    def __init__(self, info: ArrayInfo, calibration: Calibration | None, tare: Tare | None) -> None:
+    def __init__(
+        self,
+        info: ArrayInfo,
+        calibration: Calibration | None,
+        tare: Tare | None,
+        before: LiveEstimates | None = None,
+    ) -> None:
         self.calibration_problem: str | None = None
         self._info = info
         self._compensation = Compensation(info.tiles)
@@ -69,7 +78,9 @@ class LiveEstimates:
         self._left: list[tuple[FrameBatch, Columns]] = []
         self._due_t_ns: int | None = None
         self._has_begun = False
-        self.begun: deque[Begun] = deque(maxlen=_BEGUN_MAX)
+        is_same = before is not None and before.info.boot_id == info.boot_id
+        known = before.begun if before is not None and is_same else ()
+        self.begun: deque[Begun] = deque(known, _BEGUN_MAX)
         """With what it has estimated, oldest first: who computes its frames again asks."""
         if calibration is not None:
             try:
@@ -80,6 +91,11 @@ class LiveEstimates:
             except FootTileError as error:  # does not fit these tiles: report it and go without
                 self.calibration_problem = str(error)
         self.use(tare)
+
+    @property
+    def info(self) -> ArrayInfo:
+        """The array."""
+        return self._info
 
     @property
     def calibration(self) -> Calibration | None:
@@ -128,7 +144,7 @@ class LiveEstimates:
         if not self._has_begun and not (self._run is not None and is_warming()):
             self._has_begun = True
             tare = None if self._run is None else self._run.plan.tare
-            self.begun.append(Begun(int(frames.seq[0]), tare))
+            self.begun.append(Begun(int(frames.seq[0]), self._calibration, tare))
         if self._run is None:
             yield frames, {}
             return

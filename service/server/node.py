@@ -104,7 +104,7 @@ class ServerNode:
             log.warning("node %s: %s", self.name, text)
         self.present = self._stream_of(self.info)
         """The stream that it takes now."""
-        self.live: LiveEstimates
+        self.live = LiveEstimates(self.info, None, None)
         self.tare_keeper: TareKeeper
         self._has_failed = False
         self._estimate_anew()
@@ -418,7 +418,7 @@ class ServerNode:
     def _go_without_estimates(self, error: Exception) -> None:
         log.exception("node %s: this is a bug; it goes on without estimates", self.name)
         self._has_failed = True
-        self.live = LiveEstimates(self.info, None, None)
+        self.live = LiveEstimates(self.info, None, None, self.live)
         self.live.calibration_problem = f"the estimator failed, until it connects again: {error!r}"
         self.tare_keeper = TareKeeper(self.info, self.live, self.tares, automatic=False)
 
@@ -436,7 +436,7 @@ class ServerNode:
         self._has_failed = False
         try:
             tare = self.tares.to_use(self.info)
-            self.live = LiveEstimates(self.info, self.calibration, tare)
+            self.live = LiveEstimates(self.info, self.calibration, tare, self.live)
         except Exception as error:
             self._go_without_estimates(error)
             return

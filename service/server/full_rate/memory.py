@@ -70,6 +70,11 @@ class NodeMemory:
         return self._next_number - len(self._pieces)
 
     @property
+    def watchers(self) -> int:
+        """How many read it now."""
+        return len(self._waiting)
+
+    @property
     def next_number(self) -> int:
         """Number of the piece that comes next."""
         return self._next_number

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from devices.frames import ArrayInfo, FrameBatch
+from service.estimation import LIVE_LAG_MS
 from service.estimation.calibration import Calibration
 from service.estimation.ladder.plan import make_plan, warm_up_s
 from service.estimation.tare.tare import Tare
-from service.server.live_estimates import LIVE_LAG_MS
 from service.server.node import Estimated, ServerNode
 from service.server.streams import ServerStream
 from service.sessions.pipeline import Columns, EstimateRun
@@ -37,14 +37,16 @@ class Position:
 
 @dataclass(frozen=True)
 class Change:
-    """Estimates are begun anew here, with this tare; None: there are none from here on.
+    """Estimates are begun anew here; without calibration or tare there are none from here on.
 
     Attributes:
+        calibration: in use from here on.
         tare: in force from here on.
         seq: from this frame on.
         t_ns: or after this instant of the node's UTC.
     """
 
+    calibration: Calibration | None
     tare: Tare | None
     seq: int | None = None
     t_ns: int | None = None
@@ -59,7 +61,6 @@ class Change:
 def estimated(
     batches: Iterable[FrameBatch],
     info: ArrayInfo,
-    calibration: Calibration | None,
     changes: Iterable[Change],
     *,
     ends: bool,
@@ -69,12 +70,11 @@ def estimated(
     Args:
         batches: frames of one stream, in order.
         info: its array.
-        calibration: of its tiles; None: there are no estimates.
-        changes: of the tare, in order; before the first there are no estimates.
+        changes: of calibration and tare, in order; before the first there are no estimates.
         ends: no more frames will come; else those that wait for their look-ahead are left out.
     """
     run: EstimateRun | None = None
-    to_come = deque(changes) if calibration is not None else deque()
+    to_come = deque(changes)
     for frames in batches:
         rest = frames
         while to_come and (at := to_come[0].rows_before(rest)) < len(rest):
@@ -83,16 +83,19 @@ def estimated(
                 rest = rest.rows(at, len(rest))
             if run is not None:
                 yield from run.finish()
-            tare = to_come.popleft().tare
-            run = None
-            if tare is not None and calibration is not None:
-                run = EstimateRun(
-                    make_plan(info, calibration, tare, models=info.models, lag_ms=LIVE_LAG_MS)
-                )
+            run = _run(info, to_come.popleft())
         if len(rest):
             yield from _fed(run, rest)
     if ends and run is not None:
         yield from run.finish()
+
+
+def _run(info: ArrayInfo, change: Change) -> EstimateRun | None:
+    calibration, tare = change.calibration, change.tare
+    if calibration is None or tare is None:
+        return None
+    plan = make_plan(info, calibration, tare, models=info.models, lag_ms=LIVE_LAG_MS)
+    return EstimateRun(plan)
 
 
 def _fed(run: EstimateRun | None, frames: FrameBatch) -> Iterator[Estimated]:
@@ -133,8 +136,7 @@ class Recomputed:
         self._pieces = estimated(
             self._journal.read(begin, last),
             stream.info,
-            calibration,
-            _changes(node, stream, begin, last),
+            _changes(node, stream, calibration, begin, last),
             ends=ends,
         )
         self._rest: Estimated | None = None
@@ -184,10 +186,16 @@ def _rows(frames: FrameBatch, columns: Columns, begin: int, end: int) -> Estimat
     return frames.rows(begin, end), {name: v[begin:end] for name, v in columns.items()}
 
 
-def _changes(node: ServerNode, stream: ServerStream, begin: int, last: int) -> list[Change]:
+def _changes(
+    node: ServerNode,
+    stream: ServerStream,
+    calibration: Calibration | None,
+    begin: int,
+    last: int,
+) -> list[Change]:
     """Where the estimates of these frames began anew, in order."""
     own = [
-        Change(each.tare, seq=each.seq)
+        Change(each.calibration, each.tare, seq=each.seq)
         for each in (node.live.begun if stream is node.present else ())
     ]
     before = [change for change in own if change.seq is not None and change.seq <= begin]
@@ -202,4 +210,4 @@ def _changes(node: ServerNode, stream: ServerStream, begin: int, last: int) -> l
     if t_ns is None or until_ns is None:
         return own
     tares = node.tares.during(stream.info, t_ns, until_ns)
-    return [*(Change(tare, t_ns=tare.t_ns) for tare in tares), *own]
+    return [*(Change(calibration, tare, t_ns=tare.t_ns) for tare in tares), *own]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket as sockets
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,9 +14,10 @@ from websockets.sync.client import ClientConnection
 
 import service.api.routes.live_frames
 import service.server.full_rate.memory
+from tests.service.api.test_calibrations import assign, stiffer
 from tests.service.fake_node import FakeNode, NodeOf
 from tests.service.running import Running, closed
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 
 LIVE = "/api/v1/live?format=arrow"
 
@@ -220,7 +220,7 @@ def test_what_memory_has_not_any_more_is_recomputed_to_the_same_bits(
     assert differing(table, whole.table()) == {}
 
 
-def test_a_tare_is_in_force_from_the_frame_on_from_which_it_was_live(
+def test_tare_and_calibration_are_in_force_from_the_frame_on_from_which_they_were_live(
     running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with running.socket(LIVE) as socket:
@@ -229,6 +229,9 @@ def test_a_tare_is_in_force_from_the_frame_on_from_which_it_was_live(
         tared.send(200, alive=True)
         tared.taken_in()
         assert running.http.post("/nodes/bench/tare").status_code == 201
+        tared.send(100, 20.0, alive=True)
+        tared.taken_in()
+        assert assign(running, stiffer(*tared.info.serials)).status_code == 200
         tared.send(100, 20.0, alive=True)
         whole.until(tared.seq - 10)
     monkeypatch.setattr(running.server.frames.of("bench"), "_bytes_max", 1)
@@ -322,27 +325,25 @@ def test_a_node_that_is_switched_on_again_goes_on_with_its_new_stream(
 
 
 def test_a_lossless_client_that_does_not_read_is_told_from_where_to_resume(
-    running: Running, tared: FakeNode, monkeypatch: pytest.MonkeyPatch
+    running: Running, node_of: NodeOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service.api.routes.live_frames, "TOO_SLOW_S", 0.05)
-    # What kernels take in is out of sight of both ends.
-    narrow = sockets.socket()
-    narrow.setsockopt(sockets.SOL_SOCKET, sockets.SO_RCVBUF, 4096)
-    narrow.connect(("127.0.0.1", running.port))
-    with (
-        running.socket(LIVE, small=True, max_queue=1, sock=narrow) as stalled,
-        running.socket(LIVE) as other,
-    ):
-        reads = Taken(other)
-        reads.until_said("hello")
-        for _ in range(14):
-            tared.send(500, alive=True)
-        reads.until(tared.seq - 10)
+    wide = node_of(running, tiles=24)  # what kernels take in on the way is a few seconds of these
+    wide.connect()
+    wide.tared()
+    with running.socket(LIVE, small=True, max_queue=1) as stalled:
+        until(lambda: running.server.frames.of("bench").watchers)
+        for _ in range(8):
+            wide.send(500)
+        wide.taken_in()
+        with running.socket(LIVE + "&columns=grf_n") as other:
+            wide.send(60)
+            Taken(other).until(wide.seq - 10)
         taken = Taken(stalled)
         code, reason = _taken_until_closed(taken)
     assert code == 4008
-    assert reads.seqs == list(range(reads.seqs[0], reads.seqs[-1] + 1))
-    assert f"resume with boot_id={tared.boot_id}&from_seq={taken.seqs[-1] + 1}" in reason
+    assert taken.seqs == list(range(taken.seqs[0], taken.seqs[-1] + 1))
+    assert f"resume with boot_id={wide.boot_id}&from_seq={taken.seqs[-1] + 1}" in reason
 
 
 def _taken_until_closed(taken: Taken) -> tuple[int, str]:
