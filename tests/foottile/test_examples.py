@@ -81,6 +81,7 @@ def test_the_matlab_example_runs_in_octave(
     with client.connect(running.url) as server, server.record("left", "one") as session:
         session.mark("so")
     (block,) = blocks("matlab")
+    block = "function websave(file, url), urlwrite(url, file); end\n" + block
     with client.connect(running.url) as server:
         server.session(session.id).wait()
     done = subprocess.run(
