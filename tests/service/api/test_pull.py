@@ -156,6 +156,19 @@ def test_the_client_pulls_a_slice(sealed: Sealed, tmp_path: Path, to: str) -> No
     assert list(tmp_path.rglob("*.tmp")) == []
 
 
+def test_the_client_pulls_any_format_and_one_of_sealed_sessions_waits_for_that(
+    sealed: Sealed, tmp_path: Path
+) -> None:
+    begins = {"mcap": b"\x89MCAP0", "mat": b"MATLAB 5.0", "xdf": b"XDF:"}
+    with Client(sealed.running.url) as client:
+        for name, begin in begins.items():
+            pulled = client.pull_made(sealed.id, tmp_path, Slice(0.25, 0.5), format_named(name))
+            assert Path(pulled["path"]).read_bytes().startswith(begin)
+            assert Path(pulled["path"]).name == f"{sealed.id}_0.25s-0.5s.{name}"
+        with pytest.raises(LinkError, match=r"MATLAB is made when it is sealed.*xdf"):
+            client.pull_made(sealed.recording.id, tmp_path, Slice(), format_named("mat"))
+
+
 def test_a_slice_that_is_refused_leaves_nothing_behind(sealed: Sealed, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with Client(sealed.running.url) as client:
