@@ -20,7 +20,7 @@ from tests.builders.arrays import make_array
 from tests.storage.formats.exports import NOTES, cut, export, extra, frames, read
 from tests.waiting import PATIENCE_S
 
-pytestmark = [pytest.mark.process, pytest.mark.slow]
+pytestmark = [pytest.mark.process, pytest.mark.soak]
 
 OFFICE = shutil.which("soffice")
 POINT, COMMA = "CSV:44,34,76,1", "CSV:59,34,76,1,,1031"

@@ -1,10 +1,8 @@
-"""Parquet, Arrow and CSV in programs that are not ours: pandas, DuckDB, polars, LibreOffice."""
+"""Parquet, Arrow and CSV in programs that are not ours: pandas, DuckDB, polars."""
 
 from __future__ import annotations
 
 import importlib.util
-import shutil
-import subprocess
 from pathlib import Path
 
 import duckdb
@@ -65,34 +63,3 @@ def test_polars_reads_parquet_and_arrow(tmp_path: Path) -> None:
         assert found["t_ns"].to_list() == frames().t_ns.tolist()
         assert found["time_utc"].to_physical().to_list() == frames().t_ns.tolist()
         assert found["phase"].to_list() == extra()["phase"].tolist()
-
-
-@pytest.mark.soak
-@pytest.mark.skipif(shutil.which("soffice") is None, reason="LibreOffice is not installed")
-@pytest.mark.parametrize("decimal", ["point", "comma"])
-def test_libreoffice_takes_numbers_for_numbers(tmp_path: Path, decimal: str) -> None:
-    path = put(tmp_path, "csv", FormatOptions.model_validate({"decimal": decimal}))
-    # Separator, quote, UTF-8, first line, no column formats, language (English or German).
-    language, between = ("1031", "59") if decimal == "comma" else ("1033", "44")
-    subprocess.run(
-        [
-            *("soffice", "--headless", f"-env:UserInstallation=file://{tmp_path}/profile"),
-            *("--convert-to", "ods", f"--infilter=CSV:{between},34,76,1,,{language}"),
-            *("--outdir", str(tmp_path), str(path)),
-        ],
-        check=True,
-        capture_output=True,
-        timeout=240,
-    )
-    sheet = subprocess.run(
-        ["unzip", "-p", str(tmp_path / "session.ods"), "content.xml"],
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout
-    values = [
-        part.split('"')[0] for part in sheet.split('office:value-type="float" office:value="')
-    ]
-    grf_n = [value for value in extra()["grf_n"] if not np.isnan(value)]
-    found = {round(float(value), 4) for value in values[1:]}
-    assert {round(float(np.float32(value)), 4) for value in grf_n} <= found
