@@ -21,8 +21,9 @@ from service.sessions.sources import Sources
 from storage.schema import Array
 from storage.scratch import Kept, Scratch
 
-EVERY = 8192
-"""Frames between two places: of eight tiles with all models they are estimated in some 60 ms."""
+EVERY = 6144
+"""Frames between two places at least; more by less than a piece of a journal. Those of eight tiles
+are estimated in some 60 ms, with all models."""
 MOST = 8192
 """Places: then every other one is forgotten, and they are twice as far apart."""
 _EVER_NS = 2**63 - 1
