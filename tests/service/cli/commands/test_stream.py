@@ -70,9 +70,7 @@ def test_it_ends_without_a_word_when_its_reader_goes_away(
     ("arguments", "code", "said"),
     [
         (("nobody",), 2, "no node 'nobody'"),
-        (("bench", "--columns", "colour"), 2, "no column 'colour'"),
         (("bench", "--format", "xml"), 2, "expected csv or jsonl"),
-        (("bench", "--policy", "all"), 2, "lossless"),
         (("--server", "http://127.0.0.1:1"), 1, "no answer"),
     ],
 )
