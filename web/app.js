@@ -180,7 +180,7 @@ function chooseNode(wanted = state.wanted ?? kept()) {
   state.node = next;
   state.wanted = wanted ?? next?.node ?? null;
   state.fresh = true;
-  const select = byId("node-select");
+  const select = byId("node-select", HTMLSelectElement);
   const names = all.map((node) => node.node).sort();
   if (names.join("\n") !== [...select.options].map((option) => option.value).join("\n")) {
     select.replaceChildren(...names.map((name) => el("option", { value: name, text: name })));
@@ -188,9 +188,10 @@ function chooseNode(wanted = state.wanted ?? kept()) {
   if (next) select.value = next.node;
 }
 
-byId("node-select").addEventListener("change", (event) => {
-  try { localStorage.setItem(NODE_KEY, event.target.value); } catch { /* private window */ }
-  chooseNode(event.target.value);
+byId("node-select").addEventListener("change", () => {
+  const chosen = byId("node-select", HTMLSelectElement).value;
+  try { localStorage.setItem(NODE_KEY, chosen); } catch { /* private window */ }
+  chooseNode(chosen);
 });
 
 /** What must also be right while the tab draws nothing: live or frozen, and the counters. */

@@ -30,7 +30,7 @@ export async function call(method, path, body, stop = null, type = JSON_TYPE, sa
       signal: stop ? AbortSignal.any([stop, AbortSignal.timeout(10_000)]) : AbortSignal.timeout(10_000),
     });
   } catch (error) {
-    const slow = error.name === "TimeoutError";
+    const slow = error instanceof DOMException && error.name === "TimeoutError";
     throw new Refusal(slow ? "The server did not answer within 10 s." : "The server cannot be reached.", 0);
   }
   const read = () => (response.ok && type !== JSON_TYPE ? response.text() : response.json());
@@ -42,47 +42,64 @@ export async function call(method, path, body, stop = null, type = JSON_TYPE, sa
 }
 
 const id = encodeURIComponent;
+/** @param {Record<string, string | number>} query */
+const asked = (query) => new URLSearchParams(Object.entries(query).map(([name, value]) => [name, String(value)]));
 export const recent = (node, seconds, before, tiles) =>
   call("GET", `/nodes/${id(node)}/recent?seconds=${seconds}${before === undefined ? "" : `&before_seq=${before}`}${tiles ? `&tiles=${tiles}` : ""}`);
 export const tareNow = (node) => call("POST", `/nodes/${id(node)}/tare`, {});
 export const listTares = (node) => call("GET", `/nodes/${id(node)}/tares`);
 export const undoTare = (node, tare) => call("DELETE", `/nodes/${id(node)}/tares/${id(tare)}`);
+/** @type {(node: string, name: string) => Promise<Session>} */
 export const startSession = (node, name) => call("POST", "/sessions", { node, name });
+/** @type {(session: string) => Promise<Session>} */
 export const stopSession = (session) => call("POST", `/sessions/${id(session)}/stop`);
+/** @type {(session: string, event: object) => Promise<Mark>} */
 export const markEvent = (session, event) => call("POST", `/sessions/${id(session)}/events`, event);
+/** @type {(name: string) => Promise<Take>} */
 export const startTake = (name) => call("POST", "/takes", { name });
+/** @type {(take: string) => Promise<Take>} */
 export const stopTake = (take) => call("POST", `/takes/${id(take)}/stop`);
+/** @type {(take: string, event: object) => Promise<Take>} */
 export const markTake = (take, event) => call("POST", `/takes/${id(take)}/events`, event);
+/** @type {(session: string) => Promise<Session>} */
 export const getSession = (session) => call("GET", `/sessions/${id(session)}`);
+/** @type {(session: string) => Promise<{items: Mark[]}>} */
 export const listEvents = (session) => call("GET", `/sessions/${id(session)}/events`);
 export const listStances = (session) => call("GET", `/sessions/${id(session)}/stances`);
 export const stancesOverlay = (session) => call("GET", `/sessions/${id(session)}/stances/overlay`);
 export const listComparisons = (session) => call("GET", `/sessions/${id(session)}/comparisons`);
 export const getComparison = (session, name) => call("GET", `/sessions/${id(session)}/comparisons/${id(name)}`);
 export const comparisonSeries = (session, name, query, stop) =>
-  call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${new URLSearchParams(query)}`, undefined, stop);
+  call("GET", `/sessions/${id(session)}/comparisons/${id(name)}/series?${asked(query)}`, undefined, stop);
 export const newestSessions = (limit) => call("GET", `/sessions?limit=${limit}`);
+/** @type {(session: string) => Promise<Dressed>} */
 export const arrayOf = (session) => call("GET", `/sessions/${id(session)}/array`);
 export const ledgerOf = (session) => call("GET", `/sessions/${id(session)}/ledger`);
+/** @type {(session: string) => Promise<Clock>} */
 export const clockOf = (session) => call("GET", `/sessions/${id(session)}/clock`);
+/** @type {(session: string, query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} */
 export const overview = (session, query, stop) =>
-  call("GET", `/sessions/${id(session)}/overview?${new URLSearchParams(query)}`, undefined, stop);
+  call("GET", `/sessions/${id(session)}/overview?${asked(query)}`, undefined, stop);
 /** Some seconds of a session's frames, as CSV. */
 export const samples = (session, query) =>
-  call("GET", `/sessions/${id(session)}/data?${new URLSearchParams({ format: "csv", marks: "false", ...query })}`, undefined, null, "text/csv");
+  call("GET", `/sessions/${id(session)}/data?${asked({ format: "csv", marks: "false", ...query })}`, undefined, null, "text/csv");
+/** @type {(session: string, changes: object, said?: string | null) => Promise<Session>} */
 export const changeSession = (session, changes, said = null) =>
   call("PATCH", `/sessions/${id(session)}`, changes, null, JSON_TYPE, said);
+/** @type {(session: string, mark: string, changes: object, said: string) => Promise<Mark>} */
 export const changeMark = (session, mark, changes, said) =>
   call("PATCH", `/sessions/${id(session)}/events/${id(mark)}`, changes, null, JSON_TYPE, said);
 export const removeMark = (session, mark, said) =>
   call("DELETE", `/sessions/${id(session)}/events/${id(mark)}`, undefined, null, JSON_TYPE, said);
+/** @type {(session: string) => Promise<Session>} */
 export const sealSession = (session) => call("POST", `/sessions/${id(session)}/seal`);
 export const deleteSession = (session) => call("DELETE", `/sessions/${id(session)}`);
 export const listTrash = () => call("GET", "/trash");
+/** @type {(session: string) => Promise<Session>} */
 export const restoreSession = (session) => call("POST", `/trash/${id(session)}/restore`);
 export const emptyTrash = () => call("DELETE", "/trash");
-/** @param {{limit: number, cursor?: string, q?: string, complete?: string}} query */
-export const listSessions = (query) => call("GET", `/sessions?${new URLSearchParams(query)}`);
+/** @type {(query: {limit: number, cursor?: string, q?: string, complete?: string}) => Promise<{items: Session[], next_cursor: string | null}>} */
+export const listSessions = (query) => call("GET", `/sessions?${asked(query)}`);
 export const zipAddress = (ids) => `${PREFIX}/sessions/zip?ids=${ids.map(id).join(",")}`;
 export const listFormats = () => call("GET", "/formats");
 /** Of a download, with marks if there are any; Parquet without them is the sealed file itself. */

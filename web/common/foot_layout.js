@@ -2,7 +2,6 @@
 
 const GRID_FROM_M = 0.005; // tiles spread wider than this in y are a grid
 
-/** @typedef {{serial: string, x_m: number, y_m: number, z_m: number}} Tile */
 /** @typedef {{x: number, y: number}} Point in pixels */
 
 const range = (values) => [Math.min(...values), Math.max(...values)];

@@ -1,8 +1,36 @@
 // Small helpers for text and elements. All text from the server goes through textContent.
 
-export const byId = (id) => document.getElementById(id);
+/**
+ * The element of this id, which has to be there, and of this kind.
+ * @overload
+ * @param {string} id
+ * @returns {HTMLElement}
+ */
+/**
+ * @template {Element} E
+ * @overload
+ * @param {string} id
+ * @param {new () => E} kind
+ * @returns {E}
+ */
+/** @param {string} id @param {new () => Element} [kind] */
+export function byId(id, kind = HTMLElement) {
+  const element = document.getElementById(id);
+  if (!(element instanceof kind)) throw new TypeError(`This page has no ${kind.name} #${id}.`);
+  return element;
+}
 
-/** An element with class, text and children; never markup from a string. */
+/** Did it happen in something of this selector? @param {Event} event @param {string} selector */
+export const isInside = ({ target }, selector) => target instanceof Element && target.closest(selector) !== null;
+
+/**
+ * An element with class, text and children; never markup from a string.
+ * @template {keyof HTMLElementTagNameMap} T
+ * @param {T} tag
+ * @param {{cls?: string, text?: string | null, [attribute: string]: any}} [says]
+ * @param {...(Node | string)} children
+ * @returns {HTMLElementTagNameMap[T]}
+ */
 export function el(tag, { cls = "", text = null, ...attributes } = {}, ...children) {
   const element = document.createElement(tag);
   if (cls) element.className = cls;
@@ -12,42 +40,54 @@ export function el(tag, { cls = "", text = null, ...attributes } = {}, ...childr
   return element;
 }
 
-/** Write only what changed: thirty messages a second must not touch the DOM in vain. */
+/**
+ * Write only what changed: thirty messages a second must not touch the DOM in vain.
+ * @param {Element} element
+ * @param {string} text
+ */
 export function setText(element, text) {
   if (element.textContent === text) return;
   const only = element.childNodes.length === 1 ? element.firstChild : null;
-  if (only?.nodeType === Node.TEXT_NODE && text !== "") only.data = text; // no new node per message
+  if (only instanceof Text && text !== "") only.data = text; // no new node per message
   else element.textContent = text;
 }
 
+/** @param {HTMLElement | SVGElement} element @param {string} name @param {string} value */
 export function setData(element, name, value) {
   if (element.dataset[name] !== value) element.dataset[name] = value;
 }
 
 const MINUS = "\u2212";
 
-/** A number with a fixed count of decimals; a true minus sign, and never "-0.0". */
+/**
+ * A number with a fixed count of decimals; a true minus sign, and never "-0.0".
+ * @param {number | null | undefined} value
+ * @param {number} [decimals]
+ */
 export function number(value, decimals = 1) {
-  if (!Number.isFinite(value)) return "–";
+  if (!isFiniteNumber(value)) return "–";
   const text = value.toFixed(decimals);
   if (Number(text) === 0) return text.replace("-", "");
   return text.replace("-", MINUS);
 }
 
-/** What a test reads: three decimals with an ASCII minus, or nothing. */
-export const plain = (value) => (Number.isFinite(value) ? value.toFixed(3) : "");
+/** @param {unknown} value @returns {value is number} */
+const isFiniteNumber = (value) => Number.isFinite(value);
 
+/** What a test reads: three decimals with an ASCII minus, or nothing. @param {number | null | undefined} value */
+export const plain = (value) => (isFiniteNumber(value) ? value.toFixed(3) : "");
+
+/** @param {number | null | undefined} seconds */
 export function duration(seconds) {
-  if (!Number.isFinite(seconds)) return "–";
+  if (!isFiniteNumber(seconds)) return "–";
   if (seconds < 60) return `${seconds.toFixed(1)} s`;
   const whole = Math.floor(seconds);
-  const two = (n) => String(n).padStart(2, "0");
   const hours = Math.floor(whole / 3600);
   const rest = `${two(Math.floor((whole % 3600) / 60))}:${two(whole % 60)}`;
   return hours ? `${hours}:${rest} h` : `${rest} min`;
 }
 
-/** "3 min", for ages that need no precision. */
+/** "3 min", for ages that need no precision. @param {number} seconds */
 export function roughly(seconds) {
   if (seconds < 90) return `${Math.max(0, Math.round(seconds))} s`;
   if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
@@ -55,16 +95,18 @@ export function roughly(seconds) {
   return `${Math.round(seconds / 86400)} days`;
 }
 
+/** @param {number | null | undefined} count */
 export function bytes(count) {
-  if (!Number.isFinite(count)) return "–";
+  if (!isFiniteNumber(count)) return "–";
   if (count < 1e3) return `${count} B`;
   if (count < 1e6) return `${(count / 1e3).toFixed(0)} kB`;
   return count < 1e9 ? `${(count / 1e6).toFixed(1)} MB` : `${(count / 1e9).toFixed(2)} GB`;
 }
 
+/** @param {number} n */
 const two = (n) => String(n).padStart(2, "0");
 
-/** Local time, sortable: what a robotics notebook has. */
+/** Local time, sortable: what a robotics notebook has. @param {Date} date */
 export function localTime(date) {
   return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())} `
     + `${two(date.getHours())}:${two(date.getMinutes())}:${two(date.getSeconds())}`;

@@ -3,7 +3,7 @@
 import * as api from "../common/api.js";
 import { mayPress } from "../common/login.js";
 import { notice } from "../common/notices.js";
-import { byId, duration, el, localTime, setText } from "../common/text.js";
+import { byId, duration, el, isInside, localTime, setText } from "../common/text.js";
 
 const UNDO_KEY = "foottile.undo"; // survives a reload, not the tab
 
@@ -29,14 +29,14 @@ export class Actions {
       const open = bar.dataset.fields !== "true";
       bar.dataset.fields = String(open);
       byId("fields").setAttribute("aria-expanded", String(open));
-      if (open) byId("session-name").focus();
+      if (open) byId("session-name", HTMLInputElement).focus();
     });
     new ResizeObserver(() => document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`)).observe(bar);
   }
 
   /** Enter does it, Escape gives it up; both leave the field, or the next shortcut would be typed into it. */
   field(id, name) {
-    const field = byId(id);
+    const field = byId(id, HTMLInputElement);
     field.addEventListener("keydown", (event) => {
       if (event.isComposing) return;
       if (event.key === "Escape") field.value = "";
@@ -48,7 +48,7 @@ export class Actions {
 
   shortcut(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
-    if (event.target.closest?.("input, textarea, select, dialog, [contenteditable]")) return;
+    if (isInside(event, "input, textarea, select, dialog, [contenteditable]")) return;
     const name = { t: "tare", r: "record", s: "stop", m: "mark", p: "pause", "?": "help" }[event.key];
     if (!name) return;
     event.preventDefault();
@@ -58,7 +58,7 @@ export class Actions {
 
   /** Run an action once at a time, and say what came of it. */
   async run(name) {
-    const button = byId(name);
+    const button = byId(name, HTMLButtonElement);
     if (!mayPress()) {
       notice("this login may look, and not press. “viewer”, beside the title, says more.", { bad: true });
       return;
@@ -100,7 +100,7 @@ export class Actions {
   }
 
   async record(node) {
-    const field = byId("session-name");
+    const field = byId("session-name", HTMLInputElement);
     const name = field.value.trim() || localTime(new Date());
     const session = await api.startSession(node.node, name);
     field.value = "";
@@ -123,7 +123,7 @@ export class Actions {
 
   async mark() {
     const pressedMs = this.state.serverNowMs();
-    const field = byId("mark-label");
+    const field = byId("mark-label", HTMLInputElement);
     const label = field.value.trim() || "mark";
     field.value = "";
     const made = await this.marks.add(this.running(), label, pressedMs);
@@ -148,11 +148,11 @@ export class Actions {
     const { node } = this.state;
     const running = this.running();
     const why = this.state.cannotRecord;
-    byId("tare").disabled = byId("record").disabled = !node || Boolean(why);
+    byId("tare", HTMLButtonElement).disabled = byId("record", HTMLButtonElement).disabled = !node || Boolean(why);
     const box = byId("cannot-record");
     box.hidden = !why;
     setText(box, why ? `Record and Tare wait: ${why[0].toLowerCase()}${why.slice(1)}` : "");
-    byId("stop").disabled = byId("mark").disabled = !running.length;
+    byId("stop", HTMLButtonElement).disabled = byId("mark", HTMLButtonElement).disabled = !running.length;
     setText(byId("record-text"), running.length ? "Record another" : "Record");
     if (this.undoId === undefined) {
       try { this.undoId = sessionStorage.getItem(UNDO_KEY); } catch { this.undoId = null; }

@@ -16,9 +16,10 @@ const NUMBERS_FROM_PX = 26; // of a square, for a number in it
 export class Foot {
   /** @param {Range} [range] up to which force the colours go */
   constructor(range = new Range()) {
-    this.root = byId("foot");
+    this.root = byId("foot", SVGSVGElement);
     this.range = range;
     this.key = "";
+    this.resized = () => {};
     new ResizeObserver(() => this.anew()).observe(this.root);
     for (const what of ["(prefers-color-scheme: dark)", "(prefers-contrast: more)"]) {
       matchMedia(what).addEventListener("change", () => this.anew());
@@ -28,7 +29,7 @@ export class Foot {
 
   anew() {
     this.key = "";
-    this.resized?.();
+    this.resized();
   }
 
   fit(node) {

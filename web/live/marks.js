@@ -7,7 +7,7 @@ import { byId, setText } from "../common/text.js";
 const AGAIN_MS = 2000;
 
 export class Marks {
-  /** `post(id, event)` gives a mark to the server: of a session, or of a take. */
+  /** @param {(of: string, event: object) => Promise<unknown>} [post] gives a mark to the server: of a session, or of a take */
   constructor(post = api.markEvent) {
     this.post = post;
     this.waiting = [];

@@ -11,6 +11,7 @@ const FIRST_MS = 3000; // what is said so soon after the page was opened may be 
 // A chip throws an outlier now and then, which is no suction: this flag has to stay for a while.
 const BELOW_RANGE = "Below the calibrated range: suction, or an old tare.";
 const SETTLE_MESSAGES = 15;
+/** @type {[bit: number, text: string][]} */
 const FROM_ESTIMATE = [
   [ESTIMATE.TILE_MISSING, "Tile missing: of the force only a lower bound is known, and no COP."],
   [ESTIMATE.STUCK, "A tile repeats one reading: its force is not known. Unplug it and plug it in again."],
@@ -19,6 +20,7 @@ const FROM_ESTIMATE = [
   [ESTIMATE.AFTER_SATURATION, "After a load that was not seen, force is less certain for a while."],
   [ESTIMATE.OVER_RATED, "Above the 115 kPa the chip is rated for, yet calibrated."],
 ];
+/** @type {[bit: number, text: string][]} */
 const FROM_FRAME = [
   [FRAME.BUS_FAULT, "Bus fault: the node cannot read all tiles. Check its cable and supply."],
   [FRAME.OVERRUN, "The node is late: some frames are not taken."],

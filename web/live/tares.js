@@ -8,7 +8,7 @@ const SHOWN = 20;
 
 export class Tares {
   constructor() {
-    this.card = byId("tares-card");
+    this.card = byId("tares-card", HTMLDetailsElement);
     this.shown = "";
     this.card.addEventListener("toggle", () => { this.shown = ""; });
   }

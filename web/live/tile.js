@@ -4,6 +4,7 @@ import { TILE } from "../common/bits.js";
 
 const FALLBACK = { kPa: 15, N: 30 };
 
+/** @type {[bit: number, state: string, text: string][]} */
 const FAULTS = [
   [TILE.NO_ANSWER, "no_answer", "no answer"],
   [TILE.STALE, "stale", "stale"],

@@ -14,7 +14,7 @@ export class TileTraces {
   /** @param {import("./range.js").Range} range @param {() => void} onChange */
   constructor(range, onChange) {
     this.range = range;
-    this.canvas = byId("tile-traces");
+    this.canvas = byId("tile-traces", HTMLCanvasElement);
     this.context = this.canvas.getContext("2d");
     this.shown = false;
     this.drawnMs = 0;
@@ -44,7 +44,12 @@ export class TileTraces {
     this.canvas.hidden = !this.shown;
   }
 
-  /** @param {{points: object[], endS: number, windowS: number, live: boolean}} seen what the force is drawn of */
+  /**
+   * @param {{tiles: Tile[]}} node
+   * @param {{points: {tiles: Record<string, (number | null)[]> | null}[], tilesPast: any, endS: number, windowS: number, live: boolean}} seen what the force is drawn of
+   * @param {number} nowMs
+   * @param {string} unitChosen
+   */
   draw(node, { points, tilesPast, endS, windowS, live }, nowMs, unitChosen) {
     if (!this.shown || nowMs - this.drawnMs < EVERY_MS) return;
     this.drawnMs = nowMs;

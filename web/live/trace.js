@@ -14,7 +14,7 @@ const SHRINK_AFTER_MS = 4000; // a scale that follows every step of the robot ca
 export class Trace {
   /** `onWindow()` when another length of time was chosen. */
   constructor(onWindow) {
-    this.canvas = byId("trace");
+    this.canvas = byId("trace", HTMLCanvasElement);
     this.context = this.canvas.getContext("2d");
     this.still = matchMedia("(prefers-reduced-motion: reduce)");
     this.points = new Points();
@@ -22,7 +22,7 @@ export class Trace {
     this.drawnMs = 0;
     this.stepN = 5;
     this.fitsSmallerSinceMs = null;
-    this.choice = byId("trace-window");
+    this.choice = byId("trace-window", HTMLSelectElement);
     let kept = null;
     try { kept = localStorage.getItem(WINDOW_KEY); } catch { /* private window */ }
     this.windowS = WINDOWS_S.includes(Number(kept)) ? Number(kept) : 10;

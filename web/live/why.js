@@ -1,5 +1,6 @@
 // Why a warning is there and what follows from it, in two sentences; by what the warning begins with.
 
+/** @type {[begins: RegExp, why: string][]} */
 const WHY = [
   [/^Tile missing|does not answer/, "The chip in a tile gives no readings, so what it bears is not known. The other tiles go on, and their sum is what the force is at least; look at the tile's plug and cable."],
   [/^A tile repeats one reading/, "Readings of a live chip differ a little each time, and these do not. The chip hangs, so what it last said is not taken for a force."],
@@ -22,5 +23,5 @@ const WHY = [
   [/^Clock of the node/, "Nobody has told the node the date since it was switched on. Distances in time are right, dates and comparisons with other instruments may not be."],
 ];
 
-/** Two sentences, or "". */
+/** Two sentences, or "". @param {string} text */
 export const whyOf = (text) => WHY.find(([begins]) => begins.test(text))?.[1] ?? "";

@@ -3,7 +3,7 @@
 import * as api from "../common/api.js";
 import { mayPress } from "../common/login.js";
 import { notice } from "../common/notices.js";
-import { byId, duration, localTime, setData, setText } from "../common/text.js";
+import { byId, duration, isInside, localTime, setData, setText } from "../common/text.js";
 import { Marks } from "../live/marks.js";
 
 const KEYS = { r: "record-all", m: "mark-all", s: "stop-all" };
@@ -11,10 +11,10 @@ const KEYS = { r: "record-all", m: "mark-all", s: "stop-all" };
 export class Takes {
   /**
    * @param {object} page
-   * @param {Map<string, object>} page.recordings sessions that are being recorded, by id
+   * @param {Map<string, Session>} page.recordings sessions that are being recorded, by id
    * @param {() => string} page.cannotRecord why not now, or nothing
    * @param {() => number} page.serverNowMs
-   * @param {(session: object) => void} page.onSession takes every session an answer brings
+   * @param {(session: Session) => void} page.onSession takes every session an answer brings
    * @param {(failed: Object<string, string>) => void} page.onRefused takes what nodes a take lacks, and why
    */
   constructor(page) {
@@ -28,16 +28,17 @@ export class Takes {
     this.does = { "record-all": () => this.record(), "mark-all": () => this.mark(), "stop-all": () => this.stop() };
     for (const id of Object.keys(this.does)) byId(id).addEventListener("click", () => this.run(id));
     for (const [field, id] of [["take-name", "record-all"], ["take-label", "mark-all"]]) {
-      byId(field).addEventListener("keydown", (event) => {
+      const input = byId(field, HTMLInputElement);
+      input.addEventListener("keydown", (event) => {
         if (event.isComposing || !["Enter", "Escape"].includes(event.key)) return;
-        if (event.key === "Escape") event.target.value = "";
-        event.target.blur();
+        if (event.key === "Escape") input.value = "";
+        input.blur();
         if (event.key === "Enter") this.run(id);
       });
     }
     document.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
-      if (event.target.closest?.("input, dialog") || !KEYS[event.key]) return;
+      if (isInside(event, "input, dialog") || !KEYS[event.key]) return;
       event.preventDefault();
       this.run(KEYS[event.key]);
     });
@@ -55,7 +56,7 @@ export class Takes {
 
   /** Do something once at a time, and say what came of it. */
   async run(id) {
-    const button = byId(id);
+    const button = byId(id, HTMLButtonElement);
     if (!mayPress()) {
       notice("this login may look, and not press. “viewer”, beside the title, says more.", { bad: true });
       return;
@@ -80,7 +81,7 @@ export class Takes {
   }
 
   async record() {
-    const field = byId("take-name");
+    const field = byId("take-name", HTMLInputElement);
     const name = field.value.trim() || localTime(new Date());
     const take = await api.startTake(name);
     field.value = "";
@@ -91,7 +92,7 @@ export class Takes {
 
   async mark() {
     const pressedMs = this.page.serverNowMs();
-    const field = byId("take-label");
+    const field = byId("take-label", HTMLInputElement);
     const label = field.value.trim() || "mark";
     field.value = "";
     const made = await this.marks.add([this.running()], label, pressedMs);
@@ -118,8 +119,8 @@ export class Takes {
   draw() {
     const take = this.running();
     const why = take ? "" : this.page.cannotRecord();
-    byId("record-all").disabled = Boolean(take || why);
-    byId("stop-all").disabled = byId("mark-all").disabled = !take;
+    byId("record-all", HTMLButtonElement).disabled = Boolean(take || why);
+    byId("stop-all", HTMLButtonElement).disabled = byId("mark-all", HTMLButtonElement).disabled = !take;
     setData(byId("take-bar"), "running", String(Boolean(take)));
     byId("take-text").hidden = !take;
     if (take) {

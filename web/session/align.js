@@ -6,7 +6,7 @@ import { offsetAt } from "./clock.js";
  * @param {{beginNs: number, durationS: number, stances: {from: number, begun: boolean}[],
  *   marks: {label: string, timeS: number}[], offset: (tNs: number, ofServer: boolean) => number | null}} own
  * @param {{beginNs: number, durationS: number, stances: {begin_t_ns: number, begun: boolean}[],
- *   events: {label: string, t_ns: number}[], clock: object | null}} other
+ *   events: {label: string, t_ns: number}[], clock: Clock | null}} other
  * @returns {{key: string, says: string, because: string, shiftS: number}[]} the start first
  */
 export function alignments(own, other) {

@@ -14,7 +14,7 @@ export class Beside {
    * @param {object} how
    * @param {string} how.name for the legend
    * @param {Record<string, [string, string]>} how.columns least and greatest, by the panel they are drawn in
-   * @param {(query: object, stop?: AbortSignal) => Promise<object>} how.ask for bins, in its own time
+   * @param {(query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} how.ask for bins, in its own time
    * @param {() => void} how.onChange
    * @param {(error: Error) => void} how.onError
    */
@@ -44,7 +44,11 @@ export class Beside {
     this.whole = new Bins(shifted(this.answer, shiftS), { from: -Infinity, to: Infinity });
   }
 
-  /** In its own time; of what it does not reach to nobody has to be asked. */
+  /**
+   * In its own time; of what it does not reach to nobody has to be asked.
+   * @param {OverviewQuery} query
+   * @param {AbortSignal} [stop]
+   */
   async asked({ points, start_s: startS, end_s: endS }, stop) {
     const [begin, end] = [startS - this.shiftS, endS - this.shiftS];
     if (end <= 0 || begin > this.durationS) return shifted(emptied(this.answer), this.shiftS);

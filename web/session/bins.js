@@ -15,8 +15,7 @@ function placeOf(list, value) {
 
 export class Bins {
   /**
-   * @param {{begin_t_ns: number, duration_s: number, frames_in_bin: number, serials: string[],
-   *   provisional?: boolean, behind?: boolean, columns: Record<string, (number | null)[]>}} overview
+   * @param {Overview} overview
    * @param {View} covers the time that was asked for
    */
   constructor(overview, covers) {

@@ -27,8 +27,8 @@ export class Compare {
     this.references = references;
     this.page = page;
     this.offset = offset;
-    this.choice = byId("beside");
-    this.align = byId("beside-align");
+    this.choice = byId("beside", HTMLSelectElement);
+    this.align = byId("beside-align", HTMLSelectElement);
     this.choice.addEventListener("change", () => quietly(() => this.choose(this.choice.value)));
     this.align.addEventListener("change", () => { this.moveTo(this.align.value); this.link(); });
   }

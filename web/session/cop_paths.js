@@ -11,11 +11,11 @@ const SIDE_PX = 320;
 const SHADES = 24; // of time or of stances: neighbours are not told apart by eye
 
 export class CopPaths {
-  /** @param {() => void} onChange @param {(curve: object) => void} onGo */
+  /** @param {() => void} onChange @param {(curve: {number: number}) => void} onGo */
   constructor(onChange, onGo) {
-    this.canvas = byId("cop-canvas");
+    this.canvas = byId("cop-canvas", HTMLCanvasElement);
     this.by = "time";
-    for (const button of document.querySelectorAll("#cop-colour button")) {
+    for (const button of /** @type {NodeListOf<HTMLButtonElement>} */ (document.querySelectorAll("#cop-colour button"))) {
       button.addEventListener("click", () => { this.by = button.value; onChange(); });
     }
     this.canvas.addEventListener("click", (event) => {
@@ -27,7 +27,7 @@ export class CopPaths {
     });
   }
 
-  /** @param {import("../common/foot_layout.js").Tile[]} tiles */
+  /** @param {Tile[]} tiles */
   show(tiles, answer) {
     this.tiles = tiles;
     this.answer = answer;
@@ -191,7 +191,7 @@ export class CopPaths {
   }
 
   drawLegend(chosen, frames) {
-    for (const button of document.querySelectorAll("#cop-colour button")) button.setAttribute("aria-pressed", String(button.value === this.by));
+    for (const button of /** @type {NodeListOf<HTMLButtonElement>} */ (document.querySelectorAll("#cop-colour button"))) button.setAttribute("aria-pressed", String(button.value === this.by));
     const what = this.by === "time" ? ["first contact", "lift-off"] : ["first stance", "last stance"];
     const items = [
       ["shades", `${what[0]} to ${what[1]}`],

@@ -48,6 +48,7 @@ export function stretchesOf(kind, bins, begin, end) {
   return found;
 }
 
+/** @type {[bit: number, words: string][]} */
 const ESTIMATE_WORDS = [
   [ESTIMATE.SATURATED, "a tile is saturated"],
   [ESTIMATE.CLIPPED, "a tile reads no further than some pressure within its range"],
@@ -62,6 +63,7 @@ const ESTIMATE_WORDS = [
   [ESTIMATE.OUTLIER_REPLACED, "an outlier was replaced"],
   [ESTIMATE.ASSUMED_SCALE, "scale assumed"],
 ];
+/** @type {[bit: number, words: string][]} */
 const FRAME_WORDS = [
   [FRAME.BUS_FAULT, "the bus failed"],
   [FRAME.OVERRUN, "frames before it not taken"],

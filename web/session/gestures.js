@@ -1,5 +1,7 @@
 // Pointer, wheel, fingers and keys over the plots, as what they mean. Knows no data.
 
+import { isInside } from "../common/text.js";
+
 const CLICK_PX = 4;
 const DOUBLE_MS = 350;
 const WHEEL_STEP = 0.0018;
@@ -107,7 +109,7 @@ export function listen(box, means) {
 
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.target.closest?.("input, textarea, select, dialog")) return;
+    if (isInside(event, "input, textarea, select, dialog")) return;
     if (means.key(event)) event.preventDefault();
   });
 }

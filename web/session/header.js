@@ -9,6 +9,7 @@ const WORDS = {
   incomplete: "not complete",
 };
 
+/** @param {Session} session */
 export function drawHeader(session) {
   setText(byId("name"), session.name || session.id);
   const [short, long, weight] = plainState(session);

@@ -24,11 +24,12 @@ export function ledgerInWords(ledger, session) {
 
 export class LedgerCard {
   constructor() {
-    this.card = byId("ledger-card");
+    this.card = byId("ledger-card", HTMLDetailsElement);
     this.session = null;
     this.card.addEventListener("toggle", () => this.load());
   }
 
+  /** @param {Session} session */
   show(session) {
     const grown = this.session?.frames !== session.frames || this.session?.state !== session.state;
     this.session = session;

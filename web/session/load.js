@@ -12,7 +12,7 @@ export const pointsFor = (widthPx, tiles) =>
 
 export class Loader {
   /**
-   * @param {(query: object, stop?: AbortSignal) => Promise<object>} question
+   * @param {(query: OverviewQuery, stop?: AbortSignal) => Promise<Overview>} question
    * @param {(bins: Bins) => void} onBins @param {(error: Error) => void} onError
    */
   constructor(question, onBins, onError) {
@@ -66,7 +66,7 @@ export class Loader {
       if (stopping.signal.aborted) return;
       this.busy = false;
       this.asked = null; // the next move asks again
-      this.onError(error);
+      this.onError(/** @type {Error} */ (error));
     }
   }
 }

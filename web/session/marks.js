@@ -46,7 +46,7 @@ export class Marks {
   }
 
   async add(timeS) {
-    const field = byId("new-mark-label");
+    const field = byId("new-mark-label", HTMLInputElement);
     const label = field.value.trim() || "mark";
     const event = await api.markEvent(this.id, { label, t_ns: this.tNsOf(timeS) });
     field.value = "";
@@ -56,7 +56,8 @@ export class Marks {
   }
 
   /** @param {{label?: string, timeS?: number}} to */
-  async change(mark, { label, timeS }) {
+  async change(mark, to) {
+    const { label, timeS } = to;
     const changes = {};
     if (label && label !== mark.label) changes.label = label;
     if (Number.isFinite(timeS) && timeS !== mark.timeS) changes.t_ns = this.tNsOf(timeS);
@@ -107,11 +108,12 @@ export class Marks {
   }
 
   edit(mark) {
-    const [dialog, label, time] = ["mark-dialog", "mark-label", "mark-time"].map(byId);
+    const dialog = byId("mark-dialog", HTMLDialogElement);
+    const [label, time] = ["mark-label", "mark-time"].map((id) => byId(id, HTMLInputElement));
     label.value = mark.label;
     const said = time.value = mark.timeS.toFixed(6);
     const cursorS = this.on.cursor();
-    byId("mark-to-cursor").disabled = cursorS === null;
+    byId("mark-to-cursor", HTMLButtonElement).disabled = cursorS === null;
     byId("mark-to-cursor").onclick = () => { time.value = cursorS.toFixed(6); };
     dialog.returnValue = "";
     dialog.addEventListener("close", () => quietly(async () => {

@@ -18,7 +18,7 @@ export class Numbers {
   /** The view's numbers, if anyone looks at them. */
   draw(view, panels) {
     const key = `${view.from} ${view.to}`;
-    if (!byId("numbers-card").open || key === this.shown) return;
+    if (!byId("numbers-card", HTMLDetailsElement).open || key === this.shown) return;
     this.shown = key;
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.load(view, key, panels), SETTLED_MS);
@@ -35,10 +35,10 @@ export class Numbers {
     }
     if (key !== this.shown) return;
     const bins = new Bins(answer, view);
-    const rows = Array.from({ length: bins.count }, (_, i) => [readingsOf(bins, i, panels), flagsInWords(bins, i).join(", ")]);
-    const names = (rows[0]?.[0] ?? []).map(([, name]) => name).concat("To know");
+    const rows = Array.from({ length: bins.count }, (_, i) => ({ readings: readingsOf(bins, i, panels), flags: flagsInWords(bins, i).join(", ") }));
+    const names = (rows[0]?.readings ?? []).map(([, name]) => name).concat("To know");
     byId("numbers-head").replaceChildren(...names.map((name) => el("th", { scope: "col", text: name })));
-    byId("numbers-rows").replaceChildren(...rows.map(([readings, flags]) =>
+    byId("numbers-rows").replaceChildren(...rows.map(({ readings, flags }) =>
       el("tr", {}, ...readings.map(([, , value]) => el("td", { text: value })), el("td", { text: flags }))));
   }
 }

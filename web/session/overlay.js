@@ -104,6 +104,6 @@ export function drawMarks(plots, context, view, x, bottom) {
 
 /** The mark whose flag is at a place; null: there is none. @param {Plots} plots */
 export function flagAt(plots, px, py) {
-  const inside = (plots.flags ?? []).filter(({ left, right }) => py <= 20 && px >= left - 4 && px <= right + 4);
+  const inside = plots.flags.filter(({ left, right }) => py <= 20 && px >= left - 4 && px <= right + 4);
   return inside.at(-1)?.id ?? null;
 }

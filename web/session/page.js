@@ -65,7 +65,7 @@ async function change() {
   try {
     now = await api.changeSession(id, changes, before.said);
   } catch (error) {
-    if (error.status !== 412) throw error;
+    if (!(error instanceof api.Refusal) || error.status !== 412) throw error;
     notice(error.message, { bad: true });
     now = await api.getSession(id);
   }

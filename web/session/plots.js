@@ -22,14 +22,16 @@ const CONTACT = 2;
 export class Plots {
   constructor() {
     this.box = byId("plots");
-    this.canvas = byId("plots-canvas");
-    this.over = byId("cursor-canvas");
+    this.canvas = byId("plots-canvas", HTMLCanvasElement);
+    this.over = byId("cursor-canvas", HTMLCanvasElement);
     this.whole = null;
     this.detail = null;
     this.marks = [];
     this.stances = [];
     this.beside = null; // drawn over it
     this.asHeat = null;
+    this.heat = null; // least and greatest of its colours
+    this.flags = []; // of marks, where they were drawn
     this.panels = [];
     this.drawn = []; // where each panel is, and its scale
     whenColoursChange(() => { this.colours = null; this.changed(); });

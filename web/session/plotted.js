@@ -23,6 +23,7 @@ const SETTLED_MS = 250;
 const COLOURS_AT = 9; // in what is compared to know whether something has to be drawn
 
 export class Plotted {
+  /** @param {Session} session */
   constructor(session) {
     this.session = session;
     this.plots = new Plots();
@@ -45,7 +46,7 @@ export class Plotted {
     this.drawing = 0;
   }
 
-  /** Draws what there is; again for as long as the session grows, and once it is sealed. */
+  /** Draws what there is; again for as long as the session grows, and once it is sealed. @param {Session} session */
   async load(session) {
     const first = !this.view;
     const sealed = session.state === "sealed";
@@ -115,7 +116,7 @@ export class Plotted {
     byId("compare").hidden = false;
     byId("compare").addEventListener("click", () => quietly(async () => {
       await open();
-      byId("beside").focus();
+      byId("beside", HTMLSelectElement).focus();
     }));
   }
 
@@ -159,7 +160,7 @@ export class Plotted {
       event.preventDefault();
       quietly(() => this.marks.add(this.cursorS ?? this.middle));
     });
-    byId("numbers-card").addEventListener("toggle", () => this.draw());
+    byId("numbers-card", HTMLDetailsElement).addEventListener("toggle", () => this.draw());
     new ResizeObserver(() => this.draw()).observe(byId("plots"));
   }
 

@@ -35,6 +35,7 @@ export function readingsOf(bins, i, panels) {
   const shown = new Set(panels.map((panel) => panel.key));
   const many = bins.columns.frames[i];
   const time = timeWords(bins.first[i], 0.001);
+  /** @type {[string, string, string][]} */
   const found = [["time", "Time", many > 1 ? `${time}, ${many} frames` : time]];
   if (bins.estimated) {
     found.push(["grf", "GRF", grfAt(bins, i)]);
@@ -51,8 +52,10 @@ export function readingsOf(bins, i, panels) {
   return found.concat(tilesAt(bins, i).filter(([key]) => shown.has(key) || shown.has("tiles")));
 }
 
+/** @returns {[string, string, string][]} */
 function tilesAt(bins, i) {
   const [stem, unit, decimals] = bins.estimated ? ["force_n", "N", 1] : ["padc", "counts", 0];
+  /** @returns {[string, string]} */
   const names = (tile) => [`${stem}_${tile}_min`, `${stem}_${tile}_max`];
   const order = bins.serials.map((_, tile) => tile);
   const greatest = (tile) => bins.columns[names(tile)[bins.estimated ? 1 : 0]][i] ?? (bins.estimated ? -Infinity : Infinity);

@@ -24,6 +24,9 @@ export class Replay {
   constructor(on) {
     this.on = on;
     this.samples = null;
+    /** @type {Dressed | null} */
+    this.array = null;
+    this.range = this.foot = this.bars = null;
     this.walking = Promise.resolve();
     this.playing = new Playing({
       at: on.at, go: on.go, end: () => this.samples.whole.durationS,
@@ -55,7 +58,7 @@ export class Replay {
     this.sayLag();
   }
 
-  /** @param {object} array of GET /sessions/ID/array: until it is there the foot is not drawn */
+  /** @param {Dressed} array of GET /sessions/ID/array: until it is there the foot is not drawn */
   dress(array) {
     this.array = array;
     this.sayLag();
@@ -72,7 +75,7 @@ export class Replay {
 
   sayLag() {
     const { whole } = this.samples;
-    const { lag_ms: lagMs = null, estimates_problem: problem = null } = this.array ?? {};
+    const { lag_ms: lagMs = null, estimates_problem: problem = null } = this.array ?? { lag_ms: null, estimates_problem: null };
     const looks = lagMs === null ? "" : `each takes notice of the ${number(lagMs, 0)} ms behind it.`;
     let text = looks && `Forces as they are stored: ${looks}`;
     if (whole.provisional) text = looks && `Provisional forces, as they are live: ${looks} They are estimated once more when the session is sealed, with more of what follows.`;
@@ -121,6 +124,6 @@ export class Replay {
     const { going, speed } = this.playing;
     setText(byId("play-text"), going ? "Pause" : "Play");
     setData(byId("play"), "going", String(going));
-    for (const button of byId("speeds").children) button.setAttribute("aria-pressed", String(Number(button.dataset.speed) === speed));
+    for (const button of byId("speeds").querySelectorAll("button")) button.setAttribute("aria-pressed", String(Number(button.dataset.speed) === speed));
   }
 }

@@ -2,7 +2,10 @@
 
 import { byId, el, number, setText } from "../common/text.js";
 
-/** Figures of docs/compare.md: in words, unit, factor from SI, and decimals where these are not by size. */
+/**
+ * Figures of docs/compare.md: in words, unit, factor from SI, and decimals where these are not by size.
+ * @type {[name: string, words: string, unit: string, factor: number, decimals?: number][]}
+ */
 const FIGURES = [
   ["grf_bias_n", "Force: our mean error", "N", 1],
   ["grf_mae_n", "Force: our mean absolute error", "N", 1],
@@ -46,6 +49,7 @@ const between = (interval, unit, factor, fixed) =>
 const certain = ({ value, interval_95: [low, high] }, unit, factor, decimals, of = "") =>
   `${number(value * factor, decimals)} ${unit}${of} (95 %: ${number(low * factor, decimals)} to ${number(high * factor, decimals)} ${unit})`;
 
+/** @param {ComparisonReport} report */
 function alignmentWords({ alignment, contact_n: contactN, trials_are: trialsAre, trials }) {
   const parts = [];
   const { lag_s: lag, scale, offset_in_flight_n: zero, offset_removed: removed } = alignment;
@@ -57,7 +61,7 @@ function alignmentWords({ alignment, contact_n: contactN, trials_are: trialsAre,
   return parts.join(" ");
 }
 
-/** @param {{name: string, is_of_these_frames: boolean | null, is_proven: boolean, missed: string[], report: object}} found */
+/** @param {{name: string, is_of_these_frames: boolean | null, is_proven: boolean, missed: string[], report: ComparisonReport}} found */
 export function drawReport(found) {
   const { report } = found;
   const limits = report.limits ?? {};

@@ -39,10 +39,11 @@ export function columnsOf(csv) {
   return { tNs, columns: Object.fromEntries(names.map((name, i) => [name, values[i]])) };
 }
 
-/** The frame of a row, in the words of a live message. */
+/** The frame of a row, in the words of a live message. @returns {Frame} */
 function frameOf({ timeS, columns }, row, tiles) {
   const one = (name) => { const value = columns[name]?.[row]; return Number.isFinite(value) ? value : null; };
   const each = (name) => Array.from({ length: tiles }, (_, i) => one(`${name}_${i}`));
+  /** @type {any} */
   const frame = Object.fromEntries([...BY_FRAME.map((name) => [name, one(name)]), ...BY_TILE.map((name) => [name, each(name)])]);
   // A lower bound is a force without an uncertainty.
   frame.saturated = frame.force_n.map((force, i) => force !== null && frame.force_sigma_n[i] === null);
@@ -94,7 +95,7 @@ export class Samples {
 
   /**
    * The frame of an instant: the nearest one, unless it is too far away.
-   * @returns {{known: boolean, frame: object | null}} not known: it is on its way
+   * @returns {{known: boolean, frame: Frame | null}} not known: it is on its way
    */
   at(timeS) {
     const own = this.numberOf(timeS);

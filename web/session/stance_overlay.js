@@ -22,7 +22,7 @@ export class StanceOverlay {
     this.id = id;
     this.stances = stances;
     this.onGo = onGo;
-    this.canvas = byId("overlay-canvas");
+    this.canvas = byId("overlay-canvas", HTMLCanvasElement);
     this.chosen = null; // number of a stance, and its frames
     this.hover = null; // number of a curve, and the percentage
     this.paths = new CopPaths(() => this.draw(), (curve) => this.go(curve.number));

@@ -80,7 +80,7 @@ export class Stances {
     this.current = index;
     while (index >= this.body.children.length) this.add();
     for (const row of this.body.querySelectorAll("[aria-current]")) row.removeAttribute("aria-current");
-    const row = this.body.children[index];
+    const row = /** @type {HTMLElement | undefined} */ (this.body.children[index]);
     row?.setAttribute("aria-current", "true");
     if (!row) return;
     // Within its own box: the plots must stay in sight.

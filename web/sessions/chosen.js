@@ -10,13 +10,22 @@ const ZIP_MOST = 1000; // as many as the server takes
 const many = (count) => `${count} session${count === 1 ? "" : "s"}`;
 
 export class Chosen {
-  /** `all` is the box that chooses all of `shown()`; `onSession`, `onDeleted` as the list has them. */
+  /**
+   * @param {object} of
+   * @param {HTMLInputElement} of.all the box that chooses all of `shown()`
+   * @param {() => Session[]} of.shown
+   * @param {(session: Session) => void} of.onSession as the list has them
+   * @param {(id: string) => void} of.onDeleted
+   */
   constructor({ all, shown, onSession, onDeleted }) {
     this.ids = new Set();
-    Object.assign(this, { all, shown, onSession, onDeleted });
+    this.all = all;
+    this.shown = shown;
+    this.onSession = onSession;
+    this.onDeleted = onDeleted;
     all.addEventListener("change", () => {
       this.ids = new Set(all.checked ? shown().map(({ id }) => id) : []);
-      for (const box of document.querySelectorAll("#sessions .session .c-pick input")) box.checked = all.checked;
+      for (const box of /** @type {NodeListOf<HTMLInputElement>} */ (document.querySelectorAll("#sessions .session .c-pick input"))) box.checked = all.checked;
       this.draw();
     });
     byId("chosen-delete").addEventListener("click", () => quietly(() => this.delete()));
@@ -27,7 +36,7 @@ export class Chosen {
     });
   }
 
-  /** The box in a session's row. */
+  /** The box in a session's row. @param {Session} session */
   pick(session) {
     const box = el("input", { type: "checkbox", "data-part": "pick", "aria-label": `Choose ${session.name || session.id}` });
     box.checked = this.ids.has(session.id);
@@ -54,7 +63,7 @@ export class Chosen {
     const size = sealed.reduce((sum, session) => sum + (session.bytes ?? 0), 0);
     const left = chosen.length - sealed.length;
     setText(byId("chosen-text"), `${chosen.length} chosen${left ? `, ${left} not sealed yet and not in a zip file` : ""}`);
-    const zip = byId("chosen-zip");
+    const zip = byId("chosen-zip", HTMLAnchorElement);
     const can = sealed.length > 0 && sealed.length <= ZIP_MOST;
     setText(zip, can ? `Download ${many(sealed.length)} as zip, ${bytes(size)}` : sealed.length ? `At most ${ZIP_MOST} in a zip file` : "Nothing to download");
     if (can) zip.href = api.zipAddress(sealed.map(({ id }) => id));

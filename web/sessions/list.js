@@ -27,19 +27,20 @@ export class Sessions {
     this.cursor = null;
     this.asked = 0;
     this.since = null; // what was told of sessions while the newest are asked for: id -> session or null
+    /** @type {{q?: string, complete?: string}} */
     this.wanted = {}; // as the server is asked
     this.all = el("input", { type: "checkbox", "aria-label": "Choose all that are listed" });
     this.head = head(this.all);
     this.chosen = new Chosen({ all: this.all, onSession, onDeleted, shown: () => [...this.sessions.values()] });
     this.more.addEventListener("click", () => this.load(this.cursor));
     new IntersectionObserver(([one]) => { if (one.isIntersecting) this.load(this.cursor); }, { rootMargin: `${AHEAD_PX}px` }).observe(this.more);
-    const field = byId("sessions-search");
+    const field = byId("sessions-search", HTMLInputElement);
     let typing = null;
     field.addEventListener("input", () => {
       clearTimeout(typing);
       typing = setTimeout(() => this.want("q", field.value.trim()), TYPING_MS);
     });
-    const whole = byId("sessions-complete");
+    const whole = byId("sessions-complete", HTMLSelectElement);
     whole.addEventListener("change", () => this.want("complete", whole.value));
   }
 
@@ -61,6 +62,7 @@ export class Sessions {
     try {
       page = await api.listSessions({ limit: cursor ? MORE : FIRST, ...(cursor ? { cursor } : {}), ...this.wanted });
     } catch (error) {
+      if (!(error instanceof api.Refusal)) throw error;
       if (cursor) notice(error.message, { bad: true });
       return [];
     } finally {
@@ -87,6 +89,7 @@ export class Sessions {
     return this.load();
   }
 
+  /** @param {Session} session */
   take(session) {
     if (!isWanted(session, this.wanted)) return this.drop(session.id);
     // An answer that the link has overtaken: what is sealed stays sealed.
@@ -113,6 +116,7 @@ export class Sessions {
     if (this.sessions.delete(id)) this.draw();
   }
 
+  /** @param {Session} session */
   keyOf(session) {
     let key = this.keys.get(session);
     if (key === undefined) this.keys.set(session, key = JSON.stringify(session));
@@ -137,8 +141,8 @@ export class Sessions {
       const old = this.rows.get(session.id);
       rows.set(session.id, old?.key === key ? old : { key, row: makeRow(session, this.chosen.pick(session), this.buttons(session)) });
     }
-    const focused = document.activeElement;
-    const inside = this.box.contains(focused) ? [focused.closest("[data-session-id]")?.dataset.sessionId, focused.dataset.part] : null;
+    const focused = /** @type {HTMLElement | null} */ (document.activeElement);
+    const inside = this.box.contains(focused) ? [focused.closest("[data-session-id]")?.getAttribute("data-session-id"), focused.dataset.part] : null;
     this.rows = rows;
     this.place([this.head, ...[...rows.values()].map(({ row }) => row)]);
     if (inside?.[0] && !focused.isConnected) rows.get(inside[0])?.row.querySelector(`[data-part="${inside[1]}"]`)?.focus();
@@ -151,7 +155,7 @@ export class Sessions {
     wanted.forEach((row, i) => { if (this.box.children[i] !== row) this.box.insertBefore(row, this.box.children[i] ?? null); });
   }
 
-  /** What can be done with a session in its present state. */
+  /** What can be done with a session in its present state. @param {Session} session */
   buttons(session) {
     const made = [];
     const add = (part, text, action) => {
@@ -166,11 +170,13 @@ export class Sessions {
     return made;
   }
 
+  /** @param {Session} session */
   async edit(session) {
     const changes = await edit(session);
     if (changes) this.onSession(await api.changeSession(session.id, changes));
   }
 
+  /** @param {Session} session */
   async seal(session) {
     const many = frames(session.pending_frames);
     const [question, loss] = session.waits_for === "end"
@@ -184,6 +190,7 @@ export class Sessions {
     notice(`Sealed “${session.name}” ${question}.`);
   }
 
+  /** @param {Session} session */
   async delete(session) {
     await api.deleteSession(session.id);
     this.onDeleted(session.id);
@@ -195,12 +202,13 @@ export class Sessions {
 
 const MISSING = { true: "complete", lossy: "lacking frames", false: "not whole yet" };
 
+/** @param {{q?: string, complete?: string}} wanted */
 function none({ q, complete }) {
   if (q) return `No session${complete ? ` that is ${MISSING[complete]}` : ""} mentions “${q}”.`;
   return complete ? `No session is ${MISSING[complete]}.` : "No sessions yet. Press Record to start one.";
 }
 
-/** As the server chooses. */
+/** As the server chooses. @param {Session} session @param {{q?: string, complete?: string}} wanted */
 function isWanted(session, { q, complete }) {
   return (!complete || String(session.complete) === complete) && (!q || mentions(session, q.toLowerCase()));
 }

@@ -14,7 +14,7 @@ export function head(all) {
   return row;
 }
 
-/** @param {HTMLInputElement} pick chooses it @param {HTMLElement[]} buttons */
+/** @param {Session} session @param {HTMLInputElement} pick chooses it @param {HTMLElement[]} buttons */
 export function makeRow(session, pick, buttons) {
   const [short, long, weight] = plainState(session);
   const name = el("a", {
@@ -44,7 +44,7 @@ export function makeRow(session, pick, buttons) {
     el("div", { cls: "c-do", role: "cell" }, ...buttons));
 }
 
-/** What changes while a session grows, by the class of its element. */
+/** What changes while a session grows, by the class of its element. @param {Session} session */
 export function counts(session) {
   const lost = Object.values(session.lost ?? {}).reduce((sum, count) => sum + count, 0);
   return {
@@ -54,6 +54,7 @@ export function counts(session) {
   };
 }
 
+/** @param {Session} session */
 function downloads(session) {
   const box = el("div", { cls: "c-data", role: "cell" });
   for (const [format, text] of [["parquet", "Parquet"], ["arrow", "Arrow"], ["csv", "CSV"]]) {

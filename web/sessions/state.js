@@ -7,7 +7,7 @@ const WAITS = {
   end: () => "Only its end is open: what the node took last, until the stop, has not come yet. It completes by itself when it has.",
 };
 
-/** State and completeness in plain words: [short, long, how serious]. */
+/** State and completeness in plain words: [short, long, how serious]. @param {Session} session */
 export function plainState(session) {
   const why = session.problem ? ` ${session.problem}` : "";
   const losses = lossesInWords(session.lost).map((loss) => `${loss}.`);

@@ -9,7 +9,7 @@ export class Trash {
   /** `onRestored(session)` takes a session that is back. */
   constructor(onRestored) {
     this.onRestored = onRestored;
-    this.card = byId("trash-card");
+    this.card = byId("trash-card", HTMLDetailsElement);
     this.card.addEventListener("toggle", () => this.card.open && this.load());
     byId("trash-empty").addEventListener("click", () => this.empty());
   }
@@ -29,6 +29,7 @@ export class Trash {
     });
   }
 
+  /** @param {Session} session */
   row(session) {
     const back = el("button", { type: "button", cls: "small", text: "Restore", "aria-label": `Restore ${session.name}` });
     back.addEventListener("click", () => this.restore(session));
@@ -37,6 +38,7 @@ export class Trash {
     return el("li", { "data-session-id": session.id }, back, el("strong", { text: session.name }), el("span", { text: about.join(", ") }));
   }
 
+  /** @param {Session} session */
   restore(session) {
     return quietly(async () => {
       const restored = await api.restoreSession(session.id);

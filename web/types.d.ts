@@ -1,0 +1,56 @@
+// What the server says (docs/api.md), as far as the pages look at it: for `tsc --checkJs`, not for browsers.
+
+interface Session {
+  id: string; name: string; node: string; state: string; complete: boolean | "lossy"; problem: string | null;
+  started_t_ns: number; stopped_t_ns: number | null; duration_s: number; frames: number; pending_frames: number;
+  waits_for: "frames" | "end" | null; lost: Record<string, number>; tail_frames_max: number; marks: number;
+  bytes: number | null; sha256: string | null; parts: object[]; subject: string; notes: string; tags: string[];
+  take: string | null; scene: string; calibration_id: string | null; absolute_scale: "measured" | "assumed" | null;
+  said: string;
+}
+
+/** Sessions of all nodes that were begun with one press, and why there is none of some. */
+interface Take { id: string; sessions: Session[]; failed: Record<string, string> }
+
+interface Mark { id: string; label: string; t_ns: number; said: string }
+
+interface Tile {
+  serial: string; x_m: number; y_m: number; z_m: number; reference?: boolean; full_scale_n?: number | null;
+  range_kpa?: [number, number] | null;
+}
+
+/** What a live message says of one frame, or of all since the message before. */
+interface Frame {
+  node?: string; seq: number; frame_status: number; estimate_status: number | null; contact: boolean | null;
+  grf_n: number | null; grf_sigma_n: number | null; grf_at_least_n: number | null;
+  force_n: (number | null)[]; force_sigma_n: (number | null)[]; gauge_kpa: (number | null)[]; status: (number | null)[];
+  saturated: boolean[];
+  /** Of a session's page: seconds after its first frame. */
+  timeS?: number;
+  [more: string]: any;
+}
+
+/** Of GET /sessions/ID/array. */
+interface Dressed {
+  node: string; tiles: Tile[]; servo: object | null; calibration: object | null; lag_ms: number | null;
+  estimates_problem: string | null;
+}
+
+interface Overview {
+  begin_t_ns: number; duration_s: number; frames_in_bin: number; serials: string[]; provisional?: boolean; behind?: boolean;
+  columns: Record<string, (number | null)[]>;
+}
+
+type OverviewQuery = { points: number; start_s?: number; end_s?: number; columns?: string };
+
+interface Clock { streams: { stretches: { begin_t_ns: number; end_t_ns: number; offset_ns: number; drift_ppm: number }[] }[] }
+
+interface Certain { value: number; interval_95: [number, number] }
+
+/** What `foottile compare` wrote; docs/compare.md. */
+interface ComparisonReport {
+  reference: string; limits?: Record<string, number>; notes: string[]; contact_n: number | null;
+  figures: Record<string, { mean: number | null; interval_95: [number, number] | null; trials: number }>;
+  alignment: { lag_s?: Certain; scale?: Certain; offset_in_flight_n?: Certain; offset_removed?: boolean };
+  trials?: object[]; trials_are?: string;
+}
