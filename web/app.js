@@ -15,7 +15,7 @@ import { byId, el, setText } from "./common/text.js";
 import { Actions } from "./live/actions.js";
 import { Bars } from "./live/bars.js";
 import { Foot } from "./live/foot.js";
-import { helpWithKeys } from "./live/help.js";
+import { helpWithKeys } from "./common/help.js";
 import { drawGrf } from "./live/grf.js";
 import { History } from "./live/history.js";
 import { Marks } from "./live/marks.js";
@@ -45,7 +45,7 @@ const state = {
   serverNowMs: () => Date.now() + state.serverAheadMs,
 };
 
-inSunlight(byId("sun"));
+inSunlight();
 const again = () => { state.fresh = true; };
 const range = new Range(byId("range"), again);
 const bars = new Bars(again, range);

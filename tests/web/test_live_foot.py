@@ -223,9 +223,10 @@ def test_tiles_are_shown_as_traces_and_this_is_remembered(
         expect(page.locator("#bars .tile")).to_have_count(2)
 
 
-def test_in_the_sun_it_is_black_on_white_whatever_the_machine_prefers(
+def test_in_the_sun_every_page_is_black_on_white_whatever_the_machine_prefers(
     scripted: Scripted, browser: Browser
 ) -> None:
+    session = scripted.recorded("walk")
     with (
         Play(scripted.node, 15.0),
         browser.new_context(color_scheme="dark", viewport={"width": 390, "height": 844}) as context,
@@ -246,7 +247,16 @@ def test_in_the_sun_it_is_black_on_white_whatever_the_machine_prefers(
         page.reload()
         assert page.evaluate(colours) == ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
         expect(page.locator(LIVE)).to_have_count(1)
+        page.goto(f"{scripted.url}/nodes")
+        assert page.evaluate(colours) == ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
+        page.goto(f"{scripted.url}/sessions/{session.id}")
+        expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
+        assert page.evaluate(colours) == ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
+        assert complaints(page) == []
         page.click("#sun")
+        assert page.evaluate(colours) != ["rgb(0, 0, 0)", "rgb(255, 255, 255)"]
+        page.goto(scripted.url)
+        expect(page.locator(LIVE)).to_have_count(1)
         page.emulate_media(contrast="more")
         assert complaints(page) == []
 

@@ -99,6 +99,11 @@ def test_a_node_that_sends_nothing_is_not_recorded_and_its_card_says_why(
             expect(page.locator(live("bench"))).to_have_count(1)
             expect(page.locator(f"{card('silent')} .state")).to_have_text("no data yet")
             assert complaints(page) == []
+            page.keyboard.press("?")
+            expect(page.locator("#help-dialog")).to_contain_text("Record all that are connected")
+            assert complaints(page) == []
+            page.keyboard.press("Escape")
+            expect(page.locator("#help-dialog")).to_be_hidden()
             page.keyboard.press("r")
             expect(page.locator(f"{card('bench')}[data-recording=true]")).to_have_count(1)
             refused = page.locator(f"{card('silent')} .refused")

@@ -18,8 +18,15 @@ pytestmark = pytest.mark.real_time
 OpenPage = Callable[..., Page]
 
 
+TOKEN = "a-token-of-this-test"  # noqa: S105  # of this test
+
+
 @pytest.fixture
 def session(scripted: Scripted) -> Recording:
+    return marked(scripted)
+
+
+def marked(scripted: Scripted) -> Recording:
     """A sealed session with a mark in its middle."""
     session = scripted.recorded("walk")
     t_ns = session.column("t_ns")
@@ -37,11 +44,28 @@ def marks(session: Recording) -> list[dict[str, Any]]:
     return items
 
 
-def opened(session: Recording, open_page: OpenPage) -> Page:
-    page = open_page(f"{session.running.url}/sessions/{session.id}")
+def opened(session: Recording, open_page: OpenPage, ticket: str = "") -> Page:
+    page = open_page(f"{session.running.url}/sessions/{session.id}#{ticket}")
     expect(page.locator("#plots[data-settled=true]")).to_have_count(1)
     expect(page.locator("#marks-list li")).to_have_count(len(marks(session)))
     return page
+
+
+def left_px(page: Page) -> float:
+    """Where plots begin."""
+    px: float = page.locator("#plots").evaluate("(plots) => plots.clientWidth < 600 ? 40 : 56")
+    return px
+
+
+def drag_in_plots(page: Page, from_px: float, to_px: float) -> None:
+    """Drag at the height of marks' flags."""
+    page.locator("#plots").evaluate("(plots) => plots.scrollIntoView()")
+    box = page.locator("#plots").bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + from_px, box["y"] + 8)
+    page.mouse.down()
+    page.mouse.move(box["x"] + to_px, box["y"] + 8, steps=3)
+    page.mouse.up()
 
 
 def test_a_mark_is_renamed_moved_to_the_cursor_dragged_and_removed(
@@ -67,15 +91,8 @@ def test_a_mark_is_renamed_moved_to_the_cursor_dragged_and_removed(
     offset_ns = session.clock()["streams"][0]["stretches"][0]["offset_ns"]
     assert marks(session)[0]["t_ns"] - offset_ns == pytest.approx(int(t_ns[1]), abs=2e5)
 
-    page.locator("#plots").evaluate("(plots) => plots.scrollIntoView()")
-    box = page.locator("#plots").bounding_box()
-    assert box is not None
-    at_px = page.locator("#plots").evaluate("(plots) => plots.clientWidth < 600 ? 40 : 56")
     moved = marks(session)[0]["t_ns"]
-    page.mouse.move(box["x"] + at_px + 12, box["y"] + 8)
-    page.mouse.down()
-    page.mouse.move(box["x"] + 200, box["y"] + 8, steps=3)
-    page.mouse.up()
+    drag_in_plots(page, left_px(page) + 12, 200)
     wait_until(lambda: marks(session)[0]["t_ns"] > moved, "the flag to be where it was let go")
     dragged_s = (marks(session)[0]["t_ns"] - offset_ns - int(t_ns[0])) * 1e-9
     shown = page.locator("#marks-list li").get_attribute("data-time-s")
@@ -115,6 +132,26 @@ def test_what_people_say_is_changed_and_the_second_of_two_is_told(
     expect(one.locator("#notices")).to_contain_text("changed by somebody else")
     expect(one.locator("#marks-list")).to_contain_text("water")
     assert marks(session)[0]["label"] == "water"
+
+
+def test_a_viewer_drags_no_mark_and_is_offered_to_change_none(
+    script: Callable[..., Scripted], open_page: OpenPage
+) -> None:
+    server = script(token=TOKEN)
+    session = marked(server)
+    ticket = server.running.http.post("/tickets", json={"may": "look"}).json()["ticket"]
+    page = opened(session, open_page, f"ticket={ticket}")
+    expect(page.locator("#login")).to_have_text("viewer: looks only")
+    expect(page.get_by_label("Change the mark a stone")).to_be_hidden()
+    expect(page.locator("#edit")).to_be_hidden()
+    before_s = page.locator("#marks-list li").get_attribute("data-time-s")
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.method))
+    middle = (left_px(page) + page.locator("#plots").evaluate("(plots) => plots.clientWidth")) / 2
+    drag_in_plots(page, middle + 12, middle + 160)
+    expect(page.locator("#plots")).to_have_attribute("data-whole", "false")  # a stretch is chosen
+    expect(page.locator("#marks-list li")).to_have_attribute("data-time-s", before_s or "")
+    assert set(asked) <= {"GET"}
 
 
 def test_it_says_what_became_of_every_frame(session: Recording, open_page: OpenPage) -> None:

@@ -64,6 +64,7 @@ export function whenColoursChange(then) {
   for (const query of ["(prefers-color-scheme: dark)", "(forced-colors: active)", "(prefers-contrast: more)"]) {
     matchMedia(query).addEventListener("change", then);
   }
+  document.addEventListener("foottile-colours", then);
 }
 
 const TILE_PX = 8;

@@ -1,5 +1,6 @@
 // The page of all nodes: a card for each, and what is recorded on all of them together.
 
+import { helpWithKeys } from "../common/help.js";
 import { Link } from "../common/link.js";
 import { look } from "../common/login.js";
 import { inSunlight } from "../common/sunlight.js";
@@ -112,6 +113,7 @@ function recolour() {
 document.addEventListener("foottile-colours", recolour);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
 inSunlight();
+helpWithKeys();
 setInterval(write, EVERY_MS);
 write();
 draw();

@@ -2,8 +2,10 @@
 
 import * as api from "../common/api.js";
 import { edit } from "../common/dialogs.js";
+import { helpWithKeys } from "../common/help.js";
 import { enter } from "../common/login.js";
 import { notice, quietly } from "../common/notices.js";
+import { inSunlight } from "../common/sunlight.js";
 import { byId, setText } from "../common/text.js";
 import { plainState } from "../sessions/state.js";
 import { drawHeader } from "./header.js";
@@ -88,4 +90,6 @@ const WHY = {
   sealing: "This session is being written. What is shown is provisional for a moment yet.",
 };
 
+inSunlight();
+helpWithKeys();
 enter().then(() => quietly(look));

@@ -1,6 +1,7 @@
 // A sealed session: which time is shown, where the cursor is, and all that follows from these.
 
 import * as api from "../common/api.js";
+import { mayPress } from "../common/login.js";
 import { notice, quietly } from "../common/notices.js";
 import { byId, setText } from "../common/text.js";
 import { offsetAt } from "./clock.js";
@@ -133,7 +134,7 @@ export class Plotted {
     const scale = () => (this.view.to - this.view.from) / plots.plotWidth;
     listen(byId("plots"), {
       point: (px, hovering = false) => { if (!hovering || !this.replay.playing.going) this.point(time(px)); },
-      grab: (px, py) => { const id = flagAt(plots, px, py); return id !== null && this.marks.grab(id); },
+      grab: (px, py) => { const id = flagAt(plots, px, py); return id !== null && mayPress() && this.marks.grab(id); },
       drag: (px) => this.marks.drag(time(px)),
       drop: (px) => this.marks.drop(px === null ? null : time(px)),
       choosing: (from, to) => { this.chosen = [time(from), time(to)]; this.draw(); },

@@ -1,0 +1,14 @@
+// The help of a page: `?` opens it, so does its button.
+
+import { byId, isInside } from "./text.js";
+
+export function helpWithKeys() {
+  const dialog = byId("help-dialog", HTMLDialogElement);
+  const open = () => { if (!dialog.open) dialog.showModal(); };
+  byId("help").addEventListener("click", open);
+  document.addEventListener("keydown", (event) => {
+    if (event.key !== "?" || event.ctrlKey || event.metaKey || event.altKey || isInside(event, "input, textarea, select, dialog")) return;
+    event.preventDefault();
+    open();
+  });
+}
