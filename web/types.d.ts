@@ -30,6 +30,9 @@ interface Frame {
   [more: string]: any;
 }
 
+/** A place on the traces of the live page. */
+interface TilePoint { timeS: number; tiles: Record<string, (number | null)[]> | null; gap?: boolean }
+
 /** Of GET /sessions/ID/array. */
 interface Dressed {
   node: string; tiles: Tile[]; servo: object | null; calibration: object | null; lag_ms: number | null;

@@ -46,7 +46,7 @@ export class TileTraces {
 
   /**
    * @param {{tiles: Tile[]}} node
-   * @param {{points: {tiles: Record<string, (number | null)[]> | null}[], tilesPast: any, endS: number, windowS: number, live: boolean}} seen what the force is drawn of
+   * @param {{points: TilePoint[], tilesPast: TilePoint[], endS: number, windowS: number, live: boolean}} seen what the force is drawn of
    * @param {number} nowMs
    * @param {string} unitChosen
    */
