@@ -8,7 +8,7 @@ const AT_ONCE = ["parquet", "arrow", "csv"]; // they stand in the page; the othe
 export class Downloads {
   constructor() {
     this.formats = [];
-    this.links = new Map(AT_ONCE.map((name) => [name, byId(`download-${name}`)]));
+    this.links = new Map(AT_ONCE.map((name) => [name, byId(`download-${name}`, HTMLAnchorElement)]));
   }
 
   /** What the server can make; without an answer there are those in the page. */
