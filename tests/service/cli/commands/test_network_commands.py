@@ -193,7 +193,7 @@ def test_exports_say_the_same_in_every_format(demo: Demo, session: str, tmp_path
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--format", "xlsx"), "parquet or arrow or csv"),
+        (("--format", "xlsx"), "one of parquet, arrow, csv"),
         (("--format", "csv", "--columns", "nonsense"), "no column 'nonsense'"),
     ],
 )
