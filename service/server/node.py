@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -26,6 +25,7 @@ from service.estimation.calibration import Calibration
 from service.link import BOOT_ID, Hello, StreamNumbers
 from service.server.assignment import Assignment
 from service.server.live_estimates import LiveEstimates
+from service.server.pace import Pace
 from service.server.streams import ServerStream
 from service.server.tare_keeper import TareKeeper
 from service.server_clock import utc_ns
@@ -40,8 +40,6 @@ from storage.journal.journal import RING_NS, Journal
 
 log = logging.getLogger("foottile.nodes")
 
-_RATE_OVER_NS = 1_000_000_000
-_JITTER = 1.02
 IS_BOOT_ID = re.compile(BOOT_ID)
 HELLO_FILE = "hello.json"
 
@@ -85,7 +83,7 @@ class ServerNode:
         """Instant of the newest frame on the screens, in the node's UTC."""
         self._folder = folder
         self._journals_folder = journals
-        self._pace: deque[tuple[int, int]] = deque()
+        self._pace = Pace()
         self._found: list[str] = []
         for path in sorted(journals.glob("*")):
             if IS_BOOT_ID.fullmatch(path.name):
@@ -215,19 +213,9 @@ class ServerNode:
     @property
     def rate_hz(self) -> float | None:
         """Frames a second over the last second, by the node's clock; 0 if none came in it."""
-        if len(self._pace) < 2:  # a rate needs two instants
-            return None
-        if self.present.last_seen_t_ns is None or (
-            utc_ns() - self.present.last_seen_t_ns > 2 * _RATE_OVER_NS
-        ):
-            return 0.0
-        (first_ns, first_seq), (last_ns, last_seq) = self._pace[0], self._pace[-1]
-        if last_ns <= first_ns:
-            return None
-        rate_hz = (last_seq - first_seq) / ((last_ns - first_ns) * 1e-9)
-        # The nominal rate is what bus and node can do: more in one second is its jitter.
-        nominal_hz = self.info.nominal_rate_hz
-        return nominal_hz if nominal_hz < rate_hz < _JITTER * nominal_hz else rate_hz
+        seen_t_ns = self.present.last_seen_t_ns
+        silent_ns = None if seen_t_ns is None else utc_ns() - seen_t_ns
+        return self._pace.rate_hz(self.info.nominal_rate_hz, silent_ns)
 
     def attach(self, hello: Hello, now_t_ns: int) -> None:
         """The node has connected, and said which frames it has.
@@ -317,9 +305,7 @@ class ServerNode:
         if self.last_seq is not None and first <= self.last_seq:
             frames = frames.rows(self.last_seq + 1 - first, len(frames))
         self.last_seq, self.last_t_ns = last, int(frames.t_ns[-1])
-        self._pace.append((int(frames.t_mono_ns[-1]), last))
-        while self._pace[-1][0] - self._pace[0][0] > _RATE_OVER_NS and len(self._pace) > 2:
-            self._pace.popleft()
+        self._pace.note(int(frames.t_mono_ns[-1]), last)
         return first, last, self._estimated(frames)
 
     def take_tare(self, reason: str = "") -> RecordedTare:

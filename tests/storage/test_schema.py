@@ -41,6 +41,8 @@ SUFFIXES = {
     "rad": "rad",
     "ns": "ns",
     "us": "us",
+    "s": "s",
+    "utc": "UTC",
     "counts": "counts",
 }
 
@@ -180,6 +182,8 @@ def test_every_column_on_disk_says_its_unit() -> None:
     values["part"] = np.zeros(3, dtype=np.uint16)
     for column in SERVER_TIME:
         values[column.name] = np.zeros(3, dtype=np.int64)
+    values["time_s"] = np.zeros(3)
+    values["time_utc"] = np.zeros(3, dtype="datetime64[ns]")
     fields_made = [field for field, _ in flat_columns(tuple(KNOWN.values()), values)]
     assert len(fields_made) == len(KNOWN) + sum(c.per_tile for c in KNOWN.values())
     for field in fields_made:

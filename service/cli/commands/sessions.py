@@ -77,7 +77,10 @@ def sessions_command(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List recorded sessions, newest first: all, or those that fulfil all that is asked for."""
+    """List recorded sessions, newest first.
+
+    All of them, or those that fulfil all that is asked for.
+    """
     from rich.markup import escape
     from rich.table import Table
 
