@@ -31,7 +31,7 @@ from storage.schema import KNOWN
 
 FRAMES_MAX = 2_000_000
 """An hour at 544 Hz."""
-NUMBERS_MAX = 40_000_000
+NUMBERS_MAX = 50_000_000
 """Samples times channels that are kept in memory, at some 40 bytes each."""
 C3D_FRAMES_MAX = 32_767
 """Older readers know no more; several samples make one frame then."""
