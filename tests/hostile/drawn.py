@@ -22,6 +22,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
+from service.api.guard import LOGIN_PATH, SAFE_METHODS
 from tests.hostile.attack import Outcome, Play
 from tests.hostile.stage import Served, traces
 
@@ -104,8 +105,8 @@ def _ask(
     except FailureGroup as found:
         outcome.failed(f"{command}: {answer.status_code}: {found.exceptions[0]}"[:2000])
         return
-    # Who has no login may log out.
-    is_change = case.method.upper() not in ("GET", "HEAD", "OPTIONS") and case.path != "/login"
+    # Who has no login may try to get one, and log out.
+    is_change = case.method.upper() not in SAFE_METHODS and case.path != LOGIN_PATH
     if token and is_change and not headers and answer.status_code not in _REFUSED:
         outcome.failed(f"{command}: {answer.status_code} without the token")
         return
